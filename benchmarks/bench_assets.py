@@ -15,12 +15,12 @@ from benchmarks.timing import Figure
 from roadscan.assets.intensity import calibrated_scene, gains_of, intensity_sample
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
-from roadscan.jobs.assets.kinds import wanted_kinds
-from roadscan.jobs.assets.load_returns import load_squares
-from roadscan.jobs.assets.plan import AssetPlan, plan_assets
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
+from roadscan.assets.tasks.kinds import wanted_kinds
+from roadscan.assets.tasks.load_returns import load_squares
+from roadscan.assets.tasks.plan import AssetPlan, plan_assets
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene as Street
 from roadscan.simulate import simulate
 

@@ -10,14 +10,14 @@ import pyarrow.csv as pa_csv
 from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import Figure, best_seconds
-from roadscan.model.crs import world_from_geodetic
-from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned, quaternion_from_rotation, rotation_from_rph
-from roadscan.model.gpstime import NS_PER_S, WEEK_S
-from roadscan.model.imu import IMU_GRADES
-from roadscan.model.rig import Mounting, Rig
-from roadscan.navigation.calibration.estimator import Calibration, Prior, calibrate
-from roadscan.navigation.calibration.evidence import Seen, Ties, Traverse
-from roadscan.navigation.calibration.stop_and_go import HeadRun, find_orientation
+from roadscan.calibrate.estimator import Calibration, Prior, calibrate
+from roadscan.calibrate.evidence import Seen, Ties, Traverse
+from roadscan.calibrate.stop_and_go import HeadRun, find_orientation
+from roadscan.core.crs import world_from_geodetic
+from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, quaternion_from_rotation, rotation_from_rph
+from roadscan.core.gpstime import NS_PER_S, WEEK_S
+from roadscan.core.imu import IMU_GRADES
+from roadscan.core.rig import Mounting, Rig
 from roadscan.navigation.inertial.readings import ImuReadings
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.simulate import Scene, simulate

@@ -18,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.timing import Figure
-from roadscan.model.settings.segmentation import SegmentationConfig
-from roadscan.points.readings import ScanGeometry
-from roadscan.points.segmentation import segmented
-from roadscan.surfaces.coarse import CoarseModel, CoarseSettings, Stretch, coarse_model
-from roadscan.surfaces.regions import RegionSettings, find_regions
+from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.settings.segmentation import SegmentationConfig
+from roadscan.surface.coarse import CoarseModel, CoarseSettings, Stretch, coarse_model
+from roadscan.surface.regions import RegionSettings, find_regions
+from roadscan.tiles.georeferencing.segmentation import segmented
 from roadscan.tiles.grid import Bounds, TileGrid
 
 LENGTH_M, SPEED_M_PER_S = 1000.0, 50.0 / 3.6

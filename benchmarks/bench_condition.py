@@ -16,12 +16,12 @@ from scipy.linalg import expm
 
 from benchmarks.bench_lanes import RoughSurvey, rough_scene
 from benchmarks.timing import Figure, thread_seconds
-from roadscan.condition.quarter_car import GOLDEN_CAR, RULES, SPEED_M_PER_S
-from roadscan.condition.ride import ride
-from roadscan.condition.spectrum import road_spectrum
-from roadscan.condition.straightedge import straightedge_mm
-from roadscan.condition.texture import texture_segments
-from roadscan.kernels.condition.quarter_car import roll
+from roadscan.condition.kernels.quarter_car import roll
+from roadscan.condition.profiles.quarter_car import GOLDEN_CAR, RULES, SPEED_M_PER_S
+from roadscan.condition.profiles.ride import ride
+from roadscan.condition.profiles.spectrum import road_spectrum
+from roadscan.condition.profiles.straightedge import straightedge_mm
+from roadscan.condition.profiles.texture import texture_segments
 
 SAMPLES = 1_000_000
 PLAIN_SAMPLES = 20_000
@@ -79,7 +79,7 @@ def _used(survey_file: Path, stages: str) -> tuple[float, float]:
     """Peak resident memory (MiB) and processor time (s) of a process of its own that does some stages."""
     script = (
         "import json, resource, sys, time; from pathlib import Path; from benchmarks.bench_lanes import RoughSurvey;"
-        "from roadscan.jobs.run import run_stages; from roadscan.jobs.stage import stage_named;"
+        "from roadscan.run.run import run_stages; from roadscan.run.stage import stage_named;"
         "run_stages(RoughSurvey(Path(sys.argv[1])).session('store'), [stage_named(n) for n in sys.argv[2].split()]);"
         "print(json.dumps([resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, time.process_time()]))"
     )

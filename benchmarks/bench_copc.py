@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.timing import Figure
-from roadscan.jobs.publish.cloud_file import PointSpool, write_cloud
-from roadscan.model.crs import MapFrame
-from roadscan.model.ids import TileId
-from roadscan.points.cloud import QUANTA_PER_M, TilePoints
-from roadscan.products.cloud_records import Lattice
+from roadscan.core.crs import MapFrame
+from roadscan.core.ids import TileId
+from roadscan.site.cloud_file import PointSpool, write_cloud
+from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M, TilePoints
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.products.cloud_records import Lattice
 
 TILES, POINTS = 12, 500_000
 GRID = TileGrid(10.0, 0.005)

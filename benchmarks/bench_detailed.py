@@ -16,12 +16,12 @@ from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.spatial import Delaunay
 
 from benchmarks.timing import Figure, in_turns, thread_seconds
-from roadscan.surfaces.clough_tocher import cubic_surface
-from roadscan.surfaces.detailed import DetailedSettings, detailed_surface
-from roadscan.surfaces.normals import slopes_at
-from roadscan.surfaces.sites import sites
-from roadscan.surfaces.triangulation import triangulate
-from roadscan.surfaces.window import GridWindow
+from roadscan.surface.clough_tocher import cubic_surface
+from roadscan.surface.detailed import DetailedSettings, detailed_surface
+from roadscan.surface.normals import slopes_at
+from roadscan.surface.sites import sites
+from roadscan.surface.triangulation import triangulate
+from roadscan.surface.window import GridWindow
 from roadscan.tiles.grid import Bounds
 from tests.surfaces.test_detailed import franke
 

@@ -11,13 +11,13 @@ import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import Figure, best_seconds
-from roadscan.model.crs import MapFrame, world_from_geodetic
-from roadscan.model.rig import Mountings, Sensor
+from roadscan.core.crs import MapFrame, world_from_geodetic
+from roadscan.core.rig import Mountings, Sensor
+from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.navigation.trajectory import Trajectory, world_from_ned
-from roadscan.points.charts import charts_along
-from roadscan.points.place import HeightLimits, Placement
-from roadscan.points.reach import RangeSpans, Reach
-from roadscan.points.readings import ScanGeometry
+from roadscan.tiles.georeferencing.charts import charts_along
+from roadscan.tiles.georeferencing.place import HeightLimits, Placement
+from roadscan.tiles.georeferencing.reach import RangeSpans, Reach
 
 SECONDS = 10.0
 TILE_QUANTA = 1_000_000

@@ -32,18 +32,18 @@ import shapely
 
 from benchmarks.line_rate_ingest import line_rate_figures
 from benchmarks.timing import Figure, best_seconds
-from roadscan.jobs.ingest.ingest import ingest
-from roadscan.model.crs import MapFrame
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.model.rig import Sensor
-from roadscan.model.survey import Survey
-from roadscan.sensors.base import LogSource, Reject, format_named, log_formats
-from roadscan.sensors.clouds.opencrg_file import CurvedRegularGrid, write_crg
-from roadscan.sensors.motion.nmea_writer import Fix, sentences
-from roadscan.sensors.motion.ubx import HEADER, SOLUTION
-from roadscan.sensors.scanners.psi_container import PsiContainer, PsiHeader, write_psi
-from roadscan.sensors.scanners.sick_telegrams import encode_scans
-from roadscan.tables.store import Store
+from roadscan.core.crs import MapFrame
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.rig import Sensor
+from roadscan.core.survey import Survey
+from roadscan.formats.clouds.opencrg_file import CurvedRegularGrid, write_crg
+from roadscan.formats.motion.nmea_writer import Fix, sentences
+from roadscan.formats.motion.ubx import HEADER, SOLUTION
+from roadscan.formats.scanners.psi_container import PsiContainer, PsiHeader, write_psi
+from roadscan.formats.scanners.sick_telegrams import encode_scans
+from roadscan.ingest.format import LogSource, Reject, format_named, log_formats
+from roadscan.ingest.ingest import ingest
+from roadscan.store.store import Store
 
 SBET_BAR = 5.0
 """Million records a second."""

@@ -21,12 +21,12 @@ from benchmarks.timing import Figure
 from roadscan.inventory.home import Home
 from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
+from roadscan.inventory.of_survey import ADDRESS
 from roadscan.inventory.recording import Found, Rules
 from roadscan.inventory.visibility import Unknown
-from roadscan.jobs.inventory import ADDRESS
-from roadscan.tables.asset_schema import asset_schema
-from roadscan.tables.asset_truth import AssetTruth
-from roadscan.tables.store import Store
+from roadscan.store.asset_schema import asset_schema
+from roadscan.store.asset_truth import AssetTruth
+from roadscan.store.store import Store
 
 COUNTS = {"pole": 40_000, "sign": 20_000, "tree": 15_000, "kerb": 10_000, "lane_line": 10_000, "sidewalk": 5_000}
 EDITS = 1_000

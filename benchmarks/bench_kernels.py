@@ -13,16 +13,16 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.timing import Figure, best_seconds
-from roadscan.kernels.georeferencing.readings import FATES, Placed, Returns
-from roadscan.kernels.georeferencing.timed_readings import CHUNK, place_returns
-from roadscan.model.crs import MapFrame, world_from_geodetic
-from roadscan.model.ids import TileId
-from roadscan.model.rig import Mountings, Sensor
+from roadscan.core.crs import MapFrame, world_from_geodetic
+from roadscan.core.ids import TileId
+from roadscan.core.rig import Mountings, Sensor
+from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.points.charts import charts_along
-from roadscan.points.cloud import TilePoints
-from roadscan.points.place import EVERYWHERE, HeightLimits, Placement
-from roadscan.points.readings import ScanGeometry
+from roadscan.tiles.georeferencing.charts import charts_along
+from roadscan.tiles.georeferencing.cloud import TilePoints
+from roadscan.tiles.georeferencing.kernels.readings import FATES, Placed, Returns
+from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK, place_returns
+from roadscan.tiles.georeferencing.place import EVERYWHERE, HeightLimits, Placement
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.statistics import cells_of
 

@@ -20,15 +20,15 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.timing import Figure
-from roadscan.jobs.condition.against_truth import Compared, compared_values
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
-from roadscan.model.strict import load_toml
-from roadscan.model.survey import Survey
+from roadscan.condition.tasks.against_truth import Compared, compared_values
+from roadscan.core.strict import load_toml
+from roadscan.core.survey import Survey
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.surface import Surface
-from roadscan.tables.store import Store
+from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
 

@@ -23,16 +23,16 @@ from benchmarks.network import Region
 from benchmarks.scheduler import Watched, running_scheduler
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
-from roadscan.jobs.engine.bundles import Bundle, Ended
-from roadscan.jobs.engine.compute import Made, rare_collections
-from roadscan.jobs.engine.on_dask import OnDask
-from roadscan.jobs.products import OutputTask, make_products, product_context, wanted_tile_products
-from roadscan.jobs.tiles.footprints import PRODUCT, FootprintTask, index_footprints
-from roadscan.jobs.tiles.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
-from roadscan.jobs.tiles.tiles import TaskResult, compute_tiles, run_tasks
-from roadscan.tables.manifest import Manifest, OutputRecord
-from roadscan.tables.records import Packed, Row
-from roadscan.tables.store import Store
+from roadscan.run.engine.bundles import Bundle, Ended
+from roadscan.run.engine.compute import Made, rare_collections
+from roadscan.run.engine.on_dask import OnDask
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.records import Packed, Row
+from roadscan.store.store import Store
+from roadscan.tiles.footprints.footprints import PRODUCT, FootprintTask, index_footprints
+from roadscan.tiles.mosaics.products import OutputTask, make_products, product_context, wanted_tile_products
+from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
+from roadscan.tiles.tasks.tiles import TaskResult, compute_tiles, run_tasks
 
 _BAR_S = 120.0
 _Work: TypeAlias = Callable[[Any], Any]
@@ -171,7 +171,7 @@ def _timed(stage: _Stage, region: Region, client: Any, work: _Work) -> Iterator[
 
 def _imports() -> None:
     """What every worker does once, before its first task."""
-    importlib.import_module("roadscan.jobs.run")
+    importlib.import_module("roadscan.run.run")
 
 
 class _NoKernels(OnDask):

@@ -16,19 +16,19 @@ import rasterio
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.timing import Figure, thread_seconds
-from roadscan.codecs.cog import Band
-from roadscan.codecs.gdal import raster_settings
-from roadscan.model.crs import MapFrame
-from roadscan.model.ids import TileId
-from roadscan.products.base import ProductContext, Tile, TileSummary
-from roadscan.products.hillshade import HillshadeOptions, shade
-from roadscan.products.kilometre import Kilometre, KilometreOptions
-from roadscan.products.model_las import ModelLas, ModelLasFine
-from roadscan.products.pavement import IntensityOptions, PavementIntensity, PavementShaded, ShadedOptions
-from roadscan.products.raster import CellBox, SparseRaster, paste_tile
+from roadscan.core.crs import MapFrame
+from roadscan.core.ids import TileId
+from roadscan.store.codecs.cog import Band
+from roadscan.store.codecs.gdal import raster_settings
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.decimate import decimate
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.product import ProductContext, Tile, TileSummary
+from roadscan.tiles.products.hillshade import HillshadeOptions, shade
+from roadscan.tiles.products.kilometre import Kilometre, KilometreOptions
+from roadscan.tiles.products.model_las import ModelLas, ModelLasFine
+from roadscan.tiles.products.pavement import IntensityOptions, PavementIntensity, PavementShaded, ShadedOptions
+from roadscan.tiles.products.raster import CellBox, SparseRaster, paste_tile
 from roadscan.tiles.pyramid import Level
 
 EDGE, WIDTH, CELL_M = 2000, 800, 0.005

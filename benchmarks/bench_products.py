@@ -18,16 +18,16 @@ from rasterio.enums import Resampling
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.timing import Figure, thread_seconds
-from roadscan.codecs.gdal import raster_crs, raster_settings
-from roadscan.jobs.tiles.cell_files import cells_table, overviews_table, write_cells, write_overviews
-from roadscan.model.crs import MapFrame
-from roadscan.model.ids import TileId
-from roadscan.products.base import ProductContext, Tile
-from roadscan.products.geotiff import GeoTiff, GeoTiffOptions
-from roadscan.products.raster import CellBox, cell_image
+from roadscan.core.crs import MapFrame
+from roadscan.core.ids import TileId
+from roadscan.store.codecs.gdal import raster_crs, raster_settings
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.product import ProductContext, Tile
+from roadscan.tiles.products.geotiff import GeoTiff, GeoTiffOptions
+from roadscan.tiles.products.raster import CellBox, cell_image
 from roadscan.tiles.pyramid import overview_factors, pyramid_of
+from roadscan.tiles.tasks.cell_files import cells_table, overviews_table, write_cells, write_overviews
 
 READINGS_A_CELL = 25
 EDGE = 2000

@@ -15,16 +15,16 @@ import numpy as np
 from benchmarks import surveys
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure, thread_seconds
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.jobs.surface_work import plan_surface_work
-from roadscan.jobs.surfaces.surface_plan import SurfacePlan
-from roadscan.jobs.surfaces.surfaces import compute_surfaces, source_of
-from roadscan.model.survey import Survey
-from roadscan.surfaces.reconstruction import surface_of
-from roadscan.tables.store import Store
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.store.store import Store
+from roadscan.surface.reconstruction import surface_of
+from roadscan.surface.tasks.surface_plan import SurfacePlan
+from roadscan.surface.tasks.surface_work import plan_surface_work
+from roadscan.surface.tasks.surfaces import compute_surfaces, source_of
 
 PAIR_M, SICK_S = 5.0, 60.0
 _PIECES = ("crack_pieces", "pothole_pieces")

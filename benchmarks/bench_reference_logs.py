@@ -34,18 +34,18 @@ from benchmarks.settings import Settings
 from benchmarks.timing import Figure
 from roadscan.adjust.control import Sighting
 from roadscan.adjust.observations import KINDS, Observations
-from roadscan.jobs.adjust import adjustment
-from roadscan.jobs.adjust.solution import Evidence, Solution
-from roadscan.jobs.engine.compute_on import compute_on
-from roadscan.jobs.readings import load_recorded
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Reporter, Session
-from roadscan.jobs.stage import stage_named
-from roadscan.model.survey import Survey
+from roadscan.adjust.tasks import adjustment
+from roadscan.adjust.tasks.solution import Evidence, Solution
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute_on import compute_on
+from roadscan.run.run import run_stages
+from roadscan.run.session import Reporter, Session
+from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.earth import Earth
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from roadscan.tiles.tasks.readings import load_recorded
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

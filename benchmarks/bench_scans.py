@@ -18,10 +18,10 @@ import pyarrow.parquet as pq
 from fsspec.implementations.local import LocalFileSystem
 
 from benchmarks.timing import Figure, best_seconds
-from roadscan.tables.profiles import ProfileReader
-from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store
-from roadscan.tables.writer import write_parquet
+from roadscan.store.profiles import ProfileReader
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+from roadscan.store.writer import write_parquet
 
 PROFILES, READINGS = 4096, 2000
 SCHEMA = table_schema("scans")

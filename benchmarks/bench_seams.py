@@ -20,16 +20,16 @@ from scipy.spatial.transform import Rotation
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
 from roadscan.adjust.observations import FIXED, Observations
-from roadscan.jobs.adjust import solution
-from roadscan.jobs.engine.compute_on import compute_on
-from roadscan.jobs.readings import load_trajectory
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Reporter, Session
-from roadscan.jobs.stage import stage_named
-from roadscan.model.survey import Survey
+from roadscan.adjust.tasks import solution
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute_on import compute_on
+from roadscan.run.run import run_stages
+from roadscan.run.session import Reporter, Session
+from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.earth import Earth
-from roadscan.tables.store import Store
+from roadscan.store.store import Store
+from roadscan.tiles.tasks.readings import load_trajectory
 
 Float64 = npt.NDArray[np.float64]
 

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.timing import Figure
-from roadscan.model.imu import ImuGrade
-from roadscan.model.settings.smoothing import SmootherConfig
+from roadscan.core.imu import ImuGrade
+from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.adaptive import solve_adaptively
 from roadscan.navigation.inertial.outcome import figures_of
 from roadscan.navigation.inertial.readings import Solution

@@ -12,8 +12,8 @@ from scipy.ndimage import median_filter
 from scipy.sparse.linalg import cg, spsolve
 
 from benchmarks.timing import Figure, thread_seconds
-from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
-from roadscan.surfaces.smoothing import Smoothing, smooth_surface, steps
+from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
+from roadscan.surface.smoothing import Smoothing, smooth_surface, steps
 from tests.surfaces.patches import (
     CLASSES_M,
     PROFILER_1,

@@ -24,14 +24,14 @@ from benchmarks.calibration_yard import (
     profiler_yard,
 )
 from benchmarks.timing import Figure
-from roadscan.model.settings.calibration import CalibrationSettings
-from roadscan.navigation.calibration.estimator import Calibration, calibrate
-from roadscan.navigation.calibration.evidence import Evidence, Orientation
-from roadscan.navigation.calibration.surfaces.heads import HeadTies, agreement
-from roadscan.navigation.calibration.surfaces.heights import HeightTies
-from roadscan.navigation.calibration.surfaces.planes import PlaneTies
-from roadscan.navigation.calibration.surfaces.readings import level_from_world, placed
-from roadscan.navigation.calibration.unknowns import Estimate
+from roadscan.calibrate.estimator import Calibration, calibrate
+from roadscan.calibrate.evidence import Evidence, Orientation
+from roadscan.calibrate.surfaces.heads import HeadTies, agreement
+from roadscan.calibrate.surfaces.heights import HeightTies
+from roadscan.calibrate.surfaces.planes import PlaneTies
+from roadscan.calibrate.surfaces.readings import level_from_world, placed
+from roadscan.calibrate.unknowns import Estimate
+from roadscan.core.settings.calibration import CalibrationSettings
 
 BORESIGHT_DEG, LEVER_MM, OVERLAP_MM = 0.003, 3.0, 0.3
 TRAJECTORIES = {

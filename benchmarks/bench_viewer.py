@@ -13,9 +13,9 @@ from typing import Any
 
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
-from roadscan.jobs.publish.live import Served
-from roadscan.jobs.publish.server import Documents, SiteServer
-from roadscan.jobs.publish.web_part import web_folder
+from roadscan.site.live import Served
+from roadscan.site.server import Documents, SiteServer
+from roadscan.site.web_part import web_folder
 from tests.viewer.network import Network
 
 RUNS = 5

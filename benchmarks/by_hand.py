@@ -14,13 +14,13 @@ from benchmarks import skilled_user
 from benchmarks.course import CRS
 from benchmarks.pipeline import survey_with
 from benchmarks.surveys import BenchSurvey
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.model.survey import Survey
-from roadscan.tables.logs import LogRecord, read_log_records
-from roadscan.tables.store import Store
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.store.logs import LogRecord, read_log_records
+from roadscan.store.store import Store
 
 CELL_M, THINNED_M = 0.005, 0.1
 _MARGIN_NS = 1_000_000_000

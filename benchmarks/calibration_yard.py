@@ -12,12 +12,12 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from benchmarks.bench_calibration import head_runs
-from roadscan.model.imu import IMU_GRADES
-from roadscan.model.rig import Mounting, Rig
-from roadscan.navigation.calibration.evidence import Orientation, Traverse
-from roadscan.navigation.calibration.stop_and_go import find_orientation
-from roadscan.navigation.calibration.surfaces.readings import Pieces, Readings
-from roadscan.navigation.calibration.unknowns import Prior, mounting_of
+from roadscan.calibrate.evidence import Orientation, Traverse
+from roadscan.calibrate.stop_and_go import find_orientation
+from roadscan.calibrate.surfaces.readings import Pieces, Readings
+from roadscan.calibrate.unknowns import Prior, mounting_of
+from roadscan.core.imu import IMU_GRADES
+from roadscan.core.rig import Mounting, Rig
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.simulate import Scene, simulate
 from roadscan.simulate.caster import World, ray_key

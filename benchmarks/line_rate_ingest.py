@@ -19,11 +19,11 @@ import psutil
 import pyarrow as pa
 
 from benchmarks.timing import Figure
-from roadscan.jobs.engine.compute import Compute
-from roadscan.jobs.engine.compute_on import compute_on
-from roadscan.jobs.ingest.ingest import IngestResult, ingest
-from roadscan.model.survey import Survey
-from roadscan.tables.store import Store
+from roadscan.core.survey import Survey
+from roadscan.ingest.ingest import IngestResult, ingest
+from roadscan.run.engine.compute import Compute
+from roadscan.run.engine.compute_on import compute_on
+from roadscan.store.store import Store
 
 READINGS = 4_000
 PROFILES_HZ = 28_000

@@ -16,19 +16,19 @@ import numpy.typing as npt
 
 from benchmarks.course import CRS, START_GPS_NS
 from benchmarks.surveys import LINE_SPACING_M, LINE_SPEED_M_PER_S
-from roadscan.code_reach import code_digest
-from roadscan.jobs.engine.fingerprint import key_of
-from roadscan.jobs.plan.plan import SurveyPlan
-from roadscan.jobs.readings import Ground, ReadingSource, TrajectorySource
-from roadscan.jobs.tiles.footprints import FootprintRanges
-from roadscan.model.ids import LanePass, PassId, RunId
-from roadscan.model.rig import Mountings, Sensor
-from roadscan.model.survey import Survey
-from roadscan.points.place import HeightLimits
-from roadscan.tables.logs import DataFile
-from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store
+from roadscan.core.ids import LanePass, PassId, RunId
+from roadscan.core.rig import Mountings, Sensor
+from roadscan.core.survey import Survey
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.logs import DataFile
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+from roadscan.tiles.footprints.footprints import FootprintRanges
+from roadscan.tiles.georeferencing.place import HeightLimits
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.tasks.readings import Ground, ReadingSource, TrajectorySource
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
@@ -96,7 +96,7 @@ class Region:
             sources=tuple(sources),
             passes=tuple(passes),
             centre_lines=None,
-            tile_key=key_of(code_digest("roadscan.jobs.tiles.tiles:compute_tiles"), grid.cell_m),
+            tile_key=key_of(code_digest("roadscan.tiles.tasks.tiles:compute_tiles"), grid.cell_m),
         )
         return cls(plan, _joined(plan, rows), length_m)
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.course import LEAP_S, START_GPS_NS
-from roadscan.model.gpstime import GPS_EPOCH_UNIX_S
+from roadscan.core.gpstime import GPS_EPOCH_UNIX_S
 from roadscan.simulate import Scene, simulate
 
 PACKETS_PER_S = 1e6 / (12 * 46.08)

@@ -13,18 +13,18 @@ from pathlib import Path
 
 import psutil
 
-from roadscan.jobs.engine.compute import Compute
-from roadscan.jobs.engine.compute_on import compute_on
-from roadscan.jobs.run import close_run, run_stage
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import Stage, stages
-from roadscan.jobs.tiles.tile_plan import TILE
-from roadscan.model.strict import load_toml
-from roadscan.model.survey import Survey
-from roadscan.products.base import products
-from roadscan.tables.logs import read_log_records
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.store import Store
+from roadscan.core.strict import load_toml
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Compute
+from roadscan.run.engine.compute_on import compute_on
+from roadscan.run.run import close_run, run_stage
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, stages
+from roadscan.store.logs import read_log_records
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
+from roadscan.tiles.product import products
+from roadscan.tiles.tasks.tile_plan import TILE
 
 READING_TABLES = ("scans", "returns")
 WANTED = ("geotiff", "model_las")

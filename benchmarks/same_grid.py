@@ -19,9 +19,9 @@ import rasterio
 
 from benchmarks.skilled_user import Cells, Points, to_cells
 from benchmarks.timing import Figure, best_seconds
-from roadscan.model.ids import TileId
-from roadscan.points.cloud import TilePoints
+from roadscan.core.ids import TileId
 from roadscan.tiles.cells import TileCells
+from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.statistics import cells_of
 

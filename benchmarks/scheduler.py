@@ -20,8 +20,8 @@ import psutil
 from distributed import Client, Security
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from roadscan.jobs.engine.embedded import QUIET_CLUSTER, closed_cluster
-from roadscan.jobs.engine.on_dask import QUIET_CLIENT
+from roadscan.run.engine.embedded import QUIET_CLUSTER, closed_cluster
+from roadscan.run.engine.on_dask import QUIET_CLIENT
 
 
 class Held(SchedulerPlugin):  # type: ignore[misc]

@@ -28,12 +28,12 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from roadscan.assets.kind import AssetKind, asset_kinds
-from roadscan.model.strict import meanings
-from roadscan.model.witness import Witness, witnesses
-from roadscan.products.base import Product, SurfaceProduct, TileFiles, products
-from roadscan.sensors.base import LogFormat, log_formats
-from roadscan.tables.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
-from roadscan.tables.schema import TableSchema, schema_folder, schema_names, table_schema
+from roadscan.core.strict import meanings
+from roadscan.core.witness import Witness, witnesses
+from roadscan.ingest.format import LogFormat, log_formats
+from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
+from roadscan.store.schema import TableSchema, schema_folder, schema_names, table_schema
+from roadscan.tiles.product import Product, SurfaceProduct, TileFiles, products
 
 DOCS: Final = Path(__file__).resolve().parent
 TEMPLATES: Final = DOCS / "pages"
@@ -323,7 +323,7 @@ def _format_section(kind: LogFormat) -> str:
 
 def product_list(_: str) -> str:
     """Overview of the products and a section each."""
-    found = _own(products(), "roadscan.products")
+    found = _own(products(), "roadscan.tiles.products")
     overview = markdown_table(
         ("product", "what it is", "files", "made"),
         [(f"[`{n}`](#{n})", plain(p.title), _files_words(p), _made_words(p)) for n, p in found.items()],

@@ -10,9 +10,9 @@ from prefect.client.schemas.objects import State
 from prefect.states import Completed
 
 from flows.conduct import failed
-from roadscan.jobs.condition.compare import compare_surveys
-from roadscan.jobs.session import Session
-from roadscan.model.errors import RoadscanError
+from roadscan.condition.tasks.compare import compare_surveys
+from roadscan.core.errors import RoadscanError
+from roadscan.run.session import Session
 
 
 @flow(name="compare", persist_result=False)

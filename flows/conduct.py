@@ -13,16 +13,16 @@ from prefect.runtime import flow_run
 from prefect.settings import PREFECT_API_URL
 from prefect.states import Completed, Failed
 
-from roadscan.jobs.engine.compute_on import compute_on
-from roadscan.jobs.preflight import preflight
-from roadscan.jobs.run import close_run, run_stage
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import Stage, stages
-from roadscan.jobs.tiles.selection import Selection
-from roadscan.model.errors import RoadscanError, RunError
-from roadscan.model.survey import Survey
-from roadscan.progress import LineReporter
-from roadscan.tables.store import Store
+from roadscan.core.errors import RoadscanError, RunError
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute_on import compute_on
+from roadscan.run.preflight import preflight
+from roadscan.run.progress import LineReporter
+from roadscan.run.run import close_run, run_stage
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, stages
+from roadscan.store.store import Store
+from roadscan.tiles.tasks.selection import Selection
 
 
 class FlowReporter(LineReporter):

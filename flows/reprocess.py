@@ -9,11 +9,11 @@ from prefect import flow
 from prefect.client.schemas.objects import State
 
 from flows.conduct import conduct, failed, run_name
-from roadscan.jobs.tiles.selection import Selection
-from roadscan.model.errors import ConfigError, RoadscanError
-from roadscan.model.gpstime import gps_ns_from_utc
-from roadscan.model.ids import TileId
+from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.core.ids import TileId
 from roadscan.tiles.grid import Bounds
+from roadscan.tiles.tasks.selection import Selection
 
 
 @flow(name="reprocess", flow_run_name=run_name, persist_result=False)

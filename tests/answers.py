@@ -8,7 +8,7 @@ from pathlib import Path
 from typer.testing import CliRunner, Result
 
 from roadscan.cli import app
-from roadscan.model.strict import OPEN_QUESTION
+from roadscan.core.strict import OPEN_QUESTION
 
 
 def roadscan(*words: str | Path) -> Result:

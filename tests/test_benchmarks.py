@@ -18,17 +18,17 @@ from benchmarks.course import HOUR_UTC, START_GPS_NS
 from benchmarks.packets import PACKETS_PER_S, repeat_capture
 from benchmarks.roofline import Roofline
 from benchmarks.same_grid import difference_m, pdal_pipeline, with_numpy, with_roadscan, write_points
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.tiles.cell_files import read_cells
-from roadscan.jobs.tiles.tile_plan import TILE
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.model.strict import load_toml
-from roadscan.model.survey import Survey
-from roadscan.sensors.base import LogSource, format_named, log_formats
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.store import Store
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.strict import load_toml
+from roadscan.core.survey import Survey
+from roadscan.ingest.format import LogSource, format_named, log_formats
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
+from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.tasks.tile_plan import TILE
 
 PROFILES = 60
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from roadscan import code_reach
-from roadscan.code_reach import CARRIERS, code_digest, reached_code
+from roadscan.run import code_reach
+from roadscan.run.code_reach import CARRIERS, code_digest, reached_code
 
 PARTS = {
     "__init__.py": "",
@@ -146,7 +146,7 @@ def test_a_new_file_does_not_count(package: Path) -> None:
 
 def test_an_entry_that_is_gone_is_told() -> None:
     with pytest.raises(LookupError, match=r"roadscan\.jobs\.tiles\.tiles:no_such_thing"):
-        code_digest("roadscan.jobs.tiles.tiles:no_such_thing")
+        code_digest("roadscan.tiles.tasks.tiles:no_such_thing")
 
 
 def test_every_carrier_exists() -> None:
@@ -155,16 +155,19 @@ def test_every_carrier_exists() -> None:
 
 
 def test_the_tiles_reach_what_shapes_them_and_no_settings_of_other_stages() -> None:
-    reached = reached_code(["roadscan.jobs.tiles.tiles:compute_tiles"])
+    reached = reached_code(["roadscan.tiles.tasks.tiles:compute_tiles"])
     modules = {place.partition(":")[0] for place in reached}
-    assert {"roadscan.navigation.trajectory:Corrections", "roadscan.points.charts:Charts"} <= reached.keys()
-    assert {"roadscan.navigation.clocks.correction", "roadscan.tiles.cells", "roadscan.model.crs"} <= modules
+    assert {
+        "roadscan.navigation.trajectory:Corrections",
+        "roadscan.tiles.georeferencing.charts:Charts",
+    } <= reached.keys()
+    assert {"roadscan.navigation.clocks.correction", "roadscan.tiles.cells", "roadscan.core.crs"} <= modules
     rooms = ("inspect", "simulate", "surfaces", "condition", "assets", "adjust", "cli", "products.hillshade")
     assert not [m for m in modules if m.startswith(tuple(f"roadscan.{room}" for room in rooms))]
     assert not [
         p
         for p in reached
-        if p.startswith(("roadscan.model.settings.smoothing:Smoother", "roadscan.model.settings.calibration:C"))
+        if p.startswith(("roadscan.core.settings.smoothing:Smoother", "roadscan.core.settings.calibration:C"))
     ]
 
 

@@ -16,7 +16,7 @@ import pytest
 SCRIPT = """
 import sys
 import numpy as np
-from roadscan.kernels.georeferencing.poses import slope_weights
+from roadscan.navigation.kernels.poses import slope_weights
 print("ready", flush=True)
 sys.stdin.readline()
 times, weights = np.array([0.0, 1.0, 2.0]), np.zeros(3)
@@ -45,7 +45,7 @@ def test_one_process_compiles_and_the_others_load(tmp_path: Path) -> None:
 
 
 PARTS = """
-from roadscan.kernels.options import inlined, kernel
+from roadscan.compute.kernel_options import inlined, kernel
 
 @inlined
 def one_more(count):
@@ -76,7 +76,7 @@ def test_a_written_number_makes_no_second_variant_and_a_part_is_not_called_from_
 
 HANDED_BACK = """
 import numpy as np
-from roadscan.kernels.options import bare, kernel
+from roadscan.compute.kernel_options import bare, kernel
 
 @bare
 def part(values):
@@ -105,7 +105,7 @@ def test_a_kernel_that_counts_no_references_cannot_hand_an_array_back(tmp_path: 
 VARIANTS = """
 import sys
 import numpy as np
-from roadscan.kernels.options import kernel
+from roadscan.compute.kernel_options import kernel
 
 def times(factor):
     @kernel
@@ -151,7 +151,7 @@ def test_variants_of_one_name_that_two_processes_compile_have_names_of_their_own
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = """
 from pathlib import Path
-from roadscan.kernels.options import _folder_of_source
+from roadscan.compute.kernel_options import _folder_of_source
 kernels = Path("roadscan/kernels").resolve()
 for file in sorted(kernels.rglob("*.py")):
     print(file.relative_to(kernels), _folder_of_source(str(file)))
@@ -162,7 +162,7 @@ CHAIN = {
     "rooms/deep/third.py": "def f():\n    import roadscan.kernels.fourth\n",
     "fourth.py": "from . import fifth as other\n",
     "fifth.py": "FACTOR = 2\n",
-    "rooms/alone.py": "from roadscan.kernels.options import kernel\n",
+    "rooms/alone.py": "from roadscan.compute.kernel_options import kernel\n",
 }
 
 

@@ -25,21 +25,21 @@ from roadscan.assets.object_table import table_of_objects
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, GroundModel, Scene
 from roadscan.cli import app
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.jobs.status import survey_status, verify_store
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import StoreError
-from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
-from roadscan.model.ids import TileId
-from roadscan.model.survey import Survey
-from roadscan.products.base import ProductContext, SurveyProduct, Tile, TileProduct, product_named, products
-from roadscan.sensors.base import LogSource, Reject, Rows, format_of, log_formats
-from roadscan.tables.asset_schema import _files, asset_schema, asset_tables
-from roadscan.tables.schema import _schema_files, table_schema
-from roadscan.tables.sql import query
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import StoreError
+from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
+from roadscan.core.ids import TileId
+from roadscan.core.survey import Survey
+from roadscan.ingest.format import LogSource, Reject, Rows, format_of, log_formats
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.run.status import survey_status, verify_store
+from roadscan.store.asset_schema import _files, asset_schema, asset_tables
+from roadscan.store.schema import _schema_files, table_schema
+from roadscan.store.sql import query
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.product import ProductContext, SurveyProduct, Tile, TileProduct, product_named, products
 from tests.jobs.conftest import Simulated, finished, simulated  # noqa: F401  fixtures
 
 ROOT = Path(__file__).resolve().parent.parent

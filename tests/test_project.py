@@ -54,19 +54,19 @@ def test_hooks_call_make_targets_that_exist() -> None:
 
 
 VIOLATIONS = {
-    "a neighbour": ("roadscan/sensors/zz.py", "from roadscan.tables import schema", "Layers"),
-    "upward": ("roadscan/navigation/zz.py", "from roadscan.points import cloud", "Layers"),
+    "a neighbour": ("roadscan/formats/zz.py", "from roadscan.store import schema", "Layers"),
+    "upward": ("roadscan/navigation/zz.py", "from roadscan.tiles.georeferencing import cloud", "Layers"),
     "dask below jobs": ("roadscan/tiles/zz.py", "import dask.array", "Only flows and jobs know Dask"),
     "prefect in jobs": ("roadscan/jobs/zz.py", "import prefect", "Only flows and the command line know Prefect"),
     "files in kernels": ("roadscan/kernels/zz.py", "import pyarrow as pa", "Kernels see arrays only"),
     "shared rotations": (
         "roadscan/simulate/zz.py",
-        "from roadscan.model import frames",
+        "from roadscan.core import frames",
         "The simulator turns with SciPy",
     ),
     "shared geometry": (
         "roadscan/simulate/zz.py",
-        "from roadscan.points import readings",
+        "from roadscan.tiles.georeferencing import readings",
         "The simulator knows the model only",
     ),
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from roadscan.model.witness import witnesses
+from roadscan.core.witness import witnesses
 
 _MARK = re.compile(r"mark\.witness\(\s*\"([a-z0-9_]+)\"")
 

@@ -16,11 +16,11 @@ import numpy.typing as npt
 import pandas as pd
 from scipy.spatial import KDTree
 
-from roadscan.jobs.ingest.ingest import survey_records
-from roadscan.jobs.readings import TrajectorySource, load_trajectory
-from roadscan.model.survey import Survey
+from roadscan.core.survey import Survey
+from roadscan.ingest.ingest import survey_records
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.tables.store import Store
+from roadscan.store.store import Store
+from roadscan.tiles.tasks.readings import TrajectorySource, load_trajectory
 
 SURVEY_FILE = Path("two_pass.toml")
 MAX_GAP_S = 1.0

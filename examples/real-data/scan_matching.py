@@ -24,10 +24,10 @@ import pandas as pd
 import small_gicp
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.survey import Survey
-from roadscan.points.readings import ScanGeometry
-from roadscan.tables.logs import read_log_records
-from roadscan.tables.store import Store
+from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.survey import Survey
+from roadscan.store.logs import read_log_records
+from roadscan.store.store import Store
 
 SURVEY_FILE = Path("aces.toml")
 RELATIONS = Path("recordings/lms/aces.relations.gz")

@@ -28,7 +28,7 @@ from roadscan.adjust.process import MountingPrior, RunPrior, line_variance
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, Unknowns, directions_of
 from roadscan.adjust.weights import Groups
-from roadscan.model.settings.adjustment import AdjustmentSettings
+from roadscan.core.settings.adjustment import AdjustmentSettings
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]

@@ -18,7 +18,7 @@ from roadscan.adjust.targets.line import find_line
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Shape, SurveyedLine
 from roadscan.adjust.targets.values import ExpectedTarget, HeightFind, TargetFind, TargetReadings
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.mounting_change import MountingChange, Seat
 from roadscan.navigation.trajectory import Corrections
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.adjust.control_test import quantile
 from roadscan.adjust.observations import COMPONENTS
 from roadscan.adjust.unknowns import Unknowns
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.gpstime import NS_PER_S
 
 Float64 = npt.NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from roadscan.adjust.adjustment import ControlErrors
 from roadscan.adjust.control import Sighting
 from roadscan.adjust.control_test import quantile
 from roadscan.adjust.patches import level_from_map
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 from roadscan.navigation.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.crs import MapFrame
+from roadscan.core.crs import MapFrame
 from roadscan.navigation.trajectory import Poses, Trajectory, world_from_ned
 
 Float64 = npt.NDArray[np.float64]

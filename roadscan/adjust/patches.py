@@ -10,9 +10,9 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.adjust.kernels.patch_cells import Cells, Frame, cell_numbers, fill_cells, local_axes
 from roadscan.adjust.places import Place
-from roadscan.kernels.adjust.patch_cells import Cells, Frame, cell_numbers, fill_cells, local_axes
-from roadscan.model.errors import NavigationError
+from roadscan.core.errors import NavigationError
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, minimum_filter
 
+from roadscan.adjust.kernels.patch_cells import Splat, splat
 from roadscan.adjust.patches import Patch
-from roadscan.kernels.adjust.patch_cells import Splat, splat
 
 Float64 = npt.NDArray[np.float64]
 

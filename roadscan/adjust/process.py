@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from roadscan.adjust.observations import COMPONENTS
 from roadscan.compute.flags import runs_of
-from roadscan.model.errors import ConfigError
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import NS_PER_S
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import ControlErrors
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -16,9 +16,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.adjust.kernels.correlation import Laid, correlate, lay_upon
 from roadscan.adjust.pictures import BLUR_CELLS, Picture
-from roadscan.kernels.adjust.correlation import Laid, correlate, lay_upon
-from roadscan.model.settings.tie_settings import TieSettings
+from roadscan.core.settings.tie_settings import TieSettings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.patches import PassReadings, Patch, map_from_level, patch_of
 from roadscan.adjust.places import Place
-from roadscan.model.settings.tie_settings import TieSettings
+from roadscan.core.settings.tie_settings import TieSettings
 from roadscan.navigation.mounting_change import MountingChange, Seat
 from roadscan.navigation.trajectory import Corrections
 

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from roadscan.kernels.adjust.normal_equations import add_observations
-from roadscan.kernels.adjust.selected_inverse import entries, path_lengths, selected_inverse, solved_units, variances
+from roadscan.adjust.kernels.normal_equations import add_observations
+from roadscan.adjust.kernels.selected_inverse import entries, path_lengths, selected_inverse, solved_units, variances
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from roadscan.adjust.observations import COMPONENTS, FIXED, MOUNTED, Observations
 from roadscan.adjust.process import MountingPrior, RunPrior, knots_of, line_variance, precision_of, stretches
 from roadscan.adjust.sparse_normal import Rows
-from roadscan.model.errors import ConfigError
-from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
+from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

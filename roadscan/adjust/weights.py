@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.navigation.calibration.robust import length_limit
+from roadscan.calibrate.robust import length_limit
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

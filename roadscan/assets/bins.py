@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.assets.buckets import by_number, raster_cells
-from roadscan.kernels.assets.columns import distinct
+from roadscan.assets.kernels.buckets import by_number, raster_cells
+from roadscan.assets.kernels.columns import distinct
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]

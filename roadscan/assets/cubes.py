@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.ground.grid import grid_over
+from roadscan.assets.kernels import voxels
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
-from roadscan.kernels.assets import voxels
 
 EDGE_M: Final = 0.3
 """Edge of a cube; features are those of three by three by three."""
@@ -28,7 +28,7 @@ class Cubes:
     place: npt.NDArray[np.int32]
     """(cubes, 3) row, column and layer from the window's corner and the ground."""
     features: npt.NDArray[np.float32]
-    """(cubes, 7), columns as in :mod:`roadscan.kernels.assets.voxels`."""
+    """(cubes, 7), columns as in :mod:`roadscan.assets.kernels.voxels`."""
 
     def of_returns(self, column: int, otherwise: float = np.nan) -> npt.NDArray[np.float32]:
         """A feature (n,) of each return's cube."""

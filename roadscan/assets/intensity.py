@@ -22,11 +22,11 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.assets.kernels.beams import log_gains, meet_ground
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import GroundModel, Scene
+from roadscan.compute.kernel_options import read_only
 from roadscan.compute.robust import scatter_about
-from roadscan.kernels.assets.beams import log_gains, meet_ground
-from roadscan.kernels.options import read_only
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -18,8 +18,8 @@ import shapely
 from pydantic import model_validator
 
 from roadscan.assets.scene import Scene
-from roadscan.model.strict import Strict
-from roadscan.plugins import found_kinds
+from roadscan.core.plugins import found_kinds
+from roadscan.core.strict import Strict
 
 ENTRY_POINT_GROUP: Final = "roadscan.asset_kinds"
 

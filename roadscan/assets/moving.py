@@ -12,9 +12,9 @@ import numpy.typing as npt
 from roadscan.assets.bins import distinct_steps
 from roadscan.assets.cubes import Cubes
 from roadscan.assets.ground.grid import Grid, grid_over
+from roadscan.assets.kernels import columns, voxels
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
-from roadscan.kernels.assets import columns, voxels
 
 Bools = npt.NDArray[np.bool_]
 Int32 = npt.NDArray[np.int32]

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from roadscan.assets import classes
 from roadscan.assets.cubes import EDGE_M, Cubes
 from roadscan.assets.ground.grid import Grid
-from roadscan.kernels.assets import voxels
-from roadscan.kernels.assets.corridors import mark_corridor
+from roadscan.assets.kernels import voxels
+from roadscan.assets.kernels.corridors import mark_corridor
 
 Bools = npt.NDArray[np.bool_]
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.kernels.beams import ground_heights
 from roadscan.assets.returns import Returns
-from roadscan.kernels.assets.beams import ground_heights
-from roadscan.kernels.options import read_only
+from roadscan.compute.kernel_options import read_only
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]

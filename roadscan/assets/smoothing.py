@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.assets.smoothing import convolve
-from roadscan.kernels.options import read_only
+from roadscan.assets.kernels.smoothing import convolve
+from roadscan.compute.kernel_options import read_only
 
 Float64 = npt.NDArray[np.float64]
 

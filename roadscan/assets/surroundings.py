@@ -11,12 +11,12 @@ import numpy.typing as npt
 from roadscan.assets import classes
 from roadscan.assets.cubes import EDGE_M, Cubes
 from roadscan.assets.ground.grid import Grid, grid_over
+from roadscan.assets.kernels import voxels
+from roadscan.assets.kernels.standing_classes import ALONE, LEAFY, WALL, WIRE, standing_classes
 from roadscan.assets.overheads import overhead_classes
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
-from roadscan.kernels.assets import voxels
-from roadscan.kernels.assets.standing_classes import ALONE, LEAFY, WALL, WIRE, standing_classes
-from roadscan.kernels.options import read_only
+from roadscan.compute.kernel_options import read_only
 
 Bools = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]

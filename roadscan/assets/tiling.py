@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from roadscan.assets.scene import Box
-from roadscan.model.ids import TileId
+from roadscan.core.ids import TileId
 from roadscan.tiles.grid import Bounds, TileGrid
 
 

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.assets.kernels.sight import Places, Rays, follow_rays
 from roadscan.assets.scene import Scene
-from roadscan.kernels.assets.sight import Places, Rays, follow_rays
 
 CELL_M: Final = 0.5
 """Edge of the cells, whose corners are multiples of it."""

@@ -36,7 +36,7 @@ def _added() -> list[str]:
 
 
 def _stage_command(word: str) -> Any:
-    from roadscan.jobs.stage import stages
+    from roadscan.run.stage import stages
 
     stage = next((one for one in stages() if one.word == word), None)
     if stage is None:

@@ -36,7 +36,7 @@ def found_survey() -> Path:
     ConfigError
         There is none, or there are several.
     """
-    from roadscan.model.errors import ConfigError
+    from roadscan.core.errors import ConfigError
 
     usual = Path(USUAL)
     if usual.is_file():
@@ -80,7 +80,7 @@ def surveys_for(incomplete: str) -> list[str]:
 
 def formats_for(incomplete: str) -> list[tuple[str, str]]:
     """Names of formats, with what they are."""
-    from roadscan.sensors.base import log_formats
+    from roadscan.ingest.format import log_formats
 
     return [
         (name, textwrap.shorten(one.title, _HELP_WIDTH, placeholder="…"))

@@ -22,9 +22,9 @@ def camera_interior(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Write nothing.")] = False,
 ) -> None:
     """Interior orientation from pictures of a chessboard, into the rig file."""
-    from roadscan.jobs.calibrate.camera import calibrate_interior
-    from roadscan.model.errors import ConfigError
-    from roadscan.navigation.calibration.chessboard import Board
+    from roadscan.calibrate.chessboard import Board
+    from roadscan.calibrate.tasks.camera import calibrate_interior
+    from roadscan.core.errors import ConfigError
 
     sides = board.lower().split("x")
     if len(sides) != 2 or not all(side.isdigit() for side in sides):
@@ -49,9 +49,9 @@ def camera_resect(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Write nothing.")] = False,
 ) -> None:
     """Mounting of a camera from control points measured in its pictures, into the rig file."""
-    from roadscan.jobs.calibrate.camera import resect_camera
-    from roadscan.model.survey import Survey
-    from roadscan.navigation.calibration.report import report
+    from roadscan.calibrate.in_words import report
+    from roadscan.calibrate.tasks.camera import resect_camera
+    from roadscan.core.survey import Survey
 
     loaded = Survey.load(survey_file)
     found = resect_camera(

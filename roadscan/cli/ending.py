@@ -13,8 +13,8 @@ from typing import Any, NoReturn
 
 import typer
 
-from roadscan.model import stopping
-from roadscan.model.stopping import Stopped
+from roadscan.core import stopping
+from roadscan.core.stopping import Stopped
 
 _SIGNALS = ("SIGINT", "SIGTERM")
 _NAMES = {"SIGINT": "Ctrl-C (SIGINT)", "SIGTERM": "the signal SIGTERM"}
@@ -26,8 +26,8 @@ _PATIENCE_S = 3.0
 
 def ending_well(command: Callable[[], Any]) -> None:
     """Run a command; an error that the user can mend, or a request to stop, ends it with one line and no traceback."""
-    from roadscan.model.errors import RoadscanError, in_words
-    from roadscan.private_folder import UnsafeFolderError
+    from roadscan.core.errors import RoadscanError, in_words
+    from roadscan.core.private_folder import UnsafeFolderError
 
     _listen()
     try:

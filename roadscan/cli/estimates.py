@@ -11,7 +11,7 @@ from roadscan.cli.terminal import print_table
 
 def clocks(survey_file: SurveyFile) -> None:
     """Clocks of sensors as they were estimated; estimates those that are missing or out of date."""
-    from roadscan.jobs.navigate.clock_tables import kept_estimates
+    from roadscan.navigation.tasks.clock_tables import kept_estimates
 
     run = run_survey(survey_file, stages_named("navigate"), Where(0))
     rows = [
@@ -27,8 +27,8 @@ def clocks(survey_file: SurveyFile) -> None:
 
 def calibrate(survey_file: SurveyFile) -> None:
     """Mountings of sensors from the evidence that the survey file names; readings are placed by them from then on."""
-    from roadscan.jobs.calibrate.calibrate import PICTURE, calibrate_survey
-    from roadscan.model.survey import Survey
+    from roadscan.calibrate.tasks.calibrate import PICTURE, calibrate_survey
+    from roadscan.core.survey import Survey
 
     store = opened_store(survey_file)
     with store.lock():

@@ -39,12 +39,12 @@ def export(
     grid: GridOptions = GridOptions(),
 ) -> None:
     """Ingested readings as files of other programs: PSI containers or an OpenCRG grid."""
-    from roadscan.jobs.export.export_opencrg import CrgSettings, export_opencrg
-    from roadscan.jobs.export.export_psi import PsiSettings, export_psi
-    from roadscan.model.counted import counted
-    from roadscan.model.errors import ConfigError
-    from roadscan.model.survey import Survey
-    from roadscan.tables.store import Store
+    from roadscan.core.counted import counted
+    from roadscan.core.errors import ConfigError
+    from roadscan.core.survey import Survey
+    from roadscan.export.export_opencrg import CrgSettings, export_opencrg
+    from roadscan.export.export_psi import PsiSettings, export_psi
+    from roadscan.store.store import Store
 
     loaded = Survey.load(survey_file)
     store = Store(loaded.store_url, loaded.config.id)
@@ -66,9 +66,9 @@ def classes(
     out: Annotated[Path, typer.Option(help="Parquet file to write.")],
 ) -> None:
     """What became of every reading of a sensor, and which filter left it out: one row a reading."""
-    from roadscan.jobs.export.classes import write_classes
-    from roadscan.model.survey import Survey
-    from roadscan.tables.store import Store
+    from roadscan.core.survey import Survey
+    from roadscan.export.classes import write_classes
+    from roadscan.store.store import Store
 
     loaded = Survey.load(survey_file)
     reporter = new_reporter()

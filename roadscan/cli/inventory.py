@@ -53,8 +53,8 @@ def pull(
     ] = None,
 ) -> None:
     """Take in what people changed in the home."""
-    from roadscan.jobs.inventory import edits_of_file, home_of, open_inventory, page_document
-    from roadscan.jobs.session import Session
+    from roadscan.inventory.of_survey import edits_of_file, home_of, open_inventory, page_document
+    from roadscan.run.session import Session
 
     session = Session.open(survey_file)
     inventory = open_inventory(session)
@@ -187,8 +187,8 @@ def export(
 
 
 def _opened(survey_file: Path) -> Inventory:
-    from roadscan.jobs.inventory import open_inventory
-    from roadscan.jobs.session import Session
+    from roadscan.inventory.of_survey import open_inventory
+    from roadscan.run.session import Session
 
     return open_inventory(Session.open(survey_file))
 

@@ -19,8 +19,8 @@ def list_formats(
     ] = None,
 ) -> None:
     """Raw formats that can be read, and what they yield."""
-    from roadscan.model.strict import meanings
-    from roadscan.sensors.base import format_named, log_formats
+    from roadscan.core.strict import meanings
+    from roadscan.ingest.format import format_named, log_formats
 
     if name is None:
         rows = [(n, ", ".join(f.yields), f.title) for n, f in log_formats().items()]
@@ -60,8 +60,8 @@ def inspect_files(
 
     Ends with 0 if all files can be read (faults of single records do not count), with 2 if one cannot.
     """
-    from roadscan.inspect.inspect import inspect
-    from roadscan.inspect.provisional import Stated, parse_clock, parse_option
+    from roadscan.ingest.inspect.inspect import inspect
+    from roadscan.ingest.inspect.provisional import Stated, parse_clock, parse_option
 
     stated = Stated(
         clock=None if clock is None else parse_clock(clock),
@@ -74,7 +74,7 @@ def inspect_files(
         with looking(file) as progress:
             found.append(inspect(file, stated, format_name, quick=quick, progress=progress))
         if not as_json:
-            from roadscan.inspect.inspect_text import print_inspection
+            from roadscan.ingest.inspect.inspect_text import print_inspection
 
             print_inspection(found[-1])
     if as_json:
@@ -91,8 +91,8 @@ def first_survey(
     ),
 ) -> None:
     """Look through a folder of logs and write a first survey file for you to complete."""
-    from roadscan.inspect.first_survey import find_logs, need_folder
-    from roadscan.inspect.first_survey_text import refuse_to_overwrite, write_first_survey
+    from roadscan.ingest.inspect.first_survey import find_logs, need_folder
+    from roadscan.ingest.inspect.first_survey_text import refuse_to_overwrite, write_first_survey
 
     need_folder(folder)
     refuse_to_overwrite(out)

@@ -40,13 +40,13 @@ def publish(
 ) -> None:
     """The survey as a page to look at: a folder for any web server with range requests, or one file."""
     from roadscan.cli.terminal import new_reporter
-    from roadscan.jobs.publish.material import Material, Wishes, box_from_text, box_of_road
-    from roadscan.jobs.publish.single import write_single
-    from roadscan.jobs.publish.site import publish as published
-    from roadscan.jobs.publish.web_part import HOW_TO_BUILD, web_folder
-    from roadscan.jobs.session import Session
-    from roadscan.model.counted import counted
-    from roadscan.model.errors import ConfigError
+    from roadscan.core.counted import counted
+    from roadscan.core.errors import ConfigError
+    from roadscan.run.session import Session
+    from roadscan.site.material import Material, Wishes, box_from_text, box_of_road
+    from roadscan.site.single import write_single
+    from roadscan.site.site import publish as published
+    from roadscan.site.web_part import HOW_TO_BUILD, web_folder
 
     if (out is None) == (single is None):
         raise ConfigError("publish takes a folder or a single file", expected="--out FOLDER or --single FILE.html")
@@ -95,11 +95,11 @@ def view(
     """Look at the survey in a browser, while or after a run. The page is for this machine alone; Ctrl-C ends it."""
     import webbrowser
 
-    from roadscan.jobs.publish.edit_door import EditDoor
-    from roadscan.jobs.publish.live import LiveSite, open_survey
-    from roadscan.jobs.publish.server import SiteServer
-    from roadscan.jobs.publish.web_part import HOW_TO_BUILD, web_folder
-    from roadscan.jobs.session import Session
+    from roadscan.run.session import Session
+    from roadscan.site.edit_door import EditDoor
+    from roadscan.site.live import LiveSite, open_survey
+    from roadscan.site.server import SiteServer
+    from roadscan.site.web_part import HOW_TO_BUILD, web_folder
 
     site = LiveSite(open_survey(survey_file, over or (), edited=edit))
     if edit:

@@ -13,7 +13,7 @@ from roadscan.cli.terminal import print_table
 if TYPE_CHECKING:
     import pandas as pd
 
-    from roadscan.condition.profile_files import ProfileFile
+    from roadscan.condition.profiles.profile_files import ProfileFile
 
 ProfileArgument = Annotated[
     Path, typer.Argument(metavar="FILE", help="ERD, or columns of text: a station and heights to a line.",
@@ -45,8 +45,8 @@ def iri(
     as_json: AsJson = False,
 ) -> None:
     """IRI, and ride number, of longitudinal profiles in a file; of two wheel paths also their mean and half car."""
-    from roadscan.condition import tables
-    from roadscan.model.errors import RoadscanError
+    from roadscan.condition.profiles import tables
+    from roadscan.core.errors import RoadscanError
 
     read = _read(file, x_unit, height_unit, columns)
     try:
@@ -74,8 +74,8 @@ def mpd(
     as_json: AsJson = False,
 ) -> None:
     """Mean profile depth, and RMS texture, of a texture profile in a file."""
-    from roadscan.condition import tables
-    from roadscan.model.errors import RoadscanError
+    from roadscan.condition.profiles import tables
+    from roadscan.core.errors import RoadscanError
 
     read = _read(file, x_unit, height_unit, columns)
     try:
@@ -86,7 +86,7 @@ def mpd(
 
 
 def _read(file: Path, x_unit: str | None, height_unit: str | None, columns: str | None) -> ProfileFile:
-    from roadscan.condition.profile_files import StatedUnits, read_profile
+    from roadscan.condition.profiles.profile_files import StatedUnits, read_profile
 
     chosen = tuple(one.strip() for one in columns.split(",")) if columns else ()
     read = read_profile(file, StatedUnits(x_unit, height_unit, chosen))
@@ -98,7 +98,7 @@ def _read(file: Path, x_unit: str | None, height_unit: str | None, columns: str 
 
 
 def _numbers(text: str | None) -> list[float] | None:
-    from roadscan.model.errors import ConfigError
+    from roadscan.core.errors import ConfigError
 
     if text is None:
         return None

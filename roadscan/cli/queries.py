@@ -32,9 +32,9 @@ def sql(
     The statement reaches the store's files and memory alone. Ends with 1 where a damaged file is missing from the
     answer, or in it.
     """
-    from roadscan.jobs.ask import ask
-    from roadscan.jobs.session import Session
-    from roadscan.model.errors import AnswerError, StoreError
+    from roadscan.core.errors import AnswerError, StoreError
+    from roadscan.run.ask import ask
+    from roadscan.run.session import Session
 
     session = Session.open(survey_file)
     damaged: list[StoreError] = []
@@ -44,7 +44,7 @@ def sql(
         for error in damaged:
             typer.echo(f"{'damaged' if isinstance(error, AnswerError) else 'not shown'}: {error}", err=True)
     if csv:
-        from roadscan.tables.csv import write_csv
+        from roadscan.store.csv import write_csv
 
         write_csv(result, sys.stdout.buffer)
     else:
@@ -65,8 +65,8 @@ def where(
 
     Write -- before coordinates that are negative.
     """
-    from roadscan.jobs.session import Session
-    from roadscan.jobs.where import pictures_of_place
+    from roadscan.run.session import Session
+    from roadscan.site.where import pictures_of_place
 
     found = pictures_of_place(Session.open(survey_file), easting_m, northing_m, height_m, reach)
     rows = [

@@ -18,9 +18,9 @@ def report(
     ] = None,
 ) -> None:
     """One HTML page about the survey: what was recorded, made and found. It opens offline and prints on A4."""
-    from roadscan.jobs.publish.report_copy import linked_report, site_beside
-    from roadscan.jobs.report.page import keep_report
-    from roadscan.jobs.session import Session
+    from roadscan.report.page import keep_report
+    from roadscan.run.session import Session
+    from roadscan.site.report_copy import linked_report, site_beside
 
     session = Session.open(survey_file)
     session.hear_of_damage()
@@ -38,8 +38,8 @@ def compare(
 ) -> None:
     """Change of the road's condition between two surveys, section by section, and whether it is more than chance."""
     from roadscan.cli.terminal import print_table
-    from roadscan.jobs.condition.compare import compare_surveys
-    from roadscan.jobs.session import Session
+    from roadscan.condition.tasks.compare import compare_surveys
+    from roadscan.run.session import Session
 
     changes = compare_surveys(Session.open(earlier), Session.open(later))
     if out is not None:

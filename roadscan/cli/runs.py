@@ -14,7 +14,7 @@ from roadscan.cli.survey import Where, run_and_sum_up, run_survey, stages_named,
 from roadscan.cli.terminal import print_table
 
 if TYPE_CHECKING:
-    from roadscan.jobs.tiles.selection import Selection
+    from roadscan.tiles.tasks.selection import Selection
 
 
 def run(
@@ -34,7 +34,7 @@ def run(
     if flow or os.environ.get("PREFECT_API_URL"):
         from flows.conduct import require_api
         from flows.survey import survey
-        from roadscan.model.errors import ConfigError
+        from roadscan.core.errors import ConfigError
 
         if dashboard:
             raise ConfigError("--dashboard of a flow run", expected="a run without Prefect", change="leave one out")
@@ -42,7 +42,7 @@ def run(
         survey(str(survey_file), workers, scheduler)
         sum_up(survey_file, as_json)
         return
-    from roadscan.jobs.stage import stages
+    from roadscan.run.stage import stages
 
     run_and_sum_up(survey_file, stages(), Where(workers, scheduler, dashboard), as_json)
 
@@ -60,8 +60,8 @@ def ingest(
 
 def navigate(survey_file: SurveyFile) -> None:
     """Trajectories from GNSS, IMU and odometer, and clocks from shared motion."""
-    from roadscan.jobs.ingest.ingest import survey_records
-    from roadscan.jobs.navigate.navigate import plan_trajectories
+    from roadscan.ingest.ingest import survey_records
+    from roadscan.navigation.tasks.navigate import plan_trajectories
 
     run = run_survey(survey_file, stages_named("navigate"), Where(0))
     if not plan_trajectories(run.survey, run.store, survey_records(run.survey, run.store)):
@@ -115,7 +115,7 @@ def make_products(
     if survey_file is not None:
         run_and_sum_up(survey_file, stages_named("products"), Where(workers, scheduler, dashboard), as_json)
         return
-    from roadscan.products.base import SurfaceProduct, TileProduct, products
+    from roadscan.tiles.product import SurfaceProduct, TileProduct, products
 
     of = {TileProduct: "tile", SurfaceProduct: "surface"}
     made = {"any": "yes", "fine": "of cells below 2 cm", "coarse": "of cells of 2 cm or more"}
@@ -142,8 +142,8 @@ def reprocess(
     as_json: AsJson = False,
 ) -> None:
     """Compute some tiles once more, whether stale or not."""
-    from roadscan.jobs.stage import stages
-    from roadscan.model.errors import ConfigError
+    from roadscan.core.errors import ConfigError
+    from roadscan.run.stage import stages
 
     if not (tiles or bbox or span):
         raise ConfigError("nothing was chosen", expected="--tile, --bbox or --span")
@@ -157,11 +157,11 @@ def selected(tiles: list[str] | None, bbox: str | None, span: str | None) -> Sel
     """The selection of tiles that the options state."""
     import datetime as dt
 
-    from roadscan.jobs.tiles.selection import Selection
-    from roadscan.model.errors import ConfigError
-    from roadscan.model.gpstime import gps_ns_from_utc
-    from roadscan.model.ids import TileId
+    from roadscan.core.errors import ConfigError
+    from roadscan.core.gpstime import gps_ns_from_utc
+    from roadscan.core.ids import TileId
     from roadscan.tiles.grid import Bounds
+    from roadscan.tiles.tasks.selection import Selection
 
     box = times = None
     if bbox is not None:

@@ -58,9 +58,9 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """Simulate a small survey, run it, and compare the surface with the truth."""
-    from roadscan.jobs.demo import prepare_demo, summarise
-    from roadscan.jobs.publish.demo_page import page_lines
-    from roadscan.jobs.stage import stages
+    from roadscan.demo.demo import prepare_demo, summarise
+    from roadscan.run.stage import stages
+    from roadscan.site.demo_page import page_lines
 
     survey_file = prepare_demo(out, lambda text: typer.echo(text, err=as_json))
     run_survey(survey_file, stages(), Where(workers))
@@ -72,8 +72,8 @@ def demo(
 
 def _street_in_two_epochs(folder: Path, workers: int | None, as_json: bool) -> list[str]:
     """Survey the demo's street twice, with an edit by hand between; what its inventory says then."""
-    from roadscan.jobs.demo_street import AUTUMN, SPRING, STAGES, compare_epochs, edit_by_hand, prepare_street
-    from roadscan.jobs.stage import stage_named
+    from roadscan.demo.demo_street import AUTUMN, SPRING, STAGES, compare_epochs, edit_by_hand, prepare_street
+    from roadscan.run.stage import stage_named
 
     wanted = tuple(stage_named(name) for name in STAGES)
     files = [prepare_street(folder, epoch, lambda text: typer.echo(text, err=as_json)) for epoch in (SPRING, AUTUMN)]

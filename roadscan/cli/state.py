@@ -11,7 +11,7 @@ from roadscan.cli.arguments import SurveyFile
 from roadscan.cli.terminal import new_reporter, print_table
 
 if TYPE_CHECKING:
-    from roadscan.jobs.status import Status
+    from roadscan.run.status import Status
 
 
 def status(survey_file: SurveyFile) -> None:
@@ -32,13 +32,13 @@ def verify(
     ] = False,
 ) -> None:
     """Read every file the store should hold, and say which are missing or damaged, and which rows are lost."""
-    from roadscan.jobs.inventory import inventory_faults
-    from roadscan.jobs.repair import accept_losses as accept
-    from roadscan.jobs.repair import repair_store
-    from roadscan.jobs.session import Session
-    from roadscan.jobs.status import verify_store
-    from roadscan.model.counted import counted
-    from roadscan.tables.salvage import read_lost
+    from roadscan.core.counted import counted
+    from roadscan.inventory.of_survey import inventory_faults
+    from roadscan.run.repair import accept_losses as accept
+    from roadscan.run.repair import repair_store
+    from roadscan.run.session import Session
+    from roadscan.run.status import verify_store
+    from roadscan.store.salvage import read_lost
 
     session, reporter = Session.open(survey_file), new_reporter()
     told: list[str] = []
@@ -64,8 +64,8 @@ def verify(
 
 def found_status(survey_file: Path) -> Status:
     """The state of a survey's store."""
-    from roadscan.jobs.session import Session
-    from roadscan.jobs.status import survey_status
+    from roadscan.run.session import Session
+    from roadscan.run.status import survey_status
 
     return survey_status(Session.open(survey_file))
 

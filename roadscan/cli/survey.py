@@ -9,10 +9,10 @@ from roadscan.cli.summaries import print_summary
 from roadscan.cli.terminal import new_reporter
 
 if TYPE_CHECKING:
-    from roadscan.jobs.session import Session
-    from roadscan.jobs.stage import Stage
-    from roadscan.jobs.tiles.selection import Selection
-    from roadscan.tables.store import Store
+    from roadscan.run.session import Session
+    from roadscan.run.stage import Stage
+    from roadscan.store.store import Store
+    from roadscan.tiles.tasks.selection import Selection
 
 
 class Where(NamedTuple):
@@ -28,7 +28,7 @@ class Where(NamedTuple):
 
 def stages_named(name: str) -> tuple[Stage, ...]:
     """The stage of this name, as the stages of a run."""
-    from roadscan.jobs.stage import stages
+    from roadscan.run.stage import stages
 
     return tuple(s for s in stages() if s.name == name)
 
@@ -43,11 +43,11 @@ def run_survey(
     RunError
         at the end, if any unit failed; all others are finished and kept.
     """
-    from roadscan.jobs.engine.compute_on import compute_on
-    from roadscan.jobs.preflight import preflight
-    from roadscan.jobs.run import run_stages
-    from roadscan.jobs.session import Session
-    from roadscan.model.stopping import Stopped
+    from roadscan.core.stopping import Stopped
+    from roadscan.run.engine.compute_on import compute_on
+    from roadscan.run.preflight import preflight
+    from roadscan.run.run import run_stages
+    from roadscan.run.session import Session
 
     run, reporter = Session.open(survey_file), new_reporter()
     run.selection, run.reporter = selection, reporter
@@ -75,7 +75,7 @@ def run_and_sum_up(
     selection: Selection | None = None,
 ) -> Session:
     """The same, with a summary of the survey printed at the end, also of a run of which some units failed."""
-    from roadscan.model.errors import RunError
+    from roadscan.core.errors import RunError
 
     try:
         run = run_survey(survey_file, stages, where, selection)
@@ -88,15 +88,15 @@ def run_and_sum_up(
 
 def sum_up(survey_file: Path, as_json: bool, beside: dict[str, Any] | None = None) -> None:
     """Print the summary of a survey."""
-    from roadscan.model.survey import Survey
+    from roadscan.core.survey import Survey
 
     print_summary(Survey.load(survey_file), opened_store(survey_file), as_json=as_json, beside=beside)
 
 
 def opened_store(survey_file: Path) -> Store:
     """The store that a survey file names."""
-    from roadscan.model.survey import Survey
-    from roadscan.tables.store import Store
+    from roadscan.core.survey import Survey
+    from roadscan.store.store import Store
 
     loaded = Survey.load(survey_file)
     return Store(loaded.store_url, loaded.config.id)

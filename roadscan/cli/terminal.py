@@ -35,7 +35,7 @@ def print_whole(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
 
 def new_reporter() -> Any:
     """What shows a run's progress: bars on a terminal, lines in a pipe."""
-    from roadscan.progress import LineReporter, TerminalReporter
+    from roadscan.run.progress import LineReporter, TerminalReporter
 
     return TerminalReporter() if sys.stderr.isatty() else LineReporter()
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from roadscan.kernels.condition.sampling import CellTable
+from roadscan.condition.kernels.sampling import CellTable
 from roadscan.tiles.cells import TileCells
 
 

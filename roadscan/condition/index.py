@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.condition.lane_data import LaneData
-from roadscan.model.witness import Finding
-from roadscan.plugins import found_kinds
+from roadscan.core.plugins import found_kinds
+from roadscan.core.witness import Finding
 
 Float64 = npt.NDArray[np.float64]
 

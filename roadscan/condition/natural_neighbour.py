@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.condition.delaunay_mesh import mesh_of, triangulate
-from roadscan.kernels.condition.natural_neighbour import (
+from roadscan.condition.kernels.delaunay_mesh import mesh_of, triangulate
+from roadscan.condition.kernels.natural_neighbour import (
     STEP_M,
     circle_centres,
     natural_neighbour_raster,

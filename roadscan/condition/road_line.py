@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.condition.road_frame import place
+from roadscan.condition.kernels.road_frame import place
 
 Float64 = npt.NDArray[np.float64]
 

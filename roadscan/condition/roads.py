@@ -12,10 +12,10 @@ import scipy
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
+from roadscan.compute.kernels.curved_grid import thin_path
 from roadscan.compute.ways import way_along
 from roadscan.condition.road_line import NODE_M, Lane, RoadLine
-from roadscan.kernels.road.curved_grid import thin_path
-from roadscan.model.settings.condition import ConditionConfig
+from roadscan.core.settings.condition import ConditionConfig
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]

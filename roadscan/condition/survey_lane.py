@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.condition.kernels.sampling import CellTable, sample
 from roadscan.condition.on_lane.lines import LINE_REACH_M, LaneLines, lane_lines
 from roadscan.condition.on_lane.squares import TextureSquares, texture_squares
 from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.kernels.condition.sampling import CellTable, sample
-from roadscan.model.settings.condition import SectionConfig
+from roadscan.core.settings.condition import SectionConfig
 
 Float64 = npt.NDArray[np.float64]
 
@@ -138,7 +138,7 @@ def _cross_heights(
 def _heights(
     table: CellTable, places: Float64, half_m: tuple[float, float], config: SectionConfig, *, bend: bool = False
 ) -> Float64:
-    """Heights (n, 3) at places, as :func:`roadscan.kernels.condition.sampling.sample` has them.
+    """Heights (n, 3) at places, as :func:`roadscan.condition.kernels.sampling.sample` has them.
 
     Neighbours of a reconstructed surface err alike, so how they scatter says nothing of their errors.
     """

@@ -15,8 +15,8 @@ from roadscan.inventory.comparing import Change, Changes
 from roadscan.inventory.home import EditFault
 from roadscan.inventory.questions import questions_of
 from roadscan.inventory.state import State
-from roadscan.tables.asset_schema import AssetColumn, asset_schema
-from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, editable_columns
+from roadscan.store.asset_schema import AssetColumn, asset_schema
+from roadscan.store.inventory_schema import GEOMETRY, asset_columns, editable_columns
 
 _FORMULA: Final = re.compile(r"^[=@\t\r\n＝＋－＠]|^[+-](?![\s\d.,])|^[+-].*(\w\(|\||![$A-Za-z])", re.DOTALL)
 """Texts that a spreadsheet would run when it opens them; `+1` and `- leans` are none, calls and links to others are."""

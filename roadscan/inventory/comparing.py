@@ -19,8 +19,8 @@ import shapely
 
 from roadscan.inventory.home import FID, Content, EditFault
 from roadscan.inventory.identity import new_ids
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
-from roadscan.tables.inventory_schema import GEOMETRY, asset_table, evidence_table
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.inventory_schema import GEOMETRY, asset_table, evidence_table
 
 _STEP: Final = 1e-4
 """Units of the map; coordinates of products have steps of 0.1 mm, and a way to another CRS and back costs less."""

@@ -12,8 +12,8 @@ import pyarrow.compute as pc
 
 from roadscan.inventory.state import Assets, State
 from roadscan.inventory.values import encoded_column
-from roadscan.tables.asset_schema import asset_kind_names
-from roadscan.tables.inventory_schema import GEOMETRY, asset_table
+from roadscan.store.asset_schema import asset_kind_names
+from roadscan.store.inventory_schema import GEOMETRY, asset_table
 
 _OF_THE_EVIDENCE: Final = frozenset(
     {

@@ -15,9 +15,9 @@ from typing import Final, NamedTuple
 import pyarrow as pa
 
 from roadscan.inventory.values import encoded
-from roadscan.tables.asset_truth import AssetTruth, Commit
-from roadscan.tables.schema import table_schema
-from roadscan.tables.store import bytes_digest
+from roadscan.store.asset_truth import AssetTruth, Commit
+from roadscan.store.schema import table_schema
+from roadscan.store.store import bytes_digest
 
 REJECTED: Final = encoded("rejected")
 """The status of an asset that a person rejected, as edits say it."""

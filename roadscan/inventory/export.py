@@ -14,12 +14,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
+from roadscan.core.crs import crs_from_text
+from roadscan.core.errors import ConfigError, StoreError, nearest
 from roadscan.inventory.state import State
-from roadscan.model.crs import crs_from_text
-from roadscan.model.errors import ConfigError, StoreError, nearest
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
-from roadscan.tables.csv import write_csv
-from roadscan.tables.inventory_schema import GEOMETRY, asset_table
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.csv import write_csv
+from roadscan.store.inventory_schema import GEOMETRY, asset_table
 
 _FORMULA: Final = re.compile(r"^[=@+\-\t\r\n＝＋－＠]")
 """Texts that a spreadsheet may run: all that OWASP names (CSV Injection); a quote before them makes them text."""

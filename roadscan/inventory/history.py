@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pyarrow.compute as pc
 
 from roadscan.inventory.state import live_commits
-from roadscan.tables.asset_truth import AssetTruth, Commit
+from roadscan.store.asset_truth import AssetTruth, Commit
 
 
 class Event(NamedTuple):

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import pyarrow as pa
 
-from roadscan.model.errors import RoadscanError
+from roadscan.core.errors import RoadscanError
 
 
 class HomeError(RoadscanError):

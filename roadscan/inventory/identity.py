@@ -16,10 +16,10 @@ import pyarrow as pa
 import scipy.sparse
 import shapely
 
-from roadscan.model.settings.inventory import Matching
-from roadscan.tables.asset_schema import asset_schema
-from roadscan.tables.inventory_schema import GEOMETRY
-from roadscan.tables.store import bytes_digest
+from roadscan.core.settings.inventory import Matching
+from roadscan.store.asset_schema import asset_schema
+from roadscan.store.inventory_schema import GEOMETRY
+from roadscan.store.store import bytes_digest
 
 _SIGMAS: Final = 4.0
 """Gate of a match, in σ of the difference of two places."""

@@ -13,6 +13,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.core.errors import ConfigError, nearest
+from roadscan.core.witness import Finding
 from roadscan.inventory.changes import EpochChanges, epoch_changes
 from roadscan.inventory.checks import faults_of
 from roadscan.inventory.comparing import Changes, compared, published_rows, published_table
@@ -26,12 +28,10 @@ from roadscan.inventory.pulling import Pulling, clocked, new_edits, now_utc, ref
 from roadscan.inventory.qgis.project import Raster, Source, project_text
 from roadscan.inventory.recording import Found, Rules, record
 from roadscan.inventory.state import State, commit_at, live_commits, state_at
-from roadscan.model.errors import ConfigError, nearest
-from roadscan.model.witness import Finding
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
-from roadscan.tables.asset_truth import AssetTruth, Commit, Draft
-from roadscan.tables.inventory_schema import asset_table
-from roadscan.tables.store import bytes_digest
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.asset_truth import AssetTruth, Commit, Draft
+from roadscan.store.inventory_schema import asset_table
+from roadscan.store.store import bytes_digest
 
 if TYPE_CHECKING:
     import pandas as pd

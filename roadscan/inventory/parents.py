@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from roadscan.tables.asset_schema import asset_schema
+from roadscan.store.asset_schema import asset_schema
 
 _REACH_M: Final = 1.0
 """From a point or line to its parent, horizontally."""

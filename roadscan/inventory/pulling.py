@@ -7,14 +7,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from roadscan.core.witness import Finding, Witness
 from roadscan.inventory.comparing import Changes
 from roadscan.inventory.conflicts import conflicts_of
 from roadscan.inventory.edits import REJECTED, Edit, Folded, named
 from roadscan.inventory.home import Author, Decision, EditFault, FaultyEditsError
 from roadscan.inventory.state import State
 from roadscan.inventory.values import decoded, encoded
-from roadscan.model.witness import Finding, Witness
-from roadscan.tables.inventory_schema import GEOMETRY
+from roadscan.store.inventory_schema import GEOMETRY
 
 CLOCK_OF_EDITS: Final = Witness(
     name="clock_of_edits",

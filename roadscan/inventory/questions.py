@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.core.witness import Witness
 from roadscan.inventory.comparing import Change, Changes
 from roadscan.inventory.home import EditFault
 from roadscan.inventory.state import State
-from roadscan.model.witness import Witness
-from roadscan.tables.asset_schema import asset_schema
-from roadscan.tables.inventory_schema import GEOMETRY, editable_columns
+from roadscan.store.asset_schema import asset_schema
+from roadscan.store.inventory_schema import GEOMETRY, editable_columns
 
 PLACES_OF_EDITS: Final = Witness(
     name="places_of_edits",

@@ -12,17 +12,17 @@ import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
+from roadscan.core.errors import SchemaError
+from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, leap_seconds_at_gps, utc_from_gps_ns
+from roadscan.core.settings.inventory import Matching
 from roadscan.inventory.identity import Known, matched, new_ids
 from roadscan.inventory.parents import Placed, parents_of
 from roadscan.inventory.state import Assets, State, live_commits, state_at
 from roadscan.inventory.values import iso_column
 from roadscan.inventory.visibility import NOT_KNOWN, Visibility
-from roadscan.model.errors import SchemaError
-from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, leap_seconds_at_gps, utc_from_gps_ns
-from roadscan.model.settings.inventory import Matching
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
-from roadscan.tables.asset_truth import AssetTruth, Commit, Draft
-from roadscan.tables.inventory_schema import GEOMETRY, asset_table, evidence_table
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.asset_truth import AssetTruth, Commit, Draft
+from roadscan.store.inventory_schema import GEOMETRY, asset_table, evidence_table
 
 _EPOCH: Final = "first_epoch_gps_ns"
 

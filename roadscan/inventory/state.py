@@ -19,12 +19,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
+from roadscan.core.errors import ConfigError
 from roadscan.inventory.edits import Edit, Folded, folded, read_edits
 from roadscan.inventory.values import decoded
-from roadscan.model.errors import ConfigError
-from roadscan.tables.asset_schema import asset_kind_names
-from roadscan.tables.asset_truth import AssetTruth, Commit
-from roadscan.tables.inventory_schema import GEOMETRY, asset_table
+from roadscan.store.asset_schema import asset_kind_names
+from roadscan.store.asset_truth import AssetTruth, Commit
+from roadscan.store.inventory_schema import GEOMETRY, asset_table
 
 _OF_THE_PLACE: Final = ("station_m", "offset_m", "lane")
 """Columns that the evidence measured at its own place; unknown where a person moved the asset."""

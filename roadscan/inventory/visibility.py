@@ -11,9 +11,9 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.assets.visibility import BANDS_M, PASSES
-from roadscan.model.errors import SchemaError
-from roadscan.model.ids import TileId
-from roadscan.tables.asset_schema import asset_schema
+from roadscan.core.errors import SchemaError
+from roadscan.core.ids import TileId
+from roadscan.store.asset_schema import asset_schema
 
 NOT_KNOWN: Final = -1
 _HELD_SQUARES: Final = 4096

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.flags import runs_of
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.gpstime import NS_PER_S
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.rig import Mounting, Mountings
+from roadscan.core.rig import Mounting, Mountings
 
 Float64 = npt.NDArray[np.float64]
 

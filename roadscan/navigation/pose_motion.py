@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from roadscan.compute.flags import runs_of
 from roadscan.compute.robust import scatter_about
-from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
-from roadscan.model.frames import rotation_from_quaternion, rph_from_rotation
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
+from roadscan.core.frames import rotation_from_quaternion, rph_from_rotation
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.leaps import PoseTrack
 from roadscan.navigation.trajectory import Trajectory, world_from_ned
 

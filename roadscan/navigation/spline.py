@@ -29,9 +29,9 @@ from scipy.ndimage import binary_closing, median_filter
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from roadscan.compute.flags import runs_of
-from roadscan.model.errors import NavigationError
-from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
-from roadscan.model.settings.smoothing import SplineConfig
+from roadscan.core.errors import NavigationError
+from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
+from roadscan.core.settings.smoothing import SplineConfig
 from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.navigation.trajectory import Trajectory
 

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
-from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned, rph_from_rotation
+from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
+from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rph_from_rotation
 from roadscan.navigation.trajectory import Trajectory
 
 Float64 = npt.NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.robust import scatter_about
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.leaps import rotation_vectors
 
 Float64 = npt.NDArray[np.float64]

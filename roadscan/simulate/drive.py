@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.gpstime import NS_PER_S, gps_ns_from_utc
+from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import NS_PER_S, gps_ns_from_utc
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.motion import MARGIN_S, RUN_UP_S, Motion
 from roadscan.simulate.noise import stream

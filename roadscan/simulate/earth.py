@@ -12,7 +12,7 @@ import pyproj
 from pyproj.exceptions import CRSError as ProjCrsError
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 
 Float64 = npt.NDArray[np.float64]
 

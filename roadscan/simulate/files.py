@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.gpstime import gps_ns_from_utc
-from roadscan.model.imu import ImuErrors, ImuGrade
+from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.core.imu import ImuErrors, ImuGrade
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.logs import SimulatedLog
 from roadscan.simulate.noise import stream

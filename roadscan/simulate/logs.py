@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.gpstime import TimeSystem, utc_from_gps_ns
+from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import TimeSystem, utc_from_gps_ns
 from roadscan.simulate import trajectory
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive

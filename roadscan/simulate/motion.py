@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PPoly
 
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 from roadscan.simulate.scene import PassScene, Vehicle
 
 Float64 = npt.NDArray[np.float64]

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 from roadscan.simulate.files import CONTROL_FILE, RIG_FILE, SURVEY_FILE
 from roadscan.simulate.truth import TRUTH_FOLDER
 

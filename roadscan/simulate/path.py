@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.kernels.road import NODE_STEP_M
 from roadscan.simulate.scene import Route, Scene

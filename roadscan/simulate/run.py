@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 from roadscan.simulate import files, own_files, truth
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive, drives_of

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.gpstime import NS_PER_S, WEEK_S
+from roadscan.core.gpstime import NS_PER_S, WEEK_S
 from roadscan.simulate.drive import Drive, Poses
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import Scene

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pyarrow.parquet as pq
 from pydantic import ValidationError
 
-from roadscan.model.errors import FormatError
+from roadscan.core.errors import FormatError
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import objects_table

@@ -9,21 +9,21 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.cells import cell_statistics as finishing
-from roadscan.kernels.cells import pool as kernels
-from roadscan.kernels.cells.accumulate import PIECE, CountingWork, Heights, accumulate_cells, work_arrays
-from roadscan.kernels.cells.active_tiles import ActiveTiles
-from roadscan.kernels.cells.bucket_statistics import MOST, finish_buckets, row_arrays
-from roadscan.kernels.cells.cell_columns import CellColumns
-from roadscan.kernels.cells.cell_statistics import AHEAD, find_groups, finish_cells
-from roadscan.kernels.cells.row_buckets import Buckets, sizes_of_rows, take_readings
-from roadscan.kernels.georeferencing.readings import FATES
-from roadscan.kernels.simd.height_slots import LANES, SLOT_HEIGHTS, SLOT_SIZE, VECTOR
-from roadscan.model.errors import RoadscanError
-from roadscan.model.ids import TileId
-from roadscan.points.cloud import QUANTUM_M
+from roadscan.compute.kernels.height_slots import LANES, SLOT_HEIGHTS, SLOT_SIZE, VECTOR
+from roadscan.core.errors import RoadscanError
+from roadscan.core.ids import TileId
 from roadscan.tiles.cells import TileCells
+from roadscan.tiles.georeferencing.cloud import QUANTUM_M
+from roadscan.tiles.georeferencing.kernels.readings import FATES
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.kernels import cell_statistics as finishing
+from roadscan.tiles.kernels import pool as kernels
+from roadscan.tiles.kernels.accumulate import PIECE, CountingWork, Heights, accumulate_cells, work_arrays
+from roadscan.tiles.kernels.active_tiles import ActiveTiles
+from roadscan.tiles.kernels.bucket_statistics import MOST, finish_buckets, row_arrays
+from roadscan.tiles.kernels.cell_columns import CellColumns
+from roadscan.tiles.kernels.cell_statistics import AHEAD, find_groups, finish_cells
+from roadscan.tiles.kernels.row_buckets import Buckets, sizes_of_rows, take_readings
 from roadscan.tiles.row_buckets import RowBuckets
 
 ROBUST_FLOOR_QUANTA: Final = 100.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.ids import TileId
+from roadscan.core.ids import TileId
 
 
 @dataclass(frozen=True)

@@ -8,19 +8,19 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.cells.accumulate import CountingWork
-from roadscan.kernels.cells.active_tiles import ActiveTiles, Measured
-from roadscan.kernels.cells.bucket_readings import bucket_mirror, bucket_returns
-from roadscan.kernels.cells.pool import Pool
-from roadscan.kernels.cells.profile_counting import accumulate_profiles
-from roadscan.kernels.cells.row_buckets import Buckets
-from roadscan.kernels.georeferencing.flat_profiles import FlatProfiles
-from roadscan.kernels.georeferencing.readings import Georeference, MirrorProfiles, Returns
-from roadscan.kernels.georeferencing.timed_readings import CHUNK
-from roadscan.points.flat_profiles import flat_profiles
-from roadscan.points.place import COUNTED_FATES, EIGHT_TO_SIXTEEN_BITS, Placement, mirror_profiles
-from roadscan.points.readings import ScanGeometry
+from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.tiles.accumulator import Accumulator
+from roadscan.tiles.georeferencing.flat_profiles import flat_profiles
+from roadscan.tiles.georeferencing.kernels.flat_profiles import FlatProfiles
+from roadscan.tiles.georeferencing.kernels.readings import Georeference, MirrorProfiles, Returns
+from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK
+from roadscan.tiles.georeferencing.place import COUNTED_FATES, EIGHT_TO_SIXTEEN_BITS, Placement, mirror_profiles
+from roadscan.tiles.kernels.accumulate import CountingWork
+from roadscan.tiles.kernels.active_tiles import ActiveTiles, Measured
+from roadscan.tiles.kernels.bucket_readings import bucket_mirror, bucket_returns
+from roadscan.tiles.kernels.pool import Pool
+from roadscan.tiles.kernels.profile_counting import accumulate_profiles
+from roadscan.tiles.kernels.row_buckets import Buckets
 
 _EIGHT_BITS: Final = np.uint32(EIGHT_TO_SIXTEEN_BITS)
 _SIXTEEN_BITS: Final = np.uint32(1)

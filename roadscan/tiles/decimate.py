@@ -9,12 +9,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.cells import decimate as kernels
-from roadscan.kernels.cells.decimate_2x2 import decimate_2x2
-from roadscan.kernels.options import read_only
-from roadscan.model.errors import ConfigError
+from roadscan.compute.kernel_options import read_only
+from roadscan.core.errors import ConfigError
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.kernels import decimate as kernels
+from roadscan.tiles.kernels.decimate_2x2 import decimate_2x2
 
 PATCH_M: Final = 0.1
 """A slope is told from at least this much of the road: fewer cells, and a few stones would make one."""

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.ids import TileId
-from roadscan.points.cloud import QUANTA_PER_M
+from roadscan.core.errors import ConfigError
+from roadscan.core.ids import TileId
+from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
 
 ENOUGH: Final = 4
 """Readings that a cell should hold: fewer have no median that leaves an outlier out."""

@@ -12,11 +12,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.cells.decimate import Cells
-from roadscan.kernels.cells.pyramid import Levels, Pixels, reduce_cells
-from roadscan.kernels.options import read_only
-from roadscan.model.errors import ConfigError
+from roadscan.compute.kernel_options import read_only
+from roadscan.core.errors import ConfigError
 from roadscan.tiles.cells import TileCells
+from roadscan.tiles.kernels.decimate import Cells
+from roadscan.tiles.kernels.pyramid import Levels, Pixels, reduce_cells
 
 WANTED_FACTORS: Final = (2, 8, 32)
 """Cells along an edge of a pixel: cells of 5 mm become pixels of 10, 40 and 160 mm."""

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.cells.row_buckets import BLOCK, PASS, Buckets
+from roadscan.tiles.kernels.row_buckets import BLOCK, PASS, Buckets
 
 _FIRST_BLOCKS: Final = 4096
 _RECORD, _BLOCK_NUMBERS = 8, 4 * 4

@@ -7,16 +7,16 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.cells.accumulate import PIECE, CountingWork, accumulate_points
-from roadscan.kernels.cells.active_tiles import ActiveTiles
-from roadscan.kernels.cells.bucket_readings import bucket_points
-from roadscan.kernels.cells.pool import Pool
-from roadscan.kernels.cells.row_buckets import Buckets
-from roadscan.kernels.georeferencing.timed_readings import CHUNK
-from roadscan.points.cloud import TilePoints
 from roadscan.tiles.accumulator import Accumulator
 from roadscan.tiles.cells import TileCells
+from roadscan.tiles.georeferencing.cloud import TilePoints
+from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.kernels.accumulate import PIECE, CountingWork, accumulate_points
+from roadscan.tiles.kernels.active_tiles import ActiveTiles
+from roadscan.tiles.kernels.bucket_readings import bucket_points
+from roadscan.tiles.kernels.pool import Pool
+from roadscan.tiles.kernels.row_buckets import Buckets
 
 _SAMPLE: Final = 1 << 16
 """Points that are looked at for the order they come in."""

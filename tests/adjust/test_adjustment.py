@@ -16,7 +16,7 @@ from roadscan.adjust.adjustment import Adjustment, AdjustmentSettings, adjust
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations, partials
 from roadscan.adjust.process import GaussMarkov, MountingPrior, RunPrior, knots_of
 from roadscan.adjust.sparse_normal import NormalEquations
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 
 S = 10**9
 START = 10**18

@@ -13,7 +13,7 @@ from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Track
 from roadscan.adjust.publish import left_after
 from roadscan.adjust.targets.settings import TargetSettings
-from roadscan.model.frames import rotation_from_rph
+from roadscan.core.frames import rotation_from_rph
 from roadscan.navigation.trajectory import Corrections
 
 TARGETS = TargetSettings()

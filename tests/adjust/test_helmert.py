@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.helmert import helmert, rigid_fit
-from roadscan.model.errors import ConfigError
-from roadscan.model.frames import ENU_FROM_NED
+from roadscan.core.errors import ConfigError
+from roadscan.core.frames import ENU_FROM_NED
 from roadscan.navigation.trajectory import Trajectory
 
 TURN, SHIFT = Rotation.from_euler("ZYX", [40.0, -8.0, 170.0], degrees=True), np.array([310.0, -20.0, 4.0])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.level import LevelPoses, level_poses
 from roadscan.adjust.swath import swath_of
-from roadscan.model.crs import MapFrame, grid_convergence_rad
+from roadscan.core.crs import MapFrame, grid_convergence_rad
 from roadscan.navigation.trajectory import Trajectory
 
 LON, LAT = 11.4, 48.2

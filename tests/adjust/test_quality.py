@@ -15,7 +15,7 @@ from roadscan.adjust.quality import (
     relative_accuracy,
     vertical_accuracy,
 )
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 
 
 def test_vertical_figures_by_hand() -> None:

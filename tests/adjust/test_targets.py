@@ -21,13 +21,13 @@ from benchmarks.painted_targets import (
     painted_sample,
     read_picture,
 )
+from roadscan.adjust.kernels import target_shapes as kernels
 from roadscan.adjust.targets.find import find_target
 from roadscan.adjust.targets.heights import height_at
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc
 from roadscan.adjust.targets.values import PickedTarget, TargetReadings
-from roadscan.kernels.adjust import target_shapes as kernels
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 
 SETTINGS = TargetSettings()
 BAR_M = 0.0015

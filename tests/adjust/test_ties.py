@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.ties.at_place import Ties, pairs_of, ties_at
-from roadscan.model.settings.tie_settings import TieSettings
+from roadscan.core.settings.tie_settings import TieSettings
 from tests.adjust.drawn_patches import PLACE, Road, Seen, bars, crack, dash_end, edge_line, flat, joints, kerb, readings
 
 SETTINGS = TieSettings()

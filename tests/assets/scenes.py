@@ -14,7 +14,7 @@ import pytest
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
-from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, leap_seconds_at_unix
+from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, leap_seconds_at_unix
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 GROUND_LABELS = (40, 44, 48, 60, 72)

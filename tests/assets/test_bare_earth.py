@@ -18,7 +18,7 @@ from roadscan.assets.ground.undersides import undersides
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
-from roadscan.model.settings.asset_ground import GroundSettings
+from roadscan.core.settings.asset_ground import GroundSettings
 from roadscan.simulate import Scene as Street
 from tests.assets.edges.streets import returns_of
 from tests.assets.isprs import SAMPLES, isprs_sample

@@ -14,7 +14,7 @@ from roadscan.assets.intensity import (
     gains_of,
     intensity_sample,
 )
-from roadscan.tables.schema import table_schema
+from roadscan.store.schema import table_schema
 from tests.assets.av2_street import av2_scene, boundaries, ratio
 
 LASERS = 8

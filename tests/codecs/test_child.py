@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.codecs import child
-from roadscan.codecs.child import Child, ChildError
+from roadscan.store.codecs import child
+from roadscan.store.codecs.child import Child, ChildError
 
 WORKER = """
 import os, time

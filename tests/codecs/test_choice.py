@@ -16,9 +16,9 @@ WRITE = """
 import sys
 from pathlib import Path
 import numpy as np, pyarrow as pa
-from roadscan.codecs.parquet.list_table import write_list_table
-from roadscan.codecs.parquet.number_table import write_number_groups, write_number_table
-from roadscan.codecs.zlib_stream import compressed, crc32
+from roadscan.store.codecs.parquet.list_table import write_list_table
+from roadscan.store.codecs.parquet.number_table import write_number_groups, write_number_table
+from roadscan.store.codecs.zlib_stream import compressed, crc32
 folder = Path(sys.argv[1])
 rng = np.random.default_rng(0)
 lists = {n: pa.FixedSizeListArray.from_arrays(pa.array(rng.integers(0, 200, 5000).astype(k)), 50)
@@ -74,7 +74,7 @@ def test_streams_hold_the_same(folders: dict[str, Path]) -> None:
 
 def test_another_choice_is_refused() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", "import roadscan.codecs.choice"],
+        [sys.executable, "-c", "import roadscan.store.codecs.choice"],
         env=os.environ | {"ROADSCAN_CODECS": "mine"}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode and "it is one of: own, library" in done.stderr

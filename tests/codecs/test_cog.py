@@ -11,10 +11,18 @@ import pytest
 import rasterio
 from rasterio.transform import Affine
 
-from roadscan.codecs.cog import About, Band, dense_image, overview_factors, sparse_image, write_cog, write_sparse_cog
-from roadscan.codecs.tiff import check_cog
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import StoreError
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import StoreError
+from roadscan.store.codecs.cog import (
+    About,
+    Band,
+    dense_image,
+    overview_factors,
+    sparse_image,
+    write_cog,
+    write_sparse_cog,
+)
+from roadscan.store.codecs.tiff import check_cog
 
 RNG = np.random.default_rng(5)
 PLACE = Affine(0.5, 0.0, 691_000.0, 0.0, -0.5, 5_335_000.0)

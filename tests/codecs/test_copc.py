@@ -10,13 +10,13 @@ import laspy
 import numpy as np
 import pytest
 
-from roadscan.codecs import copc
-from roadscan.codecs.copc import CopcWriter
-from roadscan.codecs.las import Layout
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import StoreError
-from roadscan.points.octree import Cube, NodeCutter
-from roadscan.products.cloud_records import picked
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import StoreError
+from roadscan.store.codecs import copc
+from roadscan.store.codecs.copc import CopcWriter
+from roadscan.store.codecs.las import Layout
+from roadscan.tiles.georeferencing.octree import Cube, NodeCutter
+from roadscan.tiles.products.cloud_records import picked
 
 LAYOUT = Layout(6, (), (1e-4,) * 3, MapFrame("EPSG:32632"), "publish")
 OFFSETS = (690_000.0, 5_334_000.0, 500.0)

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.codecs.parquet.foreign_pages import ParquetPages
+from roadscan.store.codecs.parquet.foreign_pages import ParquetPages
 
 ROWS = 20_000
 NUMBERS = np.arange(ROWS, dtype=np.int64)

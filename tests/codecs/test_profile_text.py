@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from roadscan.codecs.erd import erd_text, is_erd, parse_erd
-from roadscan.codecs.profile_text import parse_columns
-from roadscan.model.errors import FormatError
+from roadscan.core.errors import FormatError
+from roadscan.store.codecs.erd import erd_text, is_erd, parse_erd
+from roadscan.store.codecs.profile_text import parse_columns
 
 LTPP = """ERDFILEV2.00
       3,      4,     -1,      1,      5,       0.0250,     -1,

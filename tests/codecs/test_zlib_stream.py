@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 import pytest
 
-from roadscan.codecs.zlib_stream import compressed, crc32
+from roadscan.store.codecs.zlib_stream import compressed, crc32
 
 RNG = np.random.default_rng(5)
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from roadscan.condition.cell_table import cell_table
+from roadscan.condition.kernels.sampling import CellTable
 from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.kernels.condition.sampling import CellTable
-from roadscan.model.ids import TileId
+from roadscan.core.ids import TileId
 from roadscan.simulate import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.tiles.cells import TileCells

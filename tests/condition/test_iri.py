@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.signal import StateSpace, lsim
 
-from roadscan.condition.iri import half_car_ride, iri_of, mean_roughness_index, rolling_iri
-from roadscan.condition.quarter_car import SPEED_M_PER_S
-from roadscan.condition.ride import ride
-from roadscan.condition.segments import Segments, segments_of
+from roadscan.condition.profiles.iri import half_car_ride, iri_of, mean_roughness_index, rolling_iri
+from roadscan.condition.profiles.quarter_car import SPEED_M_PER_S
+from roadscan.condition.profiles.ride import ride
+from roadscan.condition.profiles.segments import Segments, segments_of
 from roadscan.condition.stretches import stretches_above
-from roadscan.model.errors import ProfileError
+from roadscan.core.errors import ProfileError
 
 K1, K2, C, MU = 653.0, 63.3, 6.0, 0.15
 MOTION = np.array([[0, 1, 0, 0], [-K2, -C, K2, C], [0, 0, 0, 1], [K2 / MU, C / MU, -(K1 + K2) / MU, -C / MU]])

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import shapely
 
-from roadscan.condition.mpd import mean_profile_depth
+from roadscan.compute.edges.painted_line import painted_line, without_lines
+from roadscan.condition.kernels.intensity_means import mean_intensities
+from roadscan.condition.kernels.lane_texture import FIGURES, INTENSITY, SHARE, TEXTURE, texture_of_squares
+from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, CellTable, gather
 from roadscan.condition.on_lane.lines import lane_lines
 from roadscan.condition.on_lane.ravelling import RavelledSection, lane_levels, ravelled_section
 from roadscan.condition.on_lane.squares import TextureSquares, texture_squares
-from roadscan.condition.texture import texture_segments
-from roadscan.edges.painted_line import painted_line, without_lines
-from roadscan.kernels.condition.intensity_means import mean_intensities
-from roadscan.kernels.condition.lane_texture import FIGURES, INTENSITY, SHARE, TEXTURE, texture_of_squares
-from roadscan.kernels.condition.sampling import MOST_CELLS, Cells, CellTable, gather
+from roadscan.condition.profiles.mpd import mean_profile_depth
+from roadscan.condition.profiles.texture import texture_segments
 from tests.condition.lane_cells import LaneOfCells
 
 TEXTURE_OF = {"mpd_mm": 1.0}

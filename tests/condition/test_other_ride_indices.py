@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.signal import StateSpace, lsim, welch
 
-from roadscan.condition.ride_number import ride_number_of, ride_number_ride
-from roadscan.condition.segments import Segments, segments_of
-from roadscan.condition.spectrum import road_spectrum
-from roadscan.condition.straightedge import LENGTHS_M, straightedge_mm
+from roadscan.condition.kernels.straightedge import roll_beam, roll_wheel
+from roadscan.condition.profiles.ride_number import ride_number_of, ride_number_ride
+from roadscan.condition.profiles.segments import Segments, segments_of
+from roadscan.condition.profiles.spectrum import road_spectrum
+from roadscan.condition.profiles.straightedge import LENGTHS_M, straightedge_mm
 from roadscan.condition.stretches import stretches_above
-from roadscan.kernels.condition.straightedge import roll_beam, roll_wheel
-from roadscan.model.errors import ProfileError
+from roadscan.core.errors import ProfileError
 
 
 def random_road(c: float, w: float, length_m: float, step: float, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import roadscan as rs
 from roadscan.cli import app
-from roadscan.condition.profile_files import StatedUnits
+from roadscan.condition.profiles.profile_files import StatedUnits
 
 
 def told(*words: str | Path) -> Result:

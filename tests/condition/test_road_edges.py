@@ -13,7 +13,7 @@ from roadscan.condition.road_edges.on_lane import EdgeRows, edges_on_lane
 from roadscan.condition.road_edges.on_road import LEAD_M, RoadEdges, RoadStretch, road_edges, road_surfaces
 from roadscan.condition.road_edges.raster import TilePoints, tile_points
 from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.model.ids import TileId
+from roadscan.core.ids import TileId
 from roadscan.simulate import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.tiles.cells import TileCells

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.signal import detrend
 
-from roadscan.condition.mpd import mean_profile_depth, mean_profile_depths, segment_depth_mm
-from roadscan.condition.segments import segments_of
-from roadscan.condition.tables import mpd
-from roadscan.condition.texture import TextureSettings, rms_texture_mm, segment_rms_mm, texture_segments
-from roadscan.model.errors import ProfileError
+from roadscan.condition.profiles.mpd import mean_profile_depth, mean_profile_depths, segment_depth_mm
+from roadscan.condition.profiles.segments import segments_of
+from roadscan.condition.profiles.tables import mpd
+from roadscan.condition.profiles.texture import TextureSettings, rms_texture_mm, segment_rms_mm, texture_segments
+from roadscan.core.errors import ProfileError
 
 PLATE_MM, MARGIN_MM = 30.0, 2.0
 """The recordings' authors: what is higher is one of the steel plates at both ends; so much more is cut off."""

@@ -7,12 +7,12 @@ import numpy.typing as npt
 import pytest
 from scipy.ndimage import correlate1d
 
-from roadscan.condition.iri import iri_of
 from roadscan.condition.lane_data import Profile
 from roadscan.condition.of_sections.wheel_paths import WheelPath, noise, without_noise
-from roadscan.condition.ride import ride
-from roadscan.condition.ride_number import ride_number_of, ride_number_ride
-from roadscan.condition.segments import Segments
+from roadscan.condition.profiles.iri import iri_of
+from roadscan.condition.profiles.ride import ride
+from roadscan.condition.profiles.ride_number import ride_number_of, ride_number_ride
+from roadscan.condition.profiles.segments import Segments
 
 Float64 = npt.NDArray[np.float64]
 

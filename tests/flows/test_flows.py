@@ -20,7 +20,7 @@ from prefect.client.schemas.objects import FlowRun, State, StateType
 
 from flows.reprocess import reprocess
 from flows.survey import survey
-from roadscan.model.errors import ConfigError, RoadscanError, RunError
+from roadscan.core.errors import ConfigError, RoadscanError, RunError
 from roadscan.simulate import SimulatedSurvey
 
 pytestmark = pytest.mark.usefixtures("prefect_api")

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from roadscan.model.errors import RoadscanError
-from roadscan.model.witness import Finding
-from roadscan.sensors.base import LogFormat, LogSource, Reject, Rows, format_named, log_formats
-from roadscan.tables.schema import table_schema
+from roadscan.core.errors import RoadscanError
+from roadscan.core.witness import Finding
+from roadscan.ingest.format import LogFormat, LogSource, Reject, Rows, format_named, log_formats
+from roadscan.store.schema import table_schema
 from tests.fuzz.mutations import changed
 from tests.fuzz.samples import Sample
 

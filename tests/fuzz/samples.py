@@ -25,12 +25,12 @@ import pyarrow as pa
 import pyarrow.feather
 import pyarrow.parquet as pq
 
-from roadscan.model.crs import MapFrame
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.clouds.e57_file import page_checksums
-from roadscan.sensors.motion.nmea_writer import Fix, sentences
-from roadscan.sensors.scanners.sick_telegrams import encode_scans, encode_telegram, write_telegrams
-from roadscan.sensors.text_table import LINE_BYTES_MAX
+from roadscan.core.crs import MapFrame
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.formats.clouds.e57_file import page_checksums
+from roadscan.formats.motion.nmea_writer import Fix, sentences
+from roadscan.formats.scanners.sick_telegrams import encode_scans, encode_telegram, write_telegrams
+from roadscan.ingest.reading.text_table import LINE_BYTES_MAX
 from tests.fuzz.mutations import Change, Inside
 from tests.fuzz.pose_samples import (
     control_csv,

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.model.errors import RoadscanError
-from roadscan.sensors.base import LogSource, format_of, log_formats
+from roadscan.core.errors import RoadscanError
+from roadscan.ingest.format import LogSource, format_of, log_formats
 from tests.fuzz.harness import Broken, Fuzzer, bounded, damaged_record, others_differ, read
 from tests.fuzz.mutations import changed
 from tests.fuzz.samples import Sample, all_samples

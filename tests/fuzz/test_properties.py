@@ -18,10 +18,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.crs import MapFrame
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.scanners.sick_telegrams import encode_scans
-from roadscan.sensors.text_table import Reject, TextOptions, text_blocks, text_layout
+from roadscan.core.crs import MapFrame
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.formats.scanners.sick_telegrams import encode_scans
+from roadscan.ingest.reading.text_table import Reject, TextOptions, text_blocks, text_layout
 from tests.sensors import test_scans as scan_files
 from tests.sensors import test_sick_lms as telegrams
 from tests.sensors.log_reading import read_log

@@ -8,22 +8,22 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from roadscan.code_reach import reached_code
+from roadscan.run.code_reach import reached_code
 
 LIBRARY = Path(__file__).resolve().parents[2] / "roadscan"
 
 WAYS = {
     "a reading": (
-        "roadscan.sensors.scanners.scans",
-        "roadscan.jobs.tiles.tiles:compute_tiles",
-        "roadscan.products.geotiff",
+        "roadscan.formats.scanners.scans",
+        "roadscan.tiles.tasks.tiles:compute_tiles",
+        "roadscan.tiles.products.geotiff",
     ),
     "a crack": (
-        "roadscan.products.distress.cracks",
+        "roadscan.distress.products.cracks",
         "roadscan.condition.indices.cracking",
-        "roadscan.jobs.condition.values",
+        "roadscan.condition.tasks.values",
     ),
-    "a control point": ("roadscan.sensors.vectors.control", "roadscan.jobs.adjust.adjustment"),
+    "a control point": ("roadscan.formats.vectors.control", "roadscan.adjust.tasks.adjustment"),
 }
 """Entries of the code that something passes on its way from the log to the product."""
 

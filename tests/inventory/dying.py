@@ -20,12 +20,12 @@ from typing import Any, NamedTuple
 
 import psutil
 
+from roadscan.core.settings.inventory import Matching
 from roadscan.inventory.home import Content, Home, Mark
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.recording import Found, Rules
-from roadscan.model.settings.inventory import Matching
-from roadscan.tables.asset_truth import AssetTruth
-from roadscan.tables.store import Store
+from roadscan.store.asset_truth import AssetTruth
+from roadscan.store.store import Store
 from tests.inventory.streets import Everywhere
 
 LOOKS_S = 0.002

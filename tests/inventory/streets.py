@@ -11,15 +11,15 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
+from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.core.settings.inventory import Matching
 from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.recording import Found, Rules
 from roadscan.inventory.visibility import Unknown, Visibility
-from roadscan.model.gpstime import gps_ns_from_utc
-from roadscan.model.settings.inventory import Matching
-from roadscan.tables.asset_schema import asset_schema
-from roadscan.tables.asset_truth import AssetTruth
-from roadscan.tables.store import Store, bytes_digest
+from roadscan.store.asset_schema import asset_schema
+from roadscan.store.asset_truth import AssetTruth
+from roadscan.store.store import Store, bytes_digest
 
 CRS = "EPSG:32632"
 EAST, NORTH = 691_000.0, 5_334_000.0

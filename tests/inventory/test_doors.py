@@ -20,15 +20,15 @@ from typer.testing import CliRunner
 
 import roadscan
 from roadscan.cli import app
+from roadscan.core.errors import ConfigError, DamagedError, StoreError
 from roadscan.inventory.conflicts import pictures_of
+from roadscan.inventory.of_survey import FOUND
 from roadscan.inventory.state import state_at
-from roadscan.jobs.inventory import FOUND
-from roadscan.jobs.report.section import Material, sections
-from roadscan.model.errors import ConfigError, DamagedError, StoreError
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
-from roadscan.tables.asset_truth import AssetTruth, parquet_bytes
-from roadscan.tables.inventory_schema import asset_columns
-from roadscan.tables.store import Store, bytes_digest
+from roadscan.report.section import Material, sections
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.asset_truth import AssetTruth, parquet_bytes
+from roadscan.store.inventory_schema import asset_columns
+from roadscan.store.store import Store, bytes_digest
 from tests.inventory import qgis_edits as person
 from tests.inventory.streets import AUTUMN, EAST, NORTH, Everywhere, asset, found, inventory, poles
 
@@ -171,8 +171,8 @@ def test_the_project_of_qgis_has_a_form_for_every_column(tmp_path: Path) -> None
 
 HOLDER = """
 import sys, time
-from roadscan.tables.asset_truth import AssetTruth
-from roadscan.tables.store import Store
+from roadscan.store.asset_truth import AssetTruth
+from roadscan.store.store import Store
 with AssetTruth(Store(sys.argv[1], "street")).alone():
     print("held", flush=True)
     sys.stdin.read()

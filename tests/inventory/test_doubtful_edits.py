@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 import roadscan
 from roadscan.cli import app
-from roadscan.tables.asset_schema import asset_schema
+from roadscan.store.asset_schema import asset_schema
 from tests.inventory import qgis_edits as person
 from tests.inventory.streets import EAST, NORTH, asset, poles
 from tests.inventory.test_doors import SURVEY, write_found

@@ -17,7 +17,7 @@ import shapely
 from roadscan.inventory.home import FaultyEditsError, HomeError
 from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from tests.inventory import qgis_edits as person
 from tests.inventory.streets import (
     AUTUMN,

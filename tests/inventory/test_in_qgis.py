@@ -24,8 +24,8 @@ from roadscan.inventory.home import CHOICES, FaultyEditsError, HomeError
 from roadscan.inventory.homes.postgis import PostGis
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.qgis.project import Raster
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
-from roadscan.tables.inventory_schema import asset_columns, editable_columns
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.inventory_schema import asset_columns, editable_columns
 from tests.inventory.postgres import server
 from tests.inventory.streets import AUTUMN, CRS, EAST, NORTH, Everywhere, asset, found, inventory, poles
 

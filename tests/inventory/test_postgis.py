@@ -11,10 +11,10 @@ from xml.etree import ElementTree
 import pytest
 import shapely
 
+from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.inventory.home import FaultyEditsError, HomeError
 from roadscan.inventory.homes.postgis import PostGis
 from roadscan.inventory.inventory import Inventory
-from roadscan.model.errors import ConfigError, RoadscanError
 from tests.inventory import qgis_edits as person
 from tests.inventory.postgres import server
 from tests.inventory.streets import AUTUMN, EAST, NORTH, Everywhere, asset, found, inventory, poles

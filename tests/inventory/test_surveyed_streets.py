@@ -16,8 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import roadscan
-from roadscan.inventory.inventory import Inventory
-from roadscan.jobs.demo_street import (
+from roadscan.demo.demo_street import (
     AUTUMN,
     SPRING,
     STAGES,
@@ -27,12 +26,13 @@ from roadscan.jobs.demo_street import (
     prepare_street,
     street,
 )
-from roadscan.jobs.inventory import FOUND
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.stage import stage_named
+from roadscan.inventory.inventory import Inventory
+from roadscan.inventory.of_survey import FOUND
+from roadscan.run.run import run_stages
+from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate
 from roadscan.simulate.surface import Surface
-from roadscan.tables.asset_schema import asset_schema
+from roadscan.store.asset_schema import asset_schema
 from tests.inventory.streets import AUTUMN as IN_AUTUMN
 from tests.inventory.streets import found, poles
 

@@ -7,21 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.plan.plan import plan_survey
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
-from roadscan.jobs.tiles.cell_files import read_cells
-from roadscan.jobs.tiles.tile_plan import TILE
-from roadscan.model.survey import Survey
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, truth
-from roadscan.tables.held import held_path
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
-
-from .conftest import Lines, Simulated, changed
+from roadscan.store.held import held_path
+from roadscan.store.manifest import Manifest
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from roadscan.tiles.plan.plan import plan_survey
+from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.tasks.tile_plan import TILE
+from tests.jobs.conftest import Lines, Simulated, changed
 
 ROLES = ("gcp", "check", "gcp", "check", "gcp", "gcp")
 OFFSETS_M = (3.2, 0.6, 0.6, 3.2, 3.2, 0.6)

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.jobs.engine.compute import Compute, Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Reporter, Session
-from roadscan.jobs.stage import stages
-from roadscan.jobs.tiles.selection import Selection
-from roadscan.model.survey import Survey
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Compute, Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Reporter, Session
+from roadscan.run.stage import stages
 from roadscan.simulate import Scene, simulate
-from roadscan.tables.store import Store
+from roadscan.store.store import Store
+from roadscan.tiles.tasks.selection import Selection
 from tests.pictures import blank, drawn
 
 
@@ -119,7 +119,7 @@ def finished(simulated: Simulated) -> Simulated:
 @pytest.fixture(scope="session")
 def raw_site(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
     """Raw logs of three passes over painted targets, with errors of centimetres in the poses."""
-    from .adjusted_site import site
+    from tests.jobs.adjusted_site import site
 
     return Simulated(simulate(site(), tmp_path_factory.mktemp("adjusted") / "survey").survey_file)
 
@@ -127,7 +127,7 @@ def raw_site(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
 @pytest.fixture(scope="session")
 def adjusted(raw_site: Simulated) -> Simulated:
     """The same, run whole into the store ``store``."""
-    from .adjusted_site import CIRCLES, NO_FILES
+    from tests.jobs.adjusted_site import CIRCLES, NO_FILES
 
     raw_site.run(**CIRCLES, **NO_FILES)
     return raw_site

@@ -15,9 +15,9 @@ import time
 import psutil
 
 from roadscan.cli import main
-from roadscan.jobs.stage import stages
-from roadscan.products.base import products
-from roadscan.sensors.base import log_formats
+from roadscan.ingest.format import log_formats
+from roadscan.run.stage import stages
+from roadscan.tiles.product import products
 
 
 def run_for(seconds: float) -> str:

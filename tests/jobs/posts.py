@@ -16,7 +16,7 @@ from roadscan.assets import kind as registry
 from roadscan.assets.classes import POLE
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked, asset_kinds
 from roadscan.assets.scene import Scene
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 CELL_M = 0.25
 

@@ -11,25 +11,24 @@ import numpy as np
 import pytest
 import rasterio
 
-from roadscan.jobs.engine.compute import Done, Inline
-from roadscan.jobs.engine.embedded import embedded
-from roadscan.jobs.plan.plan import plan_survey
-from roadscan.jobs.report.blocks import Picture, Table
-from roadscan.jobs.report.section import Material
-from roadscan.jobs.report.sections.adjustment import Adjustment
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
-from roadscan.jobs.status import survey_status
-from roadscan.jobs.tiles.footprints import load_ranges, stale_footprints
-from roadscan.jobs.tiles.tile_plan import plan_tiles
-from roadscan.model.survey import Survey
-from roadscan.tables.held import held_path, read_held, write_held
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.store import Store
-
-from .adjusted_site import CIRCLES, NO_FILES, TARGETS, adjust, cell_errors, corrections, rows
-from .conftest import Lines, Simulated, changed
+from roadscan.core.survey import Survey
+from roadscan.report.blocks import Picture, Table
+from roadscan.report.section import Material
+from roadscan.report.sections.adjustment import Adjustment
+from roadscan.run.engine.compute import Done, Inline
+from roadscan.run.engine.embedded import embedded
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
+from roadscan.run.status import survey_status
+from roadscan.store.held import held_path, read_held, write_held
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
+from roadscan.tiles.footprints.footprints import load_ranges, stale_footprints
+from roadscan.tiles.plan.plan import plan_survey
+from roadscan.tiles.tasks.tile_plan import plan_tiles
+from tests.jobs.adjusted_site import CIRCLES, NO_FILES, TARGETS, adjust, cell_errors, corrections, rows
+from tests.jobs.conftest import Lines, Simulated, changed
 
 
 def test_surface_and_check_points_come_to_the_truth(adjusted: Simulated) -> None:

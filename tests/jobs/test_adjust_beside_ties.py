@@ -13,18 +13,17 @@ import pyarrow.parquet as pq
 import pyproj
 import pytest
 
-from roadscan.jobs.adjust.outcome import known_findings
-from roadscan.jobs.readings import load_recorded, load_trajectory
-from roadscan.model.errors import ConfigError, RoadscanError
-from roadscan.model.survey import Survey
-from roadscan.model.witness import Finding
+from roadscan.adjust.tasks.outcome import known_findings
+from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.tables.held import held_path
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.store import Store
-
-from .adjusted_site import CIRCLES, NO_FILES, OFF, adjust, cell_errors, corrections, rows
-from .conftest import Simulated, changed
+from roadscan.store.held import held_path
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
+from roadscan.tiles.tasks.readings import load_recorded, load_trajectory
+from tests.jobs.adjusted_site import CIRCLES, NO_FILES, OFF, adjust, cell_errors, corrections, rows
+from tests.jobs.conftest import Simulated, changed
 
 STAGES = ("ingest", "navigate", "footprints", "adjust")
 AZIMUTH = np.radians(128.0)

@@ -15,18 +15,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import findings_of, stage_named
-from roadscan.model.survey import Survey
-from roadscan.model.witness import Finding
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import findings_of, stage_named
 from roadscan.simulate import Scene, simulate
-from roadscan.tables.held import held_path, read_held
-from roadscan.tables.sql import query
+from roadscan.store.held import held_path, read_held
+from roadscan.store.sql import query
+from tests.jobs.conftest import Lines, Simulated, changed
 from tests.pictures import drawn
-
-from .conftest import Lines, Simulated, changed
 
 OFF = {"on": False}
 STAGES = ("ingest", "navigate", "footprints", "adjust")

@@ -12,15 +12,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.adjust.outcome import known_findings
-from roadscan.model.witness import Finding
+from roadscan.adjust.tasks.outcome import known_findings
+from roadscan.core.witness import Finding
 from roadscan.simulate import Scene, simulate
-from roadscan.tables.held import read_held
-from roadscan.tables.manifest import Manifest
+from roadscan.store.held import read_held
+from roadscan.store.manifest import Manifest
 from tests.answers import roadscan
 from tests.drawn_faults.kinds import _ranges, _with
-
-from .conftest import Simulated
+from tests.jobs.conftest import Simulated
 
 pytestmark = pytest.mark.nightly
 

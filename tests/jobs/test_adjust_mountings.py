@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from roadscan.jobs.adjust.outcome import known_findings
+from roadscan.adjust.tasks.outcome import known_findings
 from roadscan.simulate import Scene, simulate
-from roadscan.tables.held import held_path, read_held
-from roadscan.tables.manifest import Manifest
-
-from .adjusted_site import cell_errors
-from .conftest import Simulated
+from roadscan.store.held import held_path, read_held
+from roadscan.store.manifest import Manifest
+from tests.jobs.adjusted_site import cell_errors
+from tests.jobs.conftest import Simulated
 
 pytestmark = pytest.mark.nightly
 

@@ -12,14 +12,13 @@ import pytest
 
 from benchmarks.bench_reference_logs import true_corrections
 from roadscan.adjust.observations import Observations
-from roadscan.jobs.adjust import adjustment
-from roadscan.jobs.adjust.solution import Evidence, Solution
-from roadscan.jobs.session import Session
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.adjust.tasks import adjustment
+from roadscan.adjust.tasks.solution import Evidence, Solution
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.run.session import Session
 from roadscan.simulate import Scene, simulate
-from roadscan.tables.sql import query
-
-from .conftest import Simulated
+from roadscan.store.sql import query
+from tests.jobs.conftest import Simulated
 
 pytestmark = pytest.mark.nightly
 

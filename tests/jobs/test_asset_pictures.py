@@ -17,23 +17,23 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import roadscan
-from roadscan.jobs.assets.picture_work import CUT_OUTS, SEEN
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.publish.evidence import of_pictures as evidence_of_pictures
-from roadscan.jobs.publish.material import Material as SiteMaterial
-from roadscan.jobs.publish.parts.pictures import Pictures
-from roadscan.jobs.publish.parts.vectors import site_layers
-from roadscan.jobs.report.blocks import Picture
-from roadscan.jobs.report.section import Material
-from roadscan.jobs.report.sections.assets import Assets as AssetsSection
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
-from roadscan.model.errors import ConfigError
+from roadscan.assets.tasks.picture_work import CUT_OUTS, SEEN
+from roadscan.core.errors import ConfigError
+from roadscan.report.blocks import Picture
+from roadscan.report.section import Material
+from roadscan.report.sections.assets import Assets as AssetsSection
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.earth import Earth
-from roadscan.tables.inventory_schema import editable_columns
-from roadscan.tables.store import Store
+from roadscan.site.evidence import of_pictures as evidence_of_pictures
+from roadscan.site.material import Material as SiteMaterial
+from roadscan.site.parts.pictures import Pictures
+from roadscan.site.parts.vectors import site_layers
+from roadscan.store.inventory_schema import editable_columns
+from roadscan.store.store import Store
 from tests.jobs.conftest import Lines, Simulated, changed
 from tests.jobs.known_assets import KnownLines, KnownSigns, true_lines, true_signs
 from tests.jobs.posts import only_kinds

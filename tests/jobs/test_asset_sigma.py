@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from roadscan.jobs.assets.drives import Drives
+from roadscan.assets.tasks.drives import Drives
 from roadscan.simulate import Scene, simulate
 from tests.jobs.conftest import Simulated
 from tests.jobs.posts import Posts, only_kinds

@@ -23,26 +23,26 @@ import roadscan
 from roadscan.assets.classes import GROUND, POLE, ROAD
 from roadscan.assets.kind import Evidence
 from roadscan.assets.scene import Scene
-from roadscan.jobs.assets.evidence import EVIDENCE
-from roadscan.jobs.assets.objects import OBJECTS
-from roadscan.jobs.assets.work import MADE, due_joins, plan_evidence
-from roadscan.jobs.engine.compute import Done, Inline
-from roadscan.jobs.inventory import truth_of
-from roadscan.jobs.report.blocks import Drawing, Picture, Table
-from roadscan.jobs.report.page import report_page
-from roadscan.jobs.report.section import Material
-from roadscan.jobs.report.sections.assets import Assets as AssetsSection
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
-from roadscan.jobs.stages.assets import Assets
-from roadscan.jobs.tiles.selection import Selection
-from roadscan.model.errors import ConfigError, RunError
-from roadscan.model.ids import TileId
+from roadscan.assets.stage import Assets
+from roadscan.assets.tasks.evidence import EVIDENCE
+from roadscan.assets.tasks.objects import OBJECTS
+from roadscan.assets.tasks.work import MADE, due_joins, plan_evidence
+from roadscan.core.errors import ConfigError, RunError
+from roadscan.core.ids import TileId
+from roadscan.inventory.of_survey import truth_of
+from roadscan.report.blocks import Drawing, Picture, Table
+from roadscan.report.page import report_page
+from roadscan.report.section import Material
+from roadscan.report.sections.assets import Assets as AssetsSection
+from roadscan.run.engine.compute import Done, Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene as Street
 from roadscan.simulate import simulate
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from roadscan.tiles.tasks.selection import Selection
 from tests.jobs.conftest import Lines, Simulated, changed
 from tests.jobs.posts import Posts, only_kinds
 

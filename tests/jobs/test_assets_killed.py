@@ -9,15 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.jobs.engine.embedded import embedded
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
-from roadscan.jobs.status import verify_store
+from roadscan.run.engine.embedded import embedded
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
+from roadscan.run.status import verify_store
 from roadscan.simulate import Scene, simulate
-from roadscan.tables.store import Store
+from roadscan.store.store import Store
 from tests.conftest import REPOSITORY
-
-from .conftest import Simulated
+from tests.jobs.conftest import Simulated
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(1800)]
 KILLS = 5

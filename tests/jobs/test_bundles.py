@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from roadscan.jobs import products
-from roadscan.jobs.engine.bundles import cut_bundles, run_bundles
-from roadscan.jobs.engine.compute import Done, Inline
-from roadscan.jobs.plan.plan import plan_survey
-from roadscan.jobs.products import make_products, plan_outputs
-from roadscan.jobs.tiles import footprints
-from roadscan.jobs.tiles.footprints import PRODUCT, index_footprints
-from roadscan.model.errors import StoreError
-from roadscan.model.survey import Survey
-from roadscan.tables.manifest import Manifest, OutputRecord
-from roadscan.tables.store import Store
+from roadscan.core.errors import StoreError
+from roadscan.core.survey import Survey
+from roadscan.run.engine.bundles import cut_bundles, run_bundles
+from roadscan.run.engine.compute import Done, Inline
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.store import Store
+from roadscan.tiles.footprints import footprints
+from roadscan.tiles.footprints.footprints import PRODUCT, index_footprints
+from roadscan.tiles.mosaics import products
+from roadscan.tiles.mosaics.products import make_products, plan_outputs
+from roadscan.tiles.plan.plan import plan_survey
 from tests.jobs.conftest import Simulated
 
 

@@ -11,22 +11,21 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.jobs.calibrate.calibrate import PICTURE, TEXT, Calibrated, calibrate_survey, outdated_calibrations
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.plan.plan import plan_survey
-from roadscan.jobs.readings import load_mountings
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.jobs.status import survey_status, verify_store
-from roadscan.model.errors import ConfigError, RoadscanError
-from roadscan.model.rig import Rig
-from roadscan.model.survey import Survey
+from roadscan.calibrate.tasks.calibrate import PICTURE, TEXT, Calibrated, calibrate_survey, outdated_calibrations
+from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.core.rig import Rig
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.run.status import survey_status, verify_store
 from roadscan.simulate import Scene, simulate
-from roadscan.tables.held import held_path
-from roadscan.tables.store import Store
-
-from .conftest import changed
+from roadscan.store.held import held_path
+from roadscan.store.store import Store
+from roadscan.tiles.plan.plan import plan_survey
+from roadscan.tiles.tasks.readings import load_mountings
+from tests.jobs.conftest import changed
 
 OBJECT = {
     "kind": "object",

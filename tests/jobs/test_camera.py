@@ -14,14 +14,14 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.jobs.calibrate.camera import calibrate_interior, resect_camera
-from roadscan.jobs.ingest.ingest import ingest
-from roadscan.model.errors import ConfigError, FormatError, RunError
-from roadscan.model.rig import Rig
-from roadscan.model.survey import Survey
-from roadscan.navigation.calibration.chessboard import Board
+from roadscan.calibrate.chessboard import Board
+from roadscan.calibrate.tasks.camera import calibrate_interior, resect_camera
+from roadscan.core.errors import ConfigError, FormatError, RunError
+from roadscan.core.rig import Rig
+from roadscan.core.survey import Survey
+from roadscan.ingest.ingest import ingest
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.tables.store import Store
+from roadscan.store.store import Store
 
 BOARD = Board(columns=8, rows=5, square_m=0.04)
 FOCAL, PRINCIPAL = 450.0, (330.0, 236.0)

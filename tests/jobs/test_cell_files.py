@@ -9,18 +9,18 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.inspect.inspect import inspect
-from roadscan.jobs.tiles.cell_files import read_cells, read_overview, write_cells, write_overviews
-from roadscan.model.errors import StoreError
-from roadscan.model.ids import TileId
-from roadscan.points.cloud import TilePoints
-from roadscan.tables.manifest import OutputRecord
-from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store
+from roadscan.core.errors import StoreError
+from roadscan.core.ids import TileId
+from roadscan.ingest.inspect.inspect import inspect
+from roadscan.store.manifest import OutputRecord
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
 from roadscan.tiles.cells import TileCells
+from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.pyramid import overview_factors, pyramid_of
 from roadscan.tiles.statistics import cells_of
+from roadscan.tiles.tasks.cell_files import read_cells, read_overview, write_cells, write_overviews
 
 GRID = TileGrid(10.0, 0.125)
 ALWAYS = ["column", "row", "count", "height_robust_m", "intensity_mean"]

@@ -7,19 +7,18 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-import roadscan.jobs.tiles.tile_cells as tile_cells
-from roadscan.jobs.engine.compute_on import compute_on
-from roadscan.jobs.session import Session
-from roadscan.jobs.status import survey_status
-from roadscan.model.errors import RunError
-from roadscan.model.survey import Survey
+import roadscan.tiles.tasks.tile_cells as tile_cells
+from roadscan.core.errors import RunError
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute_on import compute_on
+from roadscan.run.session import Session
+from roadscan.run.status import survey_status
 from roadscan.simulate import simulate
-from roadscan.tables.logs import read_log_records
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.store import Store
+from roadscan.store.logs import read_log_records
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
 from roadscan.tiles.accumulator import Accumulator
-
-from .conftest import Simulated, outputs, small_scene
+from tests.jobs.conftest import Simulated, outputs, small_scene
 
 WITHOUT_POINTS = ["geotiff", "tile_table"]
 

@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 import shapely
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.plan.centre_line import CentreLines, load_buffer
-from roadscan.jobs.plan.plan import plan_survey
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.model.errors import ConfigError, CrsError
-from roadscan.model.survey import Survey
-from roadscan.points.centre_line import CentreLineBuffer
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
+from roadscan.core.errors import ConfigError, CrsError
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from roadscan.tiles.georeferencing.centre_line import CentreLineBuffer
+from roadscan.tiles.plan.centre_line import CentreLines, load_buffer
+from roadscan.tiles.plan.plan import plan_survey
 
 NORTH = np.arange(-39.5, 60.0)
 """Northings of the points, a metre apart; the road's centre line runs at 5 m."""

@@ -17,17 +17,16 @@ import shapely
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.export.classes import write_classes
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.model.errors import ConfigError
-from roadscan.model.survey import Survey
-from roadscan.points.classes import LAS_CLASSES, READING_CLASSES
-from roadscan.tables.store import Store
-
-from .conftest import outputs
+from roadscan.core.errors import ConfigError
+from roadscan.core.survey import Survey
+from roadscan.export.classes import write_classes
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.store.store import Store
+from roadscan.tiles.georeferencing.classes import LAS_CLASSES, READING_CLASSES
+from tests.jobs.conftest import outputs
 
 PROFILES, READINGS = 60, 40
 START = 1_400_000_000 * 10**9

@@ -17,22 +17,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from roadscan.jobs.ingest.clock_pairs import log_pairs
-from roadscan.jobs.ingest.ingest import ingest, survey_records
-from roadscan.jobs.navigate.clocks import estimate_clocks, load_clocks
-from roadscan.jobs.session import Session
-from roadscan.jobs.status import survey_status, verify_store
-from roadscan.model.clock_evidence import MotionEvidence
-from roadscan.model.errors import ConfigError, FormatError, RoadscanError, RunError
-from roadscan.model.gpstime import gps_ns_from_utc
-from roadscan.model.survey import LogConfig, Survey
+from roadscan.core.clock_evidence import MotionEvidence
+from roadscan.core.errors import ConfigError, FormatError, RoadscanError, RunError
+from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.core.survey import LogConfig, Survey
+from roadscan.ingest.clock_pairs import log_pairs
+from roadscan.ingest.ingest import ingest, survey_records
+from roadscan.navigation.tasks.clocks import estimate_clocks, load_clocks
+from roadscan.run.session import Session
+from roadscan.run.status import survey_status, verify_store
 from roadscan.simulate import Scene, simulate
-from roadscan.tables.logs import write_log_record
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
+from roadscan.store.logs import write_log_record
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from tests.jobs.conftest import changed
 from tests.pictures import drawn
-
-from .conftest import changed
 
 S = 10**9
 HEADS = {"offset_s": -0.7312, "drift_ppm": 23.0}

@@ -8,15 +8,14 @@ import laspy
 import numpy as np
 import pytest
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.model.errors import RunError
-from roadscan.model.survey import Survey
-from roadscan.tables.store import Store
-
-from .conftest import outputs
+from roadscan.core.errors import RunError
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.store.store import Store
+from tests.jobs.conftest import outputs
 
 
 def write_cloud(path: Path, point_format: int, easting: np.ndarray, seconds: float, height: float = 50.0) -> None:

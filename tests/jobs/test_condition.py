@@ -17,31 +17,31 @@ import pytest
 import shapely
 
 from benchmarks.bench_lanes import RoughSurvey, driven, rough_scene, run
-from roadscan.code_reach import name_of
 from roadscan.condition.cell_table import cell_table
 from roadscan.condition.index import ConditionIndex, Quantity, Value, condition_indices
 from roadscan.condition.indices.faulting import Faulting
 from roadscan.condition.indices.iri import Iri
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.survey_lane import survey_lane
-from roadscan.jobs.condition import stretches
-from roadscan.jobs.condition.against_truth import compared_values, true_lane
-from roadscan.jobs.condition.compare import compare_surveys
-from roadscan.jobs.condition.values import GroupTask, load_lane
-from roadscan.jobs.condition.work import MADE, plan_condition
-from roadscan.jobs.products import product_context
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
-from roadscan.jobs.tiles.cell_files import read_cells
-from roadscan.jobs.tiles.tile_plan import TILE
-from roadscan.model.errors import ConfigError
-from roadscan.products.distress.cracks import COLUMNS as CRACKS
-from roadscan.products.geo_table import write_geo_table
-from roadscan.tables.manifest import OutputRecord
-from roadscan.tables.schema import table_schema
-from roadscan.tables.sql import query
-from roadscan.tables.store import bytes_digest
-from roadscan.tables.writer import parquet_bytes
+from roadscan.condition.tasks import stretches
+from roadscan.condition.tasks.against_truth import compared_values, true_lane
+from roadscan.condition.tasks.compare import compare_surveys
+from roadscan.condition.tasks.values import GroupTask, load_lane
+from roadscan.condition.tasks.work import MADE, plan_condition
+from roadscan.core.errors import ConfigError
+from roadscan.distress.products.cracks import COLUMNS as CRACKS
+from roadscan.run.code_reach import name_of
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
+from roadscan.store.manifest import OutputRecord
+from roadscan.store.schema import table_schema
+from roadscan.store.sql import query
+from roadscan.store.store import bytes_digest
+from roadscan.store.writer import parquet_bytes
+from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.products.geo_table import write_geo_table
+from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.tasks.tile_plan import TILE
 
 STEP_MM = 5.0
 LINES = [{"offset_m": 0.1, "dash_m": 3.0, "gap_m": 6.0}, {"offset_m": 3.4}]
@@ -232,7 +232,7 @@ def test_a_second_run_does_nothing_and_stretches_change_no_bit(
     session.manifest.remove([r for name in MADE for r in session.manifest.of(name).values()])
     assert stage.state(session).stale == 1  # what waits for the lines is not known yet
     monkeypatch.setattr(stretches, "STRETCH_M", 20)
-    monkeypatch.setattr("roadscan.jobs.condition.values.STRETCH_M", 20)
+    monkeypatch.setattr("roadscan.condition.tasks.values.STRETCH_M", 20)
     stage.run(session)
     assert session.failures == []
     after = {
@@ -296,8 +296,8 @@ def test_a_new_index_leaves_the_others_current(
     session = again(surveyed, tmp_path)
     known = {**condition_indices(), "highest": Highest()}
     for module in ("values", "pictures"):
-        monkeypatch.setattr(f"roadscan.jobs.condition.{module}.condition_indices", lambda: known)
-    monkeypatch.setattr("roadscan.jobs.condition.values.name_of", entry_of)
+        monkeypatch.setattr(f"roadscan.condition.tasks.{module}.condition_indices", lambda: known)
+    monkeypatch.setattr("roadscan.condition.tasks.values.name_of", entry_of)
     work = plan_condition(session)
     assert not work.due_stretches
     assert {name for one in work.due_groups for name, _ in one.indices} == {"highest"}

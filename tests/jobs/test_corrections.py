@@ -11,21 +11,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.plan.plan import plan_survey
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.model.errors import DamagedError
-from roadscan.model.frames import quaternion_from_rotation
-from roadscan.model.survey import Survey
+from roadscan.core.errors import DamagedError
+from roadscan.core.frames import quaternion_from_rotation
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
 from roadscan.simulate import simulate
-from roadscan.tables.held import held_path, read_held, write_held
-from roadscan.tables.schema import table_schema
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
-
-from .conftest import Simulated, changed, outputs, small_scene
+from roadscan.store.held import held_path, read_held, write_held
+from roadscan.store.schema import table_schema
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from roadscan.tiles.plan.plan import plan_survey
+from tests.jobs.conftest import Simulated, changed, outputs, small_scene
 
 SHORT = {"length_m": 12.0, "lidar": {"on": False}, "passes": [{"lane": 2}]}
 PRODUCTS = {"products__make": ["las", "tile_table"]}

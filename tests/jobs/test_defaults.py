@@ -10,12 +10,12 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from roadscan.arrays import write_profiles
 from roadscan.cli import app
-from roadscan.jobs.ingest.planned_logs import plan_logs
-from roadscan.model.errors import ConfigError
-from roadscan.model.survey import Survey
-from roadscan.tables.store import Store
+from roadscan.core.errors import ConfigError
+from roadscan.core.survey import Survey
+from roadscan.door.arrays import write_profiles
+from roadscan.ingest.planned_logs import plan_logs
+from roadscan.store.store import Store
 
 WEEK = 2417
 FIRST_NS = (WEEK * 604_800 + 120_618) * 10**9

@@ -19,8 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.answers import roadscan
-
-from .test_inspect import sbet
+from tests.jobs.test_inspect import sbet
 
 SURVEY = """
 id = "x"

@@ -8,23 +8,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from roadscan.code_reach import name_of, reached_code
-from roadscan.jobs import products
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.plan.drives import Drives
-from roadscan.jobs.plan.plan import plan_survey
-from roadscan.jobs.products import StoredTiles, wanted_products
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import ConfigError, RoadscanError
-from roadscan.model.ids import TileId
-from roadscan.model.survey import Survey
-from roadscan.products.base import ProductContext, product_named
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.core.ids import TileId
+from roadscan.core.survey import Survey
+from roadscan.run.code_reach import name_of, reached_code
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
 from roadscan.simulate.truth import load
-from roadscan.tables.manifest import OutputRecord
-from roadscan.tables.store import Store, bytes_digest
+from roadscan.store.manifest import OutputRecord
+from roadscan.store.store import Store, bytes_digest
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.mosaics import products
+from roadscan.tiles.mosaics.products import StoredTiles, wanted_products
+from roadscan.tiles.plan.drives import Drives
+from roadscan.tiles.plan.plan import plan_survey
+from roadscan.tiles.product import ProductContext, product_named
 from tests.jobs.conftest import changed
 
 DAY = dt.date(2026, 4, 24)
@@ -70,8 +70,8 @@ def test_files_of_tiles_are_read_from_the_store(simulated):
 
 def test_the_code_that_joins_pieces_belongs_to_the_keys_of_their_tables():
     for name, joiner in (
-        ("cracks", "roadscan.surfaces.distress.crack_network"),
-        ("potholes", "roadscan.surfaces.distress.potholes"),
+        ("cracks", "roadscan.distress.crack_network"),
+        ("potholes", "roadscan.distress.potholes"),
     ):
         reached = {place.partition(":")[0] for place in reached_code([name_of(type(product_named(name)))])}
         assert joiner in reached

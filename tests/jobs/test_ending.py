@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.jobs.status import verify_store
+from roadscan.run.status import verify_store
 from roadscan.simulate import simulate
 from tests.conftest import REPOSITORY
 from tests.jobs.conftest import Simulated, outputs, small_scene

@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.model.survey import Survey
-from roadscan.tables.logs import LogRecord, read_log_records
-from roadscan.tables.store import Store
+from roadscan.core.survey import Survey
+from roadscan.store.logs import LogRecord, read_log_records
+from roadscan.store.store import Store
 from tests.sensors.test_velodyne_clock import heard, piece
 from tests.sensors.test_velodyne_pcap import capture
 

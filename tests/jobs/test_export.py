@@ -14,23 +14,22 @@ import pytest
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.export.export_opencrg import CrgSettings, export_opencrg
-from roadscan.jobs.export.export_psi import PsiSettings, export_psi
-from roadscan.jobs.ingest.ingest import ingest
-from roadscan.jobs.plan.plan import plan_survey
-from roadscan.jobs.readings import read_groups
-from roadscan.model.errors import ConfigError, FormatError, RunError
-from roadscan.model.survey import Survey
-from roadscan.points.curved_grid import CurvedHeights, fill_holes, inner_holes
-from roadscan.points.reference_line import ReferenceLine
-from roadscan.sensors.base import format_of
-from roadscan.sensors.clouds.opencrg_file import read_crg
-from roadscan.sensors.scanners.psi_container import read_psi
+from roadscan.compute.reference_line import ReferenceLine
+from roadscan.core.errors import ConfigError, FormatError, RunError
+from roadscan.core.survey import Survey
+from roadscan.export.export_opencrg import CrgSettings, export_opencrg
+from roadscan.export.export_psi import PsiSettings, export_psi
+from roadscan.formats.clouds.opencrg_file import read_crg
+from roadscan.formats.scanners.psi_container import read_psi
+from roadscan.ingest.format import format_of
+from roadscan.ingest.ingest import ingest
 from roadscan.simulate import simulate, truth
-from roadscan.tables.store import Store
+from roadscan.store.store import Store
+from roadscan.tiles.georeferencing.curved_grid import CurvedHeights, fill_holes, inner_holes
+from roadscan.tiles.plan.plan import plan_survey
+from roadscan.tiles.tasks.readings import read_groups
+from tests.jobs.conftest import small_scene
 from tests.sensors.readings import read
-
-from .conftest import small_scene
 
 
 @pytest.fixture(scope="module")
@@ -235,7 +234,7 @@ def test_a_failure_leaves_nothing(survey: Survey, tmp_path: Path, monkeypatch: p
         next(calls)
         raise OSError("disk full")
 
-    monkeypatch.setattr("roadscan.jobs.export.export_psi.write_psi", failing)
+    monkeypatch.setattr("roadscan.export.export_psi.write_psi", failing)
     with pytest.raises(OSError, match="disk full"):
         export_psi(survey, store_of(survey), *profiler(survey), tmp_path / "psi")
     assert list(tmp_path.iterdir()) == []

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from benchmarks.bench_lanes import rough_scene
 from roadscan.cli import app
 from roadscan.simulate import simulate
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
+from roadscan.store.sql import query
+from roadscan.store.store import Store
 
 SLAB_M = 5.0
 FAULTS_MM = (6.0, 0.0, -1.5, 2.0, -4.0, 1.0)

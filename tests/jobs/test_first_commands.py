@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 
 import roadscan
 from roadscan.cli import app
-from roadscan.model.errors import ConfigError
-from roadscan.sensors.base import log_formats
+from roadscan.core.errors import ConfigError
+from roadscan.ingest.format import log_formats
 from roadscan.simulate.scene import shipped_scenes
-from roadscan.tables.logs import read_log_records
+from roadscan.store.logs import read_log_records
 from tests.conftest import REPOSITORY
 from tests.jobs.conftest import Simulated
 

@@ -8,15 +8,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.plan.plan import SurveyPlan, plan_survey
-from roadscan.jobs.readings import Placer
-from roadscan.jobs.tiles.footprints import FootprintRanges, load_ranges
-from roadscan.jobs.tiles.reach import opened, touched_tiles
-from roadscan.model.errors import StoreError
-from roadscan.model.survey import Survey
-from roadscan.points.place import Window
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.store import Store
+from roadscan.core.errors import StoreError
+from roadscan.core.survey import Survey
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
+from roadscan.tiles.footprints.footprints import FootprintRanges, load_ranges
+from roadscan.tiles.footprints.reach import opened, touched_tiles
+from roadscan.tiles.georeferencing.place import Window
+from roadscan.tiles.plan.plan import SurveyPlan, plan_survey
+from roadscan.tiles.tasks.readings import Placer
 from tests.jobs.conftest import Simulated
 
 

@@ -11,19 +11,19 @@ import pyarrow as pa
 import pytest
 import shapely
 
-from roadscan.jobs.found_distresses import Ground, found_distresses
-from roadscan.jobs.inventory import found_assets, open_inventory
-from roadscan.jobs.products import product_context
-from roadscan.jobs.publish.material import Material
-from roadscan.jobs.publish.parts.vectors import site_layers
-from roadscan.jobs.session import Session
-from roadscan.products.distress.cracks import COLUMNS as CRACKS
-from roadscan.products.distress.potholes import COLUMNS as POTHOLES
-from roadscan.products.geo_table import write_geo_table
+from roadscan.distress.products.cracks import COLUMNS as CRACKS
+from roadscan.distress.products.potholes import COLUMNS as POTHOLES
+from roadscan.inventory.found_distresses import Ground, found_distresses
+from roadscan.inventory.of_survey import found_assets, open_inventory
+from roadscan.run.session import Session
 from roadscan.simulate.truth import load
-from roadscan.tables.manifest import OutputRecord
-from roadscan.tables.schema import table_schema
-from roadscan.tables.store import bytes_digest
+from roadscan.site.material import Material
+from roadscan.site.parts.vectors import site_layers
+from roadscan.store.manifest import OutputRecord
+from roadscan.store.schema import table_schema
+from roadscan.store.store import bytes_digest
+from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.products.geo_table import write_geo_table
 from tests.jobs.conftest import Simulated
 
 

@@ -19,19 +19,18 @@ from matplotlib.figure import Figure
 from PIL import Image
 from pyogrio.raw import write as write_vector
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.jobs.status import verify_store
-from roadscan.model.errors import FullDiskError, RoadscanError
-from roadscan.model.survey import Survey
-from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store
-from roadscan.tables.writer import write_parquet
+from roadscan.core.errors import FullDiskError, RoadscanError
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.run.status import verify_store
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+from roadscan.store.writer import write_parquet
+from tests.jobs.conftest import Simulated, changed, outputs
 from tests.pictures import drawn
-
-from .conftest import Simulated, changed, outputs
 
 DISK_BYTES = 48 << 20
 ROOM = r"the disk is full: [0-9.]+ MB are free of 50 MB .*see to more room, and run again: .*goes on where"

@@ -15,14 +15,14 @@ import pyarrow.parquet as pq
 import pytest
 from blake3 import blake3
 
-from roadscan.jobs.engine.compute import Compute, Done, Inline, R, T
-from roadscan.jobs.ingest.ingest import ingest
-from roadscan.jobs.session import Session
-from roadscan.jobs.status import survey_status, verify_store
-from roadscan.model.errors import RunError, StoreError
-from roadscan.model.survey import Survey
-from roadscan.tables.logs import read_log_records
-from roadscan.tables.store import Store, digest_holds, file_digest
+from roadscan.core.errors import RunError, StoreError
+from roadscan.core.survey import Survey
+from roadscan.ingest.ingest import ingest
+from roadscan.run.engine.compute import Compute, Done, Inline, R, T
+from roadscan.run.session import Session
+from roadscan.run.status import survey_status, verify_store
+from roadscan.store.logs import read_log_records
+from roadscan.store.store import Store, digest_holds, file_digest
 
 GEOMETRY = {"kind": "cartesian", "readings": 8, "first": 0.0, "step": 0.001, "range_offset_m": 1.5,
             "range_step_m": 0.0001}  # fmt: skip
@@ -40,7 +40,7 @@ class Backwards(Inline):
 
 @pytest.fixture(autouse=True)
 def all_logs_are_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadscan.jobs.ingest.ingest._SMALL_BYTES", 0)
+    monkeypatch.setattr("roadscan.ingest.ingest._SMALL_BYTES", 0)
 
 
 def write_log(path: Path, seed: int) -> None:
@@ -90,8 +90,8 @@ def test_little_memory_gives_the_same_rows(tmp_path: Path, monkeypatch: pytest.M
     """What was written out early and overlaps in time is merged."""
     survey = survey_of(tmp_path, 1)
     whole, _ = ingested(survey, "whole", None)
-    monkeypatch.setattr("roadscan.tables.writer.BUDGET_BYTES", 2000)
-    monkeypatch.setattr("roadscan.sensors.scanners.scans._CHUNK_BYTES", 2000)
+    monkeypatch.setattr("roadscan.store.writer.BUDGET_BYTES", 2000)
+    monkeypatch.setattr("roadscan.formats.scanners.scans._CHUNK_BYTES", 2000)
     pieces, _ = ingested(survey, "pieces", None)
     assert len(whole.files("tables")) == 3 < len(pieces.files("tables"))
     one, other = (
@@ -188,7 +188,7 @@ def test_a_disk_that_cannot_read_a_log_costs_that_log(tmp_path: Path, monkeypatc
             raise OSError(5, "Input/output error")
         return file_digest(path)
 
-    monkeypatch.setattr("roadscan.jobs.ingest.sources.file_digest", broken)
+    monkeypatch.setattr("roadscan.ingest.sources.file_digest", broken)
     store = Store(str(tmp_path / "store"), "s")
     with pytest.raises(RunError, match=r"1 of 2 logs .*0\.arrow: the log cannot be read: Input/output error"):
         ingest(survey_of(tmp_path, 2), store)
@@ -278,7 +278,7 @@ def test_a_full_disk_costs_the_logs_it_cannot_hold(tmp_path: Path, monkeypatch: 
         writer.write_table(short)
     store = Store(str(tmp_path / "store"), "s")
     with monkeypatch.context() as patch:
-        patch.setattr("roadscan.tables.writer.write_parquet", full)
+        patch.setattr("roadscan.store.writer.write_parquet", full)
         with pytest.raises(
             RunError, match=r"2 of 3 logs .*2\.arrow: its rows cannot be kept: .*No space left .*see to"
         ):

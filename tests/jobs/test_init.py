@@ -17,17 +17,16 @@ from scipy.spatial import KDTree
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.inspect.first_survey import FoundFolder, find_logs
-from roadscan.inspect.first_survey_text import FirstSurvey, write_first_survey
-from roadscan.model.errors import ConfigError
-from roadscan.model.strict import OPEN_QUESTION
-from roadscan.model.survey import Survey
-from roadscan.sensors.scanners.sick_telegrams import encode_scans, write_telegrams
+from roadscan.core.errors import ConfigError
+from roadscan.core.strict import OPEN_QUESTION
+from roadscan.core.survey import Survey
+from roadscan.formats.scanners.sick_telegrams import encode_scans, write_telegrams
+from roadscan.ingest.inspect.first_survey import FoundFolder, find_logs
+from roadscan.ingest.inspect.first_survey_text import FirstSurvey, write_first_survey
 from roadscan.simulate import simulate, truth
 from tests.answers import answer_questions, first_survey, roadscan, spared
-
-from .conftest import Simulated, outputs, small_scene
-from .test_inspect import sbet, written
+from tests.jobs.conftest import Simulated, outputs, small_scene
+from tests.jobs.test_inspect import sbet, written
 
 
 def runs_of(found: FoundFolder) -> dict[str, list[str]]:

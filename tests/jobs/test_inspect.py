@@ -23,16 +23,16 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.inspect import diagnosis as diagnosis_module
-from roadscan.inspect import inspect as inspect_module
-from roadscan.inspect.inspect import Inspection, inspect
-from roadscan.inspect.inspect_text import print_inspection
-from roadscan.inspect.log_figures import Fault
-from roadscan.inspect.provisional import Stated, open_log, parse_clock, parse_option
-from roadscan.model.errors import ConfigError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import Item, LogFormat, LogHeader, LogSource, Provisional, log_formats
-from roadscan.tables.schema import table_schema
+from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Provisional, log_formats
+from roadscan.ingest.inspect import diagnosis as diagnosis_module
+from roadscan.ingest.inspect import inspect as inspect_module
+from roadscan.ingest.inspect.inspect import Inspection, inspect
+from roadscan.ingest.inspect.inspect_text import print_inspection
+from roadscan.ingest.inspect.log_figures import Fault
+from roadscan.ingest.inspect.provisional import Stated, open_log, parse_clock, parse_option
+from roadscan.store.schema import table_schema
 
 RECORD = 136
 WEEK_CLOCK = Stated(clock=Clock(TimeSystem.GPS_WEEK, week=2417), crs="EPSG:4979")

@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 import roadscan
-from roadscan.jobs.tiles.tile_plan import TILE
-from roadscan.tables.manifest import Manifest
+from roadscan.store.manifest import Manifest
+from roadscan.tiles.tasks.tile_plan import TILE
 from tests.jobs.conftest import Simulated
 
 PRODUCT = '''
-from roadscan.products.base import TileProduct
+from roadscan.tiles.product import TileProduct
 
 
 class Another(TileProduct):
@@ -30,7 +30,7 @@ class Another(TileProduct):
     default = False
 '''
 FORMAT = '''
-from roadscan.sensors.base import LogFormat
+from roadscan.ingest.format import LogFormat
 
 
 class Another(LogFormat):
@@ -46,8 +46,8 @@ class Another(LogFormat):
 '''
 LOOK = """
 import sys
-from roadscan.jobs.session import Session
-from roadscan.jobs.status import survey_status
+from roadscan.run.session import Session
+from roadscan.run.status import survey_status
 
 found = survey_status(Session.open(sys.argv[1]))
 stale = [found.of(stage).stale for stage in ("footprints", "tiles", "products")]
@@ -84,7 +84,7 @@ def edited(tmp_path: Path, finished: Simulated) -> Callable[..., tuple[int, int,
 
 
 def test_what_is_added_leaves_every_output_current(edited: Callable[..., tuple[int, int, int, bool]]) -> None:
-    kernel = "from roadscan.kernels.options import kernel\n\n\n@kernel\ndef another(x):\n    return x\n"
+    kernel = "from roadscan.compute.kernel_options import kernel\n\n\n@kernel\ndef another(x):\n    return x\n"
     assert edited(
         ("kernels/another.py", "", kernel),
         ("products/another.py", "", PRODUCT),

@@ -17,11 +17,10 @@ from typer.testing import CliRunner
 
 from docs.mistakes import FIRST_GPS_S, MISTAKES, Mistake, heard, write_scans, write_survey
 from roadscan.cli import app
-from roadscan.model.errors import RoadscanError
-from roadscan.model.gpstime import gps_ns_from_utc
-from roadscan.tables.sealed import seal, unseal
-
-from .conftest import Simulated
+from roadscan.core.errors import RoadscanError
+from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.store.sealed import seal, unseal
+from tests.jobs.conftest import Simulated
 
 SOUND = Mistake("none", "")
 

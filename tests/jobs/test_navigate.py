@@ -10,17 +10,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.session import Session
-from roadscan.jobs.status import survey_status
-from roadscan.model.errors import RoadscanError
-from roadscan.model.frames import rotation_from_quaternion
-from roadscan.model.survey import Survey
+from roadscan.core.errors import RoadscanError
+from roadscan.core.frames import rotation_from_quaternion
+from roadscan.core.survey import Survey
 from roadscan.navigation.trajectory import Trajectory
+from roadscan.run.session import Session
+from roadscan.run.status import survey_status
 from roadscan.simulate import Scene, simulate
-from roadscan.tables.logs import NAVIGATION, read_log_records
-from roadscan.tables.sql import query
-
-from .conftest import Simulated, changed, outputs
+from roadscan.store.logs import NAVIGATION, read_log_records
+from roadscan.store.sql import query
+from tests.jobs.conftest import Simulated, changed, outputs
 
 FEW = {"products__make": ["tile_table"]}
 MEASURED = ("imu.csv", "gnss.pos", "encoder.csv")

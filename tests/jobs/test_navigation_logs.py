@@ -8,18 +8,17 @@ from typing import Any
 
 import pytest
 
-from roadscan.jobs.ingest.ingest import ingest
-from roadscan.jobs.ingest.planned_logs import plan_logs
-from roadscan.jobs.session import Session
-from roadscan.jobs.status import survey_status, verify_store
-from roadscan.model.survey import Survey
-from roadscan.sensors.motion.nmea_writer import Fix, write_nmea
+from roadscan.core.survey import Survey
+from roadscan.formats.motion.nmea_writer import Fix, write_nmea
+from roadscan.ingest.ingest import ingest
+from roadscan.ingest.planned_logs import plan_logs
+from roadscan.run.session import Session
+from roadscan.run.status import survey_status, verify_store
 from roadscan.simulate import Scene
-from roadscan.tables.logs import read_log_records
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
-
-from .conftest import Simulated, outputs
+from roadscan.store.logs import read_log_records
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from tests.jobs.conftest import Simulated, outputs
 
 POS = (
     "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)\n"

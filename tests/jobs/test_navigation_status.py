@@ -13,17 +13,16 @@ import pytest
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.model.survey import Survey
+from roadscan.core.survey import Survey
 from roadscan.simulate import simulate
 from roadscan.simulate.sensors.gnss import Solutions, write_pos
 from roadscan.simulate.sensors.imu import COLUMNS
-from roadscan.tables.logs import read_log_records
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
+from roadscan.store.logs import read_log_records
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from tests.jobs.test_navigate import navigating_scene
 from tests.navigation.walks import OUTAGES, Walked, walked
 from tests.pictures import drawn
-
-from .test_navigate import navigating_scene
 
 PICTURE = "products/navigation/run-1.png"
 RUN = """

@@ -10,20 +10,19 @@ import fsspec
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.jobs.status import survey_status, verify_store
-from roadscan.jobs.tiles.selection import Selection
-from roadscan.model.errors import StoreError
-from roadscan.model.ids import TileId
-from roadscan.model.survey import Survey
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
-
-from .conftest import Lines, Simulated, outputs
+from roadscan.core.errors import StoreError
+from roadscan.core.ids import TileId
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.run.status import survey_status, verify_store
+from roadscan.store.manifest import Manifest
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from roadscan.tiles.tasks.selection import Selection
+from tests.jobs.conftest import Lines, Simulated, outputs
 
 
 class Remembering(MemoryFileSystem):

@@ -14,10 +14,10 @@ import pytest
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.session import Session
-from roadscan.jobs.status import survey_status, verify_store
-from roadscan.sensors.base import log_formats
-from roadscan.tables.sql import query
+from roadscan.ingest.format import log_formats
+from roadscan.run.session import Session
+from roadscan.run.status import survey_status, verify_store
+from roadscan.store.sql import query
 
 OLD = Path(__file__).resolve().parents[1] / "stores" / "version-0.1.tar.xz"
 ROWS = {"scans": (164, 80328896), "trajectory": (580, 350080502)}

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from roadscan.jobs.engine import embedded as own_cluster
-from roadscan.jobs.engine.embedded import embedded
-from roadscan.jobs.engine.on_dask import OnDask
-from roadscan.model.errors import RoadscanError
+from roadscan.core.errors import RoadscanError
+from roadscan.run.engine import embedded as own_cluster
+from roadscan.run.engine.embedded import embedded
+from roadscan.run.engine.on_dask import OnDask
 
 DEADLY = 7
 

@@ -20,9 +20,8 @@ from docs.mistakes import FIRST_GPS_S
 from roadscan.cli import app
 from roadscan.navigation.leaps import PoseTrack
 from roadscan.navigation.pose_motion import PoseMotion
-
-from .test_mistakes import changed, said
-from .test_tick_clocks import write_drive, write_ticks
+from tests.jobs.test_mistakes import changed, said
+from tests.jobs.test_tick_clocks import write_drive, write_ticks
 
 Float64 = npt.NDArray[np.float64]
 Fault = Callable[[dict[str, Float64]], object]

@@ -13,11 +13,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from roadscan.jobs.status import verify_store
-from roadscan.tables.store import Store
+from roadscan.run.status import verify_store
+from roadscan.store.store import Store
 from tests.conftest import REPOSITORY
-
-from .conftest import Simulated, outputs
+from tests.jobs.conftest import Simulated, outputs
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(1800)]
 CUTS = 12

@@ -28,34 +28,34 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.inventory import truth_of
-from roadscan.jobs.publish import web_part
-from roadscan.jobs.publish.document import json_bytes
-from roadscan.jobs.publish.edit_door import EditDoor
-from roadscan.jobs.publish.layer import BELOW_TO_ABOVE, title_of
-from roadscan.jobs.publish.live import LiveSite, open_survey
-from roadscan.jobs.publish.material import Material, Wishes, box_from_text, box_of_road
-from roadscan.jobs.publish.parts import strips, vectors
-from roadscan.jobs.publish.parts.edits import Edits
-from roadscan.jobs.publish.parts.features import Features
-from roadscan.jobs.publish.parts.rasters import images_of
-from roadscan.jobs.publish.parts.strips import Strips
-from roadscan.jobs.publish.single import write_single
-from roadscan.jobs.publish.site import KEYS, Published, entry, publish
-from roadscan.jobs.publish.thumbnail import thumbnail
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.jobs.tiles.cell_files import read_cells
-from roadscan.jobs.tiles.tile_plan import TILE
-from roadscan.model.errors import ConfigError
-from roadscan.model.survey import Survey
-from roadscan.products.geo_table import write_geo_table
-from roadscan.products.site_rasters import Place, Raster, coarser_picture
+from roadscan.core.errors import ConfigError
+from roadscan.core.survey import Survey
+from roadscan.inventory.of_survey import truth_of
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
 from roadscan.simulate import simulate, truth
-from roadscan.tables.manifest import OutputRecord
-from roadscan.tables.store import bytes_digest
+from roadscan.site import web_part
+from roadscan.site.document import json_bytes
+from roadscan.site.edit_door import EditDoor
+from roadscan.site.layer import BELOW_TO_ABOVE, title_of
+from roadscan.site.live import LiveSite, open_survey
+from roadscan.site.material import Material, Wishes, box_from_text, box_of_road
+from roadscan.site.parts import strips, vectors
+from roadscan.site.parts.edits import Edits
+from roadscan.site.parts.features import Features
+from roadscan.site.parts.rasters import images_of
+from roadscan.site.parts.strips import Strips
+from roadscan.site.single import write_single
+from roadscan.site.site import KEYS, Published, entry, publish
+from roadscan.site.site_rasters import Place, Raster, coarser_picture
+from roadscan.site.thumbnail import thumbnail
+from roadscan.store.manifest import OutputRecord
+from roadscan.store.store import bytes_digest
+from roadscan.tiles.products.geo_table import write_geo_table
+from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.tasks.tile_plan import TILE
 from tests.inventory.streets import EAST, NORTH, asset, found
 from tests.jobs.conftest import Lines, Simulated, small_scene
 

@@ -8,17 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.jobs.status import verify_store
-from roadscan.model.errors import RoadscanError, StoreError
-from roadscan.tables.held import held_path, write_held
-from roadscan.tables.logs import copy_path, read_log_records, record_path
-from roadscan.tables.schema import table_schema
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
-from roadscan.tables.verified import Stamp
-
-from .conftest import Simulated, outputs
-from .test_damage import MAKE, say
+from roadscan.core.errors import RoadscanError, StoreError
+from roadscan.run.status import verify_store
+from roadscan.store.held import held_path, write_held
+from roadscan.store.logs import copy_path, read_log_records, record_path
+from roadscan.store.schema import table_schema
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from roadscan.store.verified import Stamp
+from tests.jobs.conftest import Simulated, outputs
+from tests.jobs.test_damage import MAKE, say
 
 OPENED = {
     "returns": "tables/returns",
@@ -140,7 +139,7 @@ def test_whole_files_are_looked_at_and_not_read_again(whole: Simulated, monkeypa
     """After a run, after `verify`, and after a query that read them."""
     store = whole.store()
     held: list[str] = []
-    from roadscan.tables import verified
+    from roadscan.store import verified
 
     real = verified.fault_of
     monkeypatch.setattr(verified, "fault_of", lambda *a: held.append(a[2]) or real(*a))
@@ -167,7 +166,7 @@ def test_a_run_notes_what_it_wrote(finished: Simulated, tmp_path: Path, monkeypa
     copy = finished.copy_to(tmp_path / "survey")
     copy.run()
     asked: list[str] = []
-    from roadscan.tables import verified
+    from roadscan.store import verified
 
     monkeypatch.setattr(verified, "fault_of", lambda *a: asked.append(a[2]))
     for view in ("returns", "trajectory", "cells", "footprints"):

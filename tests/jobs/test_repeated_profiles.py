@@ -11,8 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from docs.mistakes import FIRST_GPS_S
-
-from .test_mistakes import changed, said
+from tests.jobs.test_mistakes import changed, said
 
 PROFILES = 30
 READINGS = 40

@@ -17,12 +17,12 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.publish.report_copy import linked_report
-from roadscan.jobs.report.page import PATH, keep_report, report_page
-from roadscan.jobs.report.section import sections
-from roadscan.jobs.session import Session
-from roadscan.tables.logs import read_log_records
-from roadscan.tables.manifest import Manifest, write_failures
+from roadscan.report.page import PATH, keep_report, report_page
+from roadscan.report.section import sections
+from roadscan.run.session import Session
+from roadscan.site.report_copy import linked_report
+from roadscan.store.logs import read_log_records
+from roadscan.store.manifest import Manifest, write_failures
 from tests.jobs.conftest import Simulated
 
 BROWSERS_OWN = re.compile(r"^https?://([\w-]+\.)*(google\.com|googleapis\.com|gvt1\.com)/")

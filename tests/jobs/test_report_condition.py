@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.condition.pictures import chosen_ruts
-from roadscan.jobs.report.blocks import Paragraph, Table
-from roadscan.jobs.report.sections.adjustment import agreement
+from roadscan.condition.tasks.pictures import chosen_ruts
+from roadscan.report.blocks import Paragraph, Table
+from roadscan.report.sections.adjustment import agreement
 from roadscan.simulate import Scene, simulate
 from tests.answers import roadscan
 

@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.ingest.resolution import grid_of
+from roadscan.ingest.resolution import grid_of
 
 Float64 = npt.NDArray[np.float64]
 POSES = 300

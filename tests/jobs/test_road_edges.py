@@ -11,15 +11,15 @@ import pytest
 import shapely
 
 from benchmarks.bench_lanes import RoughSurvey, rough_scene, run
-from roadscan.jobs.condition import road_edges
-from roadscan.jobs.condition.values import GroupTask, load_lane
-from roadscan.jobs.condition.work import plan_condition
-from roadscan.jobs.products import product_context
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
-from roadscan.model.errors import RoadscanError
+from roadscan.condition.tasks import road_edges
+from roadscan.condition.tasks.values import GroupTask, load_lane
+from roadscan.condition.tasks.work import plan_condition
+from roadscan.core.errors import RoadscanError
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
 from roadscan.simulate.surface import Surface
-from roadscan.tables.sql import query
+from roadscan.store.sql import query
+from roadscan.tiles.mosaics.products import product_context
 
 HALF_M = 3.5
 KERB_M = 0.1

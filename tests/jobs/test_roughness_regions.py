@@ -12,11 +12,11 @@ import pytest
 import shapely
 
 from benchmarks.bench_lanes import RoughSurvey, rough_scene, run
-from roadscan.jobs.condition import roughness_regions
-from roadscan.jobs.condition.work import plan_condition
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
-from roadscan.tables.sql import query
+from roadscan.condition.tasks import roughness_regions
+from roadscan.condition.tasks.work import plan_condition
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
+from roadscan.store.sql import query
 
 LEAD_M = 10.0
 """The reference line begins before the road's station 0."""

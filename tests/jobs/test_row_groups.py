@@ -10,14 +10,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.session import Session
-from roadscan.jobs.tile_work import plan_tile_work
-from roadscan.jobs.tiles.footprints import FootprintRanges
-from roadscan.jobs.tiles.row_groups import GroupsByTile
-from roadscan.jobs.tiles.tiles import TaskResult
-from roadscan.model.survey import Survey
-from roadscan.tables.manifest import OutputRecord
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.session import Session
+from roadscan.store.manifest import OutputRecord
+from roadscan.tiles.footprints.footprints import FootprintRanges
+from roadscan.tiles.footprints.row_groups import GroupsByTile
+from roadscan.tiles.tasks.tile_work import plan_tile_work
+from roadscan.tiles.tasks.tiles import TaskResult
 from tests.jobs.conftest import Simulated
 
 TILES = 12

@@ -18,26 +18,25 @@ import rasterio
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.engine.compute_on import compute_on
-from roadscan.jobs.ingest.ingest import ingest
-from roadscan.jobs.session import Session
-from roadscan.jobs.status import survey_status, verify_store
-from roadscan.jobs.tile_work import plan_tile_work
-from roadscan.jobs.tiles.selection import Selection
-from roadscan.jobs.tiles.tile_points import load_points
-from roadscan.model.errors import ConfigError, RunError
-from roadscan.model.ids import TileId
-from roadscan.model.survey import Survey
-from roadscan.tables.logs import read_log_records
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
+from roadscan.core.errors import ConfigError, RunError
+from roadscan.core.ids import TileId
+from roadscan.core.survey import Survey
+from roadscan.ingest.ingest import ingest
+from roadscan.run.engine.compute import Inline
+from roadscan.run.engine.compute_on import compute_on
+from roadscan.run.session import Session
+from roadscan.run.status import survey_status, verify_store
+from roadscan.store.logs import read_log_records
+from roadscan.store.manifest import Manifest
+from roadscan.store.sql import query
+from roadscan.store.store import Store
 from roadscan.tiles.blocks import Block
 from roadscan.tiles.grid import Bounds
+from roadscan.tiles.tasks.selection import Selection
+from roadscan.tiles.tasks.tile_points import load_points
+from roadscan.tiles.tasks.tile_work import plan_tile_work
 from tests.conftest import REPOSITORY
-
-from .conftest import Simulated, changed, outputs
+from tests.jobs.conftest import Simulated, changed, outputs
 
 LONGEST_S = 2.6
 """Processor time within which a run is killed: one that has nothing to do takes 1 s, a whole one 4.5 s."""
@@ -359,7 +358,7 @@ def test_a_tile_that_could_not_be_made_again_counts_as_stale(
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("roadscan.jobs.tiles.tiles.cells_of", broken)
+        patch.setattr("roadscan.tiles.tasks.tiles.cells_of", broken)
         with pytest.raises(RunError, match=rf"tiles {unit}: OSError: disk full"):
             copy.run(selection=Selection(named=(TileId.parse(unit),)))
     assert survey_status(Session(Survey.load(copy.survey_file), store)).of("tiles").stale == 1

@@ -11,21 +11,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.export.classes import write_classes
-from roadscan.jobs.plan.plan import plan_survey
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.jobs.status import survey_status
-from roadscan.model.errors import ConfigError
-from roadscan.model.survey import Survey
-from roadscan.points.classes import LAS_CLASSES, NOT_ROAD, OVERLAPPING, READING_CLASSES
+from roadscan.core.errors import ConfigError
+from roadscan.core.survey import Survey
+from roadscan.export.classes import write_classes
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.run.status import survey_status
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.store import Store
-
-from .conftest import Simulated, changed, outputs
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
+from roadscan.tiles.georeferencing.classes import LAS_CLASSES, NOT_ROAD, OVERLAPPING, READING_CLASSES
+from roadscan.tiles.plan.plan import plan_survey
+from tests.jobs.conftest import Simulated, changed, outputs
 
 CELLS = {"products__make": ["geotiff", "tile_table"]}
 ON: dict[str, Any] = {"segmentation": {"turns": {}}}

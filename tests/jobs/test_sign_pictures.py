@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import roadscan
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.tables.store import Store
+from roadscan.store.store import Store
 from tests.jobs.conftest import Lines, changed
 
 SIGNS = [

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.jobs.publish.live import LiveSite, Served, open_survey
-from roadscan.jobs.publish.server import SiteServer, range_of
-from roadscan.model.errors import StoreError
+from roadscan.core.errors import StoreError
+from roadscan.site.live import LiveSite, Served, open_survey
+from roadscan.site.server import SiteServer, range_of
 from tests.jobs.conftest import Simulated
 
 CONTENT = bytes(range(256)) * 40

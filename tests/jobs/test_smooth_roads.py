@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 from benchmarks.bench_lanes import rough_scene
 from roadscan.cli import app
 from roadscan.simulate import simulate, truth
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
+from roadscan.store.sql import query
+from roadscan.store.store import Store
 from tests.condition.test_spacing_and_severe_places import e1926
 
 LENGTH_M = 230.0

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.model.errors import RoadscanError
+from roadscan.core.errors import RoadscanError
 from tests.jobs.conftest import Simulated
 
 LEAP_SECONDS = {

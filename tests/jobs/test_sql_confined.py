@@ -11,13 +11,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.model.errors import RoadscanError
-from roadscan.tables.sql import connect, query
-from roadscan.tables.sql_files import StoreFiles
-from roadscan.tables.store import Store
-
-from .conftest import Simulated
-from .test_damage import say
+from roadscan.core.errors import RoadscanError
+from roadscan.store.sql import connect, query
+from roadscan.store.sql_files import StoreFiles
+from roadscan.store.store import Store
+from tests.jobs.conftest import Simulated
+from tests.jobs.test_damage import say
 
 SECRET = "nobody knows"
 NORMAL = (

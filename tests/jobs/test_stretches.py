@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from roadscan.jobs.tiles.footprints import FootprintRanges
-from roadscan.jobs.tiles.row_groups import GroupsByTile
-from roadscan.jobs.tiles.stretches import DrivenTiles, cut_stretches
+from roadscan.tiles.footprints.footprints import FootprintRanges
+from roadscan.tiles.footprints.row_groups import GroupsByTile
+from roadscan.tiles.tasks.stretches import DrivenTiles, cut_stretches
 
 
 def driven(tiles: int, beyond: int) -> DrivenTiles:

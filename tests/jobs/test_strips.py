@@ -17,10 +17,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from docs.mistakes import FIRST_GPS_S
-from roadscan.jobs.strips.whose import Difference, End, whose
-
-from .test_mistakes import changed, said
-from .test_tick_clocks import SECOND_HEAD, SECOND_SENSOR
+from roadscan.strips.whose import Difference, End, whose
+from tests.jobs.test_mistakes import changed, said
+from tests.jobs.test_tick_clocks import SECOND_HEAD, SECOND_SENSOR
 
 Float64 = npt.NDArray[np.float64]
 UInt16 = npt.NDArray[np.uint16]

@@ -17,21 +17,20 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from roadscan.jobs.engine.compute import Compute, Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import Stage, stages
-from roadscan.jobs.surface_work import plan_surface_work
-from roadscan.jobs.surfaces.pictures import Pictures
-from roadscan.jobs.surfaces.surface_plan import SURFACE
-from roadscan.model.errors import ConfigError
-from roadscan.model.survey import Survey
+from roadscan.core.errors import ConfigError
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Compute, Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, stages
 from roadscan.simulate import simulate, truth
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.store import Store
-
-from .conftest import Lines, Simulated, changed, outputs, small_scene
-from .test_surfaces import SURFACES, TwoThreads
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
+from roadscan.surface.tasks.pictures import Pictures
+from roadscan.surface.tasks.surface_plan import SURFACE
+from roadscan.surface.tasks.surface_work import plan_surface_work
+from tests.jobs.conftest import Lines, Simulated, changed, outputs, small_scene
+from tests.jobs.test_surfaces import SURFACES, TwoThreads
 
 WIDTH, HEIGHT, FOCAL = 240, 160, 200.0
 DISTORTION = (-0.12, 0.03, 0.002, -0.003, 0.0)
@@ -191,9 +190,9 @@ def test_neighbours_agree_and_workers_change_no_byte(drive: Drive, monkeypatch: 
     first = np.empty((count.size, 3), np.uint8)
     first[which] = colour  # any of those at one place
     assert np.array_equal(first[which], colour)
-    monkeypatch.setattr("roadscan.jobs.surfaces.surface_plan._BLOCK_TILES", 1)
-    monkeypatch.setattr("roadscan.jobs.surfaces.picture_colours._KEPT_BYTES", 0)
-    monkeypatch.setattr("roadscan.jobs.surfaces.picture_colours._POINTS_AT_ONCE", 777)
+    monkeypatch.setattr("roadscan.surface.tasks.surface_plan._BLOCK_TILES", 1)
+    monkeypatch.setattr("roadscan.surface.tasks.picture_colours._KEPT_BYTES", 0)
+    monkeypatch.setattr("roadscan.surface.tasks.picture_colours._POINTS_AT_ONCE", 777)
     assert drive.run(drive.survey(), TwoThreads()) == files
     monkeypatch.setattr(Pictures, "near", lambda self, *_: self)  # all pictures: none that counts was left out
     assert drive.run(drive.survey()) == files

@@ -20,28 +20,27 @@ import pytest
 import rasterio
 import shapely
 
-from roadscan.jobs.engine.compute import Compute, Done, Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stages
-from roadscan.jobs.status import verify_store
-from roadscan.jobs.surface_work import plan_surface_work
-from roadscan.jobs.surfaces.surface_plan import SURFACE, SurfacePlan, SurfaceTask, bridged_tiles
-from roadscan.jobs.surfaces.surfaces import _Cells, source_of
-from roadscan.jobs.tiles.selection import Selection
-from roadscan.jobs.tiles.tile_plan import TILE
-from roadscan.model.errors import ConfigError
-from roadscan.model.ids import TileId
-from roadscan.model.survey import Survey
+from roadscan.core.errors import ConfigError
+from roadscan.core.ids import TileId
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Compute, Done, Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.run.status import verify_store
 from roadscan.simulate import simulate
 from roadscan.simulate.truth import load
-from roadscan.surfaces.reconstruction import patch_of_cells, surface_of
-from roadscan.surfaces.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
-
-from .conftest import Lines, Simulated, changed, outputs, small_scene
+from roadscan.store.manifest import Manifest
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from roadscan.surface.reconstruction import patch_of_cells, surface_of
+from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, SurfaceTask, bridged_tiles
+from roadscan.surface.tasks.surface_work import plan_surface_work
+from roadscan.surface.tasks.surfaces import _Cells, source_of
+from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.tiles.tasks.selection import Selection
+from roadscan.tiles.tasks.tile_plan import TILE
+from tests.jobs.conftest import Lines, Simulated, changed, outputs, small_scene
 
 SURFACES = tuple(s for s in stages() if s.name == "surfaces")
 CELLS: dict[str, object] = {"method": "cells", "sigma_m": 0.004}
@@ -211,8 +210,8 @@ def test_workers_and_blocks_change_no_byte(cells: Reconstructed, monkeypatch: py
     assert record.path == "" and figures["cells"] == sum(figures[k] for k in ("measured", "interpolated", "filled")) > 0
     assert figures["lowest_known"] == figures["measured"]
     cells.forget()
-    monkeypatch.setattr("roadscan.jobs.surfaces.surface_plan._BLOCK_TILES", 1)
-    monkeypatch.setattr("roadscan.jobs.surfaces.surfaces._CELLS_KEPT", 0)
+    monkeypatch.setattr("roadscan.surface.tasks.surface_plan._BLOCK_TILES", 1)
+    monkeypatch.setattr("roadscan.surface.tasks.surfaces._CELLS_KEPT", 0)
     assert cells.run(survey, TwoThreads())[1] == files
     assert verify_store(cells.store) == []
 
@@ -350,7 +349,7 @@ FOUND: dict[str, object] = {**UNSMOOTHED, "regions": "found"}
 
 
 def test_found_regions_bound_the_surface(points: Reconstructed, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadscan.jobs.surfaces.found_regions._LONGEST_S", 1)  # several pieces of the drive
+    monkeypatch.setattr("roadscan.surface.tasks.found_regions._LONGEST_S", 1)  # several pieces of the drive
     survey = points.survey(FOUND, {"make": ["surface"], "options": {}})
     before = points.plan(survey)
     assert before.waiting and not before.keys  # nobody looked for regions yet
@@ -378,7 +377,7 @@ def test_found_regions_bound_the_surface(points: Reconstructed, monkeypatch: pyt
     assert len(pieces) > 3
     manifest.forget("regions", pieces)
     points.forget()
-    monkeypatch.setattr("roadscan.jobs.surfaces.found_regions._CHUNK_ROWS", 7)
+    monkeypatch.setattr("roadscan.surface.tasks.found_regions._CHUNK_ROWS", 7)
     assert points.run(survey, TwoThreads())[1] == files  # neither workers nor chunks matter
     assert {p: points.store.read_bytes(p) for p in points.store.files("tables/regions")} == tables
     assert points.run(survey) == ([], files)

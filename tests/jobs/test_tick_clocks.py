@@ -16,8 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from docs.mistakes import FIRST_GPS_S
-
-from .test_mistakes import changed, said
+from tests.jobs.test_mistakes import changed, said
 
 Float64 = npt.NDArray[np.float64]
 

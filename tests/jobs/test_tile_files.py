@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from roadscan.jobs.tiles.tile_files import WantedProduct, tile_file_names, write_product
-from roadscan.model.strict import Strict
-from roadscan.products.base import Tile, TileProduct
-from roadscan.products.pavement import IntensityOptions, PavementIntensity
-from roadscan.tables.manifest import Manifest
-from roadscan.tables.store import Store
+from roadscan.core.strict import Strict
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
+from roadscan.tiles.product import Tile, TileProduct
+from roadscan.tiles.products.pavement import IntensityOptions, PavementIntensity
+from roadscan.tiles.tasks.tile_files import WantedProduct, tile_file_names, write_product
 
 
 class Pair(TileProduct):
@@ -63,7 +63,7 @@ def test_another_format_takes_the_old_files_away(tmp_path: Path) -> None:
 
 
 def _record(named):
-    from roadscan.tables.manifest import OutputRecord
+    from roadscan.store.manifest import OutputRecord
 
     return OutputRecord(**named, key="k", bytes=3, digest="")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.jobs.tiles.tile_plan import PlannedTiles
-from roadscan.model.ids import TileId
+from roadscan.core.ids import TileId
+from roadscan.tiles.tasks.tile_plan import PlannedTiles
 
 
 @pytest.mark.parametrize("spread", [1, 10_000_000])

@@ -18,8 +18,8 @@ import dask
 import pytest
 from distributed import Security
 
-from roadscan.jobs.engine.on_dask import connected
-from roadscan.model.errors import RoadscanError
+from roadscan.core.errors import RoadscanError
+from roadscan.run.engine.on_dask import connected
 from tests.conftest import REPOSITORY
 from tests.flows.prefect_server import background
 

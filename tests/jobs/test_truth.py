@@ -8,16 +8,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.jobs.demo import summarise
-from roadscan.jobs.ingest.ingest import ingest
-from roadscan.jobs.plan.plan import plan_survey
-from roadscan.jobs.readings import Placer
-from roadscan.model.survey import Survey
-from roadscan.points.place import EVERYWHERE
+from roadscan.core.survey import Survey
+from roadscan.demo.demo import summarise
+from roadscan.ingest.ingest import ingest
 from roadscan.simulate import simulate, truth
-from roadscan.tables.store import Store
-
-from .conftest import Simulated, small_scene
+from roadscan.store.store import Store
+from roadscan.tiles.georeferencing.place import EVERYWHERE
+from roadscan.tiles.plan.plan import plan_survey
+from roadscan.tiles.tasks.readings import Placer
+from tests.jobs.conftest import Simulated, small_scene
 
 
 @pytest.fixture(scope="module")

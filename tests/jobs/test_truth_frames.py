@@ -17,13 +17,13 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from roadscan.jobs.ingest.ingest import ingest
-from roadscan.jobs.plan.plan import SurveyPlan, plan_survey
-from roadscan.jobs.readings import Placer
-from roadscan.model.survey import Survey
-from roadscan.points.place import EVERYWHERE
+from roadscan.core.survey import Survey
+from roadscan.ingest.ingest import ingest
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.tables.store import Store
+from roadscan.store.store import Store
+from roadscan.tiles.georeferencing.place import EVERYWHERE
+from roadscan.tiles.plan.plan import SurveyPlan, plan_survey
+from roadscan.tiles.tasks.readings import Placer
 
 FRAMES = {
     "UTM north": ("EPSG:32632", 691_000.0, 5_335_000.0, 560.0),

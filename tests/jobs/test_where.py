@@ -13,11 +13,10 @@ from typer.testing import CliRunner
 
 import roadscan as rs
 from roadscan.cli import app
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 from roadscan.simulate import simulate, truth
 from roadscan.simulate.earth import Earth
-
-from .conftest import Simulated, small_scene
+from tests.jobs.conftest import Simulated, small_scene
 
 LENS = {"on": True, "every_m": 3.0, "width_px": 320, "height_px": 240, "focal_px": 260.0,
         "distortion": [-0.10, 0.02, 0.001, -0.002, 0.0]}  # fmt: skip

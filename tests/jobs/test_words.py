@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 from docs.mistakes import SURVEY, Mistake, run, write_sbet, write_survey
 from roadscan.cli import app
 from roadscan.cli.summaries import print_summary
-from roadscan.model.survey import Survey
-from roadscan.tables.manifest import Manifest, OutputRecord
-from roadscan.tables.store import Store
+from roadscan.core.survey import Survey
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.store import Store
 
 CAPTURE = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65_535, 1)
 """Header of a capture (libpcap)."""

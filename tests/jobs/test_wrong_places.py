@@ -28,10 +28,9 @@ from typer.testing import CliRunner
 
 import roadscan as rs
 from roadscan.cli import app
-from roadscan.jobs.ingest.pose_checks import pose_track
+from roadscan.ingest.pose_checks import pose_track
 from roadscan.navigation.leaps import find_leaps
-
-from .conftest import Simulated
+from tests.jobs.conftest import Simulated
 
 Float64 = npt.NDArray[np.float64]
 NAMES = ("time_s", "latitude_deg", "longitude_deg", "height_m", "roll_deg", "pitch_deg", "heading_deg")

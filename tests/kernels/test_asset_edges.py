@@ -7,11 +7,11 @@ import itertools
 import numpy as np
 import pytest
 
-from roadscan.kernels.assets.edge_links import MAX_LINKS, best_ways, find_links, trace
-from roadscan.kernels.assets.low_heights import low_heights
-from roadscan.kernels.assets.step_filter import CHUNK, FRAME, WORK, step_response, strips, thin
-from roadscan.kernels.assets.step_profiles import FACE, OFFSET, RESULTS, SIGMA_STEP, STEP, TOP, fit_nodes
-from roadscan.kernels.assets.transects import (
+from roadscan.assets.kernels.edge_links import MAX_LINKS, best_ways, find_links, trace
+from roadscan.assets.kernels.low_heights import low_heights
+from roadscan.assets.kernels.step_filter import CHUNK, FRAME, WORK, step_response, strips, thin
+from roadscan.assets.kernels.step_profiles import FACE, OFFSET, RESULTS, SIGMA_STEP, STEP, TOP, fit_nodes
+from roadscan.assets.kernels.transects import (
     END,
     OBSTACLE,
     SLOPE,
@@ -20,8 +20,8 @@ from roadscan.kernels.assets.transects import (
     WIDTH,
     walk,
 )
-from roadscan.kernels.assets.transects import RESULTS as WALK_RESULTS
-from roadscan.kernels.road.edge_across import best_path, step_and_bend
+from roadscan.assets.kernels.transects import RESULTS as WALK_RESULTS
+from roadscan.compute.kernels.edge_across import best_path, step_and_bend
 
 RNG = np.random.default_rng(8)
 

@@ -7,14 +7,14 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import binned_statistic_2d
 
-from roadscan.kernels.assets import voxels
-from roadscan.kernels.assets.columns import columns, distinct, marked, slots, tops
-from roadscan.kernels.assets.filling import begin, halved, relax
-from roadscan.kernels.assets.ground_cells import cell_heights, on_ground, scatter
-from roadscan.kernels.assets.heights import heights_above
-from roadscan.kernels.assets.lowest import counts, lowest_returns
-from roadscan.kernels.assets.planes import planes
-from roadscan.kernels.assets.voxels import features, moments, numbered
+from roadscan.assets.kernels import voxels
+from roadscan.assets.kernels.columns import columns, distinct, marked, slots, tops
+from roadscan.assets.kernels.filling import begin, halved, relax
+from roadscan.assets.kernels.ground_cells import cell_heights, on_ground, scatter
+from roadscan.assets.kernels.heights import heights_above
+from roadscan.assets.kernels.lowest import counts, lowest_returns
+from roadscan.assets.kernels.planes import planes
+from roadscan.assets.kernels.voxels import features, moments, numbered
 
 ORIGIN = np.array([2.0, -3.0])
 ROWS, COLUMNS, CELL_M = 6, 8, 0.5

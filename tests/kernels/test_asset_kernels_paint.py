@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.assets.paint_levels import FEWEST, paint_levels
+from roadscan.assets.kernels.paint_levels import FEWEST, paint_levels
 
 
 def levels(value: np.ndarray, cell: np.ndarray, shape: tuple[int, int], half: int) -> tuple[np.ndarray, np.ndarray]:

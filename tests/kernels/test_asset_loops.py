@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
-from roadscan.kernels.assets.beams import ground_heights, log_gains, meet_ground
-from roadscan.kernels.assets.buckets import by_number, raster_cells, rows_within
-from roadscan.kernels.assets.corridors import mark_strip
-from roadscan.kernels.assets.ground_cells import least_over_disk
-from roadscan.kernels.assets.paint_levels import (
+from roadscan.assets.kernels.beams import ground_heights, log_gains, meet_ground
+from roadscan.assets.kernels.buckets import by_number, raster_cells, rows_within
+from roadscan.assets.kernels.corridors import mark_strip
+from roadscan.assets.kernels.ground_cells import least_over_disk
+from roadscan.assets.kernels.paint_levels import (
     contrasts,
     distinct_in_groups,
     paint_sums,
     scan_lines,
     seen_on_ground,
 )
-from roadscan.kernels.assets.smoothing import convolve, window_means
-from roadscan.kernels.assets.standing_classes import ALONE, LEAFY, WALL, WIRE, standing_classes
-from roadscan.kernels.assets.step_filter import sizes_of, take_excess
-from roadscan.kernels.options import read_only
+from roadscan.assets.kernels.smoothing import convolve, window_means
+from roadscan.assets.kernels.standing_classes import ALONE, LEAFY, WALL, WIRE, standing_classes
+from roadscan.assets.kernels.step_filter import sizes_of, take_excess
+from roadscan.compute.kernel_options import read_only
 
 RNG = np.random.default_rng(23)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.kernels.assets.sight import Places, Rays, follow_rays
+from roadscan.assets.kernels.sight import Places, Rays, follow_rays
 
 CELL_M = 0.5
 BANDS_M = np.array([-0.3, 0.5, 1.5, 3.0])

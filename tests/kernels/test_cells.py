@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.kernels.cells import cell_statistics
-from roadscan.kernels.cells.accumulate import (
+from roadscan.compute.kernels.copies import copy_values
+from roadscan.compute.kernels.height_slots import LANES, SLOT_SIZE, VECTOR
+from roadscan.tiles.georeferencing.kernels.readings import FATES, KEPT
+from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK
+from roadscan.tiles.kernels import cell_statistics
+from roadscan.tiles.kernels.accumulate import (
     PIECE,
     Heights,
     accumulate,
@@ -15,18 +19,18 @@ from roadscan.kernels.cells.accumulate import (
     find_cells,
     work_arrays,
 )
-from roadscan.kernels.cells.active_tiles import ActiveTiles
-from roadscan.kernels.cells.adjacent_cells import run_end
-from roadscan.kernels.cells.bucket_readings import bucket_points
-from roadscan.kernels.cells.bucket_statistics import finish_buckets, row_arrays
-from roadscan.kernels.cells.cell_columns import CellColumns
-from roadscan.kernels.cells.cell_statistics import AHEAD, find_groups, finish_cells
-from roadscan.kernels.cells.decimate import Cells
-from roadscan.kernels.cells.grey_pictures import grey_intensity, shade_cells
-from roadscan.kernels.cells.large_cells import select_arrays, statistics_of_full
-from roadscan.kernels.cells.pool import Pool
-from roadscan.kernels.cells.pyramid import Levels, Pixels, reduce_cells
-from roadscan.kernels.cells.row_buckets import (
+from roadscan.tiles.kernels.active_tiles import ActiveTiles
+from roadscan.tiles.kernels.adjacent_cells import run_end
+from roadscan.tiles.kernels.bucket_readings import bucket_points
+from roadscan.tiles.kernels.bucket_statistics import finish_buckets, row_arrays
+from roadscan.tiles.kernels.cell_columns import CellColumns
+from roadscan.tiles.kernels.cell_statistics import AHEAD, find_groups, finish_cells
+from roadscan.tiles.kernels.decimate import Cells
+from roadscan.tiles.kernels.grey_pictures import grey_intensity, shade_cells
+from roadscan.tiles.kernels.large_cells import select_arrays, statistics_of_full
+from roadscan.tiles.kernels.pool import Pool
+from roadscan.tiles.kernels.pyramid import Levels, Pixels, reduce_cells
+from roadscan.tiles.kernels.row_buckets import (
     BLOCK,
     PASS,
     TAKEN,
@@ -36,11 +40,7 @@ from roadscan.kernels.cells.row_buckets import (
     sizes_of_rows,
     take_readings,
 )
-from roadscan.kernels.cells.selection import BINS, bounds_of, smallest, sort_few
-from roadscan.kernels.copies import copy_values
-from roadscan.kernels.georeferencing.readings import FATES, KEPT
-from roadscan.kernels.georeferencing.timed_readings import CHUNK
-from roadscan.kernels.simd.height_slots import LANES, SLOT_SIZE, VECTOR
+from roadscan.tiles.kernels.selection import BINS, bounds_of, smallest, sort_few
 
 EDGE, CELL = 20, 500
 GROUPS = EDGE * 2

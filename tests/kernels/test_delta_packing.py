@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from roadscan.kernels.packing import wide_packing
-from roadscan.kernels.packing.delta_packing import (
+from roadscan.store.codecs.kernels import wide_packing
+from roadscan.store.codecs.kernels.delta_packing import (
     BAD_HEADER,
     CUT_SHORT,
     LEFT_OVER,

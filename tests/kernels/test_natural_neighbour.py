@@ -8,14 +8,14 @@ import shapely
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay
 
-from roadscan.condition.natural_neighbour import insertion_order, interpolate
-from roadscan.kernels.condition.delaunay_mesh import dig, mesh_of, triangulate, walk
-from roadscan.kernels.condition.natural_neighbour import (
+from roadscan.condition.kernels.delaunay_mesh import dig, mesh_of, triangulate, walk
+from roadscan.condition.kernels.natural_neighbour import (
     STEP_M,
     circle_centres,
     natural_neighbour_raster,
     slopes_of_points,
 )
+from roadscan.condition.natural_neighbour import insertion_order, interpolate
 
 
 def scattered(n: int, seed: int = 0) -> np.ndarray:

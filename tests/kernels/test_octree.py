@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.kernels.cells.octree import (
+from roadscan.tiles.kernels.octree import (
     BITS,
     NODE_COLUMNS,
     SPAN_BITS,

@@ -9,7 +9,13 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from roadscan.kernels.georeferencing.readings import (
+from roadscan.compute.kernel_options import read_only
+from roadscan.core.crs import LOCAL_WORLD, Anchor, MapFrame
+from roadscan.core.rig import Mounting
+from roadscan.navigation.trajectory import Trajectory
+from roadscan.tiles.georeferencing.charts import charts_along
+from roadscan.tiles.georeferencing.georeference import georeference_of
+from roadscan.tiles.georeferencing.kernels.readings import (
     CLASS_KEPT,
     CLASS_NO_POSE,
     CLASS_NO_RETURN,
@@ -21,13 +27,7 @@ from roadscan.kernels.georeferencing.readings import (
     Placed,
     Returns,
 )
-from roadscan.kernels.georeferencing.timed_readings import STEP_NS, place_mirror, place_returns
-from roadscan.kernels.options import read_only
-from roadscan.model.crs import LOCAL_WORLD, Anchor, MapFrame
-from roadscan.model.rig import Mounting
-from roadscan.navigation.trajectory import Trajectory
-from roadscan.points.charts import charts_along
-from roadscan.points.georeference import georeference_of
+from roadscan.tiles.georeferencing.kernels.timed_readings import STEP_NS, place_mirror, place_returns
 
 START = 10**18
 WIDE = (0.0, 1e4, -1e5, 1e5, -1e5, 1e5)

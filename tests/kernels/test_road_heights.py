@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from roadscan.condition.cell_table import cell_table
-from roadscan.kernels.condition.road_frame import place
-from roadscan.kernels.condition.ruts import straightedge, stretched_wire, water, wire_places
-from roadscan.kernels.condition.sampling import CellTable, factorise, sample
-from roadscan.kernels.condition.steps import step_heights
-from roadscan.model.ids import TileId
+from roadscan.condition.kernels.road_frame import place
+from roadscan.condition.kernels.ruts import straightedge, stretched_wire, water, wire_places
+from roadscan.condition.kernels.sampling import CellTable, factorise, sample
+from roadscan.condition.kernels.steps import step_heights
+from roadscan.core.ids import TileId
 from roadscan.tiles.cells import TileCells
 
 CELL_M = 0.05

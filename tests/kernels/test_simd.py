@@ -7,15 +7,14 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from roadscan.kernels.cells.cell_columns import CellColumns
-from roadscan.kernels.options import bare
-from roadscan.kernels.simd.cell_streaks import find_streaks, sum_up
-from roadscan.kernels.simd.column_statistics import LANES, medians_of_16, statistics_of_64
-from roadscan.kernels.simd.covariances import PEAK, RISE, covariances, slope_covariances
-from roadscan.kernels.simd.covariances import REACH as COVARIANCE_REACH
-from roadscan.kernels.simd.factorisation import LANES as EIGHT
-from roadscan.kernels.simd.factorisation import TOGETHER, factorise
-from roadscan.kernels.simd.height_slots import (
+from roadscan.compute.kernel_options import bare
+from roadscan.compute.kernels.cell_streaks import find_streaks, sum_up
+from roadscan.compute.kernels.column_statistics import LANES, medians_of_16, statistics_of_64
+from roadscan.compute.kernels.covariances import PEAK, RISE, covariances, slope_covariances
+from roadscan.compute.kernels.covariances import REACH as COVARIANCE_REACH
+from roadscan.compute.kernels.factorisation import LANES as EIGHT
+from roadscan.compute.kernels.factorisation import TOGETHER, factorise
+from roadscan.compute.kernels.height_slots import (
     LIGHT_SHIFT,
     MARK_SHIFT,
     SLOT_HEIGHTS,
@@ -24,10 +23,11 @@ from roadscan.kernels.simd.height_slots import (
     prefetch,
     store_heights,
 )
-from roadscan.kernels.simd.patch_heights import POINTS, SCALE, heights_of_eight
-from roadscan.kernels.simd.slot_groups import chained_cells, open_group, put_apart
-from roadscan.kernels.simd.store_statistics import store_group
-from roadscan.kernels.simd.streak_slots import AT_ONCE, find_known_slots, lowest_bit
+from roadscan.compute.kernels.patch_heights import POINTS, SCALE, heights_of_eight
+from roadscan.compute.kernels.slot_groups import chained_cells, open_group, put_apart
+from roadscan.compute.kernels.store_statistics import store_group
+from roadscan.compute.kernels.streak_slots import AT_ONCE, find_known_slots, lowest_bit
+from roadscan.tiles.kernels.cell_columns import CellColumns
 
 
 @bare

@@ -9,26 +9,26 @@ from scipy import ndimage
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from roadscan.kernels.calibration.surface_patches import place, splat
-from roadscan.kernels.calibration.ties import SIDE, tie_residuals, tie_rows
-from roadscan.kernels.cracks.crack_response import add_bend, deepen, fill_holes, line_sums
-from roadscan.kernels.cracks.line_medians import keep_better, window_sums
-from roadscan.kernels.cracks.thinning import thin
-from roadscan.kernels.georeferencing.block_ranges import block_ranges
-from roadscan.kernels.georeferencing.profile_bounds import range_bounds
-from roadscan.kernels.georeferencing.tick_places import between_ticks
-from roadscan.kernels.georeferencing.tile_set import add_tile, empty, mark_zonotope, take, tile_set
-from roadscan.kernels.inertial.strapdown import geodetic_of, gravity_at, turned_frame
-from roadscan.kernels.road.curved_grid import accumulate_curved, thin_path
-from roadscan.kernels.road.road_ranges import keep_road
-from roadscan.kernels.surface.coarse import CellSums, Profiles, rasterise, spline_profiles, sum_patches
-from roadscan.kernels.surface.delaunay import flip_edges
-from roadscan.kernels.surface.directional_filters import choose_filters
-from roadscan.kernels.surface.ground import depths, grounds, highest, rim, slopes
-from roadscan.kernels.surface.picture_colours import sample, take_better
-from roadscan.kernels.surface.smoothing import descend
-from roadscan.kernels.surface.vertex_neighbourhoods import units
-from roadscan.kernels.surface.vertex_rings import grow, is_narrow, whitening
+from roadscan.calibrate.kernels.surface_patches import place, splat
+from roadscan.calibrate.kernels.ties import SIDE, tie_residuals, tie_rows
+from roadscan.compute.kernels.curved_grid import accumulate_curved, thin_path
+from roadscan.compute.kernels.profile_bounds import range_bounds
+from roadscan.distress.kernels.crack_response import add_bend, deepen, fill_holes, line_sums
+from roadscan.distress.kernels.thinning import thin
+from roadscan.navigation.inertial.kernels.strapdown import geodetic_of, gravity_at, turned_frame
+from roadscan.surface.kernels.coarse import CellSums, Profiles, rasterise, spline_profiles, sum_patches
+from roadscan.surface.kernels.delaunay import flip_edges
+from roadscan.surface.kernels.directional_filters import choose_filters
+from roadscan.surface.kernels.ground import depths, grounds, highest, rim, slopes
+from roadscan.surface.kernels.line_medians import keep_better, window_sums
+from roadscan.surface.kernels.picture_colours import sample, take_better
+from roadscan.surface.kernels.smoothing import descend
+from roadscan.surface.kernels.vertex_neighbourhoods import units
+from roadscan.surface.kernels.vertex_rings import grow, is_narrow, whitening
+from roadscan.tiles.georeferencing.kernels.block_ranges import block_ranges
+from roadscan.tiles.georeferencing.kernels.road_ranges import keep_road
+from roadscan.tiles.georeferencing.kernels.tick_places import between_ticks
+from roadscan.tiles.georeferencing.kernels.tile_set import add_tile, empty, mark_zonotope, take, tile_set
 
 
 def test_spans_of_ranges() -> None:

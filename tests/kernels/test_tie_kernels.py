@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from roadscan.kernels.adjust.correlation import Laid, correlate, lay_upon
-from roadscan.kernels.adjust.patch_cells import Cells, Frame, Splat, cell_numbers, fill_cells, local_axes, splat
-from roadscan.kernels.adjust.plane_moments import add_moments, leave_out_far
-from roadscan.kernels.adjust.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
+from roadscan.adjust.kernels.correlation import Laid, correlate, lay_upon
+from roadscan.adjust.kernels.patch_cells import Cells, Frame, Splat, cell_numbers, fill_cells, local_axes, splat
+from roadscan.adjust.kernels.plane_moments import add_moments, leave_out_far
+from roadscan.adjust.kernels.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
 
 
 def two_tracks() -> Samples:

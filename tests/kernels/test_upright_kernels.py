@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from roadscan.kernels.assets.buckets import count_buckets, fill_buckets
-from roadscan.kernels.assets.corridors import mark_corridor
-from roadscan.kernels.assets.cylinders import fit_cylinder, radius_across
-from roadscan.kernels.assets.grown_cells import low_moments
-from roadscan.kernels.assets.slices import fill_slices, label_slices, owners, slices_above_one_another
-from roadscan.kernels.assets.upright_voxels import (
+from roadscan.assets.kernels.buckets import count_buckets, fill_buckets
+from roadscan.assets.kernels.corridors import mark_corridor
+from roadscan.assets.kernels.cylinders import fit_cylinder, radius_across
+from roadscan.assets.kernels.grown_cells import low_moments
+from roadscan.assets.kernels.slices import fill_slices, label_slices, owners, slices_above_one_another
+from roadscan.assets.kernels.upright_voxels import (
     beside_line,
     gather_moments,
     grow_regions,

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.settings.calibration import (
+from roadscan.core.errors import ConfigError
+from roadscan.core.settings.calibration import (
     CalibrationEvidence,
     CalibrationSettings,
     OverlapEvidence,
     StopAndGoEvidence,
 )
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 OBJECT = {"steps": [[1.2, 1.2, 0.02]], "easting_m": 1.0, "northing_m": 2.0}
 

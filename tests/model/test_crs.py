@@ -12,7 +12,7 @@ import pyproj
 import pyproj.network
 import pytest
 
-from roadscan.model.crs import (
+from roadscan.core.crs import (
     LOCAL_WORLD,
     WGS84_WORLD,
     Anchor,
@@ -24,7 +24,7 @@ from roadscan.model.crs import (
     world_frame_of,
     world_from_geodetic,
 )
-from roadscan.model.errors import CrsError
+from roadscan.core.errors import CrsError
 
 US_SURVEY_FOOT_M = 1200 / 3937
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.model import errors
+from roadscan.core import errors
 
 KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, errors.RoadscanError)]
 

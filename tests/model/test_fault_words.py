@@ -14,10 +14,10 @@ import pytest
 from pydantic import ValidationError
 
 import roadscan
-from roadscan.model import strict
-from roadscan.model.errors import ConfigError
-from roadscan.model.strict import Strict, faults_in_words
-from roadscan.model.survey import Survey
+from roadscan.core import strict
+from roadscan.core.errors import ConfigError
+from roadscan.core.strict import Strict, faults_in_words
+from roadscan.core.survey import Survey
 
 PROBES: tuple[Any, ...] = (
     "", "nonsense", "Été 9", "2026-13-45", -1e9, 1e9, 1.5, 10**30, float("nan"), True, [], ["x"], [{}],

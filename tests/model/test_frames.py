@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.frames import (
+from roadscan.core.errors import ConfigError
+from roadscan.core.frames import (
     BODY_FROM_AXES,
     ENU_FROM_NED,
     body_from_axes,

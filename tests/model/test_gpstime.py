@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from roadscan.model.errors import ConfigError, TimeSystemError
-from roadscan.model.gpstime import (
+from roadscan.core.errors import ConfigError, TimeSystemError
+from roadscan.core.gpstime import (
     NS_PER_S,
     WEEK_S,
     Clock,
@@ -23,7 +23,7 @@ from roadscan.model.gpstime import (
     unroll_week,
     utc_from_gps_ns,
 )
-from roadscan.model.survey import ClockConfig
+from roadscan.core.survey import ClockConfig
 
 # (GPS seconds, UTC). The gravitational-wave catalogue GWTC-1 prints both scales for its events;
 # GPS 1e9 and the leap second of 2017 are in the IGS and LIGO time tables.

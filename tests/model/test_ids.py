@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.ids import LanePass, PassId, RunId, TileId
+from roadscan.core.errors import ConfigError
+from roadscan.core.ids import LanePass, PassId, RunId, TileId
 
 
 @pytest.mark.parametrize("text", ["62342_484882", "-3_7", " 12,-4 "])

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.rig import Boresight, Rig, Sensor
+from roadscan.core.errors import ConfigError
+from roadscan.core.rig import Boresight, Rig, Sensor
 
 RIG = """
 name = "van"

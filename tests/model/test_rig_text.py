@@ -11,9 +11,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.rig import Rig
-from roadscan.model.rig_text import changed_rig_text, update_rig_file
+from roadscan.core.errors import ConfigError
+from roadscan.core.rig import Rig
+from roadscan.core.rig_text import changed_rig_text, update_rig_file
 
 RIG = '''# The van of 2026 — "blue" [sensors.camera] is not a table here
 name = "van"   # as painted

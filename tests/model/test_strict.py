@@ -8,8 +8,8 @@ from typing import Literal
 import pytest
 from pydantic import Field, ValidationError, model_validator
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.strict import Strict, load_toml, meanings
+from roadscan.core.errors import ConfigError
+from roadscan.core.strict import Strict, load_toml, meanings
 
 
 class Wheel(Strict):

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from roadscan.model import rig as rig_module
-from roadscan.model import survey as survey_module
-from roadscan.model.errors import ConfigError, TimeSystemError
-from roadscan.model.gpstime import NS_PER_S, TimeSystem, gps_ns_from_utc
-from roadscan.model.ids import LanePass, PassId, RunId
-from roadscan.model.strict import Strict, meanings
-from roadscan.model.survey import Survey, SurveyConfig
+from roadscan.core import rig as rig_module
+from roadscan.core import survey as survey_module
+from roadscan.core.errors import ConfigError, TimeSystemError
+from roadscan.core.gpstime import NS_PER_S, TimeSystem, gps_ns_from_utc
+from roadscan.core.ids import LanePass, PassId, RunId
+from roadscan.core.strict import Strict, meanings
+from roadscan.core.survey import Survey, SurveyConfig
 
 MINIMAL: dict[str, Any] = {
     "id": "town",

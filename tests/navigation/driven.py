@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.csv as pa_csv
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.gpstime import TimeSystem
+from roadscan.core.gpstime import TimeSystem
 from roadscan.navigation.clocks import ClockCorrection
 from roadscan.navigation.inertial.readings import ImuReadings, OdometerReadings
 from roadscan.navigation.trajectory import Trajectory

@@ -15,9 +15,9 @@ import pyproj
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.frames import rotation_from_quaternion
-from roadscan.model.imu import IMU_GRADES, ImuErrors, ImuGrade
-from roadscan.model.settings.smoothing import SmootherConfig
+from roadscan.core.frames import rotation_from_quaternion
+from roadscan.core.imu import IMU_GRADES, ImuErrors, ImuGrade
+from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.earth import ecef_from_level
 from roadscan.navigation.inertial.readings import (
     GnssSolutions,

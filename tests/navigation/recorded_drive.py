@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.crs import world_from_geodetic
-from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S
-from roadscan.model.imu import ImuErrors
+from roadscan.core.crs import world_from_geodetic
+from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S
+from roadscan.core.imu import ImuErrors
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 
 WORLD = "EPSG:4978"

@@ -11,16 +11,16 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from roadscan.model.errors import ConfigError, NavigationError
-from roadscan.model.frames import ENU_FROM_NED
-from roadscan.model.rig import Mounting, Sensor
-from roadscan.model.settings.calibration import CalibrationSettings
-from roadscan.navigation.calibration.estimator import Estimate, ObjectPose, Prior, calibrate, priors_of
-from roadscan.navigation.calibration.evidence import Directions, Known, Orientation, Seen, Ties, Traverse
-from roadscan.navigation.calibration.observations import observations
-from roadscan.navigation.calibration.report import mounting_rows, report
-from roadscan.navigation.calibration.unknowns import Geometry, Unknowns
-from roadscan.tables.schema import table_schema
+from roadscan.calibrate.estimator import Estimate, ObjectPose, Prior, calibrate, priors_of
+from roadscan.calibrate.evidence import Directions, Known, Orientation, Seen, Ties, Traverse
+from roadscan.calibrate.in_words import mounting_rows, report
+from roadscan.calibrate.observations import observations
+from roadscan.calibrate.unknowns import Geometry, Unknowns
+from roadscan.core.errors import ConfigError, NavigationError
+from roadscan.core.frames import ENU_FROM_NED
+from roadscan.core.rig import Mounting, Sensor
+from roadscan.core.settings.calibration import CalibrationSettings
+from roadscan.store.schema import table_schema
 
 compiled = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="many ties")
 

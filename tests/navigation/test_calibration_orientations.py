@@ -8,13 +8,13 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from roadscan.model.errors import NavigationError
-from roadscan.model.rig import Mounting
-from roadscan.navigation.calibration.estimator import Prior, calibrate
-from roadscan.navigation.calibration.evidence import AttitudeInfluence, Directions, Orientation
-from roadscan.navigation.calibration.observations import observations
-from roadscan.navigation.calibration.orientations import joint_covariance
-from roadscan.navigation.calibration.unknowns import Unknowns
+from roadscan.calibrate.estimator import Prior, calibrate
+from roadscan.calibrate.evidence import AttitudeInfluence, Directions, Orientation
+from roadscan.calibrate.observations import observations
+from roadscan.calibrate.orientations import joint_covariance
+from roadscan.calibrate.unknowns import Unknowns
+from roadscan.core.errors import NavigationError
+from roadscan.core.rig import Mounting
 
 HEADS = ("left", "right")
 COARSE_RAD, FINE_RAD = np.radians(0.03), np.radians(0.0006)

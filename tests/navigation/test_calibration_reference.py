@@ -15,15 +15,15 @@ import small_gicp
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.rig import Mounting, Rig
-from roadscan.model.survey import ClockConfig
-from roadscan.navigation.calibration.estimator import Prior, calibrate
-from roadscan.navigation.calibration.evidence import Known, Seen, Traverse
-from roadscan.navigation.calibration.reference import ReferenceOptions, Registration, register
-from roadscan.navigation.calibration.surfels import Surfels
+from roadscan.calibrate.estimator import Prior, calibrate
+from roadscan.calibrate.evidence import Known, Seen, Traverse
+from roadscan.calibrate.reference import ReferenceOptions, Registration, register
+from roadscan.calibrate.surfels import Surfels
+from roadscan.core.errors import ConfigError
+from roadscan.core.rig import Mounting, Rig
+from roadscan.core.survey import ClockConfig
+from roadscan.ingest.format import Rows, format_named
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.sensors.base import Rows, format_named
 from roadscan.simulate import Scene, simulate, truth
 from tests.sensors.log_reading import source_of
 

@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.bench_surfaces import overlap_mm, solved
 from benchmarks.calibration_yard import mounting_error, profiler_yard
-from roadscan.kernels.calibration.surface_patches import MOMENTS, UNKNOWNS, Matches, match_patches
-from roadscan.model.errors import NavigationError
-from roadscan.model.settings.calibration import CalibrationSettings
-from roadscan.navigation.calibration.estimator import calibrate
-from roadscan.navigation.calibration.surfaces.heights import HeightTies, rows_of
-from roadscan.navigation.calibration.surfaces.planes import PlaneTies
-from roadscan.navigation.calibration.surfaces.readings import Pieces, Readings
-from roadscan.navigation.calibration.unknowns import Prior, mounting_of
+from roadscan.calibrate.estimator import calibrate
+from roadscan.calibrate.kernels.surface_patches import MOMENTS, UNKNOWNS, Matches, match_patches
+from roadscan.calibrate.surfaces.heights import HeightTies, rows_of
+from roadscan.calibrate.surfaces.planes import PlaneTies
+from roadscan.calibrate.surfaces.readings import Pieces, Readings
+from roadscan.calibrate.unknowns import Prior, mounting_of
+from roadscan.core.errors import NavigationError
+from roadscan.core.settings.calibration import CalibrationSettings
 
 CELL_M = 0.005
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

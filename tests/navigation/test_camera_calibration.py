@@ -16,13 +16,13 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from roadscan.model.camera import Interior
-from roadscan.model.errors import ConfigError
-from roadscan.model.rig import Mounting, Rig, Sensor
-from roadscan.navigation.calibration.chessboard import Board, InteriorOptions, interior_from_pictures
-from roadscan.navigation.calibration.estimator import Prior
-from roadscan.navigation.calibration.evidence import Traverse
-from roadscan.navigation.calibration.resection import Exposure, Measured, Target, project, resect, tangents
+from roadscan.calibrate.chessboard import Board, InteriorOptions, interior_from_pictures
+from roadscan.calibrate.estimator import Prior
+from roadscan.calibrate.evidence import Traverse
+from roadscan.calibrate.resection import Exposure, Measured, Target, project, resect, tangents
+from roadscan.core.camera import Interior
+from roadscan.core.errors import ConfigError
+from roadscan.core.rig import Mounting, Rig, Sensor
 from roadscan.simulate import Scene, simulate, truth
 
 BOARD = Board(columns=9, rows=6, square_m=0.03)

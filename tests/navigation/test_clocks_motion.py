@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from roadscan.model.errors import NavigationError
+from roadscan.core.errors import NavigationError
 from roadscan.navigation.clocks.motion import MotionFit, clock_from_motion
 from roadscan.navigation.clocks.signals import driving, felt_by_encoder, felt_by_imu, turning, turning_of_imu
 from roadscan.navigation.inertial.readings import ImuReadings, OdometerReadings
 from roadscan.navigation.trajectory import Trajectory
-
-from .driven import Driven, scene_of
+from tests.navigation.driven import Driven, scene_of
 
 CLOCK = {"offset_s": -1.2345, "drift_ppm": 37.0}
 NOISE = {"attitude_deg": 0.004, "position_m": 0.006, "time_constant_s": 60.0}

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.crs import geodetic_from_world, world_from_geodetic
-from roadscan.model.errors import ConfigError, CrsError, NavigationError, RoadscanError, TimeSystemError
-from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S
-from roadscan.model.imu import IMU_GRADES
-from roadscan.model.settings.smoothing import SmootherConfig
+from roadscan.core.crs import geodetic_from_world, world_from_geodetic
+from roadscan.core.errors import ConfigError, CrsError, NavigationError, RoadscanError, TimeSystemError
+from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S
+from roadscan.core.imu import IMU_GRADES
+from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.checks import Prepared, prepared
 from roadscan.navigation.inertial.outcome import check_outcome
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors

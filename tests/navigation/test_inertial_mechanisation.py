@@ -11,9 +11,9 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.kernels.inertial.strapdown import increments, strapdown
-from roadscan.model.frames import ecef_from_ned, quaternion_from_rotation, rotation_from_rph
+from roadscan.core.frames import ecef_from_ned, quaternion_from_rotation, rotation_from_rph
 from roadscan.navigation.inertial.earth import ecef_from_level, gravity_ecef
+from roadscan.navigation.inertial.kernels.strapdown import increments, strapdown
 from tests.navigation.inertial_drives import NO_GAPS, simulated, urban
 
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)

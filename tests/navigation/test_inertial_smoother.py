@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from roadscan.kernels.inertial.kalman_smoother import smooth_backwards
-from roadscan.kernels.inertial.kalman_states import NAVIGATION, WITHOUT_SCALES
-from roadscan.model.errors import NavigationError
-from roadscan.model.frames import rotation_from_quaternion
-from roadscan.model.imu import IMU_GRADES, ImuGrade
-from roadscan.model.settings.smoothing import SmootherConfig
+from roadscan.core.errors import NavigationError
+from roadscan.core.frames import rotation_from_quaternion
+from roadscan.core.imu import IMU_GRADES, ImuGrade
+from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial import smoother
+from roadscan.navigation.inertial.kernels.kalman_smoother import smooth_backwards
+from roadscan.navigation.inertial.kernels.kalman_states import NAVIGATION, WITHOUT_SCALES
 from roadscan.navigation.inertial.readings import ImuReadings, Solution
 from roadscan.navigation.inertial.smoother import solve
 from tests.navigation.inertial_drives import (

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from roadscan.adjust.observations import mount_partials
-from roadscan.model.frames import rotation_from_rph
-from roadscan.model.rig import Mounting, Mountings
+from roadscan.core.frames import rotation_from_rph
+from roadscan.core.rig import Mounting, Mountings
 from roadscan.navigation.mounting_change import MountingChange, Seat
 
 VALUES = np.array([0.0003, -0.0002, 0.0004, 2e-5, -3e-5, 4e-5, 8e-5])

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import NavigationError
-from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.settings.smoothing import SmootherConfig, SplineConfig
+from roadscan.core.errors import NavigationError
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.settings.smoothing import SmootherConfig, SplineConfig
 from roadscan.navigation.inertial.smoother import solve
 from roadscan.navigation.spline import Smoothed, smoothed
 from roadscan.navigation.trajectory import Trajectory

@@ -13,16 +13,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from roadscan.model.crs import world_from_geodetic
-from roadscan.model.errors import NavigationError
-from roadscan.model.frames import ecef_from_ned, quaternion_from_rotation, rotation_from_rph
-from roadscan.model.gpstime import NS_PER_S, WEEK_S
-from roadscan.model.imu import IMU_GRADES
-from roadscan.model.rig import Mounting, Rig
-from roadscan.model.settings.calibration import CalibrationSettings
-from roadscan.navigation.calibration.estimator import Prior, calibrate
-from roadscan.navigation.calibration.orientations import joint_covariance
-from roadscan.navigation.calibration.stop_and_go import HeadRun, find_orientation
+from roadscan.calibrate.estimator import Prior, calibrate
+from roadscan.calibrate.orientations import joint_covariance
+from roadscan.calibrate.stop_and_go import HeadRun, find_orientation
+from roadscan.core.crs import world_from_geodetic
+from roadscan.core.errors import NavigationError
+from roadscan.core.frames import ecef_from_ned, quaternion_from_rotation, rotation_from_rph
+from roadscan.core.gpstime import NS_PER_S, WEEK_S
+from roadscan.core.imu import IMU_GRADES
+from roadscan.core.rig import Mounting, Rig
+from roadscan.core.settings.calibration import CalibrationSettings
 from roadscan.navigation.inertial.readings import ImuReadings
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.simulate import Scene, simulate

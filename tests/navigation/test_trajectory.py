@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import NavigationError
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.errors import NavigationError
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.trajectory import Corrections, Trajectory
 
 

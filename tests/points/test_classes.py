@@ -6,9 +6,9 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
-from roadscan.points.classes import READING_CLASSES
-from roadscan.points.place import EVERYWHERE, Window
-from roadscan.points.readings import ScanGeometry
+from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.tiles.georeferencing.classes import READING_CLASSES
+from roadscan.tiles.georeferencing.place import EVERYWHERE, Window
 from tests.points.test_place import metres, placement, returns, scene
 
 N = 4000

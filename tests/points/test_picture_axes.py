@@ -6,8 +6,8 @@ import numpy as np
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.crs import MapFrame
-from roadscan.points.picture_axes import camera_from_map
+from roadscan.core.crs import MapFrame
+from roadscan.tiles.georeferencing.picture_axes import camera_from_map
 
 GEOCENTRIC, UTM = "EPSG:4978", "EPSG:32632"
 

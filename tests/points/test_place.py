@@ -10,13 +10,13 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.crs import Anchor, MapFrame, world_frame_of
-from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.rig import Mountings, Sensor
+from roadscan.core.crs import Anchor, MapFrame, world_frame_of
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.rig import Mountings, Sensor
+from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.points.charts import charts_along
-from roadscan.points.place import EVERYWHERE, HeightLimits, Placement, Window, pass_numbers, passes_of
-from roadscan.points.readings import ScanGeometry
+from roadscan.tiles.georeferencing.charts import charts_along
+from roadscan.tiles.georeferencing.place import EVERYWHERE, HeightLimits, Placement, Window, pass_numbers, passes_of
 
 TILE_QUANTA = 1_000_000
 
@@ -189,7 +189,7 @@ def test_intensity_of_eight_bits_fills_sixteen() -> None:
 
 
 def test_passes_are_half_open_spans() -> None:
-    from roadscan.model.ids import LanePass, PassId, RunId
+    from roadscan.core.ids import LanePass, PassId, RunId
 
     passes = [LanePass(PassId(7), RunId("r"), 10, 20), LanePass(PassId(9), RunId("r"), 20, 30)]
     assert passes_of(np.array([9, 10, 19, 20, 29, 30]), passes).tolist() == [0, 7, 7, 9, 9, 0]

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.crs import LOCAL_WORLD
-from roadscan.model.rig import Mounting, Mountings
-from roadscan.model.settings.segmentation import RangeFilter, RoadSegmentation
+from roadscan.core.crs import LOCAL_WORLD
+from roadscan.core.rig import Mounting, Mountings
+from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.settings.segmentation import RangeFilter, RoadSegmentation
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.points.classes import OVERLAPPING
-from roadscan.points.readings import ScanGeometry
-from roadscan.points.road_profiles import RoadFinder
-from roadscan.points.turns import WINDOW_NS, turn_limits
+from roadscan.tiles.georeferencing.classes import OVERLAPPING
+from roadscan.tiles.georeferencing.road_profiles import RoadFinder
+from roadscan.tiles.georeferencing.turns import WINDOW_NS, turn_limits
 
 RADIUS_M, SPEED_M_PER_S, KNOT_NS = 6.0, 4.0, 5_000_000
 START = 1_400_000_000 * 10**9

@@ -8,9 +8,9 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.camera import Interior
-from roadscan.model.errors import ConfigError
-from roadscan.points.views import NO_VIEW, Lens, PictureRule, Views, best_views, sampled
+from roadscan.core.camera import Interior
+from roadscan.core.errors import ConfigError
+from roadscan.surface.views import NO_VIEW, Lens, PictureRule, Views, best_views, sampled
 
 LENSES = (
     Interior(width_px=640, height_px=400, focal_px=(410.0, 405.0), principal_px=(322.0, 195.0),

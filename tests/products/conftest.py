@@ -12,12 +12,12 @@ import numpy.typing as npt
 import pandas as pd
 import pytest
 
-from roadscan.model.crs import MapFrame
-from roadscan.model.ids import LanePass, PassId, RunId, TileId
-from roadscan.points.cloud import TilePoints
-from roadscan.products.base import ProductContext, Tile, TileSummary
+from roadscan.core.crs import MapFrame
+from roadscan.core.ids import LanePass, PassId, RunId, TileId
 from roadscan.tiles.cells import TileCells
+from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.product import ProductContext, Tile, TileSummary
 
 Surface = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64]], npt.NDArray[np.float64]]
 

@@ -10,19 +10,19 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import ConfigError, StoreError
-from roadscan.model.ids import TileId
-from roadscan.model.settings.distress import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
-from roadscan.products.base import product_named
-from roadscan.products.distress.crack_pieces import CrackPieces
-from roadscan.products.distress.cracks import Cracks
-from roadscan.products.distress.pothole_pieces import PotholePieces
-from roadscan.products.distress.potholes import Potholes
-from roadscan.products.lane_direction import LaneDirections
-from roadscan.surfaces.tile import MEASURED, SurfaceTile
-from roadscan.surfaces.window import GridWindow
-from roadscan.tables.schema import table_schema
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError, StoreError
+from roadscan.core.ids import TileId
+from roadscan.core.settings.distress import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
+from roadscan.distress.products.crack_pieces import CrackPieces
+from roadscan.distress.products.cracks import Cracks
+from roadscan.distress.products.pothole_pieces import PotholePieces
+from roadscan.distress.products.potholes import Potholes
+from roadscan.store.schema import table_schema
+from roadscan.surface.tile import MEASURED, SurfaceTile
+from roadscan.surface.window import GridWindow
+from roadscan.tiles.product import product_named
+from roadscan.tiles.products.lane_direction import LaneDirections
 
 CELL_M = 0.005
 HALO = 210

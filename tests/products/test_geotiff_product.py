@@ -15,14 +15,14 @@ import pytest
 import rasterio
 from rasterio.enums import Resampling
 
-from roadscan.codecs import tiff as tiff_module
-from roadscan.codecs.cog import overview_factors
-from roadscan.codecs.gdal import raster_crs
-from roadscan.model.errors import StoreError
-from roadscan.model.ids import TileId
-from roadscan.products.base import Tile, product_named
-from roadscan.products.geotiff import GeoTiff, GeoTiffOptions
-from roadscan.products.raster import CellBox
+from roadscan.core.errors import StoreError
+from roadscan.core.ids import TileId
+from roadscan.store.codecs import tiff as tiff_module
+from roadscan.store.codecs.cog import overview_factors
+from roadscan.store.codecs.gdal import raster_crs
+from roadscan.tiles.product import Tile, product_named
+from roadscan.tiles.products.geotiff import GeoTiff, GeoTiffOptions
+from roadscan.tiles.products.raster import CellBox
 
 
 @pytest.fixture

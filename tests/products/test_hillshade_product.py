@@ -10,10 +10,10 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from scipy import ndimage
 
-from roadscan.model.errors import StoreError
-from roadscan.model.ids import TileId
-from roadscan.products.base import Tile, product_named
-from roadscan.products.hillshade import Hillshade, HillshadeOptions, horn_slopes, shade
+from roadscan.core.errors import StoreError
+from roadscan.core.ids import TileId
+from roadscan.tiles.product import Tile, product_named
+from roadscan.tiles.products.hillshade import Hillshade, HillshadeOptions, horn_slopes, shade
 
 
 @pytest.fixture

@@ -7,11 +7,11 @@ import pandas as pd
 import pytest
 import rasterio
 
-from roadscan.model.errors import StoreError
-from roadscan.model.ids import TileId
-from roadscan.products.base import Output
-from roadscan.products.hillshade import shade
-from roadscan.products.kilometre import Kilometre, KilometreOptions
+from roadscan.core.errors import StoreError
+from roadscan.core.ids import TileId
+from roadscan.tiles.product import Output
+from roadscan.tiles.products.hillshade import shade
+from roadscan.tiles.products.kilometre import Kilometre, KilometreOptions
 from roadscan.tiles.pyramid import pyramid_of
 
 CELL_M = 0.25  # 40 cells along a tile's edge: overviews of 2, 8 and 40 cells

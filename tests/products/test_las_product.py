@@ -19,14 +19,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import ConfigError, StoreError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.model.ids import TileId
-from roadscan.points.cloud import TilePoints
-from roadscan.products.base import Tile, product_named
-from roadscan.products.las import Las, LasOptions, adjusted_gps_s, thin_out
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError, StoreError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.ids import TileId
+from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.product import Tile, product_named
+from roadscan.tiles.products.las import Las, LasOptions, adjusted_gps_s, thin_out
 
 GPS_EPOCH = dt.datetime(1980, 1, 6, tzinfo=dt.UTC)
 

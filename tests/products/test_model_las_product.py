@@ -9,11 +9,11 @@ import laspy
 import numpy as np
 import pytest
 
-from roadscan.model.errors import ConfigError, StoreError
-from roadscan.products.base import Tile, is_default, product_named
-from roadscan.products.las import Las, LasOptions
-from roadscan.products.model_las import ModelLas, ModelLasFine, ModelLasFineOptions, ModelLasOptions
+from roadscan.core.errors import ConfigError, StoreError
 from roadscan.tiles.decimate import decimate
+from roadscan.tiles.product import Tile, is_default, product_named
+from roadscan.tiles.products.las import Las, LasOptions
+from roadscan.tiles.products.model_las import ModelLas, ModelLasFine, ModelLasFineOptions, ModelLasOptions
 
 CELL_M = 0.25
 OPTIONS = ModelLasOptions(spacing_m=1.0)

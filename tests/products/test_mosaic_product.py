@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import rasterio
 
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import StoreError
-from roadscan.model.ids import TileId
-from roadscan.products.base import Output
-from roadscan.products.mosaic import Mosaic, MosaicOptions
-from roadscan.products.sheets import cut_sheets
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import StoreError
+from roadscan.core.ids import TileId
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.product import Output
+from roadscan.tiles.products.mosaic import Mosaic, MosaicOptions
+from roadscan.tiles.products.sheets import cut_sheets
 
 QUANTITIES = {
     "height": "height_robust_m",

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.crs import world_from_geodetic
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.crs import world_from_geodetic
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, Solution
-from roadscan.products.pictures.navigation import (
+from roadscan.navigation.picture import (
     NavigationPicture,
     _antenna_arm,
     _axis,

@@ -8,11 +8,11 @@ import pytest
 import rasterio
 from pydantic import ValidationError
 
-from roadscan.model.errors import StoreError
-from roadscan.products.base import Tile
-from roadscan.products.hillshade import HillshadeOptions, shade
-from roadscan.products.pavement import IntensityOptions, PavementIntensity, PavementShaded, ShadedOptions
-from roadscan.products.raster import cell_image
+from roadscan.core.errors import StoreError
+from roadscan.tiles.product import Tile
+from roadscan.tiles.products.hillshade import HillshadeOptions, shade
+from roadscan.tiles.products.pavement import IntensityOptions, PavementIntensity, PavementShaded, ShadedOptions
+from roadscan.tiles.products.raster import cell_image
 
 INTENSITY = IntensityOptions(black=10_000.0, white=50_000.0)
 

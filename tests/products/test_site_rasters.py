@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from roadscan.model.ids import TileId
-from roadscan.products.site_rasters import Place, Pyramid
+from roadscan.core.ids import TileId
+from roadscan.site.site_rasters import Place, Pyramid
 from roadscan.tiles.grid import TileGrid
 
 TILES = sorted({TileId(69_000 + k, 533_400 + k // 3 + s) for k in range(-40, 40) for s in (0, 1)})

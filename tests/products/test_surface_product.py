@@ -15,16 +15,15 @@ import trimesh
 from PIL import Image
 from rasterio.enums import Resampling
 
-from roadscan.codecs.mesh import write_glb
-from roadscan.model.errors import ConfigError, StoreError
-from roadscan.model.ids import TileId
-from roadscan.products.base import ProductContext, product_named
-from roadscan.products.mesh import mesh_of
-from roadscan.surfaces.tile import EMPTY, INTERPOLATED, MEASURED, SurfaceTile
-from roadscan.surfaces.window import GridWindow
+from roadscan.core.errors import ConfigError, StoreError
+from roadscan.core.ids import TileId
+from roadscan.store.codecs.mesh import write_glb
+from roadscan.surface.tile import EMPTY, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.surface.window import GridWindow
 from roadscan.tiles.grid import TileGrid
-
-from .conftest import Place, Workshop
+from roadscan.tiles.product import ProductContext, product_named
+from roadscan.tiles.products.mesh import mesh_of
+from tests.products.conftest import Place, Workshop
 
 GRID = TileGrid(10.0, 0.05)
 NAMES = ("surface", "surface_mesh", "surface_pictures")

@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.model.errors import StoreError
-from roadscan.model.ids import TileId
-from roadscan.products.base import NoOptions, product_named
-from roadscan.products.tile_table import TileTable
-from roadscan.tables.schema import table_schema
+from roadscan.core.errors import StoreError
+from roadscan.core.ids import TileId
+from roadscan.store.schema import table_schema
+from roadscan.tiles.product import NoOptions, product_named
+from roadscan.tiles.products.tile_table import TileTable
 
 
 @pytest.fixture

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Reporter, Session
-from roadscan.jobs.stage import stages
-from roadscan.model.survey import Survey
-from roadscan.tables.logs import LogRecord, read_log_records
-from roadscan.tables.store import Store
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Reporter, Session
+from roadscan.run.stage import stages
+from roadscan.store.logs import LogRecord, read_log_records
+from roadscan.store.store import Store
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "real-data"
 sys.path.insert(0, str(EXAMPLES))

@@ -11,11 +11,10 @@ import pandas as pd
 import pytest
 import scan_matching
 
-from roadscan.jobs.session import Session
-from roadscan.jobs.status import survey_status
-from roadscan.model.survey import Survey
-
-from .conftest import Place
+from roadscan.core.survey import Survey
+from roadscan.run.session import Session
+from roadscan.run.status import survey_status
+from tests.real_data.conftest import Place
 
 OFFSET_S = 10**9
 """Added to the log's stamps by the survey file; as GPS time, which LAS writes less 10⁹ s."""

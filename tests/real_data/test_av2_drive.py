@@ -12,7 +12,7 @@ from las_points import read_points
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from .conftest import Place
+from tests.real_data.conftest import Place
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import RunError
-from roadscan.tables.sql import query
-
-from .conftest import Place
+from roadscan.core.errors import RunError
+from roadscan.store.sql import query
+from tests.real_data.conftest import Place
 
 
 def test_the_recorded_drive_through_the_survey_file(place: Place) -> None:

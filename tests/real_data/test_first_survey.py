@@ -12,8 +12,7 @@ import pytest
 from las_points import read_points
 
 from tests.answers import answer_questions, first_survey, roadscan, spared
-
-from .test_aces import expected_points, recorded_scans
+from tests.real_data.test_aces import expected_points, recorded_scans
 
 ARGOVERSE = {
     "map.crs": 'local = { name = "city frame PIT" }',

@@ -8,11 +8,10 @@ import struct
 import numpy as np
 import pytest
 
-from roadscan.model.errors import RunError
-from roadscan.model.gpstime import gps_ns_from_utc
-from roadscan.tables.sql import query
-
-from .conftest import Place
+from roadscan.core.errors import RunError
+from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.store.sql import query
+from tests.real_data.conftest import Place
 
 PCAP_HEAD, RECORD_HEAD, UDP_HEAD, BLOCK = 24, 16, 42, 100
 

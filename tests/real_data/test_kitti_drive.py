@@ -13,11 +13,10 @@ import rasterio
 import road_cells
 from las_points import read_points
 
-from roadscan.jobs.session import Session
-from roadscan.jobs.status import survey_status
-from roadscan.model.survey import Survey
-
-from .conftest import Place
+from roadscan.core.survey import Survey
+from roadscan.run.session import Session
+from roadscan.run.status import survey_status
+from tests.real_data.conftest import Place
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,8 @@ import pandas as pd
 import pytest
 import round_trip
 
-from roadscan.model.errors import RunError
-
-from .conftest import Place
+from roadscan.core.errors import RunError
+from tests.real_data.conftest import Place
 
 STEPS = dict.fromkeys("xyz", 0.01)
 

@@ -10,9 +10,8 @@ import lever_arm
 import numpy as np
 import pytest
 
-from roadscan.model.errors import RunError
-
-from .conftest import Place
+from roadscan.core.errors import RunError
+from tests.real_data.conftest import Place
 
 
 def test_the_lever_arm_is_one_length(two_pass: Path) -> None:

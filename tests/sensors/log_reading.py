@@ -10,10 +10,10 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.model.witness import Finding
-from roadscan.sensors.base import LogSource, Reject, Rows, format_named
-from roadscan.tables.schema import table_schema
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.witness import Finding
+from roadscan.ingest.format import LogSource, Reject, Rows, format_named
+from roadscan.store.schema import table_schema
 
 GPS_SECONDS = Clock(TimeSystem.GPS)
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from roadscan.model.witness import Finding
-from roadscan.sensors.base import LogSource, Reject, Rows, format_named
-from roadscan.tables.schema import table_schema
+from roadscan.core.witness import Finding
+from roadscan.ingest.format import LogSource, Reject, Rows, format_named
+from roadscan.store.schema import table_schema
 
 LARGEST_CHUNK_BYTES = 12 << 20
 LARGEST_CHUNK_ROWS = 1 << 18

@@ -11,10 +11,10 @@ import pyarrow.feather
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.model.rig import Sensor
-from roadscan.sensors.base import LogSource, NoOptions, format_named, format_of
+from roadscan.core.errors import FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.rig import Sensor
+from roadscan.ingest.format import LogSource, NoOptions, format_named, format_of
 from tests.sensors.readings import read
 
 CLOCK = Clock(TimeSystem.UNIX_GPS, unit="ns")

@@ -7,8 +7,8 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.arrow_batches import unlisted_batches
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.ingest.reading.arrow_batches import unlisted_batches
 from tests.sensors import test_pose_quaternions
 from tests.sensors.log_reading import read_log
 from tests.sensors.readings import read

@@ -13,12 +13,12 @@ import pyarrow as pa
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.model.rig import Sensor
-from roadscan.points.readings import ScanGeometry
-from roadscan.sensors.base import LogSource, Reject, Rows, format_named, format_of
-from roadscan.tables.schema import table_schema
+from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.rig import Sensor
+from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.ingest.format import LogSource, Reject, Rows, format_named, format_of
+from roadscan.store.schema import table_schema
 
 GPS = Clock(TimeSystem.GPS)
 FIRST_S = 1_400_000_000

@@ -9,9 +9,9 @@ import numpy as np
 import pyproj
 import pytest
 
-from roadscan.model.crs import Anchor, Geoid, MapFrame
-from roadscan.model.errors import ConfigError, CrsError, FormatError
-from roadscan.sensors.base import format_named, format_of
+from roadscan.core.crs import Anchor, Geoid, MapFrame
+from roadscan.core.errors import ConfigError, CrsError, FormatError
+from roadscan.ingest.format import format_named, format_of
 from tests.sensors.log_reading import read_ellipsoidal as read_log
 
 UTM32 = MapFrame(crs="EPSG:25832")

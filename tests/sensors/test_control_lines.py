@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import shapely
 
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import ConfigError, CrsError, FormatError
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError, CrsError, FormatError
 from tests.sensors.log_reading import Log
 from tests.sensors.log_reading import read_ellipsoidal as read_log
 from tests.sensors.test_control_vector import write

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import shapely
 
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import ConfigError, CrsError, FormatError
-from roadscan.sensors.base import format_named, format_of
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError, CrsError, FormatError
+from roadscan.ingest.format import format_named, format_of
 from tests.sensors.log_reading import Log
 from tests.sensors.log_reading import read_ellipsoidal as read_log
 

@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import format_of
-from roadscan.sensors.clouds.e57_file import page_checksums, unpacked
+from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.formats.clouds.e57_file import page_checksums, unpacked
+from roadscan.ingest.format import format_of
 from tests.sensors.e57_files import (
     PAGE,
     Column,

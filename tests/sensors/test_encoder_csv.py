@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from roadscan.model.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.model.rig import Rig, Sensor
-from roadscan.sensors.base import format_of
+from roadscan.core.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.rig import Rig, Sensor
+from roadscan.ingest.format import format_of
 from tests.sensors.log_reading import GPS_SECONDS, Log, read_log
 
 ENCODER = Sensor(kind="encoder")

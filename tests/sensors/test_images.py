@@ -15,13 +15,13 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from roadscan.codecs import child
-from roadscan.codecs.image_files import ImageError, image_size
-from roadscan.model.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
-from roadscan.model.rig import Sensor
-from roadscan.sensors.base import format_named, format_of
-from roadscan.sensors.cameras import video
+from roadscan.core.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
+from roadscan.core.rig import Sensor
+from roadscan.formats.cameras import video
+from roadscan.ingest.format import format_named, format_of
+from roadscan.store.codecs import child
+from roadscan.store.codecs.image_files import ImageError, image_size
 from tests.sensors.log_reading import GPS_SECONDS, Log, read_log
 
 CAMERA = Sensor(kind="camera")

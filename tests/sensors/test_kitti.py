@@ -13,9 +13,9 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import format_named, format_of
+from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.ingest.format import format_named, format_of
 from tests.sensors.readings import Readings, read
 
 UTC_S = Clock(TimeSystem.UNIX_UTC)

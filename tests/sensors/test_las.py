@@ -13,10 +13,10 @@ import numpy as np
 import pyproj
 import pytest
 
-from roadscan.model.crs import Geoid
-from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import SourceDefaults, format_named, format_of
+from roadscan.core.crs import Geoid
+from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.ingest.format import SourceDefaults, format_named, format_of
 from tests.sensors.readings import read_ellipsoidal as read
 
 ADJUSTED = Clock(TimeSystem.GPS_ADJUSTED)

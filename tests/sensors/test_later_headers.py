@@ -9,9 +9,9 @@ from typer.testing import CliRunner
 
 import roadscan as rs
 from roadscan.cli import app
-from roadscan.model.crs import MapFrame
-from roadscan.model.rig import Sensor
-from roadscan.sensors.later_headers import AGAIN
+from roadscan.core.crs import MapFrame
+from roadscan.core.rig import Sensor
+from roadscan.ingest.reading.later_headers import AGAIN
 from tests.sensors.log_reading import GPS_SECONDS, read_log
 
 GPS_S = {"system": "gps", "unit": "s"}

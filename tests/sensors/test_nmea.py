@@ -18,12 +18,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from roadscan.model.crs import Geoid
-from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
-from roadscan.sensors import text_table
-from roadscan.sensors.base import SourceDefaults, format_named, format_of
-from roadscan.sensors.motion.nmea_writer import Fix, NmeaForm, sentences, write_nmea
+from roadscan.core.crs import Geoid
+from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
+from roadscan.formats.motion.nmea_writer import Fix, NmeaForm, sentences, write_nmea
+from roadscan.ingest.format import SourceDefaults, format_named, format_of
+from roadscan.ingest.reading import text_table
 from tests.sensors.log_reading import Log, read_log, source_of
 from tests.sensors.test_rtklib_pos import ecef, flat_geoid
 
@@ -578,7 +578,7 @@ def test_a_truncated_packed_log(tmp_path: Path) -> None:
 def test_a_clock_that_stands_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sentences are not held for ever."""
     monkeypatch.setattr(text_table, "BLOCK_BYTES", 5000)
-    monkeypatch.setattr("roadscan.sensors.motion.nmea.HELD_MAX", 100)
+    monkeypatch.setattr("roadscan.formats.motion.nmea.HELD_MAX", 100)
     path = write(tmp_path / "a.nmea", rmc("093000.00", "040526"), *[gga("093000.00")] * 1000)
     log = read_log("nmea", path, **STATED)
     assert log.table.num_rows + sum(r.records for r in log.rejects) >= 1000

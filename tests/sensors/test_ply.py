@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import format_of
+from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.ingest.format import format_of
 from tests.sensors.readings import read_ellipsoidal as read
 
 plyfile = pytest.importorskip("plyfile")

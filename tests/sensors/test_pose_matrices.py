@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import format_of
+from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.ingest.format import format_of
 from tests.sensors.log_reading import read_log
 
 NAMES = "frame,unix_utc_s,r11,r12,r13,t1,r21,r22,r23,t2,r31,r32,r33,t3"

@@ -13,9 +13,9 @@ import pyarrow.parquet
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import format_named, format_of
+from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.ingest.format import format_named, format_of
 from tests.sensors.log_reading import read_log
 
 NANOSECONDS = Clock(TimeSystem.GPS, unit="ns")

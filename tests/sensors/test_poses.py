@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.crs import Geoid
-from roadscan.model.errors import ConfigError, CrsError
-from roadscan.sensors.base import LogSource, NoOptions
-from roadscan.sensors.trajectories.poses import (
+from roadscan.core.crs import Geoid
+from roadscan.core.errors import ConfigError, CrsError
+from roadscan.ingest.format import LogSource, NoOptions
+from roadscan.ingest.reading.poses import (
     GeodeticPlacement,
     WorldPlacement,
     body_quaternion,

@@ -13,9 +13,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import format_of
+from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.ingest.format import format_of
 from tests.sensors.log_reading import Log
 from tests.sensors.log_reading import read_ellipsoidal as read_log
 

@@ -19,11 +19,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import format_named, format_of
-from roadscan.sensors.scanners.psi import Psi, PsiStatement, statement_text
-from roadscan.sensors.scanners.psi_container import PsiContainer, PsiHeader, read_psi, write_psi
+from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.formats.scanners.psi import Psi, PsiStatement, statement_text
+from roadscan.formats.scanners.psi_container import PsiContainer, PsiHeader, read_psi, write_psi
+from roadscan.ingest.format import format_named, format_of
 from tests.sensors.readings import read
 
 ROWS, COLUMNS = 6, 10

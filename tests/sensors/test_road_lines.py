@@ -13,10 +13,10 @@ import pyproj
 import pytest
 import shapely
 
-from roadscan.model.crs import Anchor, MapFrame
-from roadscan.model.errors import ConfigError, CrsError, FormatError
-from roadscan.sensors.base import format_named, format_of
-from roadscan.sensors.vectors.road_lines import TIGER_ROADS
+from roadscan.core.crs import Anchor, MapFrame
+from roadscan.core.errors import ConfigError, CrsError, FormatError
+from roadscan.formats.vectors.road_lines import TIGER_ROADS
+from roadscan.ingest.format import format_named, format_of
 from tests.sensors.log_reading import Log, read_log
 
 UTM17 = MapFrame(crs="EPSG:26917")

@@ -12,10 +12,10 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError, CrsError, FormatError, TimeSystemError
-from roadscan.model.gpstime import WEEK_S, Clock, TimeSystem
-from roadscan.sensors.base import format_named, format_of
-from roadscan.sensors.trajectories import sbet
+from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
+from roadscan.core.gpstime import WEEK_S, Clock, TimeSystem
+from roadscan.formats.trajectories import sbet
+from roadscan.ingest.format import format_named, format_of
 from tests.sensors.log_reading import read_log, source_of
 
 WEEK = 2405

@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.sensors.base import LogSource, NoOptions, Rows, format_named, format_of
+from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.ingest.format import LogSource, NoOptions, Rows, format_named, format_of
 from tests.sensors.readings import read
 
 READINGS = 12
@@ -122,7 +122,7 @@ def test_short_batches_are_joined_and_a_damaged_one_costs_itself(tmp_path: Path)
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux states what a process holds")
 def test_a_long_log_is_passed_without_holding_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadscan.sensors.scanners.scans._CHUNK_BYTES", 1 << 20)
+    monkeypatch.setattr("roadscan.formats.scanners.scans._CHUNK_BYTES", 1 << 20)
     wide = np.arange(2000 * 4000, dtype=np.uint64).reshape(2000, 4000).astype(np.uint16)
     geometry = GEOMETRY | {"readings": 4000}
     write_arrow(

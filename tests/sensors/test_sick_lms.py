@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.points.readings import ScanGeometry
-from roadscan.sensors.base import format_named, format_of
-from roadscan.sensors.scanners.sick_telegrams import (
+from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.formats.scanners.sick_telegrams import (
     Checksums,
     checksum,
     encode_scans,
@@ -23,6 +22,7 @@ from roadscan.sensors.scanners.sick_telegrams import (
     read_pieces,
     write_telegrams,
 )
+from roadscan.ingest.format import format_named, format_of
 from tests.sensors.readings import Readings, read
 
 GPS = Clock(TimeSystem.GPS)
@@ -439,7 +439,7 @@ def test_pieces_find_what_one_look_finds(tmp_path: Path, monkeypatch: pytest.Mon
     starts, ends, _ = find_telegrams(np.fromfile(path, dtype=np.uint8), is_end=True)
     assert starts.size >= 60
     for size in (7, 100, 1000):
-        monkeypatch.setattr("roadscan.sensors.scanners.sick_telegrams._PIECE_BYTES", size)
+        monkeypatch.setattr("roadscan.formats.scanners.sick_telegrams._PIECE_BYTES", size)
         pieces = list(read_pieces(path))
         assert np.array_equal(np.concatenate([p.offset + p.starts for p in pieces]), starts)
         assert np.array_equal(np.concatenate([p.offset + p.ends for p in pieces]), ends)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from roadscan.model.errors import FormatError, TimeSystemError
-from roadscan.model.gpstime import WEEK_S, Clock, TimeSystem
-from roadscan.sensors import text_table
-from roadscan.sensors.base import format_named, format_of
+from roadscan.core.errors import FormatError, TimeSystemError
+from roadscan.core.gpstime import WEEK_S, Clock, TimeSystem
+from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading import text_table
 from tests.sensors.log_reading import Log, read_log, source_of
 
 WEEK = 2405
@@ -215,7 +215,7 @@ def test_many_blocks_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     times = np.sort(rng.uniform(990, 1110, 2000))
     poses = sbet(tmp_path / "a.sbet", times.tolist())
     monkeypatch.setattr(text_table, "BLOCK_BYTES", 800)
-    monkeypatch.setattr("roadscan.sensors.trajectories.sbet.CHUNK_RECORDS", 64)
+    monkeypatch.setattr("roadscan.formats.trajectories.sbet.CHUNK_RECORDS", 64)
     log = sbet_with(poses, "acc.out")
     expected = np.interp(times, known, sigma, left=np.nan, right=np.nan)
     np.testing.assert_allclose(log.table.column("sigma_east_m").to_numpy(), expected, rtol=1e-5)

@@ -8,10 +8,9 @@ import numpy as np
 import pyproj
 import pytest
 
-from roadscan.sensors.base import format_of
-from roadscan.sensors.motion.ubx import HEADER, SOLUTION
-
-from .log_reading import Log, read_log
+from roadscan.formats.motion.ubx import HEADER, SOLUTION
+from roadscan.ingest.format import format_of
+from tests.sensors.log_reading import Log, read_log
 
 FLAGS_AT = 6 + 21
 VALID_AT = 6 + 11
@@ -100,5 +99,5 @@ def test_frames_are_found_across_blocks(
 ) -> None:  # fmt: skip
     whole = read(tmp_path, recording)
     for size in (1, 99, 100, 101, 517):
-        monkeypatch.setattr("roadscan.sensors.motion.ubx._BLOCK_BYTES", size)
+        monkeypatch.setattr("roadscan.formats.motion.ubx._BLOCK_BYTES", size)
         assert read(tmp_path, recording).table.equals(whole.table)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from roadscan.model.errors import TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
+from roadscan.core.errors import TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
 from tests.sensors.readings import Readings, read
 from tests.sensors.test_velodyne_pcap import (
     CLOCK,

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import velodyne_decoder
 
-from roadscan.model.errors import ConfigError, FormatError, TimeSystemError
-from roadscan.model.gpstime import Clock, TimeSystem
-from roadscan.model.rig import Sensor
-from roadscan.sensors.base import format_named, format_of
+from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.rig import Sensor
+from roadscan.ingest.format import format_named, format_of
 from tests.sensors.readings import Readings, read
 
 DATE = dt.date(2026, 5, 4)

@@ -15,9 +15,9 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.rig import Rig, Sensor
-from roadscan.model.survey import ClockConfig
+from roadscan.core.errors import ConfigError
+from roadscan.core.rig import Rig, Sensor
+from roadscan.core.survey import ClockConfig
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.scene import Camera
 from roadscan.simulate.sensors.lens import Lens

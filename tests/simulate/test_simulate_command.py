@@ -7,7 +7,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.model.errors import ConfigError, FormatError
+from roadscan.core.errors import ConfigError, FormatError
 from roadscan.simulate import truth
 from roadscan.simulate.scene import shipped_scenes
 

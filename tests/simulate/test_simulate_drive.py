@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 from roadscan.simulate.drive import RUN_UP_S, Drive, drives_of
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.scene import Mount, Scene

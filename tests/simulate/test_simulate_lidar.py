@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import velodyne_decoder as vd
 
-from roadscan.model.gpstime import gps_ns_from_utc, utc_from_gps_ns
+from roadscan.core.gpstime import gps_ns_from_utc, utc_from_gps_ns
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive

@@ -13,8 +13,8 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.gpstime import gps_ns_from_utc
-from roadscan.model.survey import Survey
+from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.core.survey import Survey
 from roadscan.simulate import Scene, SimulatedSurvey, simulate, truth
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.earth import Earth

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from roadscan.model.errors import ConfigError, FormatError
+from roadscan.core.errors import ConfigError, FormatError
 from roadscan.simulate import Scene, simulate, trajectory, truth
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.earth import Earth

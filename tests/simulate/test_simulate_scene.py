@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 from roadscan.simulate.kernels.profiles import in_the_way
 from roadscan.simulate.scene import Scene, shipped_scenes
 from roadscan.simulate.surface import Surface

@@ -15,11 +15,11 @@ import pytest
 from pyins import strapdown
 from pyproj import Transformer
 
-from roadscan.jobs.ingest.ingest import ingest
-from roadscan.model.errors import ConfigError
-from roadscan.model.gpstime import NS_PER_S, Clock, TimeSystem, gps_ns_from_utc
-from roadscan.model.rig import Rig
-from roadscan.model.survey import Survey
+from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem, gps_ns_from_utc
+from roadscan.core.rig import Rig
+from roadscan.core.survey import Survey
+from roadscan.ingest.ingest import ingest
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
@@ -28,8 +28,8 @@ from roadscan.simulate.sensors.clock import SensorClock
 from roadscan.simulate.sensors.gnss import FIXED, FLOAT, solve
 from roadscan.simulate.sensors.imu import AT_BODY, felt, imu_of
 from roadscan.simulate.surface import Surface
-from roadscan.tables.logs import read_log_records
-from roadscan.tables.store import Store
+from roadscan.store.logs import read_log_records
+from roadscan.store.store import Store
 
 BARE = {"profilers": {"on": False}, "lidar": {"on": False}}
 

@@ -11,10 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.gpstime import Clock, TimeSystem, gps_ns_from_utc
-from roadscan.points.readings import ScanGeometry
-from roadscan.sensors.base import Reject, format_named
+from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
+from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.ingest.format import Reject, format_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.run import SimulatedSurvey
 from roadscan.simulate.sensors.sick import telegrams

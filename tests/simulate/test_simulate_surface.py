@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 from roadscan.simulate.features import faults_of
 from roadscan.simulate.scene import Scene, shipped_scenes
 from roadscan.simulate.scene.road import Crack, Element, Marking, Patch, Pothole, Rut, Slabs, Wave

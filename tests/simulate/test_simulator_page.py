@@ -9,7 +9,7 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel
 
-from roadscan.model.strict import load_toml
+from roadscan.core.strict import load_toml
 from roadscan.simulate import Scene
 from roadscan.simulate.scene import shipped_scenes
 

@@ -7,9 +7,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import generic_filter
 
-from roadscan.kernels.surface.coarse import median_filter, natural_spline
-from roadscan.surfaces.coarse import FILLED, INTERPOLATED, MEASURED, NOTHING, CoarseSettings, Stretch, coarse_model
-from roadscan.surfaces.regions import FOUND, STATED, RegionSettings, find_regions, stated_regions
+from roadscan.surface.coarse import FILLED, INTERPOLATED, MEASURED, NOTHING, CoarseSettings, Stretch, coarse_model
+from roadscan.surface.kernels.coarse import median_filter, natural_spline
+from roadscan.surface.regions import FOUND, STATED, RegionSettings, find_regions, stated_regions
 from roadscan.tiles.grid import TileGrid
 
 EAST, NORTH = 2_683_200.0, 1_247_900.0
@@ -145,7 +145,7 @@ def test_noise_that_is_largest_below_the_scanner_is_no_region(monkeypatch: pytes
     height += 0.008 * np.cos(angle) ** 2 * np.random.default_rng(2).standard_normal(height.shape)
     model = coarse_model(Stretch.of_points(easting, northing, height, classes, path), CoarseSettings())
     assert find_regions(model, RegionSettings(factor=2.0)) == []
-    monkeypatch.setattr("roadscan.surfaces.regions._BESIDE", 1000)  # the street as a whole
+    monkeypatch.setattr("roadscan.surface.regions._BESIDE", 1000)  # the street as a whole
     assert find_regions(model, RegionSettings(factor=2.0)) != []
 
 

@@ -11,16 +11,16 @@ import pytest
 import shapely
 from numpy.lib.stride_tricks import sliding_window_view
 
-from roadscan.kernels.cracks.quantiles_along import quantiles_along
-from roadscan.model.settings.distress import CrackDetection, CrackJoining
+from roadscan.core.settings.distress import CrackDetection, CrackJoining
+from roadscan.distress.crack_depths import NARROW_CELLS, WIDE_CELLS, blended
+from roadscan.distress.crack_network import join_cracks
+from roadscan.distress.cracks import crack_pieces
+from roadscan.distress.kernels.quantiles_along import quantiles_along
+from roadscan.distress.valley_lines import LINE_HALF, flank_cells
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
-from roadscan.surfaces.distress.crack_depths import NARROW_CELLS, WIDE_CELLS, blended
-from roadscan.surfaces.distress.crack_network import join_cracks
-from roadscan.surfaces.distress.cracks import crack_pieces
-from roadscan.surfaces.distress.valley_lines import LINE_HALF, flank_cells
-from roadscan.surfaces.heights import HeightWindow
-from roadscan.surfaces.lowest import LowestReadings
+from roadscan.surface.heights import HeightWindow
+from roadscan.surface.lowest import LowestReadings
 
 Float64 = npt.NDArray[np.float64]
 

@@ -12,18 +12,18 @@ from scipy.ndimage import distance_transform_edt, label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from roadscan.kernels.cracks.cross_sections import cross_sections
-from roadscan.model.errors import ConfigError, RoadscanError
-from roadscan.model.settings.distress import CrackDetection, CrackJoining
+from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.core.settings.distress import CrackDetection, CrackJoining
+from roadscan.distress.crack_network import join_cracks
+from roadscan.distress.crack_parts import bridges
+from roadscan.distress.cracks import CrackPiece, crack_pieces, halo_cells, needed_part, sharpened
+from roadscan.distress.kernels.cross_sections import cross_sections
+from roadscan.distress.skeleton_graph import SkeletonGraph, pruned
+from roadscan.distress.valleys import _boxes, _thinned, find_valleys
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
-from roadscan.surfaces.distress.crack_network import join_cracks
-from roadscan.surfaces.distress.crack_parts import bridges
-from roadscan.surfaces.distress.cracks import CrackPiece, crack_pieces, halo_cells, needed_part, sharpened
-from roadscan.surfaces.distress.skeleton_graph import SkeletonGraph, pruned
-from roadscan.surfaces.distress.valleys import _boxes, _thinned, find_valleys
-from roadscan.surfaces.heights import HeightWindow
-from roadscan.surfaces.lowest import LowestReadings
+from roadscan.surface.heights import HeightWindow
+from roadscan.surface.lowest import LowestReadings
 
 CONFIG, JOINING = CrackDetection(), CrackJoining()
 CELL_M = 0.0025

@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.kernels.cracks.faint_cracks import (
+from roadscan.core.settings.surface import SurfaceConfig
+from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
+from roadscan.surface.detail_median import REACH, detail_median
+from roadscan.surface.faint_cracks import confirmed_strips
+from roadscan.surface.kernels.faint_cracks import (
     FIELDS,
     HALF_CUT,
     chain_lines,
@@ -14,11 +18,7 @@ from roadscan.kernels.cracks.faint_cracks import (
     line_depths,
     mark_peaks,
 )
-from roadscan.model.settings.surface import SurfaceConfig
-from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
-from roadscan.surfaces.detail_median import REACH, detail_median
-from roadscan.surfaces.distress.faint_cracks import confirmed_strips
-from roadscan.surfaces.smoothing import Smoothing, smooth_surface
+from roadscan.surface.smoothing import Smoothing, smooth_surface
 from tests.surfaces.patches import (
     IMPULSES,
     PROFILER_5,

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import shapely
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.settings.distress import PotholeDetection, PotholeJoining
+from roadscan.core.errors import ConfigError
+from roadscan.core.settings.distress import PotholeDetection, PotholeJoining
+from roadscan.distress.potholes import around_cells, join_potholes, pothole_pieces
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
-from roadscan.surfaces.distress.potholes import around_cells, join_potholes, pothole_pieces
-from roadscan.surfaces.heights import HeightWindow
+from roadscan.surface.heights import HeightWindow
 
 CONFIG, JOINING = PotholeDetection(), PotholeJoining()
 CELL_M = 0.01

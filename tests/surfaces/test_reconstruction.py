@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.model.ids import TileId
-from roadscan.model.settings.surface import SurfaceConfig
-from roadscan.model.settings.surface_smoothing import SurfaceSmoothing
-from roadscan.surfaces import reconstruction
-from roadscan.surfaces.reconstruction import Patch, SurfaceGrid, surface_of
-from roadscan.surfaces.smoothing import halo_cells, smooth_surface
+from roadscan.core.ids import TileId
+from roadscan.core.settings.surface import SurfaceConfig
+from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
+from roadscan.surface import reconstruction
+from roadscan.surface.reconstruction import Patch, SurfaceGrid, surface_of
+from roadscan.surface.smoothing import halo_cells, smooth_surface
 from roadscan.tiles.grid import TileGrid
 
 

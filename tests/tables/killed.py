@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from roadscan.tables.store import Store
+from roadscan.store.store import Store
 
 
 def dies_at_removal(store: Store, number: int | None, monkeypatch: pytest.MonkeyPatch) -> None:

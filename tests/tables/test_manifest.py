@@ -11,12 +11,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.model.errors import StoreError
-from roadscan.tables import manifest as manifest_module
-from roadscan.tables.manifest import Manifest, OutputRecord
-from roadscan.tables.records import Packed, latest, rows_of, table_of
-from roadscan.tables.sql import query
-from roadscan.tables.store import Store
+from roadscan.core.errors import StoreError
+from roadscan.store import manifest as manifest_module
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.records import Packed, latest, rows_of, table_of
+from roadscan.store.sql import query
+from roadscan.store.store import Store
 from tests.tables.killed import dies_at_removal
 
 _COLUMNS = {"product": "string", "unit": "string", "key": "string", "path": "string", "bytes": "int64"} | dict.fromkeys(

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.model.errors import DamagedError, StoreError
-from roadscan.tables import manifest as manifest_module
-from roadscan.tables.logs import (
+from roadscan.core.errors import DamagedError, StoreError
+from roadscan.store import manifest as manifest_module
+from roadscan.store.logs import (
     DataFile,
     LogRecord,
     copy_path,
@@ -22,10 +22,10 @@ from roadscan.tables.logs import (
     retire_log,
     write_log_record,
 )
-from roadscan.tables.manifest import Manifest, OutputRecord
-from roadscan.tables.mend import mend_records
-from roadscan.tables.records import Packed, sound_rows, table_of
-from roadscan.tables.store import Store, bytes_digest
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.mend import mend_records
+from roadscan.store.records import Packed, sound_rows, table_of
+from roadscan.store.store import Store, bytes_digest
 
 
 @pytest.fixture(params=["folder", "memory"])

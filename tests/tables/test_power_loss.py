@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from roadscan.tables.manifest import Manifest, OutputRecord
-from roadscan.tables.store import Store
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.store import Store
 
 
 class Disk:

@@ -12,12 +12,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.codecs.parquet.list_table import is_list_table
-from roadscan.model.errors import StoreError
-from roadscan.tables.profiles import ProfileReader, Profiles
-from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store
-from roadscan.tables.writer import LogWriter, write_parquet
+from roadscan.core.errors import StoreError
+from roadscan.store.codecs.parquet.list_table import is_list_table
+from roadscan.store.profiles import ProfileReader, Profiles
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+from roadscan.store.writer import LogWriter, write_parquet
 
 SCHEMA = table_schema("scans")
 GROUP = SCHEMA.row_group_rows

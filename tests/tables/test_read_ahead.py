@@ -12,12 +12,12 @@ import pyarrow as pa
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from roadscan.model.errors import StoreError
-from roadscan.tables.profiles import ProfileReader
-from roadscan.tables.read_ahead import ReadAhead
-from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store
-from roadscan.tables.writer import write_parquet
+from roadscan.core.errors import StoreError
+from roadscan.store.profiles import ProfileReader
+from roadscan.store.read_ahead import ReadAhead
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+from roadscan.store.writer import write_parquet
 
 FILE = "tables/scans/part-00000.parquet"
 GROUP, GROUPS, READINGS = table_schema("scans").row_group_rows, 6, 40

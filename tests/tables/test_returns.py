@@ -11,12 +11,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.codecs.parquet.number_table import is_number_table, write_number_table
-from roadscan.model.errors import StoreError
-from roadscan.tables.returns import Returns, ReturnsReader
-from roadscan.tables.schema import table_schema
-from roadscan.tables.store import Store
-from roadscan.tables.writer import write_parquet
+from roadscan.core.errors import StoreError
+from roadscan.store.codecs.parquet.number_table import is_number_table, write_number_table
+from roadscan.store.returns import Returns, ReturnsReader
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+from roadscan.store.writer import write_parquet
 
 SCHEMA = table_schema("returns")
 START = 1_454_644_020_000_000_000

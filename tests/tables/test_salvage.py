@@ -8,11 +8,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.model.gpstime import NS_PER_S
-from roadscan.tables.salvage import Lost, read_lost, salvaged, write_lost
-from roadscan.tables.store import Store
-
-from .test_store import START, returns, write
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.store.salvage import Lost, read_lost, salvaged, write_lost
+from roadscan.store.store import Store
+from tests.tables.test_store import START, returns, write
 
 
 @pytest.mark.parametrize("group", [0, 1, 2])

@@ -6,8 +6,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from roadscan.model.errors import SchemaError
-from roadscan.tables.schema import Column, TableSchema, schema_names, table_schema
+from roadscan.core.errors import SchemaError
+from roadscan.store.schema import Column, TableSchema, schema_names, table_schema
 
 TABLE = TableSchema(
     name="demo",

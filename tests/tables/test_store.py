@@ -16,16 +16,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.model.errors import StoreError
-from roadscan.model.gpstime import NS_PER_S
-from roadscan.tables import manifest as manifest_module
-from roadscan.tables.logs import DataFile, LogRecord, has_log, read_log_records, retire_log, write_log_record
-from roadscan.tables.manifest import Manifest, OutputRecord
-from roadscan.tables.merge import merged
-from roadscan.tables.schema import table_schema
-from roadscan.tables.sql import connect, query
-from roadscan.tables.store import Store
-from roadscan.tables.writer import LogWriter
+from roadscan.core.errors import StoreError
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.store import manifest as manifest_module
+from roadscan.store.logs import DataFile, LogRecord, has_log, read_log_records, retire_log, write_log_record
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.merge import merged
+from roadscan.store.schema import table_schema
+from roadscan.store.sql import connect, query
+from roadscan.store.store import Store
+from roadscan.store.writer import LogWriter
 from tests.tables.killed import dies_at_removal
 
 START = 1_400_000_000
@@ -86,7 +86,7 @@ def test_rows_are_partitioned_and_sorted_whatever_their_order(store: Store) -> N
 
 
 def test_parts_of_a_partition_that_overlap_are_merged(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadscan.tables.writer.BUDGET_BYTES", 20_000)
+    monkeypatch.setattr("roadscan.store.writer.BUDGET_BYTES", 20_000)
     epochs = START * NS_PER_S + np.arange(3000, dtype=np.int64) * 1_000_000
     in_turn = write(store, [returns(p) for p in np.split(epochs, 10)], "one")["returns"]
     assert len(in_turn) > 1

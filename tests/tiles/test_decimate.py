@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.kernels.cells.decimate import Cells, Squares, decimate_cells
-from roadscan.kernels.cells.decimate_2x2 import decimate_2x2
-from roadscan.kernels.options import read_only
-from roadscan.model.errors import ConfigError
-from roadscan.model.ids import TileId
+from roadscan.compute.kernel_options import read_only
+from roadscan.core.errors import ConfigError
+from roadscan.core.ids import TileId
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.decimate import FLOOR_UM, cells_per_square, decimate, patch_cells
 from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.kernels.decimate import Cells, Squares, decimate_cells
+from roadscan.tiles.kernels.decimate_2x2 import decimate_2x2
 
 EDGE = 40  # cells of 5 mm: a tile of 20 cm
 CELL_M = 0.005

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from roadscan.model.ids import TileId
+from roadscan.core.ids import TileId
 from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.grid import Bounds, TileGrid
 

@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.ids import TileId
+from roadscan.core.errors import ConfigError
+from roadscan.core.ids import TileId
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from roadscan.model.ids import TileId
-from roadscan.points.cloud import TilePoints
+from roadscan.core.ids import TileId
+from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.statistics import cells_of
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from roadscan.jobs.publish.live import Served
-from roadscan.jobs.publish.server import SiteServer
-from roadscan.jobs.publish.web_part import DATA_MARK, single_page, web_folder
+from roadscan.site.live import Served
+from roadscan.site.server import SiteServer
+from roadscan.site.web_part import DATA_MARK, single_page, web_folder
 from tests.viewer.street import write_site
 
 AXE = Path(__file__).resolve().parents[2] / "viewer/node_modules/axe-core/axe.min.js"

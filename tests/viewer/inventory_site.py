@@ -7,14 +7,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
 
+from roadscan.core.crs import MapFrame
 from roadscan.inventory.homes.page_edits import PageDocument
-from roadscan.jobs.publish.document import json_bytes
-from roadscan.jobs.publish.layer import SiteLayer
-from roadscan.jobs.publish.layers.assets import Assets
-from roadscan.jobs.publish.live import Served
-from roadscan.jobs.publish.material import Wishes
-from roadscan.jobs.publish.parts import vectors
-from roadscan.model.crs import MapFrame
+from roadscan.site.document import json_bytes
+from roadscan.site.layer import SiteLayer
+from roadscan.site.layers.assets import Assets
+from roadscan.site.live import Served
+from roadscan.site.material import Wishes
+from roadscan.site.parts import vectors
 from tests.inventory.streets import EAST, NORTH, asset, found, inventory
 from tests.viewer.street import EAST_M, HOSTILE, NORTH_M
 

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from roadscan.jobs.publish.document import json_bytes
-from roadscan.jobs.publish.layer import GOOD_TO_POOR, SiteColumn, SiteLayer, Style
-from roadscan.jobs.publish.live import Served
-from roadscan.jobs.publish.parts import vectors
+from roadscan.site.document import json_bytes
+from roadscan.site.layer import GOOD_TO_POOR, SiteColumn, SiteLayer, Style
+from roadscan.site.live import Served
+from roadscan.site.parts import vectors
 
 WEST_M: Final = 500_000.0
 SOUTH_M: Final = 6_000_000.0

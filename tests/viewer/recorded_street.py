@@ -12,14 +12,14 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.jobs.engine.compute import Inline
-from roadscan.jobs.publish.material import Material, Wishes
-from roadscan.jobs.publish.site import publish
-from roadscan.jobs.run import run_stages
-from roadscan.jobs.session import Session
-from roadscan.jobs.stage import stage_named
-from roadscan.model.survey import Survey
-from roadscan.tables.store import Store
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.run import run_stages
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
+from roadscan.site.material import Material, Wishes
+from roadscan.site.site import publish
+from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
 

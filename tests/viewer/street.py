@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.codecs.copc import CopcWriter
-from roadscan.codecs.mesh import Mesh, write_glb
-from roadscan.jobs.publish.layer import title_of
-from roadscan.jobs.publish.parts import edits
-from roadscan.model.crs import MapFrame
-from roadscan.points.octree import Cube, NodeCutter
-from roadscan.products.cloud_records import layout_of
+from roadscan.core.crs import MapFrame
+from roadscan.site.layer import title_of
+from roadscan.site.parts import edits
+from roadscan.store.codecs.copc import CopcWriter
+from roadscan.store.codecs.mesh import Mesh, write_glb
+from roadscan.tiles.georeferencing.octree import Cube, NodeCutter
+from roadscan.tiles.products.cloud_records import layout_of
 
 Float64 = npt.NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import pytest
 import shapely
 
-from roadscan.jobs.publish.server import SiteServer
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
+from roadscan.site.server import SiteServer
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from tests.viewer.conftest import go_to, serious
 from tests.viewer.inventory_site import CRACK, POLES, EditedSite
 from tests.viewer.street import EAST_M, HOSTILE, NORTH_M

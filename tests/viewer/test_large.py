@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from roadscan.jobs.publish.document import json_bytes
-from roadscan.jobs.publish.server import SiteServer
-from roadscan.jobs.publish.web_part import web_folder
+from roadscan.site.document import json_bytes
+from roadscan.site.server import SiteServer
+from roadscan.site.web_part import web_folder
 from tests.viewer.conftest import FolderSite, go_to
 from tests.viewer.network import APART_M, SOUTH_M, WEST_M, Network
 from tests.viewer.street import HOSTILE

@@ -17,10 +17,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import roadscan as rs
-from roadscan.jobs.publish.live import LiveSite, open_survey
-from roadscan.jobs.publish.server import SiteServer
 from roadscan.simulate import simulate, truth
 from roadscan.simulate.earth import Earth
+from roadscan.site.live import LiveSite, open_survey
+from roadscan.site.server import SiteServer
 from tests.jobs.conftest import Simulated, small_scene
 from tests.viewer.test_page import _look, _middle, _read
 

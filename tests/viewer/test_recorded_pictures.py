@@ -15,8 +15,8 @@ import numpy.typing as npt
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from roadscan.jobs.publish.server import SiteServer
-from roadscan.jobs.publish.web_part import web_folder
+from roadscan.site.server import SiteServer
+from roadscan.site.web_part import web_folder
 from tests.viewer.conftest import FolderSite
 from tests.viewer.recorded_street import POLE, RecordedStreet, recorded_street
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from roadscan.jobs.publish.document import json_bytes
+from roadscan.site.document import json_bytes
 from tests.viewer.conftest import FolderSite, go_to
 from tests.viewer.street import EAST_M, NORTH_M
 from tests.viewer.test_large import served

@@ -15,11 +15,11 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.adjust.kernels import target_shapes as kernels
+from roadscan.adjust.kernels.target_shapes import EAST, NORTH, SIZE, TURN, UNKNOWNS
 from roadscan.adjust.targets.cells import Cells
 from roadscan.adjust.targets.shapes import Disc, Shape
 from roadscan.compute.robust import scatter_about
-from roadscan.kernels.adjust import target_shapes as kernels
-from roadscan.kernels.adjust.target_shapes import EAST, NORTH, SIZE, TURN, UNKNOWNS
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

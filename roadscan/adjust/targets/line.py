@@ -12,8 +12,8 @@ from roadscan.adjust.targets.heights import height_at
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import SurveyedLine
 from roadscan.adjust.targets.values import HeightFind, TargetReadings
+from roadscan.compute.edges.painted_line import LINE_M, painted_line, without_lines
 from roadscan.compute.robust import scatter_about
-from roadscan.edges.painted_line import LINE_M, painted_line, without_lines
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]

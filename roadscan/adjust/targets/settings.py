@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 
 class TargetSettings(Strict):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 
 
 @dataclass(frozen=True)

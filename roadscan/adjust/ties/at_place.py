@@ -17,8 +17,8 @@ from roadscan.adjust.ties.height import height_tie
 from roadscan.adjust.ties.plane import plane_ties
 from roadscan.adjust.ties.shift import KINDS_OF_PICTURES, Pictures, shift_ties
 from roadscan.adjust.ties.tie import SAME_PASS, Tie
-from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.settings.tie_settings import TieSettings
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.settings.tie_settings import TieSettings
 
 Float64 = npt.NDArray[np.float64]
 

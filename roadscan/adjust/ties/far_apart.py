@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from roadscan.adjust.ties.tie import HEIGHT, SHIFT
-from roadscan.model.settings.tie_settings import AgainSettings, TieSettings
+from roadscan.core.settings.tie_settings import AgainSettings, TieSettings
 
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]

@@ -17,7 +17,7 @@ from roadscan.assets.edges.profiles import smooth_line
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
-from roadscan.edges.across import edge_along
+from roadscan.compute.edges.across import edge_along
 
 Float64 = npt.NDArray[np.float64]
 

@@ -13,10 +13,10 @@ from roadscan.assets.edges.find import edges_of
 from roadscan.assets.edges.free import free_edges
 from roadscan.assets.edges.line_pieces import NODE_COLUMNS, columns_of, cut_at, dense, line_schema, pieces_table
 from roadscan.assets.edges.raster import HeightRaster, raster_of
+from roadscan.assets.kernels import transects as kernel
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.smoothing import gaussian
-from roadscan.kernels.assets import transects as kernel
 
 Float64 = npt.NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from roadscan.assets import classes
 from roadscan.assets.edges.find import Edge, edges_of
 from roadscan.assets.edges.line_pieces import columns_of
 from roadscan.assets.edges.raster import HeightRaster, raster_of
+from roadscan.assets.kernels.corridors import mark_corridor
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
-from roadscan.kernels.assets.corridors import mark_corridor
 
 _FENCE_M: Final = (0.35, 1.2)
 """Heights above the ground at which every fence and wall is seen."""

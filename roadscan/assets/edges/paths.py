@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from roadscan.assets.bins import in_bins
 from roadscan.assets.edges.steps import Places
-from roadscan.kernels.assets.edge_links import MAX_LINKS, best_ways, find_links, trace
+from roadscan.assets.kernels.edge_links import MAX_LINKS, best_ways, find_links, trace
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

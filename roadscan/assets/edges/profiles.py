@@ -12,8 +12,8 @@ import scipy.ndimage
 from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.edges.paths import Chain
 from roadscan.assets.edges.raster import HeightRaster
+from roadscan.assets.kernels import step_profiles as kernel
 from roadscan.compute.ways import way_along
-from roadscan.kernels.assets import step_profiles as kernel
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

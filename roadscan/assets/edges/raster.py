@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from roadscan.assets import classes
 from roadscan.assets.bins import cells_of
+from roadscan.assets.kernels.low_heights import low_heights
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.smoothing import gaussian
-from roadscan.kernels.assets.low_heights import low_heights
 
 Float64 = npt.NDArray[np.float64]
 

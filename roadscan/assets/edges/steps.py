@@ -13,8 +13,8 @@ import numpy.typing as npt
 import scipy.ndimage
 
 from roadscan.assets.edges.raster import HeightRaster
-from roadscan.kernels.assets.smoothing import window_means
-from roadscan.kernels.assets.step_filter import (
+from roadscan.assets.kernels.smoothing import window_means
+from roadscan.assets.kernels.step_filter import (
     CHUNK,
     FRAME,
     WORK,

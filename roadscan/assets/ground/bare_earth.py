@@ -12,8 +12,8 @@ from roadscan.assets.ground.planes import plane_ground
 from roadscan.assets.ground.raster import ground_model
 from roadscan.assets.ground.sparse import sparse_ground
 from roadscan.assets.ground.surface import Found, Place, is_dense
+from roadscan.assets.kernels.heights import heights_above
 from roadscan.assets.scene import GroundModel
-from roadscan.kernels.assets.heights import heights_above
 
 Float32 = npt.NDArray[np.float32]
 

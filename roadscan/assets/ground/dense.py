@@ -13,8 +13,8 @@ from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.ground.morphological import bare_cells
 from roadscan.assets.ground.surface import Found, Place, Surface
 from roadscan.assets.ground.undersides import undersides
-from roadscan.kernels.assets.ground_cells import on_ground, scatter
-from roadscan.kernels.assets.lowest import lowest_returns
+from roadscan.assets.kernels.ground_cells import on_ground, scatter
+from roadscan.assets.kernels.lowest import lowest_returns
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]

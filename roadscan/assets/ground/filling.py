@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.assets.filling import begin, halved, relax
+from roadscan.assets.kernels.filling import begin, halved, relax
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]

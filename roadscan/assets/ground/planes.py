@@ -17,9 +17,9 @@ import numpy.typing as npt
 from roadscan.assets.ground.filling import filled
 from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.ground.surface import Found, Place, Surface, is_dense
-from roadscan.kernels.assets.heights import heights_above
-from roadscan.kernels.assets.lowest import lowest_returns
-from roadscan.kernels.assets.planes import planes
+from roadscan.assets.kernels.heights import heights_above
+from roadscan.assets.kernels.lowest import lowest_returns
+from roadscan.assets.kernels.planes import planes
 
 _BLOCK_M: Final = 10.0
 """Planes are sought in squares of the map of this edge."""

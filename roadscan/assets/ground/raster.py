@@ -10,8 +10,8 @@ import numpy.typing as npt
 from roadscan.assets.ground.filling import distances, filled
 from roadscan.assets.ground.grid import grid_over
 from roadscan.assets.ground.surface import Found, Place
+from roadscan.assets.kernels.ground_cells import cell_heights
 from roadscan.assets.scene import GroundModel
-from roadscan.kernels.assets.ground_cells import cell_heights
 
 Float32 = npt.NDArray[np.float32]
 

@@ -12,9 +12,9 @@ from roadscan.assets.ground.filling import filled
 from roadscan.assets.ground.grid import grid_over
 from roadscan.assets.ground.morphological import bare_cells
 from roadscan.assets.ground.surface import Found, Place, Surface
-from roadscan.kernels.assets.ground_cells import cell_heights
-from roadscan.kernels.assets.heights import heights_above
-from roadscan.kernels.assets.lowest import lowest_returns
+from roadscan.assets.kernels.ground_cells import cell_heights
+from roadscan.assets.kernels.heights import heights_above
+from roadscan.assets.kernels.lowest import lowest_returns
 
 Float32 = npt.NDArray[np.float32]
 

@@ -24,7 +24,7 @@ from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
 from roadscan.compute.ways import way_along
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 Float64 = npt.NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from roadscan.assets.paint.detection import paint_of, rows_of_paint
 from roadscan.assets.paint.lane_lines import lane_lines
 from roadscan.assets.paint.line_pieces import LINE_PIECES, line_pieces
 from roadscan.assets.scene import Scene
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 _LONGEST_GAP_M: Final = 15.0
 

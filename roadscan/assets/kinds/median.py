@@ -16,7 +16,7 @@ from roadscan.assets.edges.probability import kerb_probability
 from roadscan.assets.edges.strips import Strip, polygon_of, sigma_width_m, strips_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 SAME_SHARE = 0.3
 """Two polygons that share this much of the smaller one are one median, found from both of its edges."""

@@ -17,7 +17,7 @@ from roadscan.assets.edges.line_pieces import Line, joined_lines, line_schema, p
 from roadscan.assets.edges.raster import raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 
 class RoadEdgeOptions(Strict):

@@ -16,7 +16,7 @@ from roadscan.assets.edges.strips import Strip, polygon_of, running_slope, sigma
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.kinds.kerb import types_along
 from roadscan.assets.scene import Scene
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 
 class SidewalkOptions(Strict):

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.bins import in_bins
+from roadscan.assets.kernels.paint_levels import distinct_in_groups
 from roadscan.assets.paint.contrast import CELL_M, Contrast
-from roadscan.kernels.assets.paint_levels import distinct_in_groups
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

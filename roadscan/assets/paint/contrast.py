@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.classes import PERSON, VEHICLE
+from roadscan.assets.kernels.paint_levels import contrasts, paint_levels, paint_sums, scan_lines, seen_on_ground
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
-from roadscan.kernels.assets.paint_levels import contrasts, paint_levels, paint_sums, scan_lines, seen_on_ground
-from roadscan.kernels.options import read_only
+from roadscan.compute.kernel_options import read_only
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.object_table import reference_point
-from roadscan.plugins import found_kinds
+from roadscan.core.plugins import found_kinds
 
 Float64 = npt.NDArray[np.float64]
 UInt8 = npt.NDArray[np.uint8]

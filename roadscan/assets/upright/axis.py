@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.assets.cylinders import fit_cylinder
+from roadscan.assets.kernels.cylinders import fit_cylinder
 
 Float64 = npt.NDArray[np.float64]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.kernels.corridors import mark_strip
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.lines import Chain
 from roadscan.assets.upright.places import places_of
-from roadscan.kernels.assets.corridors import mark_strip
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

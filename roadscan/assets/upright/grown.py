@@ -13,11 +13,11 @@ from pydantic import Field
 
 from roadscan.assets import classes
 from roadscan.assets.bins import cells_of, in_bins
+from roadscan.assets.kernels.grown_cells import low_moments
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
 from roadscan.assets.upright.panels import panels_of
-from roadscan.kernels.assets.grown_cells import low_moments
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -11,12 +11,12 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from roadscan.assets import classes
+from roadscan.assets.kernels.corridors import mark_corridor
 from roadscan.assets.kind import KindOptions
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.pieces import passes_of
 from roadscan.assets.upright.places import ground_light
 from roadscan.assets.upright.slices import usable
-from roadscan.kernels.assets.corridors import mark_corridor
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

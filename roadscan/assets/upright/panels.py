@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from roadscan.assets import classes
 from roadscan.assets.bins import in_bins
+from roadscan.assets.kernels.upright_voxels import beside_line, in_stretches, near_middles, passing_lines
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.quantiles import median, quantiles
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.regions import Region, regions_of
-from roadscan.kernels.assets.upright_voxels import beside_line, in_stretches, near_middles, passing_lines
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

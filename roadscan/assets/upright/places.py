@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
+from roadscan.assets.kernels.buckets import count_buckets, fill_buckets
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.slices import usable
-from roadscan.kernels.assets.buckets import count_buckets, fill_buckets
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.bins import in_bins
+from roadscan.assets.kernels.upright_voxels import gather_moments, grow_regions, region_ranges, thin_elements
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.quantiles import quantiles
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.slices import usable_above_m
-from roadscan.kernels.assets.upright_voxels import gather_moments, grow_regions, region_ranges, thin_elements
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

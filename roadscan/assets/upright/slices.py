@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from roadscan.assets import classes
 from roadscan.assets.bins import in_bins
+from roadscan.assets.kernels.slices import fill_slices, label_slices, owners
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
-from roadscan.kernels.assets.slices import fill_slices, label_slices, owners
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -31,10 +31,10 @@ import numpy.typing as npt
 
 from roadscan.compute.robust import scatter_about
 from roadscan.condition.index import ConditionIndex, Quantity, Value
+from roadscan.condition.kernels.steps import step_heights
 from roadscan.condition.lane_data import LaneData, Profile
 from roadscan.condition.of_sections.wheel_paths import bridged
-from roadscan.condition.quarter_car import SEVERE_M
-from roadscan.kernels.condition.steps import step_heights
+from roadscan.condition.profiles.quarter_car import SEVERE_M
 
 Float64 = npt.NDArray[np.float64]
 

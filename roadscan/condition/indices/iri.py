@@ -2,7 +2,7 @@
 
 Of each section the golden car begins 100 m before it (or where the profile begins), so that a section's
 value depends on nothing farther away: what is left of the beginning after 100 m is below a millionth. Formulas and
-sources: :mod:`roadscan.condition.iri`.
+sources: :mod:`roadscan.condition.profiles.iri`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import ClassVar, Final
 import numpy as np
 
 from roadscan.condition.index import ConditionIndex, Quantity, Value
-from roadscan.condition.iri import iri_of, mean_roughness_index, rolling_iri
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.wheel_paths import (
     LEAD_M,
@@ -25,10 +24,11 @@ from roadscan.condition.of_sections.wheel_paths import (
     wheel_paths,
     without_noise,
 )
-from roadscan.condition.quarter_car import RULES, SEVERE_M
-from roadscan.condition.ride import Ride, ride
-from roadscan.condition.segments import Segments
-from roadscan.model.witness import Witness
+from roadscan.condition.profiles.iri import iri_of, mean_roughness_index, rolling_iri
+from roadscan.condition.profiles.quarter_car import RULES, SEVERE_M
+from roadscan.condition.profiles.ride import Ride, ride
+from roadscan.condition.profiles.segments import Segments
+from roadscan.core.witness import Witness
 
 SEVERE_STEP: Final = Witness(
     name="severe_step",

@@ -1,7 +1,7 @@
 """Ravelling: patches of a lane that have lost stones, by their texture against that of their section.
 
 The texture of a square of 0.2 m is the root mean square of its heights within blocks of 50 mm about their planes
-(:mod:`roadscan.kernels.condition.lane_texture`), so that slopes, ruts and wide holes count nothing. It is that of the
+(:mod:`roadscan.condition.kernels.lane_texture`), so that slopes, ruts and wide holes count nothing. It is that of the
 median block, so that cracks count little. A patch is coarser than its section by 15 %, and by five times the spread of
 its sound squares; a road of another texture is its own measure, and a dark or wet place without texture is none. Where
 most of a section has lost stones, the lane over its kilometre says what is sound.

@@ -1,6 +1,6 @@
 """Ride number of a section, of both wheel paths together.
 
-Formula and sources: :mod:`roadscan.condition.ride_number`.
+Formula and sources: :mod:`roadscan.condition.profiles.ride_number`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from roadscan.condition.of_sections.wheel_paths import (
     wheel_paths,
     without_noise,
 )
-from roadscan.condition.ride_number import ride_number, ride_number_of, ride_number_ride
+from roadscan.condition.profiles.ride_number import ride_number, ride_number_of, ride_number_ride
 
 Float64 = npt.NDArray[np.float64]
 

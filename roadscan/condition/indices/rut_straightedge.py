@@ -12,9 +12,9 @@ from typing import ClassVar, Final
 import numpy as np
 
 from roadscan.condition.index import ConditionIndex, PerCrossSection, Quantity, Value, by_section
+from roadscan.condition.kernels.ruts import straightedge
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.whole_sections import WholeSections
-from roadscan.kernels.condition.ruts import straightedge
 
 _MM = 1e3
 LENGTHS_M: Final = (1.2, 1.8, 2.0, 3.0)

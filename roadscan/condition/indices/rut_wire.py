@@ -19,9 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.condition.index import ConditionIndex, How, PerCrossSection, Quantity, Value, by_section
+from roadscan.condition.kernels.ruts import stretched_wire, water
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.whole_sections import WholeSections
-from roadscan.kernels.condition.ruts import stretched_wire, water
 
 Float64 = npt.NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Power spectral density of the wheel paths over a section, and its class of ISO 8608.
 
-Formulas and sources: :mod:`roadscan.condition.spectrum`. A section of 100 m is one window, so that its density at 0.1
+Formulas and sources: :mod:`roadscan.condition.profiles.spectrum`. A section of 100 m is one window, so that its density at 0.1
 cycles a metre is known to a third or so; the standard deviation is that of the fitted line.
 """
 
@@ -14,8 +14,8 @@ import numpy as np
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.wheel_paths import WheelPath, wheel_paths
-from roadscan.condition.spectrum import road_class, road_spectrum
-from roadscan.model.errors import ProfileError
+from roadscan.condition.profiles.spectrum import road_class, road_spectrum
+from roadscan.core.errors import ProfileError
 
 _CM3: Final = 1e6
 

@@ -1,6 +1,6 @@
 """Greatest deviation under the middle of a rolling straightedge in the wheel paths.
 
-Formula and sources: :mod:`roadscan.condition.straightedge`.
+Formula and sources: :mod:`roadscan.condition.profiles.straightedge`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.wheel_paths import WheelPath, greatest_of, spread_of, wheel_paths
-from roadscan.condition.straightedge import LENGTHS_M, straightedge_mm
+from roadscan.condition.profiles.straightedge import LENGTHS_M, straightedge_mm
 
 _BEAMS: Final = {"straightedge_3m_max_mm": LENGTHS_M["3 m"], "straightedge_16ft_max_mm": LENGTHS_M["16 ft"]}
 

@@ -20,8 +20,8 @@ import scipy.ndimage
 from scipy.special import ndtr
 
 from roadscan.condition.lane_data import LaneData, Profile
-from roadscan.condition.quarter_car import RULES
-from roadscan.condition.segments import Segments
+from roadscan.condition.profiles.quarter_car import RULES
+from roadscan.condition.profiles.segments import Segments
 
 Float64 = npt.NDArray[np.float64]
 

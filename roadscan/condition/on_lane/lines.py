@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.edges.painted_line import painted_line, without_lines
+from roadscan.condition.kernels.intensity_means import mean_intensities
+from roadscan.condition.kernels.sampling import CellTable
 from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.edges.painted_line import painted_line, without_lines
-from roadscan.kernels.condition.intensity_means import mean_intensities
-from roadscan.kernels.condition.sampling import CellTable
 
 Float64 = npt.NDArray[np.float64]
 

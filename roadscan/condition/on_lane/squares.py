@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.kernels.condition.lane_texture import (
+from roadscan.condition.kernels.lane_texture import (
     FIGURES,
     INTENSITY,
     LINE,
@@ -21,7 +20,8 @@ from roadscan.kernels.condition.lane_texture import (
     WITHIN,
     texture_of_squares,
 )
-from roadscan.kernels.condition.sampling import CellTable
+from roadscan.condition.kernels.sampling import CellTable
+from roadscan.condition.road_line import Lane, RoadLine
 
 Float64 = npt.NDArray[np.float64]
 

@@ -4,7 +4,7 @@ After P. Kumar, C. P. McElhinney, P. Lewis and T. McCarthy, *An automated algori
 terrestrial mobile LiDAR data* (ISPRS Journal 85, 2013): the slope across the road tells its edge, and intensity and
 pulse width where the slope does not. They let a snake find its way over rasters of the three; here each change across
 the road is measured in standard deviations, and the best path is found by dynamic programming
-(:mod:`roadscan.edges.across`). Pulse widths are in no table of roadscan. Where neither heights nor intensities tell an
+(:mod:`roadscan.compute.edges.across`). Pulse widths are in no table of roadscan. Where neither heights nor intensities tell an
 edge, the line painted along the border of the lane stands for it.
 """
 
@@ -18,10 +18,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
 
+from roadscan.compute.edges.across import DEFAULT, AcrossSettings, counted, evidence_across, path_along
+from roadscan.compute.edges.painted_line import PAINT, without_lines
 from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.condition.road_edges.raster import OFFSET_M, STATION_M, SideRaster
-from roadscan.edges.across import DEFAULT, AcrossSettings, counted, evidence_across, path_along
-from roadscan.edges.painted_line import PAINT, without_lines
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]

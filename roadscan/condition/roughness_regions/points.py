@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.errors import ProfileError
+from roadscan.core.errors import ProfileError
 
 Float64 = npt.NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rot
 from roadscan.condition.roughness_regions.raster import IntensityRaster, closed, intensity_raster
 from roadscan.condition.roughness_regions.severity import UNKNOWN, Severity, severity
 from roadscan.condition.roughness_regions.surface import RoadSurface, road_below
-from roadscan.model.settings.roughness_regions import RoughnessRegionsConfig
+from roadscan.core.settings.roughness_regions import RoughnessRegionsConfig
 
 Float64 = npt.NDArray[np.float64]
 

@@ -22,6 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
+from roadscan.core.crs import MapFrame
 from roadscan.inventory.home import CHOICES, FID, Content, Decision, EditFault, Home, HomeError, Mark, Sheet
 from roadscan.inventory.homes.added_tables import keep_added
 from roadscan.inventory.homes.map_crs import into_map
@@ -29,10 +30,9 @@ from roadscan.inventory.homes.stored_values import OddValue, odd_values
 from roadscan.inventory.homes.value_lists import add_value_lists
 from roadscan.inventory.qgis.styles import add_styles
 from roadscan.inventory.values import iso_wkb
-from roadscan.model.crs import MapFrame
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
-from roadscan.tables.inventory_schema import GEOMETRY, asset_columns, asset_table
-from roadscan.tables.store import process_lives
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.inventory_schema import GEOMETRY, asset_columns, asset_table
+from roadscan.store.store import process_lives
 
 MARKS: Final = "roadscan_inventory"
 CONFLICTS: Final = "conflicts"

@@ -10,10 +10,10 @@ import numpy.typing as npt
 import pyproj
 import shapely
 
+from roadscan.core.crs import MapFrame, accuracy_words, best_operation, crs_from_text
+from roadscan.core.errors import CrsError
+from roadscan.core.witness import Witness
 from roadscan.inventory.home import HomeError
-from roadscan.model.crs import MapFrame, accuracy_words, best_operation, crs_from_text
-from roadscan.model.errors import CrsError
-from roadscan.model.witness import Witness
 
 CRS_OF_EDITS: Final = Witness(
     name="crs_of_edits",

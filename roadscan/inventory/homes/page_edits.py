@@ -19,14 +19,14 @@ import pyarrow.compute as pc
 import shapely
 from pydantic import Field
 
+from roadscan.core.errors import ConfigError
+from roadscan.core.strict import Strict
 from roadscan.inventory.conflicts import Conflict, value_shown
 from roadscan.inventory.edits import Edit
 from roadscan.inventory.home import FID, Author, Content, EditFault, Home, HomeError, Mark, Sheet
 from roadscan.inventory.values import encoded, iso_wkb
-from roadscan.model.errors import ConfigError
-from roadscan.model.strict import Strict
-from roadscan.tables.asset_schema import asset_schema
-from roadscan.tables.inventory_schema import GEOMETRY, asset_table, kinds_by_table
+from roadscan.store.asset_schema import asset_schema
+from roadscan.store.inventory_schema import GEOMETRY, asset_table, kinds_by_table
 
 LAYER: Final = "asset_"
 """Layers of the page are named so, followed by the table of their kind."""

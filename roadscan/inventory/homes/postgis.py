@@ -18,14 +18,14 @@ import pyarrow as pa
 import pyarrow.csv
 import shapely
 
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError
 from roadscan.inventory.home import CHOICES, FID, Author, Content, Decision, Home, HomeError, Mark, Sheet
 from roadscan.inventory.homes.map_crs import into_map
 from roadscan.inventory.homes.postgis_schema import ROLES, statements
 from roadscan.inventory.values import iso_wkb
-from roadscan.model.crs import MapFrame
-from roadscan.model.errors import ConfigError
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
-from roadscan.tables.inventory_schema import GEOMETRY, asset_table, kinds_by_table
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.inventory_schema import GEOMETRY, asset_table, kinds_by_table
 
 MARKS: Final = "roadscan_inventory"
 _WAIT_MS: Final = 10_000

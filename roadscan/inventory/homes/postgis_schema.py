@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from roadscan.tables.asset_schema import AssetColumn, AssetSchema, asset_schema
-from roadscan.tables.inventory_schema import asset_columns
+from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_schema
+from roadscan.store.inventory_schema import asset_columns
 
 _TYPES: Final = {
     "bool": "boolean", "date": "date", "float64": "double precision", "int32": "integer", "int64": "bigint",

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 
-from roadscan.model.witness import Witness
+from roadscan.core.witness import Witness
 
 STORED_VALUES: Final = Witness(
     name="stored_values",

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from roadscan.tables.asset_schema import AssetColumn, asset_schema
-from roadscan.tables.inventory_schema import asset_columns
+from roadscan.store.asset_schema import AssetColumn, asset_schema
+from roadscan.store.inventory_schema import asset_columns
 
 _RANGE: Final = "INSERT INTO gpkg_data_column_constraints VALUES (?, 'range', NULL, ?, 1, ?, 1, NULL)"
 _VALUE: Final = "INSERT INTO gpkg_data_column_constraints VALUES (?, 'enum', ?, NULL, NULL, NULL, NULL, NULL)"

@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element, SubElement
 
 from roadscan.inventory.conflicts import CONFLICT_COLUMNS, DECISION
 from roadscan.inventory.home import CHOICES
-from roadscan.tables.asset_schema import AssetColumn, asset_schema
-from roadscan.tables.inventory_schema import asset_columns, editable_columns
+from roadscan.store.asset_schema import AssetColumn, asset_schema
+from roadscan.store.inventory_schema import asset_columns, editable_columns
 
 _NOT_NULL: Final = 1
 _EXPRESSION: Final = 4

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
+from roadscan.core.crs import crs_from_text
 from roadscan.inventory.qgis.styles import QGIS_VERSION, SHEETS, sheet_elements, style_elements
-from roadscan.model.crs import crs_from_text
-from roadscan.tables.asset_schema import asset_schema
+from roadscan.store.asset_schema import asset_schema
 
 _GEOMETRY: Final = {
     "PointZ": "Point", "LineStringZ": "Line", "MultiLineStringZ": "Line", "PolygonZ": "Polygon",

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 import pyarrow as pa
 
 from roadscan.inventory.qgis.forms import decision_elements, form_elements
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
 
 QGIS_VERSION: Final = "3.22.0-Białowieża"
 """Of the oldest QGIS that the files are tried with: it warns of files of a newer one."""

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.robust import SIGMA_OF_MAD
-from roadscan.model.clock_evidence import USUAL_DRIFT, Drift
+from roadscan.core.clock_evidence import USUAL_DRIFT, Drift
 
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]

@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.clock_evidence import Drift
-from roadscan.model.errors import NavigationError
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.clock_evidence import Drift
+from roadscan.core.errors import NavigationError
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.clocks.correction import ClockCorrection, Residuals
 from roadscan.navigation.clocks.lag import STEP_S, Lag, coarse_lag
 from roadscan.navigation.clocks.lines import Line, robust_line

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.clock_evidence import USUAL_DRIFT, Drift
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.clock_evidence import USUAL_DRIFT, Drift
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.clocks.correction import ClockCorrection, Residuals
 from roadscan.navigation.clocks.lines import Line, robust_line
 

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from roadscan.model.crs import LOCAL_WORLD
-from roadscan.model.errors import NavigationError
-from roadscan.model.frames import rotation_from_quaternion
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.crs import LOCAL_WORLD
+from roadscan.core.errors import NavigationError
+from roadscan.core.frames import rotation_from_quaternion
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.inertial.readings import ImuReadings, OdometerReadings
 from roadscan.navigation.trajectory import Trajectory
 

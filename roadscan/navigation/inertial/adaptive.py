@@ -33,9 +33,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.robust import scatter_about
-from roadscan.model.errors import NavigationError
-from roadscan.model.frames import rotation_from_quaternion
-from roadscan.model.settings.smoothing import SmootherConfig
+from roadscan.core.errors import NavigationError
+from roadscan.core.frames import rotation_from_quaternion
+from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.earth import ecef_from_level
 from roadscan.navigation.inertial.noise import fixes_of, usable
 from roadscan.navigation.inertial.readings import (

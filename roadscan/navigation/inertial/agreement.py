@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.flags import runs_of
-from roadscan.model.errors import ConfigError, NavigationError, TimeSystemError
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.errors import ConfigError, NavigationError, TimeSystemError
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.inertial.motion import GRAVITY_M_PER_S2, STEP_S, Windows, imu_means
 from roadscan.navigation.inertial.readings import ImuReadings, VehicleSensors
 

@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from roadscan.kernels.inertial.strapdown import increments, turned_frame
-from roadscan.model.errors import NavigationError
+from roadscan.core.errors import NavigationError
 from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, ecef_from_level, gravity_ecef
+from roadscan.navigation.inertial.kernels.strapdown import increments, turned_frame
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
 from roadscan.navigation.inertial.timeline import merged
 

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.flags import runs_of
-from roadscan.model.errors import NavigationError, TimeSystemError
-from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S, iso_from_gps_ns
+from roadscan.core.errors import NavigationError, TimeSystemError
+from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S, iso_from_gps_ns
 from roadscan.navigation.inertial.agreement import (
     Felt,
     check_axes,

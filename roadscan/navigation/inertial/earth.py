@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.inertial.strapdown import EARTH_RATE_RAD_PER_S, geodetic_of, gravity_at
+from roadscan.navigation.inertial.kernels.strapdown import EARTH_RATE_RAD_PER_S, geodetic_of, gravity_at
 
 Float64 = npt.NDArray[np.float64]
 

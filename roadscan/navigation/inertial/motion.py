@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from roadscan.compute.flags import runs_of
 from roadscan.compute.robust import scatter_about
-from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
-from roadscan.model.frames import ENU_FROM_NED, ecef_from_ned
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
+from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
 
 Float64 = npt.NDArray[np.float64]

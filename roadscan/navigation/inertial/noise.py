@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
 
-from roadscan.kernels.inertial.kalman_states import Fixes
-from roadscan.model.settings.smoothing import SmootherConfig
+from roadscan.core.settings.smoothing import SmootherConfig
+from roadscan.navigation.inertial.kernels.kalman_states import Fixes
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
 
 Float64 = npt.NDArray[np.float64]

@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.errors import NavigationError
-from roadscan.model.frames import rotation_from_quaternion
-from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
+from roadscan.core.errors import NavigationError
+from roadscan.core.frames import rotation_from_quaternion
+from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.navigation.inertial.readings import GnssSolutions, Solution, VehicleSensors
 

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.flags import runs_of
-from roadscan.model.crs import LOCAL_WORLD, geodetic_from_world
-from roadscan.model.errors import CrsError, NavigationError
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
+from roadscan.core.errors import CrsError, NavigationError
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.navigation.inertial.readings import GnssSolutions
 from roadscan.navigation.inertial.records import FASTEST_M_PER_S, FEWEST_SPOILT, Kept, Repair, listed

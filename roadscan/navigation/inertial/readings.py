@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.imu import ImuErrors
+from roadscan.core.imu import ImuErrors
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.flags import runs_of
-from roadscan.model.errors import NavigationError, TimeSystemError
-from roadscan.model.gpstime import NS_PER_S, iso_from_gps_ns
+from roadscan.core.errors import NavigationError, TimeSystemError
+from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
 
 Float64 = npt.NDArray[np.float64]

@@ -1,7 +1,7 @@
 """The smoother: a trajectory from IMU, GNSS and odometer.
 
-A loosely coupled error-state Kalman filter (:mod:`roadscan.kernels.inertial.kalman`) runs forwards over a run, a
-smoother (:mod:`roadscan.kernels.inertial.kalman_smoother`) back. The order of things is
+A loosely coupled error-state Kalman filter (:mod:`roadscan.navigation.inertial.kernels.kalman`) runs forwards over a run, a
+smoother (:mod:`roadscan.navigation.inertial.kernels.kalman_smoother`) back. The order of things is
 :mod:`~roadscan.navigation.inertial.timeline`, the first attitude :mod:`~roadscan.navigation.inertial.alignment`,
 standstill :mod:`~roadscan.navigation.inertial.standing`, the trust in readings
 :mod:`~roadscan.navigation.inertial.noise`.
@@ -17,15 +17,24 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
-from roadscan.kernels.inertial.kalman import filter_forwards
-from roadscan.kernels.inertial.kalman_smoother import Poses, smooth_backwards, spread
-from roadscan.kernels.inertial.kalman_states import NAVIGATION, Layout, Model, Nodes, Record, Start, Track, Updates
-from roadscan.model.crs import LOCAL_WORLD
-from roadscan.model.errors import NavigationError
-from roadscan.model.frames import quaternion_from_rotation
-from roadscan.model.settings.smoothing import SmootherConfig
+from roadscan.core.crs import LOCAL_WORLD
+from roadscan.core.errors import NavigationError
+from roadscan.core.frames import quaternion_from_rotation
+from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.alignment import Alignment, align
 from roadscan.navigation.inertial.earth import ecef_from_level
+from roadscan.navigation.inertial.kernels.kalman import filter_forwards
+from roadscan.navigation.inertial.kernels.kalman_smoother import Poses, smooth_backwards, spread
+from roadscan.navigation.inertial.kernels.kalman_states import (
+    NAVIGATION,
+    Layout,
+    Model,
+    Nodes,
+    Record,
+    Start,
+    Track,
+    Updates,
+)
 from roadscan.navigation.inertial.noise import usable
 from roadscan.navigation.inertial.readings import (
     GnssSolutions,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.kernels.inertial.kalman_states import Fixes, Nodes, Steps
-from roadscan.kernels.inertial.strapdown import increments
-from roadscan.model.settings.smoothing import SmootherConfig
+from roadscan.core.settings.smoothing import SmootherConfig
+from roadscan.navigation.inertial.kernels.kalman_states import Fixes, Nodes, Steps
+from roadscan.navigation.inertial.kernels.strapdown import increments
 from roadscan.navigation.inertial.noise import colour_restarts, fixes_of, imu_noise
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.navigation.inertial.standing import odometer_distance

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from roadscan import compiler
+from roadscan.compute import compiler
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 

@@ -14,8 +14,8 @@ from typing import Any, Self
 
 from pydantic import BaseModel, Field, model_validator
 
-from roadscan.model.errors import ConfigError, nearest
-from roadscan.model.strict import NAME_PATTERN, Strict, load_toml
+from roadscan.core.errors import ConfigError, nearest
+from roadscan.core.strict import NAME_PATTERN, Strict, load_toml
 from roadscan.simulate.scene.rig import (
     Camera,
     ClockError,

@@ -6,9 +6,9 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.model.gpstime import TimeSystem
-from roadscan.model.imu import ImuErrors, ImuGrade
-from roadscan.model.strict import Strict
+from roadscan.core.gpstime import TimeSystem
+from roadscan.core.imu import ImuErrors, ImuGrade
+from roadscan.core.strict import Strict
 
 
 class ClockError(Strict):

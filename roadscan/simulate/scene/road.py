@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 Shade = Annotated[float, Field(ge=0, le=255)]
 """Intensity of a surface, in digital numbers of a profiler."""

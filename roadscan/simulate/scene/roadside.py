@@ -9,7 +9,7 @@ from typing import Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 from roadscan.simulate.scene.road import Shade
 
 SignColour: TypeAlias = Literal["white", "red", "blue", "yellow", "green", "brown", "orange", "black"]

@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.model.strict import Strict
+from roadscan.core.strict import Strict
 
 
 class Stop(Strict):

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.errors import ConfigError
-from roadscan.model.gpstime import (
+from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import (
     GPS_EPOCH_UNIX_S,
     NS_PER_S,
     WEEK_S,

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.sensors.clock import SensorClock

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, utc_from_gps_ns
+from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, utc_from_gps_ns
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import Mount, Scene

@@ -13,8 +13,8 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from scipy.spatial.transform import Rotation
 
-from roadscan.model.gpstime import NS_PER_S
-from roadscan.model.imu import IMU_GRADES, ImuErrors
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.imu import IMU_GRADES, ImuErrors
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import Mount, Scene

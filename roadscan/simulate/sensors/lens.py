@@ -8,7 +8,7 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.errors import ConfigError
+from roadscan.core.errors import ConfigError
 from roadscan.simulate.scene import Camera
 
 Float64 = npt.NDArray[np.float64]

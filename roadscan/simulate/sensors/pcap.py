@@ -11,7 +11,7 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.model.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, TimeSystem, leap_seconds_at_gps
+from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, TimeSystem, leap_seconds_at_gps
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.sensors.clock import SensorClock

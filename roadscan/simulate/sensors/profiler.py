@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.special import ndtri
 
-from roadscan.model.gpstime import TimeSystem
+from roadscan.core.gpstime import TimeSystem
 from roadscan.simulate.caster import SLOT_NS
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.kernels import profiles as kernels

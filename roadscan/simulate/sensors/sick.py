@@ -23,7 +23,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.model.gpstime import NS_PER_S
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.simulate.caster import Hits, Pattern, World, ray_key, steps_within
 from roadscan.simulate.drive import RUN_UP_S, Drive
 from roadscan.simulate.noise import stream

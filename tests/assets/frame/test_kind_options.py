@@ -7,8 +7,8 @@ import pytest
 from roadscan.assets.kinds.shoulder import ShoulderOptions
 from roadscan.assets.upright.overhead import ClearanceOptions
 from roadscan.assets.upright.plates import SignOptions
-from roadscan.model.errors import ConfigError
-from roadscan.model.strict import Strict
+from roadscan.core.errors import ConfigError
+from roadscan.core.strict import Strict
 
 
 @pytest.mark.parametrize(

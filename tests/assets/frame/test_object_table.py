@@ -8,8 +8,8 @@ import shapely
 
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.object_table import object_names, objects_of_table, reference_point, table_of_objects
-from roadscan.tables.asset_schema import asset_kind_names, asset_schema, asset_tables
-from roadscan.tables.schema import schema_names
+from roadscan.store.asset_schema import asset_kind_names, asset_schema, asset_tables
+from roadscan.store.schema import schema_names
 
 
 def found(shape: shapely.Geometry, **attributes: object) -> AssetObject:

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from roadscan.assets.tasks.along_roads import along_roads
+from roadscan.assets.tasks.load_returns import _Columns, in_order
+from roadscan.assets.tasks.objects import clustered
 from roadscan.assets.tiling import AssetGrid
 from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.jobs.assets.along_roads import along_roads
-from roadscan.jobs.assets.load_returns import _Columns, in_order
-from roadscan.jobs.assets.objects import clustered
-from roadscan.jobs.condition.lines import Roads
-from roadscan.model.crs import MapFrame
-from roadscan.model.ids import TileId
-from roadscan.model.rig import Mounting, Mountings
-from roadscan.model.settings.assets import AssetsConfig
+from roadscan.condition.tasks.lines import Roads
+from roadscan.core.crs import MapFrame
+from roadscan.core.ids import TileId
+from roadscan.core.rig import Mounting, Mountings
+from roadscan.core.settings.assets import AssetsConfig
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.points.sensor_places import sensor_places
+from roadscan.tiles.georeferencing.sensor_places import sensor_places
 from roadscan.tiles.grid import TileGrid
 
 

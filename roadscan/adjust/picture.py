@@ -1,0 +1,85 @@
+"""Picture of an adjustment: where its evidence lies and what is left of it, before and after."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.canvas import empty_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Float64 = npt.NDArray[np.float64]
+
+_BEFORE: Final = "#d1495b"
+_AFTER: Final = "#1f5fa8"
+_LEAST_MM: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Differences of one kind, before and after (m), and where they were found on the map (m)."""
+
+    title: str
+    easting_m: Float64
+    northing_m: Float64
+    before_m: Float64
+    after_m: Float64
+
+
+@dataclass(frozen=True)
+class AdjustmentPicture:
+    """What is drawn."""
+
+    title: str
+    ways_m: tuple[Float64, ...]
+    """(n, 2) easting and northing of each track."""
+    residuals: tuple[Residuals, ...]
+    """Heights of ties, of control, of check points."""
+
+
+def draw_adjustment(shown: AdjustmentPicture, path: Path) -> None:
+    """A row a kind: a map of what is left, and histograms of before and after. Equal input gives equal bytes."""
+    known = [one for one in shown.residuals if one.before_m.size]
+    figure = empty_figure(11.0, 1.0 + 3.2 * max(len(known), 1), 120)
+    figure.suptitle(shown.title)
+    axes = figure.subplots(max(len(known), 1), 2, squeeze=False)
+    for row, one in zip(axes, known, strict=False):
+        _map(row[0], shown, one)
+        _histogram(row[1], one)
+    figure.savefig(path, metadata={"Software": None})
+
+
+def _map(axes: Axes, shown: AdjustmentPicture, one: Residuals) -> None:
+    every = np.concatenate([way for way in shown.ways_m if len(way)] or [np.zeros((1, 2))])
+    corner = np.floor(every.min(axis=0))
+    for way in shown.ways_m:
+        axes.plot(*(way - corner).T, color="#bbbbbb", linewidth=0.8)
+    limit = max(1e3 * float(np.percentile(np.abs(one.after_m), 98)), _LEAST_MM)
+    points = axes.scatter(
+        one.easting_m - corner[0], one.northing_m - corner[1], c=1e3 * one.after_m, s=14, cmap="coolwarm",
+        vmin=-limit, vmax=limit,
+    )  # fmt: skip
+    axes.figure.colorbar(points, ax=axes, label="left (mm)")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_title(one.title)
+    axes.set_xlabel(f"easting − {corner[0]:.0f} m")
+    axes.set_ylabel(f"northing − {corner[1]:.0f} m")
+
+
+def _histogram(axes: Axes, one: Residuals) -> None:
+    both = 1e3 * np.concatenate([one.before_m, one.after_m])
+    limit = max(float(np.percentile(np.abs(both), 98)) * 1.1, _LEAST_MM)
+    edges = np.linspace(-limit, limit, 41)
+    for values, colour, word in ((one.before_m, _BEFORE, "before"), (one.after_m, _AFTER, "after")):
+        rms = 1e3 * float(np.sqrt(np.mean(values**2)))
+        inside = np.clip(1e3 * values, -limit, limit)
+        axes.hist(inside, edges.tolist(), color=colour, alpha=0.6, label=f"{word}: RMS {rms:.2f} mm")
+    axes.set_xlabel("difference (mm)")
+    axes.set_ylabel(f"of {one.before_m.size:,}")
+    axes.legend(fontsize="small")

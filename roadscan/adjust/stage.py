@@ -1,0 +1,75 @@
+"""Stage `adjust`: corrections of the poses, from passes that overlap and from ground control."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.adjust.tasks.adjustment import adjust_survey, is_current, withdraw
+from roadscan.adjust.tasks.hand_ties import read_hand_ties
+from roadscan.adjust.tasks.outcome import FOLDER, TABLES, known_findings, known_lines
+from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, StageState
+from roadscan.store.logs import LogRecord
+from roadscan.store.manifest import Manifest
+from roadscan.store.schema import table_schema
+from roadscan.tiles.footprints.footprints import index_footprints
+
+
+class Adjust(Stage):
+    """Evidence is a file some places or a point; corrections are a small table that navigation applies."""
+
+    name = "adjust"
+    title = "corrections of the poses, from passes that overlap and from ground control"
+    after = ("footprints",)
+
+    def run(self, session: Session) -> None:
+        """Adjust where evidence, settings or code are others than those of the last solution."""
+        if is_current(session.plan, session.manifest):
+            return
+        if session.survey.config.adjust.on:
+            adjust_survey(session)
+        else:
+            withdraw(session)
+        session.replan(session.plan.corrected_anew())
+        # Corrections beyond what footprints leave room for make these anew, and nothing else does.
+        found = index_footprints(session.plan, session.manifest, session.compute, session.bar("footprints"))
+        session.renew("footprints")
+        session.failed(self.name, found)
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """Whether the file of picked targets is there, and that of ties by hand is one."""
+        if not survey.config.adjust.on:
+            return []
+        found: list[RoadscanError] = []
+        picked = survey.config.adjust.targets.picked
+        file = None if picked is None else survey.resolve(picked)
+        if file is not None and not file.is_file():
+            found.append(
+                ConfigError("there is no file of picked targets", change="correct adjust.targets.picked", file=file)
+            )
+        try:
+            read_hand_ties(survey)
+        except ConfigError as error:
+            found.append(error)
+        return found
+
+    def state(self, session: Session) -> StageState:
+        """Whether the corrections are those of the survey as it is, and what they are worth."""
+        due = int(not is_current(session.plan, session.manifest))
+        notes = []
+        if due and session.survey.config.adjust.on:
+            notes = ["the adjustment is due: it may make more tiles stale than these"]
+        lines = known_lines(session.manifest)
+        return StageState(1 - due, due, next_run={self.name: due}, notes=notes, lines=lines)
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """What the last solution doubts."""
+        return known_findings(manifest)
+
+    def folders(self) -> Sequence[str]:
+        """Evidence, tables of the outcome, pictures."""
+        locations = [table_schema(name).location for name in ("ties", "control_sightings", *TABLES)]
+        return [*(location for location in locations if location is not None), FOLDER]

@@ -1,0 +1,437 @@
+"""The adjustment of a survey, from raw readings to the table `corrections` and what it is worth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.control import ControlPoint, Sighting
+from roadscan.adjust.control_faults import listed
+from roadscan.adjust.picture import AdjustmentPicture, Residuals
+from roadscan.adjust.places import Place, Track, places_of_overlap
+from roadscan.adjust.process import RunPrior
+from roadscan.adjust.quality import NSSDA_CHECK_POINTS
+from roadscan.adjust.tasks.control_lines import lines_line
+from roadscan.adjust.tasks.control_work import (
+    SIGHTINGS,
+    ControlTask,
+    control_points,
+    control_tasks,
+    load_sightings,
+    sight_control,
+)
+from roadscan.adjust.tasks.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
+from roadscan.adjust.tasks.failed_ties import failed_ties
+from roadscan.adjust.tasks.figures import (
+    Held,
+    Rows,
+    accuracy_rows,
+    control_rows,
+    distance_rows,
+    of_points,
+    relative_rows,
+    tie_rows,
+)
+from roadscan.adjust.tasks.hand_ties import HandWork, hand_file, hand_work, with_hand_ties
+from roadscan.adjust.tasks.heads import COMMON_M, exchanged, head_findings, odd_steps, seams, steps_of
+from roadscan.adjust.tasks.mountings import (
+    Mounted,
+    calibrated_sigma,
+    held_values,
+    mounted_of,
+    mounting_findings,
+    mounting_lines,
+    publish_mountings,
+)
+from roadscan.adjust.tasks.near import Sources
+from roadscan.adjust.tasks.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES, keep_pictures, keep_tables
+from roadscan.adjust.tasks.publication import digests_of, foreign_runs, publish
+from roadscan.adjust.tasks.seams import shown_seams
+from roadscan.adjust.tasks.solution import Evidence, Solution, priors_of, solve
+from roadscan.adjust.tasks.tie_work import TIES, KnownTies, TieTask, collect_ties, load_ties, tie_tasks
+from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
+from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
+from roadscan.core.counted import counted as count_of
+from roadscan.core.settings.tie_settings import PlaceSettings
+from roadscan.core.witness import Finding
+from roadscan.navigation.movement import largest
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.session import Session
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.store import file_digest
+from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.plan.road import road_key
+
+Float64 = npt.NDArray[np.float64]
+
+_BUNDLE_BYTES: Final = 20_000_000.0
+"""Compressed bytes that a task reads, about."""
+_BUNDLE_POINTS: Final = 8
+
+
+@dataclass(frozen=True)
+class Work:
+    """Evidence that is to be collected."""
+
+    tracks: tuple[Track, ...]
+    ties: tuple[TieTask, ...]
+    control: tuple[ControlTask, ...]
+    points: tuple[ControlPoint, ...]
+    """Control points of the survey."""
+    hand: HandWork
+    """Ties by hand."""
+
+    @property
+    def own_points(self) -> list[ControlPoint]:
+        """Those that do not stand for a surveyed line."""
+        return [point for point in self.points if not point.is_of_line]
+
+
+class Seen(NamedTuple):
+    """What passes saw."""
+
+    evidence: Evidence
+    rows: list[dict[str, Any]]
+    """Sightings of control points as rows of their table."""
+    unmeasured: list[Finding]
+    """On ties by hand."""
+
+
+def solution_key(plan: SurveyPlan) -> str:
+    """Hash of all that the solution depends on: settings, code, readings, poses, control. No reading is read for it."""
+    config = plan.survey.config.adjust
+    picked = None if config.targets.picked is None else plan.survey.resolve(config.targets.picked)
+    by_hand = [None if f is None or not f.is_file() else file_digest(f) for f in (picked, hand_file(plan.survey))]
+    sources = [
+        [s.key, *road_key(s), s.trajectory is not None, [f.digest for f in files]]
+        for s, files in adjusted_sources(plan)
+    ]
+    beside = [
+        [r.key, [f.digest for f in r.tables.get(table, ())]]
+        for r in plan.records
+        for table in ("control_points", "control_lines", "trajectory_accuracy")
+        if r.tables.get(table)
+    ]
+    return key_of(
+        code_digest(f"{__name__}:adjust_survey"), config.model_dump(mode="json"), runs_of(plan), sources, beside,
+        [
+            [name, s.lever_arm_sigma_m, s.boresight_sigma_deg, s.range_scale_sigma]
+            for name, s in sorted(plan.survey.rig.sensors.items())
+        ],
+        sorted((name, sigma.tolist()) for name, sigma in calibrated_sigma(plan.store).items()),
+        by_hand, sorted(foreign_runs(plan.store)),
+    )  # fmt: skip
+
+
+def is_current(plan: SurveyPlan, manifest: Manifest) -> bool:
+    """True where nothing has changed since the last solution, and what it made is there."""
+    record = manifest.get(ADJUSTMENT, SOLUTION)
+    if not plan.survey.config.adjust.on:
+        return record is None
+    if record is None or record.key != solution_key(plan):
+        return False
+    parts = [r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()]
+    whole = all(manifest.is_current(r.product, r.unit, r.key) for r in parts)
+    return whole and record.figures()["table"] == digests_of(plan.store)
+
+
+def withdraw(session: Session) -> None:
+    """Take away what the stage made: the poses hold as they were recorded."""
+    manifest, plan = session.manifest, session.plan
+    manifest.remove([r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()])
+    publish(session.store, {}, plan.survey.config.adjust)
+    publish_mountings(session.store, None, plan.survey.config.adjust)
+    manifest.forget(ADJUSTMENT, [SOLUTION])
+
+
+class _Collector:
+    """Brings evidence up to date, round by round."""
+
+    def __init__(self, session: Session, sources: Sources, priors: tuple[RunPrior, ...], mounted: Mounted) -> None:
+        self.session, self.sources, self.priors, self.mounted = session, sources, priors, mounted
+        self.runs = runs_of(session.plan)
+        self.work = plan_work(session.plan, sources, priors)
+        self.lacks = False
+        """Whether some of the evidence failed."""
+        self._seams = {place.number for task in self.work.ties for place in task.places if place.seam}
+        self.of_heads, self._useless = self._heads()
+        """Findings on heads that do not meet as they should."""
+        self.again = first_ties(session.plan, sources, self.work.ties, self.work.control, (self.observe, self.load))
+
+    def observe(self, tasks: Sequence[TieTask]) -> None:
+        """Bring ties up to date."""
+        self.lacks |= _collect_ties(self.session, tasks)
+
+    def load(self, tasks: Sequence[TieTask]) -> KnownTies:
+        """Ties that are up to date."""
+        return self._loaded(tasks).of_seams(self._seams, COMMON_M)
+
+    def _loaded(self, tasks: Sequence[TieTask]) -> KnownTies:
+        return load_ties(self.session.store, self.session.manifest, tasks, self.runs, self.mounted)
+
+    def _heads(self) -> tuple[list[Finding], frozenset[int]]:
+        """Findings on heads of one pass where they meet, and runs whose heads are exchanged.
+
+        A run in which heads meet otherwise than in the others gets mountings of its own.
+        """
+        self.observe(self.work.ties)
+        steps = steps_of(self._loaded(self.work.ties), self.session.plan.survey.config.adjust.ties.return_s)
+        swapped = exchanged(self.session.plan, self.sources, steps)
+        useless = {one.run for one, _ in swapped}
+        odd = odd_steps([one for one in steps if one.run not in useless])
+        if self.mounted.priors and odd:
+            self.mounted = self.mounted.apart((one.run, head) for one, _ in odd for head in one.heads)
+        return head_findings(swapped, odd), frozenset(map(self.runs.index, useless))
+
+    def evidence(self, ties: KnownTies, control: Sequence[ControlTask]) -> Seen:
+        """All that is known, with what passes see of control points and at ends of ties by hand."""
+        store, manifest, hand = self.session.store, self.session.manifest, self.work.hand
+        self.lacks |= _collect_sightings(self.session, [*control, *hand.tasks])
+        points, rows = load_sightings(store, manifest, control)
+        ends, _ = load_sightings(store, manifest, hand.tasks)
+        joined, unmeasured = with_hand_ties(ties, hand, ends, self.mounted, self.runs)
+        wide = self.again.misplaced
+        priors = tuple(p.widened(wide[p.run]) if p.run in wide else p for p in self.priors)
+        evidence = Evidence(self.runs, priors, joined, tuple(points), self.mounted, self._useless)
+        return Seen(evidence, rows, unmeasured)
+
+    def solve(self, ties: KnownTies, control: Sequence[ControlTask]) -> Solution:
+        """Corrections of all runs."""
+        return solve(self.session.plan, self.evidence(ties, control).evidence)
+
+
+def adjust_survey(session: Session) -> None:
+    """Collect what evidence is missing, solve, and publish the corrections, tables and pictures."""
+    plan, manifest, config = session.plan, session.manifest, session.plan.survey.config.adjust
+    key = solution_key(plan)
+    foreign = foreign_runs(session.store)
+    sources = [pair for pair in adjusted_sources(plan) if pair[0].run not in foreign]
+    mounted = mounted_of(plan, sources, foreign=bool(foreign))
+    collector = _Collector(session, sources, priors_of(plan, sources, runs_of(plan)), mounted)
+    work, again = collector.work, collector.again
+    seen = collector.evidence(again.ties, again.control)
+    doubts = [
+        CORRECTED_ELSEWHERE.finds(f"run '{run}'", "its poses were corrected by another program: they are not adjusted")
+        for run in sorted(foreign)
+    ]
+    doubts += [*collector.of_heads, *again.findings, *work.hand.findings, *seen.unmeasured]
+    evidence = seen.evidence
+    if not (evidence.ties.accepted.any() or any(one.point.role == "gcp" for one in evidence.sightings)):
+        lines = [f"nothing to adjust: {_no_ties(work)}, {_seen(work, evidence.sightings)}"]
+        held: Held = publish(session.store, {}, config)
+        publish_mountings(session.store, None, config)
+        manifest.remove([r for name in (*TABLES, PICTURES) for r in manifest.of(name).values()])
+        _forget_others(manifest, again, work)
+        said = lines, [*doubts, *_of_points(work, evidence.sightings)]
+        _keep(session, key, {}, said, failed=collector.lacks)
+        return
+    tools = collector.observe, collector.load, collector.solve
+    again, solution, unsettled = settled(plan, sources, again, tools)
+    seen = collector.evidence(again.ties, again.control)
+    evidence = seen.evidence
+    _forget_others(manifest, again, work)
+    held = publish(session.store, solution.corrections, config)
+    changes = publish_mountings(session.store, solution.mountings, config)
+    tables = _tables(evidence, solution, held, held_values(collector.mounted, changes), work.tracks)
+    keep_tables(session.store, manifest, key, tables)
+    shown, not_drawn = shown_seams(again.every, evidence, solution, (held, changes), session.compute)
+    keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), shown), seen.rows)
+    lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
+    if config.mode in ("joint", "vertical"):
+        doubts += failed_ties(evidence.ties, solution.tie_weight)
+    doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings)]
+    doubts += _of_points(work, evidence.sightings)
+    _keep(session, key, held, (lines, doubts), failed=collector.lacks)
+
+
+def _tables(
+    evidence: Evidence, solution: Solution, held: Held, added: Float64, tracks: Sequence[Track]
+) -> dict[str, Rows]:
+    """Rows of the tables of the outcome; added : (s, 6) what is added to the mountings."""
+    points = control_rows(evidence, solution, held, added)
+    return {
+        "tie_residuals": tie_rows(evidence, solution, held, added),
+        "control_residuals": points,
+        "relative_accuracy": relative_rows(evidence, tracks, held, added),
+        "absolute_accuracy": accuracy_rows(points, evidence, solution),
+        "accuracy_by_distance": distance_rows(of_points(points, evidence), evidence, solution, tracks),
+    }
+
+
+def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) -> Work:
+    """Where passes overlap and where they come by control points: tasks for both."""
+    tracks = tracks_of(plan, sources)
+    config = plan.survey.config.adjust
+    places = _places(tracks, config.places)
+    points = control_points(plan)
+    ties = tie_tasks(plan, sources, places, runs_of(plan), config.ties)
+    control = control_tasks(plan, sources, tracks, points, priors)
+    hand = hand_work(plan, sources, tracks, priors, len(points))
+    return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points), hand)
+
+
+def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
+    """Places of dense sensors, those of lidars, which are larger, and the seams of heads: they are numbered through."""
+    dense = places_of_overlap([t for t in tracks if t.ahead_m == 0.0], settings)
+    ahead = settings.model_copy(update={"per_km": settings.lidar_per_km})
+    sparse = places_of_overlap([t for t in tracks if t.ahead_m > 0.0], ahead)
+    found = [*dense, *sparse, *seams(tracks, dense, settings)]
+    return [replace(place, number=number) for number, place in enumerate(found)]
+
+
+def _collect_ties(session: Session, tasks: Sequence[TieTask]) -> bool:
+    """Bring ties up to date; True where some failed."""
+    manifest = session.manifest
+    due = [t for t in tasks if not manifest.is_current(TIES, t.unit, t.key)]
+    ended = run_bundles(
+        collect_ties, due, lambda t: t.bytes, _BUNDLE_BYTES, manifest, session.compute, session.bar("ties")
+    )
+    failed = [(task.unit, reason) for task, reason in ended]
+    session.failed("adjust", failed)
+    return bool(failed)
+
+
+def _collect_sightings(session: Session, tasks: Sequence[ControlTask]) -> bool:
+    """Bring what was seen of control points, and at ends of ties by hand, up to date; True where some failed."""
+    manifest = session.manifest
+    due = [t for t in tasks if not manifest.is_current(SIGHTINGS, t.unit, t.key)]
+    if not due:
+        return False
+    ended = run_bundles(
+        sight_control, due, lambda _: 1, _BUNDLE_POINTS, manifest, session.compute, session.bar("control points")
+    )
+    failed = [(f"{task.unit} ({task.point.name})", reason) for task, reason in ended]
+    session.failed("adjust", failed)
+    return bool(failed)
+
+
+def _forget_others(manifest: Manifest, again: Again, work: Work) -> None:
+    """Remove evidence that is no more asked for."""
+    manifest.remove(manifest.beside([TIES], {t.unit for t in again.every}))
+    manifest.remove(manifest.beside([SIGHTINGS], {t.unit for t in (*again.control, *work.hand.tasks)}))
+
+
+def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Finding]], *, failed: bool) -> None:
+    """Record the solution and say what it found; one that lacks evidence is made anew by the next run."""
+    lines, doubts = said
+    detail = {
+        "runs": sorted(held), "table": digests_of(session.store), "lines": lines,
+        "findings": [asdict(one) for one in doubts],
+    }  # fmt: skip
+    own = key if not failed else key_of(key, "failed")
+    session.manifest.add([OutputRecord(ADJUSTMENT, SOLUTION, own, "", 0, "", json.dumps(detail))])
+    for line in lines:
+        session.reporter.line(f"adjust: {line}")
+
+
+def _no_ties(work: Work) -> str:
+    """Why no tie counts."""
+    places = sum(len(task.places) for task in work.ties)
+    if not work.tracks:
+        return "no readings with poses (points of a cloud are placed already)"
+    return (
+        f"no tie that counts at {places:,} places of overlap" if places else "no place where passes with poses overlap"
+    )
+
+
+def _seen(work: Work, sightings: Sequence[Sighting]) -> str:
+    if not work.own_points:
+        return "no control point"
+    seen = len({one.point.number for one in sightings if one.status != "unseen" and not one.point.is_of_line})
+    return f"{seen} of {len(work.own_points)} control points seen"
+
+
+def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[Finding]:
+    """Findings on points that no pass saw, and on targets that are not as they should be."""
+    found: list[Finding] = []
+    points = work.own_points
+    if points and not any(not task.point.is_of_line for task in work.control):
+        text = f"not one of the {len(points)} control points lies where a pass drove: check crs of their [[control]]"
+        found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(points)))
+    elif beside := _beside(work, sightings):
+        text = (
+            f"{len(beside)} of {len(points)} control points lie where no pass saw the road: {listed(beside)}; "
+            "they are of another stretch, or in another CRS"
+        )
+        found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(beside)))
+    return found + target_findings(sightings)
+
+
+def _beside(work: Work, sightings: Sequence[Sighting]) -> list[str]:
+    """Points that no pass saw, and how far they lie from where the nearest sensor went."""
+    seen = {one.point.number for one in sightings if one.status != "unseen"}
+    unseen = [one for one in work.own_points if one.number not in seen]
+    ways = np.concatenate([np.zeros((0, 2)), *(np.stack([t.easting_m, t.northing_m], axis=-1) for t in work.tracks)])
+    return [
+        f"{one.name} ({np.hypot(*(ways - [one.easting_m, one.northing_m]).T).min():,.1f} m from the nearest track)"
+        for one in unseen
+    ]
+
+
+def _lines(
+    work: Work, again: Again, evidence: Evidence, solution: Solution, held: Held, tables: dict[str, Rows]
+) -> list[str]:  # fmt: skip
+    places, counted = sum(len(t.places) for t in work.ties), int((solution.tie_weight > 0).sum())
+    lines = [
+        f"{places:,} places of overlap with {evidence.ties.observations.size:,} ties, {counted:,} of which count; "
+        f"{_seen(work, evidence.sightings)}"
+    ]
+    lines += [line for line in (lines_line(evidence.sightings), again.line()) if line]
+    if held:
+        moved = {run: largest(own) for run, own in held.items()}
+        down = max(float(np.abs(own.north_east_down_m[:, 2]).max()) for own in held.values())
+        across = max(shift for shift, _ in moved.values())
+        lines.append(
+            f"{len(held)} runs corrected by up to {across * 1e3:.1f} mm horizontally, {down * 1e3:.1f} mm in height"
+        )
+    heights = [row for row in tables["tie_residuals"] if row["kind"] == "height_tie" and row["accepted"]]
+    if heights:
+        before, after = (_rms([row[f"{word}_m"] for row in heights]) for word in ("before", "after"))
+        lines.append(f"pass against pass in height: RMS {before * 1e3:.2f} mm before, {after * 1e3:.2f} mm after")
+    by = {(r["points"], r["component"], r["poses"]): r for r in tables["absolute_accuracy"]}
+    for component in ("height", "horizontal"):
+        was, now = (by.get(("check", component, poses)) for poses in ("recorded", "adjusted"))
+        if was and now:
+            lines.append(
+                f"check points, {component}: RMSE {was['rmse_m'] * 1e3:.2f} mm before, {now['rmse_m'] * 1e3:.2f} mm "
+                f"after, {_statement(now['count'], now['nssda_95_m'])}"
+            )
+    left = by.get(("left_out", "height", "adjusted"))
+    if left:
+        lines.append(f"each GCP against all other evidence, height: RMSE {left['rmse_m'] * 1e3:.2f} mm")
+    return [*lines, *solution.lines]
+
+
+def _statement(count: int, nssda_95_m: float) -> str:
+    """Accuracy after NSSDA, or that there are too few points for it."""
+    if count < NSSDA_CHECK_POINTS:
+        return f"of {count_of(count, 'point')} (NSSDA takes {NSSDA_CHECK_POINTS} at least)"
+    return f"95 % within {nssda_95_m * 1e3:.2f} mm (NSSDA, {count} points)"
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _picture(plan: SurveyPlan, work: Work, tables: dict[str, Rows]) -> AdjustmentPicture:
+    ways = tuple(np.stack([t.easting_m, t.northing_m], axis=-1) for t in work.tracks)
+    ties = [row for row in tables["tie_residuals"] if row["kind"] == "height_tie" and row["accepted"]]
+    parts = [_residuals("ties, height", ties, "")]
+    for role, title in (("gcp", "ground control, height"), ("check", "check points, height")):
+        own = [r for r in tables["control_residuals"] if r["role"] == role and r["height_before_m"] is not None]
+        parts.append(_residuals(title, own, "height_"))
+    return AdjustmentPicture(plan.survey.config.id, ways, tuple(parts))
+
+
+def _residuals(title: str, rows: Rows, prefix: str) -> Residuals:
+    columns = [np.array([row[name] for row in rows], np.float64) for name in (
+        "easting_m", "northing_m", f"{prefix}before_m", f"{prefix}after_m",
+    )]  # fmt: skip
+    return Residuals(title, *columns)

@@ -1,0 +1,322 @@
+"""Control points of a survey: a task a point that passes came by, a file of the table `control_sightings` for each."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, passes_by, sight_shifted
+from roadscan.adjust.patches import Shift, shifted
+from roadscan.adjust.places import Track, Traverse
+from roadscan.adjust.process import RunPrior
+from roadscan.adjust.targets.settings import TargetSettings
+from roadscan.adjust.targets.shapes import Chequered, Disc, Shape
+from roadscan.adjust.tasks.control_lines import line_points
+from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files
+from roadscan.adjust.tasks.tracks import runs_of
+from roadscan.core.errors import ConfigError
+from roadscan.core.frames import rotation_from_rph, rph_from_rotation
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.settings.adjust import AdjustConfig, TargetConfig
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store, bytes_digest
+from roadscan.store.writer import parquet_bytes
+from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.plan.road import road_key
+from roadscan.tiles.tasks.readings import Ground, read_groups
+
+SIGHTINGS: Final = "control_sightings"
+"""Table, and product of its files in the manifest."""
+
+HAND: Final = "hand"
+"""Role of an end of a tie by hand."""
+
+_PICKED_COLUMNS: Final = ("run", "name", "easting_m", "northing_m")
+_FIT_RADII: Final = 1.5
+"""Readings are kept that far around the search, in radii of the target."""
+
+
+@dataclass(frozen=True)
+class ControlTask:
+    """A point, and the row groups that saw it; it holds no data."""
+
+    store: Store
+    ground: Ground
+    settings: TargetSettings
+    runs: tuple[str, ...]
+    sigma_pose_m: tuple[float, ...]
+    """Of each pass 1 σ of its recorded poses on each horizontal axis."""
+    point: ControlPoint
+    passes: tuple[tuple[Traverse, ...], ...]
+    """Of each pass the traverses of its sensors."""
+    picked: tuple[PickedPlace | None, ...]
+    """Of each pass what the user picked."""
+    files: tuple[NearFile, ...]
+    key: str
+    round: int = 0
+    """Of the solution that says where the readings lie; 0: the recorded poses do."""
+    shifts_m: tuple[Shift, ...] = ()
+    """Of each pass: how far that solution moves it; none in round 0."""
+
+    @property
+    def unit(self) -> str:
+        """Its name in the manifest."""
+        again = f"-round-{self.round}" if self.round else ""
+        return f"{'hand' if self.point.role == HAND else 'point'}-{self.point.number:06d}{again}"
+
+    @property
+    def bytes(self) -> int:
+        """Compressed bytes to read, about."""
+        return sum(one.bytes for one in self.files)
+
+
+def control_points(plan: SurveyPlan) -> list[ControlPoint]:
+    """Surveyed points of all control logs, in the order of the survey file and of their names, then those that stand
+    for surveyed lines.
+    """
+    config = plan.survey.config.adjust
+    found: list[ControlPoint] = []
+    for record in plan.records:
+        for file in record.tables.get("control_points", ()):
+            rows = read_groups(plan.store, file.path, range(len(file.group_rows))).to_pylist()
+            found += [_point(len(found) + k, row, config) for k, row in enumerate(rows)]
+    return found + line_points(plan, len(found))
+
+
+def _point(number: int, row: Mapping[str, Any], config: AdjustConfig) -> ControlPoint:
+    horizontal, upright = row["sigma_horizontal_m"], row["sigma_height_m"]
+    return ControlPoint(
+        number, row["name"], row["role"], row["code"] or "", row["easting_m"], row["northing_m"], row["height_m"],
+        horizontal or config.control.sigma_horizontal_m, upright or config.control.sigma_height_m,
+        _shape(config.targets.of_code(row["code"])),
+    )  # fmt: skip
+
+
+def _shape(target: TargetConfig) -> Shape | None:
+    match target.shape:
+        case "circle":
+            return Disc(target.size_m, target.centre_m)
+        case "chequered":
+            return Chequered(target.size_m)
+        case _:
+            return None
+
+
+def picked_places(plan: SurveyPlan, points: Sequence[ControlPoint]) -> dict[tuple[str, str], PickedPlace]:
+    """What the user picked, by run and name of the point.
+
+    Raises
+    ------
+    ConfigError
+        where the file is not there or a row of it is none.
+    """
+    targets = plan.survey.config.adjust.targets
+    if targets.picked is None:
+        return {}
+    path = plan.survey.resolve(targets.picked)
+    if not path.is_file():
+        raise ConfigError("there is no file of picked targets", change="correct adjust.targets.picked", file=path)
+    with path.open(encoding="utf-8-sig", newline="") as stream:
+        rows = csv.DictReader(stream)
+        missing = [name for name in _PICKED_COLUMNS if name not in (rows.fieldnames or ())]
+        if missing:
+            raise ConfigError(
+                f"the picked targets have no column '{missing[0]}'", expected=", ".join(_PICKED_COLUMNS), file=path
+            )
+        known = {point.name for point in points}
+        runs = {run.id for run in plan.survey.config.runs}
+        found: dict[tuple[str, str], PickedPlace] = {}
+        for number, row in enumerate(rows, 2):
+            if row["name"] not in known or row["run"] not in runs:
+                raise ConfigError(
+                    f"a target of point '{row['name']}' was picked in run '{row['run']}'",
+                    expected="a control point and a run of the survey", file=path, record=number,
+                )  # fmt: skip
+            try:
+                place = (float(row["easting_m"]), float(row["northing_m"]))
+            except ValueError as error:
+                raise ConfigError(str(error), expected="metres", file=path, record=number) from error
+            found[row["run"], row["name"]] = PickedPlace(*place, targets.picked_sigma_m)
+    return found
+
+
+def control_tasks(
+    plan: SurveyPlan,
+    sources: Sources,
+    tracks: Sequence[Track],
+    points: Sequence[ControlPoint],
+    priors: Sequence[RunPrior],
+) -> list[ControlTask]:
+    """A task for each point that a pass came by, with the key of what is seen of it.
+
+    priors : of each run, in the order of the survey file.
+    """
+    passes = [passes_of(plan, tracks, point) for point in points]
+    seen = list(zip(points, passes, strict=True))
+    return sighting_tasks(plan, sources, priors, seen, picked_places(plan, points))
+
+
+def _settings(plan: SurveyPlan) -> TargetSettings:
+    """How targets are looked for."""
+    config = plan.survey.config.adjust
+    return TargetSettings(search_radius_m=config.targets.search_m, height_radius_m=config.control.radius_m)
+
+
+def sighting_tasks(
+    plan: SurveyPlan,
+    sources: Sources,
+    priors: Sequence[RunPrior],
+    seen: Sequence[tuple[ControlPoint, Sequence[tuple[Traverse, ...]]]],
+    picked: Mapping[tuple[str, str], PickedPlace],
+    again: tuple[int, Sequence[tuple[Shift, ...]]] = (0, ()),
+) -> list[ControlTask]:
+    """A task for each point that the traverses of a pass or more came by.
+
+    again : round, and shifts of each point's passes; none where the recorded poses say where readings lie.
+    """
+    runs, settings, (number, shifts) = runs_of(plan), _settings(plan), again
+    code = code_digest(f"{__name__}:sight_control")
+    shaping = [code, settings.model_dump(mode="json"), plan.ground.max_gap_s, runs]
+    tasks: list[ControlTask] = []
+    for (point, passes), moved in zip(seen, shifts if number else [()] * len(seen), strict=True):
+        if not passes:
+            continue
+        files = tuple(near_files(sources, [t for own in passes for t in own], runs))
+        own = tuple(picked.get((runs[p[0].run], point.name)) for p in passes)
+        sigma = tuple(_sigma_pose_m(priors[p[0].run], p[0]) for p in passes)
+        read = [one.key(road_key(one.source)) for one in files]
+        key = key_of(
+            shaping, asdict(point), [[asdict(t) for t in p] for p in passes], [str(o) for o in own], sigma, read,
+            *([number, moved] if number else []),
+        )  # fmt: skip
+        tasks.append(
+            ControlTask(
+                plan.store, plan.ground, settings, runs, sigma, point, tuple(passes), own, files, key, number, moved
+            )
+        )  # fmt: skip
+    return tasks
+
+
+def _sigma_pose_m(prior: RunPrior, traverse: Traverse) -> float:
+    ends = np.array([traverse.first_gps_ns, traverse.last_gps_ns], np.int64)
+    return float(prior.sigma_at(ends)[:, :2].max())
+
+
+def _radius_m(point: ControlPoint, settings: TargetSettings) -> float:
+    reach = 0.0 if point.shape is None else _FIT_RADII * point.shape.reach_m
+    return max(settings.search_radius_m + reach if point.shape is not None else 0.0, settings.height_radius_m)
+
+
+def passes_of(plan: SurveyPlan, tracks: Sequence[Track], point: ControlPoint) -> list[tuple[Traverse, ...]]:
+    """Traverses by a point, those of one run at one time together."""
+    radius_m, apart_s = _radius_m(point, _settings(plan)), plan.survey.config.adjust.places.return_s
+    every = sorted(
+        (t for track in tracks for t in passes_by(track, point.easting_m, point.northing_m, radius_m, apart_s)),
+        key=lambda t: (t.run, t.first_gps_ns, t.sensor),
+    )
+    found: list[list[Traverse]] = []
+    for one in every:
+        last = found[-1] if found else None
+        ends = max(t.last_gps_ns for t in last) if last else 0
+        if last and last[0].run == one.run and one.first_gps_ns - ends < apart_s * NS_PER_S:
+            last.append(one)
+        else:
+            found.append([one])
+    return [tuple(one) for one in found]
+
+
+def sight_control(task: ControlTask) -> OutputRecord:
+    """See what each pass saw of a point and write it (runs on a worker)."""
+    reader = NearReader(task.store, task.ground, task.files, task.runs)
+    found = []
+    moved = task.shifts_m or ((0.0, 0.0, 0.0),) * len(task.passes)
+    for own, picked, sigma_pose_m, shift in zip(task.passes, task.picked, task.sigma_pose_m, moved, strict=True):
+        reach_m = _radius_m(task.point, task.settings) + float(np.hypot(*shift[:2]))
+        circle = Circle(task.point.easting_m, task.point.northing_m, reach_m)
+        heads = [shifted(reader.of(traverse, circle), np.array(shift)) for traverse in own]
+        # Profiles are dense and returns sparse: where a pass has both, the profiles show the point.
+        dense = [h for h in heads if not h.returns and h.pose.size] or heads
+        found.append(sight_shifted(task.point, dense, task.settings, sigma_pose_m, picked, np.array(shift)))
+    schema = table_schema(SIGHTINGS)
+    rows = pa.Table.from_pylist([_row(one, task.runs, task.round) for one in found], schema=schema.arrow())
+    content = parquet_bytes(rows, schema)
+    target = f"{schema.location}/{task.unit}.parquet"
+    task.store.write_bytes(target, content, lasting=False)
+    return OutputRecord(SIGHTINGS, task.unit, task.key, target, len(content), bytes_digest(content))
+
+
+def _row(one: Sighting, runs: Sequence[str], number: int) -> dict[str, Any]:
+    seen = bool(np.isfinite(one.level_from_body).all())
+    turned = [float(a) for a in rph_from_rotation(one.level_from_body)] if seen else [None] * 3
+    picture = None if one.find is None else one.find.picture
+    values: dict[str, Any] = {
+        "point": one.point.number,
+        "round": number,
+        "name": one.point.name,
+        "run": runs[one.run],
+        "sensor": one.sensor,
+        "epoch_gps_ns": one.epoch_gps_ns,
+        "status": one.status,
+        "why_not": one.why_not,
+        "count": one.count,
+        "convergence_rad": one.convergence_rad,
+        "picture": [] if picture is None else picture.grey.ravel().tolist(),
+        "picture_columns": 0 if picture is None else picture.grey.shape[1],
+        "picture_cell_m": None if picture is None else picture.cell_m,
+    }
+    values |= dict(zip(("roll_rad", "pitch_rad", "heading_rad"), turned, strict=True))
+    numbers = {
+        "easting_m": one.easting_m,
+        "northing_m": one.northing_m,
+        "covariance_ee_m2": one.covariance_m2[0, 0],
+        "covariance_en_m2": one.covariance_m2[0, 1],
+        "covariance_nn_m2": one.covariance_m2[1, 1],
+        "contrast": one.contrast,
+        "score": one.score,
+        **{name: getattr(one, name) for name in ("height_m", "sigma_height_m", "slope_east", "slope_north")},
+        **dict(zip(("arm_forward_m", "arm_right_m", "arm_down_m"), one.arm_body_m, strict=True)),
+    }
+    return values | {name: float(value) if np.isfinite(value) else None for name, value in numbers.items()}
+
+
+def load_sightings(
+    store: Store, manifest: Manifest, tasks: Sequence[ControlTask]
+) -> tuple[list[Sighting], list[dict[str, Any]]]:
+    """Sightings of some points, in order, and their rows of the table."""
+    sightings, rows = [], []
+    last = {task.point.number: task for task in sorted(tasks, key=lambda task: task.round)}
+    for task in last.values():
+        record = manifest.get(SIGHTINGS, task.unit)
+        if record is None or not record.path:
+            continue
+        for row in store.parse_table(read_recorded(store, record), record.path).to_pylist():
+            sightings.append(_sighting(task.point, row, task.runs))
+            rows.append(row)
+    return sightings, rows
+
+
+def _sighting(point: ControlPoint, row: Mapping[str, Any], runs: Sequence[str]) -> Sighting:
+    def number(name: str) -> float:
+        return float("nan") if row[name] is None else float(row[name])
+
+    covariance = np.array(
+        [
+            [number("covariance_ee_m2"), number("covariance_en_m2")],
+            [number("covariance_en_m2"), number("covariance_nn_m2")],
+        ]
+    )
+    turned = rotation_from_rph(number("roll_rad"), number("pitch_rad"), number("heading_rad"))
+    return Sighting(
+        point, runs.index(row["run"]), row["sensor"], row["status"], row["why_not"], row["epoch_gps_ns"],
+        number("easting_m"), number("northing_m"), covariance, number("height_m"), number("sigma_height_m"),
+        number("slope_east"), number("slope_north"), row["count"], number("contrast"), number("score"),
+        np.array([number(f"arm_{a}_m") for a in ("forward", "right", "down")]), turned, number("convergence_rad"),
+    )  # fmt: skip

@@ -1,0 +1,366 @@
+"""Mountings of the sensors in an adjustment: what is known of them before it, and what it adds to them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import null_space
+from scipy.special import chdtri
+
+from roadscan.adjust.adjustment import MountingErrors
+from roadscan.adjust.control_test import APART
+from roadscan.adjust.observations import MOUNTED
+from roadscan.adjust.process import MountingPrior
+from roadscan.adjust.tasks.near import Sources
+from roadscan.adjust.unknowns import sharing
+from roadscan.core.rig import Mountings
+from roadscan.core.settings.adjust import AdjustConfig
+from roadscan.core.witness import Finding, Witness
+from roadscan.navigation.mounting_change import MountingChange, Seat
+from roadscan.store.held import held_path, read_held, write_held
+from roadscan.store.store import Store
+from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.tasks.readings import MOUNTING_COLUMNS, MountingChanges, key_of_row, mounting_change_of
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+TABLE: Final = "mounting_corrections"
+_NAMES: Final = (
+    "lever arm forward", "lever arm to the right", "lever arm down",
+    "boresight roll", "boresight pitch", "boresight heading", "range scale",
+)  # fmt: skip
+DOUBTED: Final = 3.0
+"""A mounting that is off by more than so many σ of what was stated is named."""
+_CHANCE: Final = 0.0027
+"""Of evidence that contradicts right mountings: that of 3 σ."""
+_MOST_WRONG: Final = 3
+"""Of more sensors that are wrong at once, which they are is not sought: all are estimated."""
+_FREE: Final = 100.0
+"""An error within so many prior σ is as good as unknown."""
+_CALIBRATED_SIGMAS: Final = (
+    "sigma_lever_forward_m", "sigma_lever_right_m", "sigma_lever_down_m",
+    "sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg",
+)  # fmt: skip
+
+MOUNTING: Final = Witness(
+    "mounting",
+    input="rig file",
+    fault="The mounting of a sensor, or the scale of its ranges, is not what the rig file or the calibration states.",
+    asks="passes side by side, heads of one pass and ground control, all in one adjustment",
+    does="mounting and scale are estimated with their stated σ as prior, and readings are placed with them; one that "
+    "is off by more than three σ of what was stated is named",
+    told=("findings",),
+)
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """Mountings of the sensors that the adjustment may ask about."""
+
+    priors: tuple[MountingPrior, ...]
+    """By name; none where mountings are not estimated."""
+    stated: Mapping[tuple[str, str], Mountings]
+    """By run and sensor."""
+    parallel: frozenset[tuple[str, str]]
+    """Run and sensor of heads whose beams are all along their z."""
+
+    def number(self, run: str, sensor: str) -> int:
+        """Place of a sensor of a run in `priors`, −1: not estimated."""
+        keys = [one.key for one in self.priors]
+        return next((keys.index(key) for key in ((run, sensor), ("*", sensor)) if key in keys), -1)
+
+    def apart(self, heads: Iterable[tuple[str, str]]) -> Mounted:
+        """The same, and mountings of their own for some sensors (run, name) whose heights tell of another one."""
+        known = {one.sensor: one for one in self.priors}
+        own = [replace(known[sensor], run=run) for run, sensor in sorted(set(heads)) if sensor in known]
+        return replace(self, priors=(*self.priors, *own))
+
+    def seats(self, run: str, sensor: str, epochs_gps_ns: Int64) -> Seat:
+        """Stated lever arms and directions of the beams (n, 3) at epochs."""
+        own = self.stated[run, sensor]
+        levers = np.array([one.lever_arm_body_m for one in own.mountings])
+        beams = np.array([np.array(one.body_from_sensor)[:, 2] for one in own.mountings])
+        if (run, sensor) not in self.parallel:
+            beams = np.full(beams.shape, np.nan)
+        at = np.searchsorted(np.array(own.since_gps_ns[1:], np.int64), epochs_gps_ns, side="right")
+        return Seat(levers[at], beams[at])
+
+    def seat(self, run: str, sensor: str, epoch_gps_ns: int) -> Seat:
+        """The same at one epoch, (3,)."""
+        found = self.seats(run, sensor, np.array([epoch_gps_ns], np.int64))
+        return Seat(found.lever_body_m[0], found.beam_body[0])
+
+
+def mounted_of(plan: SurveyPlan, sources: Sources, *, foreign: bool) -> Mounted:
+    """Mountings of the sources that are adjusted.
+
+    foreign : another program corrected the poses of a run, with the mountings as they are stated.
+    """
+    config = plan.survey.config.adjust
+    stated = {(source.run, source.sensor): source.mountings for source, _ in sources}
+    parallel = frozenset((source.run, source.sensor) for source, _ in sources if source.has_parallel_beams)
+    if foreign or config.mode != "joint":
+        return Mounted((), stated, parallel)
+    calibrated = calibrated_sigma(plan.store)
+    priors = []
+    # A run that is held is right as it is, and so are the mountings that place its readings.
+    held = {sensor for run, sensor in stated if run in config.fixed}
+    for sensor in sorted({sensor for _, sensor in stated} - held):
+        sigma = _sigma(plan, config, sensor, calibrated.get(sensor))
+        if (sigma > 0.0).any():
+            priors.append(MountingPrior(sensor, sigma))
+    return Mounted(tuple(priors), stated, parallel)
+
+
+def _sigma(plan: SurveyPlan, config: AdjustConfig, sensor: str, calibrated: Float64 | None) -> Float64:
+    """1 σ (7,) of a mounting: of its calibration, else of the rig file, else of the settings; 0 where these are 0."""
+    own = config.mountings
+    assumed = np.array(
+        [
+            own.sigma_forward_m, own.sigma_right_m, own.sigma_down_m,
+            *np.radians([own.sigma_roll_deg, own.sigma_pitch_deg, own.sigma_heading_deg]), own.sigma_range_scale,
+        ]
+    )  # fmt: skip
+    known = plan.survey.rig.sensors.get(sensor)
+    levers = None if known is None else known.lever_arm_sigma_m
+    angles = None if known is None else known.boresight_sigma_deg
+    stated = np.full(len(MOUNTED), np.nan)
+    if known is not None and known.range_scale_sigma is not None:
+        stated[6] = known.range_scale_sigma
+    if levers is not None:
+        stated[:3] = levers
+    if angles is not None:
+        stated[3:6] = np.radians(angles)
+    if calibrated is not None:
+        stated = np.where(np.isfinite(calibrated), calibrated, stated)
+    return np.where(assumed > 0.0, np.where(np.isfinite(stated), stated, assumed), 0.0)
+
+
+def calibrated_sigma(store: Store) -> dict[str, Float64]:
+    """1 σ (7,) of calibrated mountings by sensor, the largest of all runs and times; NaN where not stated."""
+    table = read_held(store, "mountings")
+    found: dict[str, Float64] = {}
+    for row in [] if table is None else table.to_pylist():
+        values = [np.nan if row.get(name) is None else float(row[name]) for name in _CALIBRATED_SIGMAS]
+        sigma = np.array([*values[:3], *np.radians(values[3:]), np.nan])
+        found[row["sensor"]] = np.fmax(found.get(row["sensor"], np.full(sigma.size, np.nan)), sigma)
+    return found
+
+
+def held_values(mounted: Mounted, changes: MountingChanges) -> Float64:
+    """(s, 7) what is added now to the mountings of the sensors that `mounted` counts."""
+    own = [changes[one.key].values if one.key in changes else np.zeros(len(MOUNTED)) for one in mounted.priors]
+    return np.array(own).reshape(-1, len(MOUNTED))
+
+
+def publish_mountings(store: Store, found: MountingErrors | None, config: AdjustConfig) -> MountingChanges:
+    """Bring the table up to date; what moves a point by no more than `adjust.moved_m` stays as it was, to the bit."""
+    table = read_held(store, TABLE)
+    before = {key_of_row(row): row for row in ([] if table is None else table.to_pylist())}
+    after: dict[tuple[str, str], dict[str, Any]] = {}
+    if found is not None:
+        for k, sensor in enumerate(found.sensors):
+            if found.error[k].any():
+                known = before.get(sensor)
+                after[sensor] = known if known and _stays(known, found.error[k], config) else _row(found, k)
+    if after != before:
+        write_held(store, TABLE, [after[sensor] for sensor in sorted(after)])
+    if not after and store.exists(held_path(TABLE)):
+        store.remove(held_path(TABLE))
+    return {sensor: MountingChange.of(_values(row)) for sensor, row in after.items()}
+
+
+def _values(row: Mapping[str, Any]) -> Float64:
+    return mounting_change_of(row).values
+
+
+def _stays(row: Mapping[str, Any], error: Float64, config: AdjustConfig) -> bool:
+    away = error - _values(row)
+    turned = np.linalg.norm(away[3:6]) + abs(away[6])
+    return bool(np.linalg.norm(away[:3]) + config.moved_arm_m * turned <= config.moved_m)
+
+
+def _row(found: MountingErrors, k: int) -> dict[str, Any]:
+    columns = {"": found.error[k], "sigma_": found.sigma[k], "prior_sigma_": found.prior_sigma[k]}
+    numbers = {
+        f"{prefix}{name}": float(value)
+        for prefix, values in columns.items()
+        for name, value in zip(MOUNTING_COLUMNS, values, strict=True)
+    }
+    return dict(zip(("run", "sensor"), found.sensors[k], strict=True)) | numbers
+
+
+def disproved(found: MountingErrors) -> npt.NDArray[np.bool_]:
+    """Components (s, 7) whose stated σ is contradicted.
+
+    Were it right, the estimate would have the variance by which evidence lowers that of the prior.
+    """
+    shown = np.sqrt(np.maximum(found.prior_sigma**2 - found.sigma**2, 0.0))
+    error = np.abs(found.error)
+    return np.asarray((error > found.prior_sigma) & (error > DOUBTED * shown))
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What evidence alone, without the priors, says of the mountings: normal equations in units of the prior σ.
+
+    The height that all sensors have in common is left out of them.
+    """
+
+    matrix: Float64
+    """(m, m)"""
+    right: Float64
+    """(m,) of errors x of which it says matrix · x = right."""
+    sensor: Int64
+    """(m,) of each unknown."""
+    component: Int64
+
+    @classmethod
+    def of(cls, found: MountingErrors) -> _Told:
+        """From an adjustment that estimated all of them."""
+        sensor, component = np.nonzero(found.prior_sigma > 0.0)
+        prior = found.prior_sigma[sensor, component]
+        rows = sensor * found.prior_sigma.shape[1] + component
+        unit = found.covariance[np.ix_(rows, rows)] / np.outer(prior, prior)
+        down = np.where(component == MOUNTED.index("down_m"), 1.0 / prior, 0.0)
+        groups = sharing([run for run, _ in found.sensors], found.prior_sigma)
+        common = np.array([np.where(np.isin(sensor, own), down, 0.0) for own in groups])
+        free = null_space(common) if groups else np.eye(prior.size)
+        precision = np.linalg.inv(free.T @ (0.5 * (unit + unit.T)) @ free)
+        right = free @ (precision @ (free.T @ (found.error[sensor, component] / prior)))
+        return cls(free @ (precision - np.eye(len(precision))) @ free.T, right, sensor, component)
+
+    def explained(self, rows: Int64, prior: float = 1.0) -> tuple[float, float]:
+        """By how much the weighted squares fall where some errors are free within so many prior σ, and how much of
+        that is to be expected by chance: the number of errors that the evidence determines.
+        """
+        own = self.matrix[np.ix_(rows, rows)]
+        solved = np.linalg.solve(own + np.eye(rows.size) / prior**2, np.column_stack([self.right[rows], own]))
+        return float(self.right[rows] @ solved[:, 0]), float(np.trace(solved[:, 1:]))
+
+
+def contradicted(found: MountingErrors) -> npt.NDArray[np.bool_]:
+    """Sensors (s,) whose stated mountings evidence contradicts: the fewest that explain all of it.
+
+    Where two explain it as well, and nothing tells which of them is off, both are among them. Components that evidence
+    does not tell apart, as the height of a head and its range scale, contradict together.
+    """
+    count = len(found.sensors)
+    none = np.zeros(count, bool)
+    if not (found.prior_sigma > 0.0).any():
+        return none
+    told = _Told.of(found)
+    fall, determined = told.explained(np.arange(told.sensor.size))
+    for size in range(min(count, _MOST_WRONG) + 1):
+        holding = []
+        for chosen in combinations(range(count), size):
+            own, known = told.explained(np.flatnonzero(np.isin(told.sensor, chosen)))
+            if fall - own <= chdtri(max(determined - known, 1.0), _CHANCE):
+                holding.append((own, chosen))
+        if holding:
+            best = max(holding)[0]
+            return np.isin(np.arange(count), [k for own, chosen in holding if best - own < APART for k in chosen])
+    return ~none
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One error of one mounting that would explain what contradicts the stated ones."""
+
+    sensor: tuple[str, str]
+    """Run and name."""
+    component: int
+    error: float
+    sigma: float
+
+
+def causes(found: MountingErrors) -> tuple[Cause, ...]:
+    """Single errors of which each explains all that contradicts the stated mountings, and none much better than the
+    others; none where it takes several of them.
+    """
+    if not contradicted(found).any():
+        return ()
+    told = _Told.of(found)
+    fall, determined = told.explained(np.arange(told.sensor.size), _FREE)
+    each = [told.explained(np.array([k]), _FREE)[0] for k in range(told.sensor.size)]
+    enough = fall - chdtri(max(determined - 1.0, 1.0), _CHANCE)
+    named = []
+    for k, (sensor, component) in enumerate(zip(told.sensor.tolist(), told.component.tolist(), strict=True)):
+        if each[k] >= enough and max(each) - each[k] < APART:
+            prior, precision = found.prior_sigma[sensor, component], told.matrix[k, k]
+            named.append(
+                Cause(found.sensors[sensor], component, prior * told.right[k] / precision, prior / np.sqrt(precision))
+            )
+    return tuple(named)
+
+
+def cause_line(found: Sequence[Cause]) -> str:
+    """What may be wrong with a mounting, where several errors would explain the same; "" for less than two."""
+    if len(found) < 2:
+        return ""
+    words = [
+        f"{_NAMES[one.component]} of {_called(one.sensor)} {_told(one.error, one.component, signed=True)}"
+        for one in found
+    ]
+    return (
+        f"heads, passes and control do not agree with the stated mountings, and do not tell which of these is off: "
+        f"{', or '.join(words)}; the adjustment shares it among them as their σ allow"
+    )
+
+
+def mounting_findings(found: MountingErrors | None) -> list[Finding]:
+    """Mountings that are off by more than was stated."""
+    said: list[Finding] = []
+    if found is None:
+        return said
+    for k, sensor in enumerate(found.sensors):
+        prior, error = found.prior_sigma[k], found.error[k]
+        off = np.flatnonzero(disproved(found)[k])
+        if off.size:
+            words = [f"{_NAMES[c]} {_told(error[c], c, signed=True)} (σ {_told(found.sigma[k, c], c)}, "
+                     f"stated σ {_told(prior[c], c)})" for c in off.tolist()]  # fmt: skip
+            said.append(
+                MOUNTING.finds(
+                    _called(sensor),
+                    f"passes and control contradict the stated mounting: {', '.join(words)} have to be added to it; "
+                    "readings are placed with the estimated mounting, correct the rig file or calibrate it anew",
+                )
+            )
+    return said
+
+
+def mounting_lines(found: MountingErrors | None) -> list[str]:
+    """What the adjustment says of the mountings, a line a sensor."""
+    lines: list[str] = []
+    if found is None:
+        return lines
+    for k, sensor in enumerate(found.sensors):
+        prior, sigma = found.prior_sigma[k], found.sigma[k]
+        known = np.flatnonzero((prior > 0.0) & (sigma < _KNOWN * prior)).tolist()
+        unknown = np.flatnonzero((prior > 0.0) & (sigma >= _KNOWN * prior)).tolist()
+        words = [f"{_NAMES[c]} {_told(found.error[k, c], c, signed=True)} (σ {_told(sigma[c], c)})" for c in known]
+        words += [f"{', '.join(_NAMES[c] for c in unknown)} not determined"] if unknown else []
+        lines.append(f"mounting of {_called(sensor)}: {'; '.join(words)}")
+    return lines
+
+
+def _called(sensor: tuple[str, str]) -> str:
+    run, name = sensor
+    return name if run == "*" else f"{name} in run '{run}'"
+
+
+_KNOWN: Final = 0.7
+"""A component whose σ fell below this share of the stated one is determined: half of its variance is gone."""
+
+
+def _told(value: float, component: int, *, signed: bool = False) -> str:
+    sign = "+" if signed else ""
+    if component == MOUNTED.index("range_scale"):
+        return f"{1e2 * value:{sign}.3f} %"
+    return f"{1e3 * value:{sign}.1f} mm" if component < 3 else f"{np.degrees(value):{sign}.4f}°"

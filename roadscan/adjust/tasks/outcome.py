@@ -1,0 +1,95 @@
+"""Tables and pictures of an adjustment: written whole, recorded in the manifest with its key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from roadscan.adjust.picture import AdjustmentPicture, draw_adjustment
+from roadscan.adjust.seams_picture import ShownSeam, draw_seams
+from roadscan.adjust.tasks.figures import Rows
+from roadscan.core.witness import Finding
+from roadscan.navigation.tasks.recorded_pictures import keep_file
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.codecs.grey_picture import write_png
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store, bytes_digest
+from roadscan.store.writer import parquet_bytes
+
+ADJUSTMENT: Final = "adjustment"
+SOLUTION: Final = "solution"
+"""Name and unit in the manifest of the solution; it has no file of its own."""
+TABLES: Final = (
+    "tie_residuals", "control_residuals", "relative_accuracy", "absolute_accuracy", "accuracy_by_distance",
+)  # fmt: skip
+"""Tables of the outcome; each is a product of the manifest with one unit."""
+PICTURES: Final = "adjustment_picture"
+FOLDER: Final = "products/adjustment"
+_WHOLE: Final = "all"
+SEAMS: Final = "seams"
+"""Unit of the picture of seams."""
+
+
+def known_lines(manifest: Manifest) -> list[str]:
+    """What the last solution said, in words."""
+    record = manifest.get(ADJUSTMENT, SOLUTION)
+    return [] if record is None else list(record.figures()["lines"])
+
+
+def known_findings(manifest: Manifest) -> list[Finding]:
+    """What it found wrong."""
+    record = manifest.get(ADJUSTMENT, SOLUTION)
+    return [] if record is None else [Finding.of(one) for one in record.figures()["findings"]]
+
+
+def keep_tables(store: Store, manifest: Manifest, key: str, tables: Mapping[str, Rows]) -> None:
+    """Write the tables of an outcome; those without a row are removed."""
+    for name in TABLES:
+        rows, schema = tables.get(name, []), table_schema(name)
+        if not rows:
+            manifest.remove(list(manifest.of(name).values()))
+            continue
+        table = pa.Table.from_pylist(rows, schema=schema.arrow()).sort_by([(c, "ascending") for c in schema.sort])
+        content, target = parquet_bytes(table, schema), f"{schema.location}/part-00000.parquet"
+        store.write_bytes(target, content, lasting=False)
+        manifest.add([OutputRecord(name, _WHOLE, key, target, len(content), bytes_digest(content))])
+
+
+def keep_pictures(
+    store: Store,
+    manifest: Manifest,
+    key: str,
+    shown: tuple[AdjustmentPicture, Sequence[ShownSeam]],
+    sightings: Sequence[Mapping[str, Any]],
+) -> None:
+    """Draw the outcome and seams, and the picture of each target as each pass saw it; remove those of no target."""
+    outcome, seams = shown
+    targets = {_target_name(row): row for row in sightings if row["picture"]}
+    manifest.remove(manifest.beside([PICTURES], {_WHOLE, *targets, *([SEAMS] if seams else [])}))
+    if not manifest.is_current(PICTURES, _WHOLE, key):
+        draw = partial(draw_adjustment, outcome)
+        keep_file(store, manifest, (PICTURES, _WHOLE), key, f"{FOLDER}/adjustment.png", draw)
+    if seams and not manifest.is_current(PICTURES, SEAMS, key):
+        keep_file(store, manifest, (PICTURES, SEAMS), key, f"{FOLDER}/seams.png", partial(draw_seams, seams))
+    for name, row in targets.items():
+        own = key_of(row["picture"], row["picture_columns"], row["status"])
+        if not manifest.is_current(PICTURES, name, own):
+            write = partial(_write_target, row)
+            keep_file(store, manifest, (PICTURES, name), own, f"{FOLDER}/targets/{name}.png", write)
+
+
+def _target_name(row: Mapping[str, Any]) -> str:
+    """Number of the point, run and GPS second: names of points may hold what no file name may."""
+    return f"{row['point']:05d}-{row['run']}-{row['epoch_gps_ns'] // 1_000_000_000}"
+
+
+def _write_target(row: Mapping[str, Any], path: Path) -> None:
+    grey = np.array(row["picture"], np.uint8).reshape(-1, row["picture_columns"])
+    texts = {"Title": f"{row['name']} in {row['run']}: {row['status']}".encode("latin-1", "replace").decode("latin-1")}
+    write_png(path, np.maximum(grey, 1), row["picture_cell_m"], texts, smooth=True)

@@ -1,0 +1,452 @@
+"""From evidence to corrections: what enters, what is solved, what of the control is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.adjustment import Adjustment, ControlErrors, MountingErrors, adjust
+from roadscan.adjust.control import ControlPoint, SeenBy, Sighting, observations_of
+from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height
+from roadscan.adjust.control_test import COMPONENTS as _AXES
+from roadscan.adjust.control_test import HEIGHT, PLACE
+from roadscan.adjust.helmert import RigidFit, rigid_fit
+from roadscan.adjust.level import level_poses
+from roadscan.adjust.observations import FIXED, MOUNTED, Observations
+from roadscan.adjust.patches import level_from_map
+from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of
+from roadscan.adjust.quality import LeaveOneOut, leave_one_out
+from roadscan.adjust.targets.shapes import SurveyedLine
+from roadscan.adjust.tasks.control_lines import line_findings
+from roadscan.adjust.tasks.doubts import (
+    CONTROL,
+    CONTROL_DATUM,
+    HELMERT_TURN,
+    datum_figures,
+    exchanged,
+    far_points,
+    not_held,
+    offset_findings,
+    offset_line,
+    power_line,
+    run_findings,
+    shift_findings,
+    solver_findings,
+    solver_line,
+    time_line,
+    wrong_points,
+)
+from roadscan.adjust.tasks.fixed import fixed_findings, fixed_line
+from roadscan.adjust.tasks.hand_ties import wrong_hand_ties
+from roadscan.adjust.tasks.mountings import Cause, Mounted, cause_line, causes, contradicted, disproved
+from roadscan.adjust.tasks.near import Sources
+from roadscan.adjust.tasks.tie_work import KnownTies
+from roadscan.adjust.tasks.tracks import span_of
+from roadscan.core.settings.adjust import AdjustConfig, PosePriors
+from roadscan.core.settings.adjustment import AdjustmentSettings, ControlRules
+from roadscan.core.witness import Finding
+from roadscan.navigation.mounting_change import NO_SEAT
+from roadscan.navigation.tasks.pose_sigma import stated_pose_sigma
+from roadscan.navigation.trajectory import Corrections
+from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.tasks.readings import TrajectorySource, load_recorded
+
+Float64 = npt.NDArray[np.float64]
+Int32 = npt.NDArray[np.int32]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+_WIDENED: Final = 3
+"""Adjustments, at most, until no mounting is off by more than its σ allows."""
+_NONE: Final = (GaussMarkov(0.0, 1.0),) * 6
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that the adjustment knows."""
+
+    runs: tuple[str, ...]
+    """Of the survey; observations count them so."""
+    priors: tuple[RunPrior, ...]
+    """Of each of them; without σ where a run is not adjusted."""
+    ties: KnownTies
+    sightings: tuple[Sighting, ...]
+    mounted: Mounted
+    useless: frozenset[int] = frozenset()
+    """Runs whose readings are not where they seem: neither their ties nor their control counts."""
+
+    def seen_by(self, one: Sighting) -> SeenBy:
+        """The sensor that saw a point."""
+        if one.status == "unseen":
+            return SeenBy(-1, NO_SEAT)
+        seat = self.mounted.seat(self.runs[one.run], one.sensor, one.epoch_gps_ns)
+        return SeenBy(self.mounted.number(self.runs[one.run], one.sensor), seat)
+
+
+@dataclass(frozen=True)
+class PointFigures:
+    """What the adjustment says of a control point, or of one in one run where each run is adjusted alone."""
+
+    weight_height: float
+    weight_horizontal: float
+    left_out_height_m: float
+    """Surveyed height minus what all others say."""
+    left_out_horizontal_m: Float64
+    """(2,) surveyed minus the others, north and east."""
+    left_out_sigma_m: Float64
+    """(3,) 1 σ, north, east, down."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Corrections, and what they say of the evidence."""
+
+    corrections: Mapping[str, Corrections]
+    """Of the runs that evidence reaches."""
+    tie_weight: Float64
+    """(t,) of each tie that could be measured."""
+    points: Mapping[tuple[int, int], PointFigures]
+    """By number of the point and run, −1 for all runs."""
+    control: Observations
+    """Of all sightings, check points too."""
+    findings: tuple[Finding, ...]
+    """What is wrong with control, runs and stated σ."""
+    lines: tuple[str, ...]
+    """What the solution says of itself."""
+    left_out: LeaveOneOut | None = None
+    datum: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Poses minus control as a whole, and 1 σ of the datum (m): see :func:`datum_figures`."""
+    mountings: MountingErrors | None = None
+    """What is wrong with the mountings of the sensors; None where they are not estimated."""
+
+    def point(self, number: int, run: int) -> PointFigures | None:
+        """Figures of a point as a run saw it."""
+        return self.points.get((number, -1)) or self.points.get((number, run))
+
+
+def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[RunPrior, ...]:
+    """Errors of the recorded poses of each run; of a run without readings there are none."""
+    config, found = plan.survey.config.adjust.priors, []
+    for run in runs:
+        own = [(s, files) for s, files in sources if s.run == run]
+        trajectory = own[0][0].trajectory if own else None
+        if trajectory is None:
+            found.append(RunPrior(run, 0, 0, _NONE))
+            continue
+        spans = [span_of(s, files) for s, files in own]
+        stated = _stated(plan, trajectory) if config.source == "sigma" else None
+        first, last = min(a for a, _ in spans), max(b for _, b in spans)
+        held = run in plan.survey.config.adjust.fixed
+        found.append(RunPrior(run, first, last, _processes(config, stated), stated, held))
+    return tuple(found)
+
+
+def _stated(plan: SurveyPlan, trajectory: TrajectorySource) -> StatedSigma | None:
+    epochs, sigma = stated_pose_sigma(plan.store, plan.records, trajectory)
+    return StatedSigma(epochs, sigma) if epochs.size else None
+
+
+def _processes(
+    config: PosePriors, stated: StatedSigma | None
+) -> tuple[GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov]:
+    """Those of the settings, with the median of the σ that the logs state of a component."""
+    assumed = np.array(
+        [
+            config.sigma_horizontal_m,
+            config.sigma_horizontal_m,
+            config.sigma_down_m,
+            config.sigma_roll_pitch_deg,
+            config.sigma_roll_pitch_deg,
+            config.sigma_heading_deg,
+        ]
+    )
+    assumed[3:] = np.radians(assumed[3:])
+    usual = np.full(assumed.size, np.nan) if stated is None else np.median(stated.sigma, axis=0)
+    sigma = np.where(np.isfinite(usual), usual, assumed)
+    times = (config.position_time_s,) * 3 + (config.attitude_time_s,) * 3
+    n, e, d, r, p, h = (GaussMarkov(float(s), t) for s, t in zip(sigma, times, strict=True))
+    return n, e, d, r, p, h
+
+
+def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
+    """Corrections of all runs that evidence reaches.
+
+    Raises
+    ------
+    ConfigError
+        where a Helmert transformation has too few points.
+    """
+    config = plan.survey.config.adjust
+    control = observations_of(evidence.sightings, [evidence.seen_by(one) for one in evidence.sightings])
+    sightings = _by_observation(evidence.sightings)
+    role = np.array([one.point.role == "gcp" for one in sightings], bool)
+    datum = datum_fault(evidence.sightings, config.control.largest_m)
+    far = {} if datum else far_in_height(evidence.sightings, config.control.largest_m)
+    names = np.array([one.point.name for one in sightings], dtype=object)
+    entering = role & ~np.isin(names, list(far)) & (config.control.on and not datum)
+    entering &= ~np.isin(control.run.max(axis=1), list(evidence.useless))
+    found = [CONTROL_DATUM.finds(CONTROL, datum, left_out=len(set(names.tolist())))] if datum else []
+    found += _far_findings(far, evidence)
+    if config.mode == "helmert":
+        return _rigid_solution(plan, evidence, control, entering, found)
+    entering_ties = _entering(evidence)
+    adjusted, first, named = _adjusted(config, evidence, control.chosen(entering), config.mode)
+    wrong_ties, said = wrong_hand_ties(evidence.ties, entering_ties, adjusted, config.control.false_alarm)
+    if wrong_ties:
+        found += said
+        evidence = replace(evidence, ties=evidence.ties.refused(np.isin(evidence.ties.columns["name"], wrong_ties)))
+        entering_ties = _entering(evidence)
+        adjusted, first, named = _adjusted(config, evidence, control.chosen(entering), config.mode)
+    weight = np.zeros(entering_ties.size)
+    weight[entering_ties] = adjusted.weight[: int(entering_ties.sum())]
+    points = _points(adjusted.control, first)
+    wrong = _wrong(evidence.sightings, adjusted, first)
+    of_lines = {one.point.name for one in evidence.sightings if one.point.is_of_line}
+    found += wrong_points([one for one in wrong if one.name not in of_lines])
+    found += line_findings([one for one in wrong if one.name in of_lines], evidence.sightings)
+    counting = len(_counting_points(adjusted.control))
+    found += offset_findings(adjusted.verdict, adjusted.applied, counting)
+    found += shift_findings(adjusted.verdict.shift) + run_findings(evidence.runs, adjusted.run_factors)
+    joined = evidence.ties.observations.chosen(weight > 0.0)
+    found += _not_held(evidence, joined.run, control.chosen(entering), points)
+    found += fixed_findings(adjusted.fixed, config.control.false_alarm)
+    found += solver_findings(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled)
+    reached = {
+        int(run) for run in np.unique([*joined.run.ravel(), *control.chosen(entering).run.ravel()]) if run != FIXED
+    }
+    moved = sorted(run for run in reached if _moves(evidence.priors[run]))
+    corrections = {evidence.runs[k]: _with_sigma(adjusted, k) for k in moved}
+    lines = [
+        solver_line(adjusted.variance_factors, adjusted.rounds, settled=adjusted.settled),
+        fixed_line(adjusted.fixed), time_line(evidence.priors, adjusted.priors),
+        offset_line(adjusted.verdict, adjusted.applied),
+        power_line(adjusted.verdict, adjusted.control.left_out_sigma_m[:, 2].tolist()), cause_line(named),
+    ]  # fmt: skip
+    return Solution(
+        corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),
+        _left_out(adjusted.control, first, evidence), datum_figures(adjusted.verdict, adjusted.applied),
+        adjusted.mountings if adjusted.mountings.sensors else None,
+    )  # fmt: skip
+
+
+def _left_out(control: ControlErrors, first: int, evidence: Evidence) -> LeaveOneOut | None:
+    """Accuracy at each GCP against all others; a line, which binds across it alone, is none."""
+    lines = {one.point.number for one in evidence.sightings if one.point.is_of_line}
+    own = control.chosen(~np.isin(control.place - first, list(lines)))
+    return leave_one_out(own) if own.place.size else None
+
+
+def _entering(evidence: Evidence) -> Bool:
+    """Ties (t,) that enter: those that passed their tests, and for mountings those between heads of one pass."""
+    ties = evidence.ties
+    useful = ~np.isin(ties.observations.run, list(evidence.useless)).any(axis=1)
+    return useful & (ties.accepted | ties.of_heads if evidence.mounted.priors else ties.accepted)
+
+
+def _adjusted(
+    config: AdjustConfig, evidence: Evidence, control: Observations, mode: Literal["joint", "each_pass", "vertical"]
+) -> tuple[Adjustment, int, tuple[Cause, ...]]:
+    """The adjustment of ties and control, the place that stands for point 0, and what may be wrong with mountings.
+
+    A mounting that is off by more than its stated σ allows would be held back by it: such a σ is taken to be as large
+    as what was found, and the adjustment is made once more. Control that is off as a whole looks like lever arms of all
+    sensors that are off: they are not estimated then, and the control is what is doubted. A sensor whose mounting
+    nothing contradicts keeps the stated one: what would be estimated is the noise of the evidence.
+    """
+    ties = evidence.ties.observations
+    first = int(ties.place.max(initial=-1)) + 1
+    joined = Observations.joined([ties.chosen(_entering(evidence)), replace(control, place=control.place + first)])
+    rules = {name: getattr(config.control, name) for name in ControlRules.model_fields}
+    settings = AdjustmentSettings(mode=mode, **config.solver.model_dump(), **rules)
+    priors = evidence.mounted.priors
+    for _ in range(_WIDENED):
+        found = adjust(joined, evidence.priors, settings, priors)
+        shared = [axis for name in found.verdict.doubted for axis in _AXES[name]]
+        if len(priors) and any((one.sigma[shared] > 0.0).any() for one in priors):
+            priors = tuple(replace(one, sigma=_without(one.sigma, shared)) for one in priors)
+            continue
+        off = disproved(found.mountings)
+        if not off.any():
+            break
+        sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
+        priors = tuple(replace(one, sigma=own) for one, own in zip(priors, sigma, strict=True))
+    stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, len(MOUNTED))
+    estimated, wrong = found.mountings, contradicted(found.mountings)
+    named = causes(found.mountings)
+    if priors and not wrong.all():
+        priors = tuple(
+            replace(one, sigma=one.sigma if is_wrong else np.zeros(len(MOUNTED)))
+            for one, is_wrong in zip(priors, wrong, strict=True)
+        )
+        found = adjust(joined, evidence.priors, settings, priors)
+        estimated = replace(
+            estimated,
+            error=np.where(wrong[:, None], found.mountings.error, 0.0),
+            sigma=np.where(wrong[:, None], found.mountings.sigma, estimated.sigma),
+        )
+    return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named
+
+
+def _without(sigma: Float64, axes: Sequence[int]) -> Float64:
+    """σ (7,) of a mounting, and 0 for components that are not to be estimated."""
+    return np.where(np.isin(np.arange(sigma.size), axes), 0.0, sigma)
+
+
+def _counting_points(control: ControlErrors) -> set[int]:
+    """Points of which a survey counts."""
+    return set(control.place[(control.weight > 0.0).any(axis=1)].tolist())
+
+
+def _not_held(
+    evidence: Evidence, links: Int32, control: Observations, points: Mapping[tuple[int, int], PointFigures]
+) -> list[Finding]:
+    """Runs that nothing holds, by ties that count and by points that do."""
+    right = {number for (number, _), own in points.items() if own.weight_height != 0.0 or own.weight_horizontal != 0.0}
+    held = {int(run) for run, point in zip(control.run.max(axis=1), control.place, strict=True) if int(point) in right}
+    held |= {number for number, prior in enumerate(evidence.priors) if prior.fixed}
+    moving = [number for number, prior in enumerate(evidence.priors) if _moves(prior)]
+    return not_held(evidence.runs, moving, np.asarray(links, np.int64), held)
+
+
+def _by_observation(sightings: Sequence[Sighting]) -> list[Sighting]:
+    """The sighting of each observation of :func:`observations_of`."""
+    return [one for one in sightings for _ in range(one.observed)]
+
+
+def _moves(prior: RunPrior) -> bool:
+    return not prior.fixed and any(process.sigma > 0.0 for process in prior.processes)
+
+
+def _with_sigma(found: Adjustment, run: int) -> Corrections:
+    own = found.corrections(found.runs[run])
+    return replace(own, sigma=found.sigma[run])
+
+
+def _points(control: ControlErrors, first: int) -> dict[tuple[int, int], PointFigures]:
+    """Figures by number of the point and run; `first` : place that stands for point 0."""
+    points: dict[tuple[int, int], PointFigures] = {}
+    for k, (place, run) in enumerate(zip(control.place.tolist(), control.run.tolist(), strict=True)):
+        points[place - first, run] = PointFigures(
+            float(control.weight[k, 2]), float(control.weight[k, :2].min()),
+            # Down is the height's negative.
+            -float(control.left_out_m[k, 2]), control.left_out_m[k, :2], control.left_out_sigma_m[k],
+        )  # fmt: skip
+    return points
+
+
+def _far_findings(far: Mapping[str, float], evidence: Evidence) -> list[Finding]:
+    surveyed = {one.point.name: one.point.height_m for one in evidence.sightings}
+    # The poses are as they were recorded.
+    sigma = max(
+        (float(evidence.priors[one.run].sigma_at(_epoch(one))[0, 2]) for one in evidence.sightings), default=0.0
+    )
+    points = [WrongPoint(name, away, float("nan"), sigma, surveyed[name]) for name, away in sorted(far.items())]
+    return far_points(far) + exchanged(points)
+
+
+def _wrong(sightings: Sequence[Sighting], adjusted: Adjustment, first: int) -> list[WrongPoint]:
+    """Points whose height or place is wrong, by name."""
+    by_number, control = {one.point.number: one.point for one in sightings}, adjusted.control
+    found: list[WrongPoint] = []
+    for one in adjusted.verdict.wrong:
+        point = by_number[int(control.place[one.point]) - first]
+        others = tuple(sorted(by_number[int(control.place[k]) - first].name for k in one.alternatives))
+        away = control.left_out_m[one.point]
+        height = -float(away[2]) if one.component == HEIGHT else float("nan")
+        place = _aside_m(point, away) if one.component == PLACE else float("nan")
+        sigma = float(control.left_out_sigma_m[one.point, 2])
+        found.append(WrongPoint(point.name, height, place, sigma, point.height_m, one.sigmas, one.limit, others))
+    return sorted(found, key=lambda one: one.name)
+
+
+def _aside_m(point: ControlPoint, away_m: Float64) -> float:
+    """How far a surveyed place lies from another (3,; north, east, down): across its line where it stands for one."""
+    if isinstance(point.shape, SurveyedLine):
+        sine, cosine = np.sin(point.shape.azimuth_rad), np.cos(point.shape.azimuth_rad)
+        return abs(float(away_m[1] * cosine - away_m[0] * sine))
+    return float(np.hypot(*away_m[:2]))
+
+
+def _rigid_solution(
+    plan: SurveyPlan, evidence: Evidence, control: Observations, entering: Bool, found: list[Finding]
+) -> Solution:
+    """The survey as a whole, shifted and turned onto its control."""
+    config = plan.survey.config.adjust
+    fit = _rigid_fit(evidence, entering, config.control.false_alarm)
+    points = _points(fit.control, 0)
+    found += wrong_points(_left_out_of(evidence.sightings, points))
+    # What poses and ties say of the control as a whole; a rigid movement follows the control whatever they say.
+    following = config.model_copy(update={"control": config.control.model_copy(update={"datum_offset": "follow"})})
+    adjusted, _, _ = _adjusted(following, evidence, control.chosen(entering), "joint")
+    found += offset_findings(adjusted.verdict, adjusted.applied, len(points))
+    corrections, sides_m = _rigid_corrections(plan, evidence, fit)
+    prior = max((float(p.sigmas[2]) for p in evidence.priors), default=0.0)
+    if sides_m > prior:
+        found.append(
+            HELMERT_TURN.finds(
+                "adjust", f"control lies along a line, which leaves the turn about it open: σ of heights "
+                f"{config.moved_arm_m:g} m to the side of the vehicle is {1e3 * sides_m:.1f} mm by the transformation "
+                f"alone, more than the {1e3 * prior:.1f} mm of the poses",
+            )
+        )  # fmt: skip
+    return Solution(
+        corrections, np.zeros(evidence.ties.observations.size), points, control, tuple(found),
+        tuple(line for line in (offset_line(adjusted.verdict, adjusted.applied),) if line), leave_one_out(fit.control),
+    )  # fmt: skip
+
+
+def _left_out_of(sightings: Sequence[Sighting], points: Mapping[tuple[int, int], PointFigures]) -> list[WrongPoint]:
+    """Points that a rigid movement leaves out as a whole, by name."""
+    by_number = {one.point.number: one.point for one in sightings}
+    wrong: list[WrongPoint] = []
+    for (number, _), own in points.items():
+        if own.weight_height == 0.0:
+            point, away = by_number[number], float(np.hypot(*own.left_out_horizontal_m))
+            wrong.append(
+                WrongPoint(point.name, own.left_out_height_m, away, float(own.left_out_sigma_m[2]), point.height_m)
+            )
+    return sorted(wrong, key=lambda one: one.name)
+
+
+def _rigid_fit(evidence: Evidence, entering: Bool, false_alarm: float) -> RigidFit:
+    """The one rigid movement of the survey onto its targets."""
+    sightings = _by_observation(evidence.sightings)
+    own = {id(sightings[k]): sightings[k] for k in np.flatnonzero(entering)}.values()
+    seen = [one for one in own if one.is_placed and np.isfinite(one.height_m) and not one.point.is_of_line]
+    sigma = np.array([evidence.priors[one.run].sigma_at(_epoch(one))[0, :3] for one in seen]).reshape(-1, 3)
+    return rigid_fit(seen, sigma, false_alarm)
+
+
+def _epoch(one: Sighting) -> Int64:
+    return np.array([one.epoch_gps_ns], np.int64)
+
+
+def _rigid_corrections(
+    plan: SurveyPlan, evidence: Evidence, fit: RigidFit
+) -> tuple[dict[str, Corrections], float]:  # fmt: skip
+    """A rigid movement as corrections of each run, and the largest σ of a height to the side of the vehicles."""
+    corrections: dict[str, Corrections] = {}
+    config, largest = plan.survey.config.adjust, 0.0
+    for prior in evidence.priors:
+        source = next((s for s, _ in plan.sources if s.run == prior.run and s.trajectory is not None), None)
+        if source is None or source.trajectory is None or not _moves(prior):
+            continue
+        knots = knots_of(prior, config.solver.knot_spacing_s)
+        recorded = load_recorded(
+            plan.store, source.trajectory, [(int(knots[0]), int(knots[-1]))], plan.ground.max_gap_s
+        )
+        poses = level_poses(recorded, plan.ground.map, knots)
+        if poses.epoch_gps_ns.size:
+            places = level_from_map(poses.body_m - fit.origin_m, fit.convergence_rad)
+            own = fit.helmert.corrections(poses.epoch_gps_ns, places, poses.level_from_body)
+            sides = config.moved_arm_m * poses.level_from_body[:, :, 1]
+            sigma = np.max([fit.helmert.sigma_of(places + way * sides) for way in (-1.0, 0.0, 1.0)], axis=0)
+            largest = max(largest, float(sigma[:, 2].max()))
+            recorded_sigma = prior.sigma_at(poses.epoch_gps_ns)
+            whole = np.concatenate([np.hypot(sigma, recorded_sigma[:, :3]), recorded_sigma[:, 3:]], 1)
+            corrections[prior.run] = replace(own, sigma=whole)
+    return corrections, largest

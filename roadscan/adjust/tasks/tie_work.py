@@ -1,0 +1,277 @@
+"""Ties of a survey: tasks over some places each, a file of the table `ties` for each task."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.adjust.observations import KINDS, Observations, mount_partials
+from roadscan.adjust.patches import PassReadings, Shift, shifted
+from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.tasks.mountings import Mounted
+from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files
+from roadscan.adjust.ties.at_place import Ties, ties_at
+from roadscan.adjust.ties.tie import HEIGHT, SAME_PASS
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.settings.tie_settings import TieSettings
+from roadscan.navigation.mounting_change import Seat
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store, bytes_digest
+from roadscan.store.writer import parquet_bytes
+from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.plan.road import road_key
+from roadscan.tiles.tasks.readings import Ground
+
+TIES: Final = "ties"
+"""Table, and product of its files in the manifest."""
+
+_PLACES: Final = 50
+"""Places of a task: a quarter of a kilometre of one road at the usual spacing."""
+_SEAM_CELLS: Final = 40
+"""A seam is compared where both heads saw so many cells: a strip that is one cell wide holds 160 along 4 m."""
+DIAGONAL: Final = 1.5
+"""Readings are kept within this many radii of a place: the square's corners, and some margin."""
+_APART: Final = 0.25
+"""Profiles that lie closer than this share of a cell of the pictures say the same; some are left out."""
+_SHIFTS: Final = tuple(f"{end}_by_{axis}" for end in ("first", "second") for axis in ("forward", "right", "down"))
+_ARMS: Final = ("first_arm_along_m", "second_arm_along_m")
+_TRIED: Final = (
+    "place", "kind", "group", "first_run", "second_run", "first_sensor", "second_sensor", "first_epoch_gps_ns",
+    "second_epoch_gps_ns", "value_m", "sigma_m", "direction_north", "direction_east", "accepted", "why_not",
+)  # fmt: skip
+_TURNS: Final = tuple(
+    f"{end}_by_{axis}_m_per_rad" for end in ("first", "second") for axis in ("roll", "pitch", "heading")
+)
+
+
+@dataclass(frozen=True)
+class TieTask:
+    """Some places, and the row groups that saw them; it holds no data."""
+
+    store: Store
+    ground: Ground
+    settings: TieSettings
+    runs: tuple[str, ...]
+    places: tuple[Place, ...]
+    files: tuple[NearFile, ...]
+    key: str
+    round: int = 0
+    """Of the solution that says where the readings lie; 0: the recorded poses do."""
+    shifts_m: tuple[tuple[Shift, ...], ...] = ()
+    """Of each place and traverse: how far that solution moves it; none in round 0."""
+
+    @property
+    def unit(self) -> str:
+        """Its name in the manifest: the number of its first place, and the round."""
+        again = f"-round-{self.round}" if self.round else ""
+        return f"places-{self.places[0].number:07d}{again}"
+
+    @property
+    def bytes(self) -> int:
+        """Compressed bytes to read, about."""
+        return sum(one.bytes for one in self.files)
+
+
+def tie_tasks(
+    plan: SurveyPlan,
+    sources: Sources,
+    places: Sequence[Place],
+    runs: tuple[str, ...],
+    settings: TieSettings,
+    again: tuple[int, Sequence[tuple[Shift, ...]]] = (0, ()),
+) -> list[TieTask]:
+    """Tasks over all places, each with a key of what its ties depend on.
+
+    again : round, and shifts of each place's traverses; none where the recorded poses say where readings lie.
+    """
+    code, (number, shifts) = code_digest(f"{__name__}:collect_ties"), again
+    shaping = [code, settings.model_dump(mode="json"), plan.ground.max_gap_s, runs]
+    tasks = []
+    for start in range(0, len(places), _PLACES):
+        own, moved = tuple(places[start : start + _PLACES]), tuple(shifts[start : start + _PLACES])
+        files = tuple(near_files(sources, [t for place in own for t in place.traverses], runs))
+        seen = [one.key(road_key(one.source)) for one in files]
+        key = key_of(shaping, [asdict(place) for place in own], seen, *([number, moved] if number else []))
+        tasks.append(TieTask(plan.store, plan.ground, settings, runs, own, files, key, number, moved))
+    return tasks
+
+
+def collect_ties(task: TieTask) -> OutputRecord:
+    """Compare the passes at some places and write what was found (runs on a worker)."""
+    reader = NearReader(task.store, task.ground, task.files, task.runs, _APART * task.settings.shift_cell_m)
+    moves = zip(task.places, task.shifts_m or [None] * len(task.places), strict=True)
+    found = Ties.joined([ties_of(reader, place, task.settings, shifts) for place, shifts in moves])
+    if not found.observations.size:
+        return OutputRecord(TIES, task.unit, task.key, "", 0, "")
+    schema = table_schema(TIES)
+    content = parquet_bytes(_rows(found, task.runs, task.round), schema)
+    target = f"{schema.location}/{task.unit}.parquet"
+    task.store.write_bytes(target, content, lasting=False)
+    return OutputRecord(TIES, task.unit, task.key, target, len(content), bytes_digest(content))
+
+
+def ties_of(reader: NearReader, place: Place, settings: TieSettings, shifts_m: Sequence[Shift] | None = None) -> Ties:
+    """Ties of a place, of traverses that may be shifted, told as the recorded poses place them."""
+    if place.seam:
+        settings = settings.model_copy(update={"least_cells": min(settings.least_cells, _SEAM_CELLS)})
+    if shifts_m is None:
+        shifts_m = [(0.0, 0.0, 0.0)] * len(place.traverses)
+    readings, moved = list[PassReadings](), dict[tuple[int, str], list[tuple[Traverse, npt.NDArray[Any]]]]()
+    for traverse, shift in zip(place.traverses, np.array(shifts_m), strict=True):
+        reach = DIAGONAL * place.radius_m + float(np.hypot(*shift[:2]))
+        own = reader.of(traverse, Circle(place.easting_m, place.northing_m, reach))
+        readings.append(shifted(own, shift))
+        moved[traverse.run, traverse.sensor] = [*moved.get((traverse.run, traverse.sensor), []), (traverse, shift)]
+    found = ties_at(place, readings, settings)
+    if not found.observations.size or not np.any(shifts_m):
+        return found
+    ends = [
+        [_shift_at(moved[run, sensor], epoch) for run, sensor, epoch in zip(
+            found.observations.run[:, k].tolist(), found.columns[f"{end}_sensor"].tolist(),
+            found.observations.epoch_gps_ns[:, k].tolist(), strict=True)]
+        for k, end in enumerate(("first", "second"))
+    ]  # fmt: skip
+    away = np.einsum("eni,nei->n", np.array(ends), found.observations.partials[:, :, :3])
+    observed = found.observations.observed_m + away
+    return Ties(replace(found.observations, observed_m=observed), {**found.columns, "value_m": observed})
+
+
+def _shift_at(known: Sequence[tuple[Traverse, npt.NDArray[Any]]], epoch_gps_ns: int) -> npt.NDArray[Any]:
+    return next(s for t, s in known if t.first_gps_ns - NS_PER_S <= epoch_gps_ns <= t.last_gps_ns + NS_PER_S)
+
+
+def _rows(found: Ties, runs: Sequence[str], number: int) -> pa.Table:
+    """Ties as rows of the table, by place and group; what is not a number is empty."""
+    columns: dict[str, npt.NDArray[Any]] = dict(found.columns)
+    columns["round"] = np.full(found.observations.size, number, np.uint8)
+    named = np.array([*runs, ""], dtype=object)
+    for end in ("first_run", "second_run"):
+        columns[end] = named[found.columns[end]]
+    turns = found.observations.partials[:, :, 3:].reshape(-1, 6)
+    columns |= {name: turns[:, k] for k, name in enumerate(_TURNS)}
+    arrow = table_schema(TIES).arrow()
+    arrays = [pa.array(_finite(columns[f.name]), f.type, from_pandas=True) for f in arrow]
+    return pa.Table.from_arrays(arrays, schema=arrow)
+
+
+def _finite(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return np.where(np.isfinite(values), values, np.nan) if values.dtype.kind == "f" else values
+
+
+def _by_mounting(
+    column: Mapping[str, npt.NDArray[Any]],
+    end: str,
+    geometry: tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]],
+    mounted: Mounted,
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
+    """Number (n,) of the sensor of one end, and derivatives (n, 7) by its mounting.
+
+    geometry : derivatives by a shift and by a turn of the pose, body axes, the arm along the direction, and epochs.
+    """
+    shifts, turns, along, epochs = geometry
+    runs, sensors = column[f"{end}_run"], column[f"{end}_sensor"]
+    seat = Seat(np.zeros(shifts.shape), np.full(shifts.shape, np.nan))
+    number = np.full(len(runs), -1, np.int32)
+    for run, sensor in sorted(set(zip(runs.tolist(), sensors.tolist(), strict=True))):
+        own = (runs == run) & (sensors == sensor)
+        number[own] = mounted.number(run, sensor)
+        one = mounted.seats(run, sensor, epochs[own])
+        seat.lever_body_m[own], seat.beam_body[own] = one.lever_body_m, one.beam_body
+    return number, mount_partials(shifts, turns, along, seat)
+
+
+@dataclass(frozen=True)
+class KnownTies:
+    """All ties of a survey that could be measured."""
+
+    observations: Observations
+    columns: Mapping[str, npt.NDArray[Any]]
+    """(n,) of the table, those that the quality figures need."""
+    tried: Mapping[str, npt.NDArray[Any]]
+    """(m,) the same of all comparisons, those too that measured nothing."""
+
+    @property
+    def accepted(self) -> npt.NDArray[np.bool_]:
+        """(n,) ties that passed their tests."""
+        return np.asarray(self.columns["accepted"] == 1)
+
+    def of_seams(self, places: Set[int], sigma_m: float) -> KnownTies:
+        """The same, heights of heads of one pass as ties of a kind of their own.
+
+        Those of two heads at some places have an error in common: what they say together is known no better than it.
+        """
+        own = np.isin(self.observations.place, list(places)) & self.of_heads
+        names = ("first_run", "first_sensor", "second_sensor", "kind")
+        columns = [np.unique(self.columns[name], return_inverse=True)[1] for name in names]
+        group = np.unique(np.stack(columns)[:, own], axis=1, return_inverse=True)[1].ravel()
+        sigma = self.observations.sigma_m.copy()
+        sigma[own] = np.hypot(sigma[own], sigma_m * np.sqrt(np.bincount(group)[group]))
+        upright = self.of_heads & (self.observations.kind == KINDS.index(HEIGHT))
+        kind = np.where(upright, np.uint8(KINDS.index("head_tie")), self.observations.kind)
+        return replace(self, observations=replace(self.observations, sigma_m=sigma, kind=kind))
+
+    def with_more(self, other: KnownTies, which: npt.NDArray[np.bool_]) -> KnownTies:
+        """These, and some (n,) ties of another collection of tasks."""
+        if not which.any():
+            return self
+        observations = Observations.joined([self.observations, other.observations.chosen(which)])
+        columns = {name: np.concatenate([own, other.columns[name][which]]) for name, own in self.columns.items()}
+        return replace(self, observations=observations, columns=columns)
+
+    def refused(self, which: npt.NDArray[np.bool_]) -> KnownTies:
+        """The same, where some (n,) do not count."""
+        return replace(self, columns={**self.columns, "accepted": np.where(which, 0, self.columns["accepted"])})
+
+    @property
+    def of_heads(self) -> npt.NDArray[np.bool_]:
+        """(n,) ties between heads of one pass: they say nothing of poses, and much of mountings."""
+        apart = self.columns["first_sensor"] != self.columns["second_sensor"]
+        return np.asarray((self.columns["why_not"] == SAME_PASS) & apart)
+
+
+def load_ties(
+    store: Store, manifest: Manifest, tasks: Sequence[TieTask], runs: Sequence[str], mounted: Mounted
+) -> KnownTies:
+    """Ties of some tasks, in order, those of the last round of each place; runs are counted as in `runs`, sensors as in
+    `mounted`.
+    """
+    records = [r for task in tasks if (r := manifest.get(TIES, task.unit)) is not None and r.path]
+    empty = table_schema(TIES).arrow().empty_table()
+    rows = pa.concat_tables([empty, *(store.parse_table(read_recorded(store, r), r.path) for r in records)])
+    last = np.zeros(1 + max((place.number for task in tasks for place in task.places), default=0), np.uint8)
+    for task in tasks:
+        at = [place.number for place in task.places]
+        last[at] = np.maximum(last[at], task.round)
+    rows = rows.filter(pa.array(rows.column("round").to_numpy() == last[rows.column("place").to_numpy()]))
+    tried = {name: rows.column(name).to_numpy() for name in _TRIED}
+    rows = rows.filter(pa.compute.is_valid(rows.column("value_m")))
+    rows = rows.filter(pa.compute.is_valid(rows.column("sigma_m")))
+    column = {name: rows.column(name).to_numpy() for name in rows.column_names}
+    number = {run: k for k, run in enumerate(runs)}
+    direction = np.stack([column[f"direction_{a}"] for a in ("north", "east", "down")], axis=-1)
+    turns = np.stack([column[name] for name in _TURNS], axis=-1).reshape(-1, 2, 3)
+    partials = np.concatenate([np.stack([direction, -direction], axis=1), turns], axis=2)
+    ends = ("first", "second")
+    group = np.unique(np.stack([column["place"], column["group"]]), axis=1, return_inverse=True)[1].ravel()
+    epochs = np.stack([column[f"{e}_epoch_gps_ns"] for e in ends], axis=-1)
+    shifts = np.stack([column[name] for name in _SHIFTS], axis=-1).reshape(-1, 2, 3)
+    mounts = [
+        _by_mounting(column, e, (shifts[:, k], turns[:, k], column[_ARMS[k]], epochs[:, k]), mounted)
+        for k, e in enumerate(ends)
+    ]
+    observations = Observations(
+        np.array([KINDS.index(kind) for kind in column["kind"]], np.uint8),
+        np.array([[number[run] for run in column[f"{e}_run"]] for e in ends], np.int32).T.reshape(-1, 2),
+        epochs, partials, column["value_m"], column["sigma_m"], group.astype(np.int64), column["place"],
+        sensor=np.stack([sensor for sensor, _ in mounts], axis=-1),
+        mount_partials=np.stack([by for _, by in mounts], axis=1),
+    )  # fmt: skip
+    return KnownTies(observations, column, tried)

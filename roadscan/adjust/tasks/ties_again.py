@@ -1,0 +1,337 @@
+"""Ties that are observed again where the solution says that the passes lie, and larger patches before the first one.
+
+Poses of two passes may lie decimetres apart. What is then compared is not one place of the road: shifts are not found,
+and heights are those of neighbouring spots. So the solution of the first ties says where to look again, until no place
+moves by more than a share of its patch. Where too few places match to begin with, larger patches are sought first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.patches import Shift
+from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.tasks.control_work import ControlTask, sighting_tasks
+from roadscan.adjust.tasks.near import Sources
+from roadscan.adjust.tasks.solution import Solution, priors_of
+from roadscan.adjust.tasks.tie_work import KnownTies, TieTask, tie_tasks
+from roadscan.adjust.tasks.tracks import runs_of
+from roadscan.adjust.ties.far_apart import agreeing, is_matched, misplaced, places_of_pairs
+from roadscan.core.counted import counted
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.settings.adjust import AdjustConfig
+from roadscan.core.settings.tie_settings import TieSettings
+from roadscan.core.witness import Finding, Witness
+from roadscan.navigation.trajectory import Corrections
+from roadscan.tiles.plan.plan import SurveyPlan
+
+Bool = npt.NDArray[np.bool_]
+Float64 = npt.NDArray[np.float64]
+
+_STILL: Final[Shift] = (0.0, 0.0, 0.0)
+_STEP_M: Final = 0.001
+"""Shifts are rounded to this, so that a solution that changes by less leaves what was observed as it is."""
+
+
+TIES_SETTLED: Final = Witness(
+    "ties_settled",
+    input="ties",
+    fault="Ties that are observed where the solution says move the solution again, and again.",
+    asks="how far the last solution moves each place since it was observed",
+    does="the last solution is published",
+    told=("findings",),
+)
+
+RUNS_APART: Final = Witness(
+    "runs_apart",
+    input="trajectories",
+    fault="The poses of a pass lie decimetres from those of other passes over the same road.",
+    asks="larger patches of the road, each 100 m: the shift that most of them agree on",
+    does="ties are observed again where the solution puts the passes; σ of a run that most others contradict, or of "
+    "both where nothing tells which is wrong, is taken to be as large as the shift",
+    told=("findings",),
+)
+_APART: Final = 4.0
+"""Two passes that are so many σ apart contradict their σ: one of 16,000 does by chance."""
+
+Observe = Callable[[Sequence[TieTask]], None]
+"""Brings the ties of some tasks up to date."""
+Load = Callable[[Sequence[TieTask]], KnownTies]
+"""Ties of tasks that are up to date."""
+Solve = Callable[[KnownTies, Sequence[ControlTask]], Solution]
+"""The solution of ties and of what passes see of control points, which tasks bring up to date first."""
+
+
+@dataclass(frozen=True)
+class Again:
+    """What is observed, and with which shifts it was observed last."""
+
+    tasks: tuple[TieTask, ...]
+    """Of all rounds, in their order."""
+    ties: KnownTies
+    """Those that count, with larger patches where these are needed."""
+    larger: tuple[TieTask, ...] = ()
+    """Tasks of larger patches."""
+    control: tuple[ControlTask, ...] = ()
+    """Tasks that look at control points, of all rounds."""
+    far: KnownTies | None = None
+    """What these found."""
+    shifts: Mapping[int, tuple[Shift, ...]] = field(default_factory=dict)
+    """Of the traverses of each place that was observed again, by its number."""
+    counts: tuple[int, ...] = ()
+    """Places that were observed again, of each round."""
+    misplaced: Mapping[str, Float64] = field(default_factory=dict)
+    """Runs whose σ do not hold that they lie so far (3,; m) from others."""
+    findings: tuple[Finding, ...] = ()
+    """On these."""
+
+    @property
+    def every(self) -> tuple[TieTask, ...]:
+        """All tasks."""
+        return (*self.tasks, *self.larger)
+
+    def places(self) -> list[Place]:
+        """Each of them, as it was observed first."""
+        return [place for task in self.tasks if task.round == 0 for place in task.places]
+
+    def line(self) -> str:
+        """Rounds in words; "" where nothing was observed again."""
+        told = f"ties observed again where the solution puts the passes: {', then '.join(map(str, self.counts))} places"
+        return told if self.counts else ""
+
+
+def first_ties(
+    plan: SurveyPlan,
+    sources: Sources,
+    tasks: Sequence[TieTask],
+    control: Sequence[ControlTask],
+    tools: tuple[Observe, Load],
+) -> Again:
+    """Ties where the recorded poses say, and of larger patches where these agree that passes lie elsewhere."""
+    observe, load = tools
+    observe(tasks)
+    ties = load(tasks)
+    larger = _larger_patches(plan, sources, tasks, ties)
+    if not larger:
+        return Again(tuple(tasks), ties, control=tuple(control))
+    observe(larger)
+    far = load(larger)
+    kept, apart = _agreed(far, ties, plan.survey.config.adjust, _sigmas(plan, sources))
+    misplaced, findings = _contradicted(plan, sources, ties, apart)
+    # What was matched where two passes lie apart is not one place of the road.
+    joined = ties.refused(_of_pairs(ties, apart)).with_more(far, kept)
+    return Again(
+        tuple(tasks), joined, tuple(larger), tuple(control), far, misplaced=misplaced, findings=tuple(findings)
+    )
+
+
+def settled(
+    plan: SurveyPlan, sources: Sources, again: Again, tools: tuple[Observe, Load, Solve]
+) -> tuple[Again, Solution, list[Finding]]:
+    """The solution whose ties lie where it says, and what was observed for it."""
+    config, (observe, load, solve) = plan.survey.config.adjust, tools
+    solution = solve(again.ties, again.control)
+    tied, findings = config.mode in ("joint", "vertical"), list[Finding]()
+    while tied and config.again.rounds:
+        more, shifts, largest_m = _places_again(plan, sources, again, solution.corrections)
+        if not more:
+            break
+        if len(again.counts) == config.again.rounds:
+            text = (
+                f"the solution still moves passes against one another by up to {1e3 * largest_m:.0f} mm at "
+                f"{len(shifts)} places after ties were observed again {counted(config.again.rounds, 'time')} "
+                "(adjust.again.rounds)"
+            )
+            findings.append(TIES_SETTLED.finds("adjust", text))
+            break
+        observe(more)
+        tasks = (*again.tasks, *more)
+        ties = load(tasks)
+        joined = ties if again.far is None else _still_needed(plan, sources, ties, again.far)
+        counts, control = (*again.counts, len(shifts)), _points_again(plan, sources, again, solution.corrections)
+        again = replace(
+            again, tasks=tasks, ties=joined, shifts={**again.shifts, **shifts}, counts=counts, control=control
+        )
+        solution = solve(joined, control)
+    return again, solution, findings
+
+
+def _larger_patches(plan: SurveyPlan, sources: Sources, tasks: Sequence[TieTask], ties: KnownTies) -> list[TieTask]:
+    """Tasks for larger patches of all pairs of runs that share places; their places are numbered on."""
+    config, runs = plan.survey.config.adjust, runs_of(plan)
+    known = {place.number: place for task in tasks for place in task.places}
+    first, found = 1 + max(known, default=-1), list[Place]()
+    sought = config.again.rounds and config.mode in ("joint", "vertical")
+    for pair, numbers in places_of_pairs(ties.tried).items() if sought else ():
+        places = [known[number] for number in numbers if known[number].radius_m == config.places.radius_m]
+        for place in _spread(places, config):
+            own = _of_pair(place, (runs.index(pair[0]), runs.index(pair[1])))
+            if len(own) == 2:
+                reach_m = config.again.radius_m + config.again.search_m
+                wide = tuple(_widened(t, reach_m / (place.radius_m + config.places.margin_m), config) for t in own)
+                found.append(replace(place, number=first + len(found), radius_m=config.again.radius_m, traverses=wide))
+    return tie_tasks(plan, sources, found, runs, _larger(config)) if found else []
+
+
+def _larger(config: AdjustConfig) -> TieSettings:
+    """How larger patches are compared: coarser, farther apart, with σ of centimetres."""
+    own = config.again
+    return config.ties.model_copy(update={
+        "cell_m": own.cell_m, "shift_cell_m": own.cell_m, "search_m": own.search_m, "most_apart_m": own.search_m,
+        "misplaced_m": own.search_m, "most_scatter_m": own.cell_m, "most_shift_sigma_m": own.cell_m,
+        "shift_floor_m": own.cell_m / 4, "sigma_floor_m": own.cell_m / 40,
+    })  # fmt: skip
+
+
+def _spread(places: Sequence[Place], config: AdjustConfig) -> list[Place]:
+    """Some of the places, about evenly along the road."""
+    wanted = max(config.again.least, round(len(places) * 1000.0 / config.places.per_km / config.again.each_m))
+    rows = np.unique(np.linspace(0, len(places) - 1, min(wanted, len(places))).round().astype(np.int64))
+    return [places[k] for k in rows.tolist()]
+
+
+def _of_pair(place: Place, runs: tuple[int, int]) -> list[Traverse]:
+    """A traverse of each of two runs; the first and the last one of a run that comes by again."""
+    first = next((t for t in place.traverses if t.run == runs[0]), None)
+    last = next((t for t in reversed(place.traverses) if t.run == runs[1]), None)
+    return [] if first is None or last is None or first is last else [first, last]
+
+
+def _widened(traverse: Traverse, times: float, config: AdjustConfig) -> Traverse:
+    """The same over so many times its length, and no longer than a place may take."""
+    middle = (traverse.first_gps_ns + traverse.last_gps_ns) // 2
+    half = 0.5 * min(times * (traverse.last_gps_ns - traverse.first_gps_ns), config.places.longest_s * NS_PER_S)
+    return replace(traverse, first_gps_ns=middle - round(half), last_gps_ns=middle + round(half))
+
+
+def _contradicted(
+    plan: SurveyPlan, sources: Sources, ties: KnownTies, apart: Mapping[tuple[str, str], Float64]
+) -> tuple[dict[str, Float64], list[Finding]]:
+    """Runs that lie farther from others than their σ allow, by how much (3,), and findings on them."""
+    runs, config = runs_of(plan), plan.survey.config.adjust
+    sigma = _sigmas(plan, sources)
+    found = misplaced(runs, places_of_pairs(ties.tried).keys() - apart.keys(), apart, config.fixed)
+    wrong, said = dict[str, Float64](), dict[tuple[str, ...], list[str]]()
+    for pair, shift in sorted(apart.items()):
+        ratio = np.abs(shift) / np.hypot(*(np.maximum(sigma[run], 1e-6) for run in pair))
+        own = tuple(run for run in pair if run in found)
+        if ratio.max() <= _APART or not own:
+            continue
+        for run in own:
+            # A position that is off in one component is not to be trusted in the others.
+            wrong[run] = np.full(3, max(float(found[run].max()), *wrong.get(run, np.zeros(3))))
+        other, (north, east, down) = (pair[0], shift) if own[-1] == pair[1] else (pair[1], -shift)
+        said.setdefault(own, []).append(
+            f"{north:+.2f} m north, {east:+.2f} m east and {-down:+.2f} m up from {other} ({ratio.max():.0f} σ)"
+        )
+    return wrong, [_apart_finding(own, told) for own, told in said.items()]
+
+
+def _apart_finding(runs: tuple[str, ...], told: Sequence[str]) -> Finding:
+    doubt = "" if len(runs) == 1 else "; nothing tells which of both is wrong"
+    text = (
+        f"where the road matches, it lies {', '.join(told)}{doubt}. σ of {' and '.join(runs)} is taken to be as large, "
+        "and ties are observed again where the solution puts the passes"
+    )
+    return RUNS_APART.finds(f"run '{runs[-1]}'", text)
+
+
+def _sigmas(plan: SurveyPlan, sources: Sources) -> dict[str, Float64]:
+    """Usual 1 σ (3,) of the recorded positions of each run, north, east, down."""
+    return {one.run: one.sigmas[:3] for one in priors_of(plan, sources, runs_of(plan))}
+
+
+def _still_needed(plan: SurveyPlan, sources: Sources, ties: KnownTies, larger: KnownTies) -> KnownTies:
+    """The ties, and those of larger patches of pairs of runs that still do not match."""
+    kept, apart = _agreed(larger, ties, plan.survey.config.adjust, _sigmas(plan, sources))
+    return ties.with_more(larger, kept & _of_pairs(larger, [p for p in apart if not is_matched(ties.tried, p)]))
+
+
+def _agreed(
+    larger: KnownTies, ties: KnownTies, config: AdjustConfig, sigmas: Mapping[str, Float64]
+) -> tuple[Bool, dict[tuple[str, str], Float64]]:
+    """Which ties (n,) of larger patches count, and by pair of runs the shift that they agree on."""
+    tried, kept, apart = larger.tried, np.zeros(larger.observations.size, np.bool_), dict[tuple[str, str], Float64]()
+    measured = np.isfinite(tried["value_m"].astype(np.float64)) & np.isfinite(tried["sigma_m"].astype(np.float64))
+    for pair in places_of_pairs(tried):
+        rows = np.flatnonzero((tried["first_run"] == pair[0]) & (tried["second_run"] == pair[1]) & measured)
+        up_m = _APART * float(np.hypot(*(sigmas[run][2] for run in pair)))
+        own = {name: values[rows] for name, values in tried.items()}
+        of_pair = (ties.tried["first_run"] == pair[0]) & (ties.tried["second_run"] == pair[1])
+        near = {name: values[of_pair] for name, values in ties.tried.items()}
+        fits, shift = agreeing(own, near, config.again, config.ties, up_m)
+        kept[np.searchsorted(np.flatnonzero(measured), rows[fits])] = True
+        if fits.any():
+            apart[pair] = shift
+    return kept, apart
+
+
+def _of_pairs(ties: KnownTies, pairs: Iterable[tuple[str, str]]) -> Bool:
+    """Ties (n,) of some pairs of runs."""
+    own = np.zeros(ties.observations.size, np.bool_)
+    for first, second in pairs:
+        own |= (ties.columns["first_run"] == first) & (ties.columns["second_run"] == second)
+    return own
+
+
+def _places_again(
+    plan: SurveyPlan, sources: Sources, again: Again, corrections: Mapping[str, Corrections]
+) -> tuple[list[TieTask], dict[int, tuple[Shift, ...]], float]:
+    """Tasks for the places that a solution moves by too much since they were observed, their shifts, and by how much
+    most (m).
+    """
+    config, runs = plan.survey.config.adjust, runs_of(plan)
+    chosen, shifts, largest_m = list[Place](), dict[int, tuple[Shift, ...]](), 0.0
+    for place in again.places():
+        own = tuple(_shift(corrections.get(runs[t.run]), t) for t in place.traverses)
+        before = again.shifts.get(place.number, (_STILL,) * len(own))
+        moved = np.array(own) - np.array(before)
+        # What lies beside the patch is not compared with it, and what lies far above it is refused.
+        aside_m, above_m = _extent(moved[:, :2]), float(np.ptp(moved[:, 2]))
+        if aside_m > config.again.share * 2.0 * place.radius_m or above_m > 0.5 * config.ties.most_apart_m:
+            largest_m = max(largest_m, aside_m, above_m)
+            reach_m = float(np.hypot(*np.array(own)[:, :2].T).max())
+            times = 1.0 + reach_m / (place.radius_m + config.places.margin_m)
+            chosen.append(replace(place, traverses=tuple(_widened(t, times, config) for t in place.traverses)))
+            shifts[place.number] = own
+    moves = [shifts[place.number] for place in chosen]
+    number = len(again.counts) + 1
+    return tie_tasks(plan, sources, chosen, runs, config.ties, (number, moves)), shifts, largest_m
+
+
+def _points_again(
+    plan: SurveyPlan, sources: Sources, again: Again, corrections: Mapping[str, Corrections]
+) -> tuple[ControlTask, ...]:
+    """Tasks that look at control points, with those of points whose passes a solution moves by too much."""
+    config, runs = plan.survey.config.adjust, runs_of(plan)
+    least_m, seen, moves = config.again.share * 2.0 * config.places.radius_m, [], []
+    last = {task.point.number: task for task in again.control}
+    for task in (one for one in again.control if one.round == 0):
+        own = tuple(_shift(corrections.get(runs[one[0].run]), one[0]) for one in task.passes)
+        before = last[task.point.number].shifts_m or (_STILL,) * len(own)
+        if np.hypot(*(np.array(own)[:, :2] - np.array(before)[:, :2]).T).max() > least_m:
+            times = 1.0 + float(np.hypot(*np.array(own)[:, :2].T).max()) / config.targets.search_m
+            seen.append((task.point, [tuple(_widened(t, times, config) for t in one) for one in task.passes]))
+            moves.append(own)
+    priors, number = priors_of(plan, sources, runs), len(again.counts) + 1
+    picked = {(runs[one[0].run], task.point.name): place for task in again.control for one, place in zip(
+        task.passes, task.picked, strict=True) if place is not None}  # fmt: skip
+    return (*again.control, *sighting_tasks(plan, sources, priors, seen, picked, (number, moves)))
+
+
+def _shift(corrections: Corrections | None, traverse: Traverse) -> Shift:
+    if corrections is None:
+        return _STILL
+    middle = np.array([(traverse.first_gps_ns + traverse.last_gps_ns) // 2], np.int64)
+    north, east, down = (_STEP_M * np.round(corrections.at(middle)[0][0] / _STEP_M)).tolist()
+    return north, east, down
+
+
+def _extent(moved: npt.NDArray[np.float64]) -> float:
+    """Largest distance between two of some points (n, 2)."""
+    return float(np.hypot(*(moved[:, None] - moved[None]).T).max())

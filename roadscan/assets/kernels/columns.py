@@ -1,0 +1,106 @@
+"""What stands in each cell of a raster: at which heights, and when ground and things were seen there."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from roadscan.compute.kernel_options import kernel
+
+LEVELS = 32
+"""Bits of a column: heights above ground in steps."""
+THINGS, GROUND, HIGH = range(3)
+"""What may be seen in a slot of time."""
+
+
+@kernel
+def distinct(epoch, step, out):
+    """Write each step of time that follows another one to out (most,) int64; how many there are, at most `most`.
+
+    epoch : (n,) int64; step : int64, its length in the epoch's unit.
+    """
+    found, last = 0, np.int64(-1)
+    for k in range(epoch.size):
+        at = epoch[k] // step
+        if at != last or k == 0:
+            last = at
+            if found < out.size:
+                out[found] = at
+            found += 1
+    return found
+
+
+@kernel
+def slots(epoch, step, steps, per_slot, out):
+    """Slot (n,) uint8 of each epoch: its step's place in the sorted `steps` (m,) int64, so many a slot."""
+    last, slot = np.int64(-1), 0
+    for k in range(epoch.size):
+        at = epoch[k] // step
+        if at != last or k == 0:
+            last = at
+            slot = np.searchsorted(steps, at) // per_slot
+        out[k] = slot
+
+
+@kernel
+def columns(x, y, above, on_ground, slot, origin, per_m, level_m, band, levels, seen):
+    """Heights that each cell holds, and the slots of time in which things, ground, and what is higher were seen in it.
+
+    Parameters
+    ----------
+    x, y : (n,) float64 (m); above : (n,) float32 (m); on_ground : (n,) bool; slot : (n,) uint8 below 64.
+    origin : (2,) float64; per_m : cells a metre; level_m : height of a level.
+    band : (3,) float64, things are returns between the first two of these heights, what is higher reaches the last (m).
+    levels : (rows, columns) uint32, bits of heights; seen : (3, rows, columns) uint64, bits of slots.
+    """
+    rows, many = levels.shape
+    for k in range(x.size):
+        i, j = math.floor((y[k] - origin[1]) * per_m), math.floor((x[k] - origin[0]) * per_m)
+        if i < 0 or j < 0 or i >= rows or j >= many:
+            continue
+        if on_ground[k]:
+            seen[GROUND, i, j] |= np.uint64(1) << np.uint64(slot[k])
+            continue
+        h = above[k]
+        if h >= 0.0 and h < LEVELS * level_m:
+            levels[i, j] |= np.uint32(1) << np.uint32(int(h / level_m))
+            if band[0] <= h <= band[2]:
+                seen[THINGS if h <= band[1] else HIGH, i, j] |= np.uint64(1) << np.uint64(slot[k])
+
+
+@kernel
+def tops(levels, first, start, gap, out):
+    """Level that what stands on the ground reaches in each cell, -1 of none.
+
+    It begins at a level from `first` up to `start` and goes on over no more than `gap` empty levels.
+    levels : (rows, columns) uint32; out : (rows, columns) int32.
+    """
+    for i in range(levels.shape[0]):
+        for j in range(levels.shape[1]):
+            top, empty = -1, 0
+            bits = levels[i, j]
+            for m in range(first, LEVELS):
+                if (bits >> np.uint32(m)) & np.uint32(1):
+                    top, empty = m, 0
+                else:
+                    empty += 1
+                    if (top >= 0 and empty > gap) or (top < 0 and m >= start):
+                        break
+            out[i, j] = top
+
+
+@kernel
+def marked(x, y, above, origin, per_m, cells, lowest, highest, out):
+    """Number (n,) int32 of the cell of each return between the heights that the cell's number stands for; else 0.
+
+    cells : (rows, columns) int32; lowest, highest : (numbers,) float64, heights by number (m).
+    """
+    rows, many = cells.shape
+    for k in range(x.size):
+        i, j = math.floor((y[k] - origin[1]) * per_m), math.floor((x[k] - origin[0]) * per_m)
+        out[k] = 0
+        if i >= 0 and j >= 0 and i < rows and j < many:
+            at = cells[i, j]
+            if at > 0 and lowest[at] <= above[k] <= highest[at]:
+                out[k] = at

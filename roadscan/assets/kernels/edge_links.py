@@ -1,0 +1,201 @@
+"""Paths through places of an edge: which place may follow which, and the evidence of the best way on from each."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roadscan.compute.kernel_options import inlined, kernel
+
+MAX_LINKS = 12
+"""Places that may follow a place, at most."""
+
+
+@inlined
+def link_gain(ax, ay, adx, ady, aq, bx, by, bdx, bdy, bq, limits):
+    """Evidence (σ · m) of going on from a place to another, or −inf where that is no smooth way.
+
+    limits : (longest free gap (m), cosine of the greatest bend, cost of a metre of gap, cost of a bend).
+    """
+    ex, ey = bx - ax, by - ay
+    length = np.sqrt(ex * ex + ey * ey)
+    forward_a, forward_b = (ex * adx + ey * ady) / length, (ex * bdx + ey * bdy) / length
+    if forward_a < limits[1] or forward_b < limits[1] or adx * bdx + ady * bdy < limits[1]:
+        return -np.inf
+    bend = (1.0 - forward_a) + (1.0 - forward_b)
+    free = min(length, limits[0])
+    return free * 0.5 * (aq + bq) - (length - free) * limits[2] - limits[3] * bend * free
+
+
+@kernel
+def find_links(place, quality, order, starts, bins, reach, limits, links, lengths, gains):
+    """Fill `links` (n, MAX_LINKS) with the places that may follow each, −1 after the last, `lengths` (m) and `gains`.
+
+    place : (n, 4) x, y (m) and unit vector of the direction. quality : (n,) evidence (σ) less what chance gives.
+    order, starts : places sorted by bin and the first of each bin. bins : (x_min_m, y_min_m, size_m, rows, columns).
+    reach : (near, far) distances (m); farther places are looked for where none is near.
+    """
+    rows, columns = int(bins[3]), int(bins[4])
+    for i in range(place.shape[0]):
+        count = 0
+        for far in range(2):
+            if count > 0:
+                break
+            near_m, far_m = (0.0, reach[0]) if far == 0 else (reach[0], reach[1])
+            spread = int(np.ceil(far_m / bins[2]))
+            column, row = int((place[i, 0] - bins[0]) / bins[2]), int((place[i, 1] - bins[1]) / bins[2])
+            for r in range(max(row - spread, 0), min(row + spread + 1, rows)):
+                for c in range(max(column - spread, 0), min(column + spread + 1, columns)):
+                    for k in range(starts[r * columns + c], starts[r * columns + c + 1]):
+                        j = order[k]
+                        ex, ey = place[j, 0] - place[i, 0], place[j, 1] - place[i, 1]
+                        length = np.sqrt(ex * ex + ey * ey)
+                        if j == i or length <= max(near_m, 0.04) or length > far_m:
+                            continue
+                        gain = link_gain(
+                            place[i, 0], place[i, 1], place[i, 2], place[i, 3], quality[i],
+                            place[j, 0], place[j, 1], place[j, 2], place[j, 3], quality[j], limits,
+                        )  # fmt: skip
+                        if gain == -np.inf:
+                            continue
+                        count = insert(links[i], lengths[i], gains[i], count, j, length, gain)
+
+
+@inlined
+def insert(links, lengths, gains, count, j, length, gain):
+    """Put a link into its row, best gain per metre first; the worst falls out of a full row. Returns their number."""
+    at = count
+    while at > 0 and gains[at - 1] / lengths[at - 1] < gain / length:
+        at -= 1
+    if at >= MAX_LINKS:
+        return count
+    last = min(count, MAX_LINKS - 1)
+    for k in range(last, at, -1):
+        links[k], lengths[k], gains[k] = links[k - 1], lengths[k - 1], gains[k - 1]
+    links[at], lengths[at], gains[at] = j, length, gain
+    return min(count + 1, MAX_LINKS)
+
+
+@kernel
+def best_ways(links, lengths, gains, memory_m, rounds, ahead, following, behind, preceding):
+    """Fill `ahead` and `behind` (n,): the evidence of the best way on from each place and to it; and the next places.
+
+    Evidence of what lies x metres away counts e^(−x / memory_m): the sum is that of a path of about `memory_m`.
+    following, preceding : (n,) the next place of the best way, −1 where it ends.
+    """
+    n = ahead.size
+    new, fade = np.zeros(n), np.empty(lengths.shape)
+    for i in range(n):
+        for k in range(links.shape[1]):
+            fade[i, k] = np.exp(-lengths[i, k] / memory_m)
+    for _ in range(rounds):
+        changed = False
+        for i in range(n):
+            best, then = 0.0, -1
+            for k in range(links.shape[1]):
+                j = links[i, k]
+                if j < 0:
+                    break
+                value = gains[i, k] + ahead[j] * fade[i, k]
+                if value > best:
+                    best, then = value, j
+            new[i] = best
+            following[i] = then
+        for i in range(n):
+            changed = changed or new[i] > ahead[i] + 1e-3
+            ahead[i] = new[i]
+        if not changed:
+            break
+    for _ in range(rounds):
+        new[:] = 0.0
+        preceding[:] = -1
+        for i in range(n):
+            for k in range(links.shape[1]):
+                j = links[i, k]
+                if j < 0:
+                    break
+                value = gains[i, k] + behind[i] * fade[i, k]
+                if value > new[j]:
+                    new[j] = value
+                    preceding[j] = i
+        changed = False
+        for i in range(n):
+            changed = changed or new[i] > behind[i] + 1e-3
+            behind[i] = new[i]
+        if not changed:
+            break
+
+
+@kernel
+def trace(place, total, following, preceding, ranked, order, starts, bins, limits, chain, owner):
+    """Follow the best ways from the strongest places on; returns the number of chains.
+
+    total : (n,) evidence of the best path through each place. ranked : places, strongest first. order, starts, bins :
+    places sorted by bin, as in :func:`find_links`. limits : (least evidence to begin, least evidence to go on,
+    distances within which a chain leaves no second one and no other side of a gutter (m)). chain : (n, 2) filled, in
+    chains one after another: the chain's number and the place. owner : (n,) −1 at first; then the chain that holds the
+    place or lies beside it.
+    """
+    n = total.size
+    length, chains = 0, 0
+    way = np.empty(n, np.int64)
+    for s in range(n):
+        seed = ranked[s]
+        if total[seed] < limits[0]:
+            break
+        if owner[seed] >= 0:
+            continue
+        first = n
+        at = seed
+        # Back from the seed, filled from the end of `way`.
+        back = 0
+        while at >= 0 and owner[at] < 0 and total[at] >= limits[1] and back < n - 1:
+            owner[at] = chains
+            back += 1
+            way[first - back] = at
+            at = preceding[at]
+        for k in range(first - back, first):
+            chain[length, 0], chain[length, 1] = chains, way[k]
+            length += 1
+        at = following[seed]
+        while at >= 0 and owner[at] < 0 and total[at] >= limits[1]:
+            owner[at] = chains
+            chain[length, 0], chain[length, 1] = chains, at
+            length += 1
+            at = following[at]
+        cover(place, chain, length, chains, order, starts, bins, (limits[2], limits[3]), owner)
+        chains += 1
+    return chains, length
+
+
+@inlined
+def cover(place, chain, length, number, order, starts, bins, reach, owner):
+    """Give all places beside the chain that ends the list to it, and the other sides of its gutter.
+
+    reach : distances within which places lie beside it, and within which they are the other side of a gutter (m).
+    """
+    rows, columns = int(bins[3]), int(bins[4])
+    far = max(reach[0], reach[1])
+    for k in range(length - 1, -1, -1):
+        if chain[k, 0] != number:
+            break
+        j = chain[k, 1]
+        west, east = (
+            int(np.floor((place[j, 0] - far - bins[0]) / bins[2])),
+            int((place[j, 0] + far - bins[0]) / bins[2]),
+        )
+        south, north = (
+            int(np.floor((place[j, 1] - far - bins[1]) / bins[2])),
+            int((place[j, 1] + far - bins[1]) / bins[2]),
+        )
+        for r in range(max(south, 0), min(north + 1, rows)):
+            for at in range(starts[r * columns + max(west, 0)], starts[r * columns + min(east, columns - 1) + 1]):
+                i = order[at]
+                if owner[i] >= 0:
+                    continue
+                ex, ey = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1]
+                apart = ex * ex + ey * ey
+                # The other side of a gutter: each lies on the lower side, the left, of the other.
+                against = place[i, 2] * place[j, 2] + place[i, 3] * place[j, 3] < -0.7
+                gutter = against and ex * place[j, 3] - ey * place[j, 2] < 0.0 and apart <= reach[1] * reach[1]
+                if gutter or apart <= reach[0] * reach[0]:
+                    owner[i] = number

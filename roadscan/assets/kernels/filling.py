@@ -1,0 +1,59 @@
+"""Heights of cells that hold none, from those around: a membrane (Laplace's equation), solved from coarse to fine."""
+
+from __future__ import annotations
+
+from roadscan.compute.kernel_options import kernel
+
+
+@kernel
+def halved(z, known, coarse, coarse_known):
+    """Mean height of the known cells of each two by two.
+
+    z : (rows, columns) float32; known : (rows, columns) bool; coarse, coarse_known : (⌈rows/2⌉, ⌈columns/2⌉), out.
+    """
+    rows, columns = z.shape
+    for i in range(coarse.shape[0]):
+        for j in range(coarse.shape[1]):
+            total, count = 0.0, 0
+            for a in range(2 * i, min(2 * i + 2, rows)):
+                for b in range(2 * j, min(2 * j + 2, columns)):
+                    if known[a, b]:
+                        total += z[a, b]
+                        count += 1
+            coarse_known[i, j] = count > 0
+            coarse[i, j] = total / count if count > 0 else 0.0
+
+
+@kernel
+def begin(coarse, known, z):
+    """Fill the unknown cells of z from the coarse level, bilinear between the middles of its cells.
+
+    coarse : (⌈rows/2⌉, ⌈columns/2⌉) float32, whole; known : (rows, columns) bool; z : (rows, columns) float32, changed.
+    """
+    m, n = coarse.shape
+    for i in range(z.shape[0]):
+        a = i // 2
+        a2 = min(max(a + (1 if i % 2 else -1), 0), m - 1)
+        for j in range(z.shape[1]):
+            if not known[i, j]:
+                b = j // 2
+                b2 = min(max(b + (1 if j % 2 else -1), 0), n - 1)
+                near = 0.75 * coarse[a, b] + 0.25 * coarse[a, b2]
+                far = 0.75 * coarse[a2, b] + 0.25 * coarse[a2, b2]
+                z[i, j] = 0.75 * near + 0.25 * far
+
+
+@kernel
+def relax(z, known, times):
+    """Replace each unknown cell by the mean of its four neighbours, row by row, `times` over (Gauss–Seidel).
+
+    z : (rows, columns) float32, changed; known : (rows, columns) bool. The slope across the grid's edge is zero.
+    """
+    rows, columns = z.shape
+    for _ in range(times):
+        for i in range(rows):
+            south, north = max(i - 1, 0), min(i + 1, rows - 1)
+            for j in range(columns):
+                if not known[i, j]:
+                    west, east = max(j - 1, 0), min(j + 1, columns - 1)
+                    z[i, j] = 0.25 * (z[south, j] + z[north, j] + z[i, west] + z[i, east])

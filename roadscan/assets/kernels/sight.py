@@ -1,0 +1,87 @@
+"""Which places rays pass on their way to what they hit, and which ones lie behind that."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.compute.kernel_options import inlined, kernel
+
+
+class Rays(NamedTuple):
+    """n rays from a sensor to what they hit; x, y from a corner of the map and height (m)."""
+
+    from_x: npt.NDArray[np.float64]
+    from_y: npt.NDArray[np.float64]
+    from_height: npt.NDArray[np.float64]
+    to_x: npt.NDArray[np.float64]
+    to_y: npt.NDArray[np.float64]
+    to_height: npt.NDArray[np.float64]
+
+
+class Places(NamedTuple):
+    """Cells of a raster, each cut into bands of height above the ground."""
+
+    corner: npt.NDArray[np.float64]
+    """(2,) x and y of the raster's south-western corner (m)."""
+    cell_m: float
+    """Edge of a cell, and the way along a ray from one of its places to the next."""
+    ground: npt.NDArray[np.float32]
+    """(rows, columns) height of the ground at the middles of cells (m), row 0 the southern one; NaN where unknown."""
+    bands: npt.NDArray[np.float64]
+    """(b + 1,) ascending heights above the ground between which the bands lie (m)."""
+
+
+@inlined
+def part_within(start, way, least, most, first, last):
+    """The part of first … last along a ray where its coordinate lies between least and most; empty: first > last."""
+    if way == 0.0:
+        return (first, last) if least <= start <= most else (1.0, 0.0)
+    one, other = (least - start) / way, (most - start) / way
+    return max(first, min(one, other)), min(last, max(one, other))
+
+
+@kernel
+def follow_rays(rays, places, reach_m, hit_m, passed, hidden):
+    """Count rays by the places that they pass, and by those behind what they hit.
+
+    A ray counts once for each `cell_m` of its way. What it hits counts as passed, `hit_m` to both sides.
+
+    Parameters
+    ----------
+    rays : Rays; those of no length are left out.
+    places : Places
+    reach_m : how far from the sensor rays are followed.
+    passed, hidden : (rows, columns, b) uint32; counts are added.
+    """
+    rows, columns = places.ground.shape
+    step, top = places.cell_m, places.bands.size - 1
+    west, south = places.corner[0], places.corner[1]
+    for k in range(rays.from_x.size):
+        x, y, z = rays.from_x[k], rays.from_y[k], rays.from_height[k]
+        way_x, way_y, way_z = rays.to_x[k] - x, rays.to_y[k] - y, rays.to_height[k] - z
+        length = np.sqrt(way_x * way_x + way_y * way_y + way_z * way_z)
+        if not length > 0.0:
+            continue
+        way_x, way_y, way_z = way_x / length, way_y / length, way_z / length
+        first, last = part_within(x, way_x, west, west + columns * step, 0.0, reach_m)
+        first, last = part_within(y, way_y, south, south + rows * step, first, last)
+        if first > last:
+            continue
+        for number in range(int(np.ceil(first / step - 0.5)), int(np.floor(last / step - 0.5)) + 1):
+            along = (number + 0.5) * step
+            column, row = int((x + along * way_x - west) / step), int((y + along * way_y - south) / step)
+            if column < 0 or row < 0 or column >= columns or row >= rows:
+                continue
+            above = z + along * way_z - places.ground[row, column]
+            if not (above >= places.bands[0] and above < places.bands[top]):
+                continue
+            band = 0
+            while above >= places.bands[band + 1]:
+                band += 1
+            if along <= length + hit_m:
+                passed[row, column, band] += 1
+            else:
+                hidden[row, column, band] += 1

@@ -1,0 +1,200 @@
+"""The step at a node of an edge: where it lies, how high it is, and how wide its face, from a profile across."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roadscan.compute.kernel_options import inlined, kernel
+
+BIN_M = 0.01
+QUARTERS = 4
+"""Parts of a window along the edge, of which COVERED tells the share that was seen on both sides."""
+NEAR_M = 0.35
+HALF_BINS = 120
+"""A profile reaches this many bins to each side."""
+RESULTS = 11
+OFFSET, STEP, SIGMA_STEP, FACE, TOP, SCATTER, RETURNS, SEEN_LOW, SEEN_HIGH, SIGMA_OFFSET, COVERED = range(RESULTS)
+"""Columns of what :func:`fit_nodes` fills, all in metres except the number of returns."""
+
+
+@kernel
+def fit_nodes(node, x_m, y_m, z_m, starts, bins, along_m, search, prior, out):
+    """Fill `out` (n, RESULTS) with the step at each node; SIGMA_STEP is NaN where it cannot be told.
+
+    node : (n, 7) x, y (m), unit vector along the edge (higher side to its right), height (m) and the ground's slope at
+    large along and across it (to the right). x_m, y_m, z_m : (m,) heights of the ground, sorted by bin. starts : the
+    first of each bin. bins : (x_min_m, y_min_m, size_m, rows, columns). along_m : half the length of the window along
+    the edge. search : (farthest offset (m), least and greatest face (m), depth of a side (m)). prior : (σ of a side's
+    slope (m/m), σ of a height (m)). OFFSET : from the node to the upper edge, to the right. SCATTER : of strips of 0.1
+    m about their side's line. SEEN_LOW : share of strips of 0.1 m with heights on the lower side, up to the farthest of
+    at most 1.2 m; 0 of fewer than four. SEEN_HIGH : width with heights on the higher side, of at most 1.2 m. COVERED :
+    share of the window along the edge with heights near it on both sides.
+    """
+    columns = int(bins[4])
+    profile, near = np.empty((4, 2 * HALF_BINS)), np.empty((2, QUARTERS))
+    sums, lines = np.empty((6, 2 * HALF_BINS + 1)), np.empty((7, 2 * HALF_BINS + 1))
+    reach = np.sqrt(along_m * along_m + (BIN_M * HALF_BINS) ** 2)
+    # How far from the middle of a bin its heights lie at most.
+    corner = 0.708 * bins[2]
+    for i in range(node.shape[0]):
+        profile[:] = 0.0
+        near[:] = 0.0
+        out[i] = 0.0
+        out[i, SIGMA_STEP] = np.nan
+        c_low = max(int((node[i, 0] - reach - bins[0]) / bins[2]), 0)
+        c_high = min(int((node[i, 0] + reach - bins[0]) / bins[2]), columns - 1)
+        r_low = max(int((node[i, 1] - reach - bins[1]) / bins[2]), 0)
+        r_high = min(int((node[i, 1] + reach - bins[1]) / bins[2]), int(bins[3]) - 1)
+        ux, uy = node[i, 2], node[i, 3]
+        for r in range(r_low, r_high + 1):
+            for c in range(c_low, c_high + 1):
+                ex = bins[0] + (c + 0.5) * bins[2] - node[i, 0]
+                ey = bins[1] + (r + 0.5) * bins[2] - node[i, 1]
+                if abs(ex * ux + ey * uy) > along_m + corner or abs(ex * uy - ey * ux) > BIN_M * HALF_BINS + corner:
+                    continue
+                for j in range(starts[r * columns + c], starts[r * columns + c + 1]):
+                    ex, ey = x_m[j] - node[i, 0], y_m[j] - node[i, 1]
+                    t, d = ex * ux + ey * uy, ex * uy - ey * ux
+                    b = int(np.floor(d / BIN_M)) + HALF_BINS
+                    if abs(t) <= along_m and 0 <= b < 2 * HALF_BINS:
+                        z = z_m[j] - node[i, 4] - t * node[i, 5]
+                        profile[0, b] += 1.0
+                        profile[1, b] += d
+                        profile[2, b] += z
+                        profile[3, b] += z * z
+                        if abs(d) <= NEAR_M:
+                            near[0 if d < 0.0 else 1, min(int((t / along_m + 1.0) * 0.5 * QUARTERS), QUARTERS - 1)] = (
+                                1.0
+                            )
+        accumulate(profile, sums)
+        search_step(profile, sums, lines, search, prior, node[i, 6], out[i])
+        out[i, COVERED] = np.sum(near[0] * near[1]) / QUARTERS
+
+
+@inlined
+def accumulate(profile, sums):
+    """Running sums over bins of 1, d, d², z, d z and z²."""
+    sums[:, 0] = 0.0
+    for b in range(2 * HALF_BINS):
+        n = profile[0, b]
+        d = profile[1, b] / n if n > 0.0 else 0.0
+        sums[0, b + 1] = sums[0, b] + n
+        sums[1, b + 1] = sums[1, b] + n * d
+        sums[2, b + 1] = sums[2, b] + n * d * d
+        sums[3, b + 1] = sums[3, b] + profile[2, b]
+        sums[4, b + 1] = sums[4, b] + d * profile[2, b]
+        sums[5, b + 1] = sums[5, b] + profile[3, b]
+
+
+@inlined
+def line_between(sums, a, b, at_m, slope, precision):
+    """Line through bins a to b: its height at `at_m`, its slope, its χ (m²), returns, and share of variance there."""
+    n = sums[0, b] - sums[0, a]
+    if n < 4.0:
+        return 0.0, 0.0, np.inf, n, np.inf
+    d1, d2 = sums[1, b] - sums[1, a], sums[2, b] - sums[2, a]
+    z1, zd, z2 = sums[3, b] - sums[3, a], sums[4, b] - sums[4, a], sums[5, b] - sums[5, a]
+    s1, s2 = d1 - n * at_m, d2 - 2.0 * at_m * d1 + n * at_m * at_m + precision
+    t1 = zd - at_m * z1 + precision * slope
+    determinant = n * s2 - s1 * s1
+    level = (s2 * z1 - s1 * t1) / determinant
+    found = (n * t1 - s1 * z1) / determinant
+    rest = max(z2 + precision * slope * slope - level * z1 - found * t1, 0.0)
+    return level, found, rest, n, s2 / determinant
+
+
+@inlined
+def side_lines(profile, sums, ends, bounds, slope, precision, lines):
+    """Fill `lines` with the lines of both sides at each bin that a face may begin or end at.
+
+    ends : first and last bin of the lower and the higher side. bounds : first and last bin that is asked for. lines :
+    height, rest and returns of the lower side's line, then those of the higher side's, then the mean place of the bin's
+    heights (bins).
+    """
+    for b in range(bounds[0], bounds[1] + 1):
+        at = (b - HALF_BINS) * BIN_M
+        low, _, rest_low, n_low, _ = line_between(sums, ends[0], b, at, slope, precision)
+        high, _, rest_high, n_high, _ = line_between(sums, b, ends[1], at, slope, precision)
+        lines[0, b], lines[1, b], lines[2, b] = low, rest_low, n_low
+        lines[3, b], lines[4, b], lines[5, b] = high, rest_high, n_high
+        n = profile[0, b]
+        lines[6, b] = profile[1, b] / n / BIN_M + HALF_BINS if n > 0.0 else 0.0
+
+
+@inlined
+def search_step(profile, sums, lines, search, prior, slope, out):
+    """Find offset and face of least rest, and fill a row of results; all candidates are held against the same bins."""
+    precision = (prior[1] / prior[0]) ** 2
+    farthest, narrow, wide = int(search[0] / BIN_M), int(search[1] / BIN_M), int(search[2] / BIN_M)
+    first, last = HALF_BINS - farthest - int(search[3] / BIN_M), HALF_BINS + farthest + int(search[3] / BIN_M)
+    bounds = (HALF_BINS - farthest - wide // 2, HALF_BINS + farthest + wide - wide // 2)
+    side_lines(profile, sums, (first, last), bounds, slope, precision, lines)
+    best, a, b = np.inf, -1, -1
+    for face in range(narrow, wide + 1, 2):
+        # A face wider than needed has to explain more than chance would.
+        doubt = 1.0 + 0.002 * (face - narrow)
+        for e in range(-farthest, farthest + 1):
+            begin = HALF_BINS + e - face // 2
+            end = begin + face
+            low, high = lines[0, begin], lines[3, end]
+            if lines[2, begin] < 4.0 or lines[5, end] < 4.0 or high < low:
+                continue
+            rest = lines[1, begin] + lines[4, end]
+            for k in range(begin, end):
+                # It only grows.
+                if rest * doubt >= best:
+                    break
+                n = profile[0, k]
+                if n > 0.0:
+                    z = low + (lines[6, k] - begin) / face * (high - low)
+                    rest += max(profile[3, k] - 2.0 * z * profile[2, k] + n * z * z, 0.0)
+            rest *= doubt
+            if rest < best:
+                best, a, b = rest, begin, end
+    if a < 0:
+        return
+    low, slope_low, rest_low, n_low, var_low = line_between(sums, first, a, (a - HALF_BINS) * BIN_M, slope, precision)
+    high, slope_high, rest_high, n_high, var_high = line_between(
+        sums, b, last, (b - HALF_BINS) * BIN_M, slope, precision
+    )
+    noise = np.sqrt((rest_low + rest_high) / max(n_low + n_high - 4.0, 1.0))
+    out[STEP] = high - low
+    out[SIGMA_STEP] = np.sqrt((var_low + var_high) * noise * noise)
+    out[OFFSET] = (b - HALF_BINS) * BIN_M
+    out[FACE] = (b - a) * BIN_M
+    out[TOP] = high
+    out[RETURNS] = n_low + n_high
+    scatter(profile, a, b, low, slope_low, high, slope_high, out)
+    # A shift of the edge changes the rest by the returns in its way; it is known to where that is the noise's.
+    near = max((sums[0, min(b + 10, 2 * HALF_BINS)] - sums[0, max(a - 10, 0)]) / (20.0 + b - a), 0.2)
+    out[SIGMA_OFFSET] = min(BIN_M * (1.0 + 2.0 * noise * noise / max(near * (high - low) ** 2, 1e-9)), 0.3)
+
+
+@inlined
+def scatter(profile, a, b, low, slope_low, high, slope_high, out):
+    """Fill SCATTER, SEEN_LOW and SEEN_HIGH from strips of 0.1 m beyond both ends of the face."""
+    total, strips = 0.0, 0
+    for side in range(2):
+        seen, last = 0, 0
+        for j in range(12):
+            n, rest = 0.0, 0.0
+            for k in range(10):
+                at = a - 1 - 10 * j - k if side == 0 else b + 10 * j + k
+                if 0 <= at < 2 * HALF_BINS and profile[0, at] > 0.0:
+                    d = profile[1, at] / profile[0, at]
+                    level = low + slope_low * (d - (a - HALF_BINS) * BIN_M)
+                    if side == 1:
+                        level = high + slope_high * (d - (b - HALF_BINS) * BIN_M)
+                    n += profile[0, at]
+                    rest += profile[2, at] - profile[0, at] * level
+            if n > 0.0:
+                seen += 1
+                last = j + 1
+                # What lies farther off may bend away.
+                total += min(abs(rest / n), 0.1) / (1.0 + 0.15 * j)
+                strips += 1
+        if side == 0:
+            out[SEEN_LOW] = seen / last if seen >= 4 else 0.0
+        else:
+            out[SEEN_HIGH] = 0.1 * seen
+    out[SCATTER] = total / max(strips, 1)

@@ -1,0 +1,230 @@
+"""Upright planes in voxels: moments of the returns seen from above, thin elements of them, and what they join to."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from roadscan.compute.kernel_options import inlined, kernel
+
+
+@kernel
+def gather_moments(x, y, above, corner, sizes, index, moments, voxel_of):
+    """Number of voxels with returns; their moments, and the voxel of each return (-1: none).
+
+    x, y : (n,) float64; above : (n,) float32 heights (m), NaN is left out; corner : (x, y, height) of voxel (0, 0, 0);
+    sizes : (side, height of a layer) of a voxel (m); index : (layers, rows, columns) int32, all -1, gets the voxel's
+    number; moments : (most voxels, 10): n, Σx, Σy, Σx², Σxy, Σy² (from the voxel's corner), least and greatest height,
+    row, column; voxel_of : (n,) int32.
+    """
+    layers, rows, columns = index.shape
+    found = 0
+    for i in range(x.size):
+        voxel_of[i] = -1
+        height = above[i] - corner[2]
+        if not height >= 0.0:
+            continue
+        k = int(height / sizes[1])
+        u, v = (x[i] - corner[0]) / sizes[0], (y[i] - corner[1]) / sizes[0]
+        if k >= layers or u < 0.0 or v < 0.0 or u >= columns or v >= rows:
+            continue
+        r, c = int(v), int(u)
+        j = index[k, r, c]
+        if j < 0:
+            j = found
+            index[k, r, c] = j
+            found += 1
+            moments[j, :6] = 0.0
+            moments[j, 6], moments[j, 7] = above[i], above[i]
+            moments[j, 8], moments[j, 9] = r, c
+        a, b = (u - c) * sizes[0], (v - r) * sizes[0]
+        moments[j, 0] += 1.0
+        moments[j, 1] += a
+        moments[j, 2] += b
+        moments[j, 3] += a * a
+        moments[j, 4] += a * b
+        moments[j, 5] += b * b
+        moments[j, 6], moments[j, 7] = min(moments[j, 6], above[i]), max(moments[j, 7], above[i])
+        voxel_of[i] = j
+    return found
+
+
+@kernel
+def thin_elements(index, moments, side_m, limits, elements):
+    """Number of voxels whose returns, with those of the eight beside them in their layer, lie on an upright plane.
+
+    limits : (4,) fewest returns, least standard deviation along the plane, greatest across it (m), greatest ratio of
+    the two; elements : (voxels, 6) float64, gets 1 or 0, middle x, y (from the corner of the voxels, m), direction of
+    the plane seen from above (its cosine and sine), standard deviation across it (m).
+    """
+    layers, rows, columns = index.shape
+    good = 0
+    for k in range(layers):
+        for r in range(rows):
+            for c in range(columns):
+                j = index[k, r, c]
+                if j < 0:
+                    continue
+                n, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                for rr in range(max(r - 1, 0), min(r + 2, rows)):
+                    for cc in range(max(c - 1, 0), min(c + 2, columns)):
+                        i = index[k, rr, cc]
+                        if i < 0:
+                            continue
+                        m = moments[i, 0]
+                        a, b = (cc - c) * side_m, (rr - r) * side_m
+                        n += m
+                        sx += moments[i, 1] + m * a
+                        sy += moments[i, 2] + m * b
+                        sxx += moments[i, 3] + 2.0 * a * moments[i, 1] + m * a * a
+                        sxy += moments[i, 4] + a * moments[i, 2] + b * moments[i, 1] + m * a * b
+                        syy += moments[i, 5] + 2.0 * b * moments[i, 2] + m * b * b
+                elements[j] = 0.0
+                if n < limits[0]:
+                    continue
+                mx, my = sx / n, sy / n
+                cxx, cxy, cyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+                mean, half = 0.5 * (cxx + cyy), math.hypot(0.5 * (cxx - cyy), cxy)
+                along, across = math.sqrt(max(mean + half, 0.0)), math.sqrt(max(mean - half, 0.0))
+                angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
+                elements[j, 1], elements[j, 2] = c * side_m + mx, r * side_m + my
+                elements[j, 3], elements[j, 4], elements[j, 5] = math.cos(angle), math.sin(angle), across
+                if along >= limits[1] and across <= limits[2] and across <= limits[3] * along:
+                    elements[j, 0] = 1.0
+                    good += 1
+    return good
+
+
+@inlined
+def _continue_one_another(elements, i, j, least_cosine, most_m):
+    """Whether two elements lie on one plane, within limits."""
+    if abs(elements[i, 3] * elements[j, 3] + elements[i, 4] * elements[j, 4]) < least_cosine:
+        return False
+    dx, dy = elements[j, 1] - elements[i, 1], elements[j, 2] - elements[i, 2]
+    first = abs(dy * elements[i, 3] - dx * elements[i, 4])
+    second = abs(dy * elements[j, 3] - dx * elements[j, 4])
+    return first <= most_m and second <= most_m
+
+
+@kernel
+def grow_regions(index, elements, least_cosine, most_m, reach, region, stack):
+    """Number of regions: elements that touch, in and across layers, and continue one another's plane.
+
+    reach : (layers, cells) that a neighbour may be away; region : (voxels,) int32, all 0, gets the region's number from
+    1, in the order of layers, rows and columns; stack : (voxels, 3) int32, working space.
+    """
+    layers, rows, columns = index.shape
+    found = 0
+    for k in range(layers):
+        for r in range(rows):
+            for c in range(columns):
+                seed = index[k, r, c]
+                if seed < 0 or elements[seed, 0] == 0.0 or region[seed] != 0:
+                    continue
+                found += 1
+                region[seed] = found
+                stack[0, 0], stack[0, 1], stack[0, 2] = k, r, c
+                waiting = 1
+                while waiting > 0:
+                    waiting -= 1
+                    level, row, column = stack[waiting, 0], stack[waiting, 1], stack[waiting, 2]
+                    i = index[level, row, column]
+                    for kk in range(max(level - reach[0], 0), min(level + reach[0] + 1, layers)):
+                        for rr in range(max(row - reach[1], 0), min(row + reach[1] + 1, rows)):
+                            for cc in range(max(column - reach[1], 0), min(column + reach[1] + 1, columns)):
+                                j = index[kk, rr, cc]
+                                if j < 0 or elements[j, 0] == 0.0 or region[j] != 0:
+                                    continue
+                                if _continue_one_another(elements, i, j, least_cosine, most_m):
+                                    region[j] = found
+                                    stack[waiting, 0], stack[waiting, 1], stack[waiting, 2] = kk, rr, cc
+                                    waiting += 1
+    return found
+
+
+@kernel
+def beside_line(x, y, rows, middle, along, t, d):
+    """Fill `t` and `d` (k,): how far the places at `rows` (k,) lie along a line from its middle, and left of it (m)."""
+    for i in range(rows.size):
+        past_x, past_y = x[rows[i]] - middle[0], y[rows[i]] - middle[1]
+        t[i] = past_x * along[0] + past_y * along[1]
+        d[i] = past_y * along[0] - past_x * along[1]
+
+
+@kernel
+def in_stretches(t, edges, stretch):
+    """Fill `stretch` (k,) int32: the stretch of a line that t (k,) lies in; beyond the ends, the first and the last.
+
+    edges : (stretches + 1,) float64 where they begin, evenly apart, and where the last one ends (m).
+    """
+    last = edges.size - 2
+    scale = (last + 1) / max(edges[last + 1] - edges[0], 1e-9)
+    for i in range(t.size):
+        k = int(min(max((t[i] - edges[0]) * scale, 0.0), float(last)))
+        while k < last and t[i] >= edges[k + 1]:
+            k += 1
+        while k > 0 and t[i] < edges[k]:
+            k -= 1
+        stretch[i] = k
+
+
+@kernel
+def near_middles(t, d, stretch, edges, middle, most_m, near):
+    """Fill `near` (k,) bool: whether d is no farther than `most_m` from the line through the middles of stretches.
+
+    middle : (stretches,) float64 d of the line halfway along each; t, stretch, edges : as :func:`in_stretches`.
+    """
+    for i in range(t.size):
+        k = stretch[i]
+        share = (t[i] - edges[k]) / (edges[k + 1] - edges[k]) - 0.5
+        other = min(max(k + (1 if share > 0.0 else -1), 0), middle.size - 1)
+        near[i] = abs(d[i] - middle[k] - abs(share) * (middle[other] - middle[k])) <= most_m
+
+
+@kernel
+def passing_lines(x, y, height, sensor_x, sensor_y, sensor_height, segments, passed):
+    """Count the sight lines that cross upright rectangles and end behind them.
+
+    x, y, height : (n,) returns; sensor_x, sensor_y, sensor_height : (n,) where they were seen from (m); segments :
+    (s, 6) ends x, y and x, y of a rectangle seen from above, height of its lower and of its upper edge; passed : (s,)
+    int64, is added to.
+    """
+    for s in range(segments.shape[0]):
+        ax, ay, bx, by = segments[s, 0], segments[s, 1], segments[s, 2], segments[s, 3]
+        ux, uy = bx - ax, by - ay
+        length = math.hypot(ux, uy)
+        if length == 0.0:
+            continue
+        ux, uy = ux / length, uy / length
+        for i in range(x.size):
+            beyond = ux * (y[i] - ay) - uy * (x[i] - ax)
+            before = ux * (sensor_y[i] - ay) - uy * (sensor_x[i] - ax)
+            if beyond * before >= 0.0 or abs(beyond) < 0.3:
+                continue
+            share = before / (before - beyond)
+            px, py = sensor_x[i] + share * (x[i] - sensor_x[i]), sensor_y[i] + share * (y[i] - sensor_y[i])
+            along = (px - ax) * ux + (py - ay) * uy
+            if along < 0.0 or along > length:
+                continue
+            crossing = sensor_height[i] + share * (height[i] - sensor_height[i])
+            if segments[s, 4] <= crossing <= segments[s, 5]:
+                passed[s] += 1
+
+
+@kernel
+def region_ranges(region, members, starts):
+    """Sort the voxels by region: members (voxels,) int64 in their order, starts (regions + 2,) int64 of each region.
+
+    region : (voxels,) int32 from 0 (none).
+    """
+    starts[:] = 0
+    for j in range(region.size):
+        starts[region[j] + 1] += 1
+    for k in range(1, starts.size):
+        starts[k] += starts[k - 1]
+    at = np.empty(starts.size, np.int64)
+    at[:] = starts
+    for j in range(region.size):
+        members[at[region[j]]] = j
+        at[region[j]] += 1

@@ -1,0 +1,199 @@
+"""Stage `assets`: returns into evidence, evidence into objects, objects into tables and files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from roadscan.assets.kinds.lane_line import LaneLine
+from roadscan.assets.paint.contrast import ROUGHEST_M
+from roadscan.assets.tasks.drives import drives_key, load_drives
+from roadscan.assets.tasks.evidence import EVIDENCE, evidence_tasks, find_evidence, singly
+from roadscan.assets.tasks.gains import current_gains, find_samples, sample_tasks, write_gains
+from roadscan.assets.tasks.objects import OBJECTS, Cluster, join_objects, plan_joins
+from roadscan.assets.tasks.picture_work import PicturePlan, picture_tasks, plan_asset_pictures
+from roadscan.assets.tasks.pictures import FOLDER as PICTURE_FOLDER
+from roadscan.assets.tasks.pictures import find_pictures
+from roadscan.assets.tasks.plan import AssetPlan, check_assets
+from roadscan.assets.tasks.sections import SECTIONS, plan_sections, write_sections
+from roadscan.assets.tasks.tables import TABLES, plan_files, plan_tables, write_file, write_table
+from roadscan.assets.tasks.work import AssetsWork, due_joins, plan_evidence
+from roadscan.condition.tasks.lines import roads_key, survey_roads
+from roadscan.condition.tasks.tasks import run_units
+from roadscan.core.errors import RoadscanError
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding, Witness
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, StageState
+from roadscan.store.asset_schema import ASSET_FOLDER
+from roadscan.store.logs import LogRecord
+from roadscan.store.manifest import Manifest
+from roadscan.tiles.tasks.tiles import run_tasks
+
+_MOST_ROUGH: Final = 0.5
+"""Verges and kerbs are rough; half of the ground is so only where the readings are."""
+
+ROUGH_READINGS: Final = Witness(
+    "rough_readings",
+    "lidar",
+    "Readings or poses scatter by more than the road's own roughness, so that nothing painted is found.",
+    f"the scatter of the returns on the ground about their mean height, against {1e3 * ROUGHEST_M:.0f} mm",
+    "paint is not sought where it is larger; where that is more than half of the ground, it is named",
+    ("findings",),
+)
+
+
+class Assets(Stage):
+    """What stands on, beside and over the road, where the survey file has a section `[assets]`."""
+
+    name = "assets"
+    title = "what stands on, beside and over the road: ground, kerbs, markings, signs, poles, by kind"
+    after = ("condition",)
+
+    def run(self, session: Session) -> None:
+        """Compute what is missing or stale."""
+        work = plan_evidence(session)
+        session.manifest.remove(work.gone)
+        if work.plan is None:
+            return
+        if not work.plan.keys:
+            session.note("assets: no lidar, no line scanner with a turning mirror and no cloud saw anything")
+        if work.gains_due:
+            self._calibrate(session, work, work.plan)
+            work = plan_evidence(session)
+        if work.plan is not None:
+            self._search(session, work, work.plan)
+            self._join(session, work.plan)
+            self._write(session, work.plan, self._look(session, work.plan))
+
+    def _calibrate(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
+        """Gains of the intensity: samples of some squares, then the table."""
+        manifest, due = session.manifest, work.samples
+        failures = run_tasks(
+            find_samples, sample_tasks(plan, due), len(due), lambda squares: sample_tasks(plan, due, squares),
+            manifest, session.compute, session.bar("squares that tell of intensity"),
+        )  # fmt: skip
+        session.failed(self.name, failures)
+        if not work.gains.due(manifest):
+            manifest.add([write_gains(work.gains, manifest, plan, work.gains.key(manifest))])
+
+    def _search(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
+        manifest = session.manifest
+        due, gains = work.squares, current_gains(work.gains, session.manifest)
+        tasks = evidence_tasks(plan, due, gains, session.compute.workers)
+        failures = run_tasks(
+            find_evidence, tasks, len(due), lambda squares: singly(plan, due, gains, squares), manifest,
+            session.compute, session.bar("squares searched for assets"),
+        )  # fmt: skip
+        session.failed(self.name, failures)
+
+    def _join(self, session: Session, plan: AssetPlan) -> None:
+        """Join pieces kind after kind, each after those that it looks at."""
+        manifest = session.manifest
+        clusters: dict[str, list[Cluster]] = {}
+        for wanted in plan.kinds:
+            joins = plan_joins(session.store, plan.grid, wanted, manifest, clusters)
+            manifest.remove(joins.gone)
+            due = joins.due(manifest)
+            if due:
+                bar = session.bar(f"objects: {wanted.name}")
+                failed = run_units(join_objects, due, manifest, session.compute, bar)
+                session.failed(self.name, failed)
+
+    def _look(self, session: Session, plan: AssetPlan) -> PicturePlan:
+        """Hold objects against pictures, where there are any."""
+        manifest = session.manifest
+        pictures = plan_asset_pictures(plan, manifest)
+        for note in pictures.notes:
+            session.note(f"assets: {note}")
+        due = pictures.due(manifest)
+        if pictures.pictures is not None and due:
+            tasks = picture_tasks(plan, pictures.pictures, due, manifest, session.compute.workers)
+            bar = session.bar("squares whose assets are sought in pictures")
+            session.failed(self.name, run_units(find_pictures, tasks, manifest, session.compute, bar))
+        manifest.remove(pictures.gone(manifest))
+        unreadable = pictures.unreadable(manifest)
+        if unreadable:
+            session.note(f"assets: {len(unreadable):,} pictures cannot be read: {'; '.join(unreadable[:5])}")
+        return pictures
+
+    def _write(self, session: Session, plan: AssetPlan, pictures: PicturePlan) -> None:
+        manifest, context = session.manifest, plan.context
+        roads, key = survey_roads(plan.survey, manifest)
+        if plan.kinds and not roads.lines:
+            session.note("assets: no run has a trajectory of 20 m or more, so assets have no road, station and offset")
+        tables = plan_tables(plan.kinds, manifest, key + drives_key(plan), context, pictures)
+        due = [one for one in tables if not manifest.is_current(TABLES, one.unit, one.key)]
+        if due:
+            drives = load_drives(plan)
+            for table in due:
+                manifest.add([write_table(table, roads, drives, session.store, context)])
+        for file in plan_files(plan.kinds, manifest, plan.config, context):
+            if not manifest.is_current(TABLES, file.unit, file.key):
+                manifest.add([write_file(file, session.store, context)])
+        sections = plan_sections(roads, plan.config.cross_sections, plan.grid, manifest, context)
+        manifest.remove(manifest.beside({SECTIONS}, {unit for one in sections for unit in one.units}))
+        for one in sections:
+            if not all(manifest.is_current(SECTIONS, unit, one.key) for unit in one.units):
+                manifest.add(write_sections(one, plan.grid, session.store, context))
+        manifest.settle()
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """Where most of the ground is too rough to seek paint on it."""
+        records_of = manifest.of(EVIDENCE)
+        found = [one.figures() for unit, one in records_of.items() if unit.startswith(f"{LaneLine.name}/")]
+        dense, rough = (sum(one.get(name, 0) for one in found) for name in ("dense_cells", "rough_cells"))
+        if survey.config.assets is None or rough <= _MOST_ROUGH * dense:
+            return ()
+        said = (
+            f"Paint was not sought on {rough / dense:.0%} of the ground that is seen densely enough: its returns "
+            f"scatter by more than {1e3 * ROUGHEST_M:.0f} mm about their mean height, so lane lines and markings are "
+            "missing there. The sensor's noise, poses of passes that disagree, or rough ground do that."
+        )
+        return (ROUGH_READINGS.finds("assets", said),)
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """Kinds, their settings and sensors are such that there are."""
+        try:
+            check_assets(survey)
+        except RoadscanError as error:
+            return [error]
+        return []
+
+    def state(self, session: Session) -> StageState:
+        """Outputs of squares, objects and files that are there, and those that are due as far as is known by now."""
+        if session.survey.config.assets is None:
+            return StageState()
+        work = plan_evidence(session)
+        plan, manifest = work.plan, session.manifest
+        if plan is None:
+            return StageState()
+        made = manifest.files()
+        stale = work.evidence_due
+        if not stale:
+            stale = len(due_joins(plan, manifest)) or self._files_due(session, plan)
+        current = sum(made.get(name, 0) for name in (EVIDENCE, OBJECTS, TABLES))
+        next_run = {"asset squares": len(work.squares)} if work.squares else {}
+        return StageState(current, stale, next_run=next_run or ({"assets": stale} if stale else {}))
+
+    def _files_due(self, session: Session, plan: AssetPlan) -> int:
+        manifest, context = session.manifest, plan.context
+        key = roads_key(plan.survey) + drives_key(plan)
+        pictures = plan_asset_pictures(plan, manifest)
+        tables = plan_tables(plan.kinds, manifest, key, context, pictures)
+        due = len(pictures.due(manifest)) + sum(not manifest.is_current(TABLES, one.unit, one.key) for one in tables)
+        files = plan_files(plan.kinds, manifest, plan.config, context)
+        due += sum(not manifest.is_current(TABLES, one.unit, one.key) for one in files)
+        if due or plan.config.cross_sections is None:
+            return due
+        roads, _ = survey_roads(plan.survey, manifest)
+        sections = plan_sections(roads, plan.config.cross_sections, plan.grid, manifest, context)
+        return sum(not manifest.is_current(SECTIONS, unit, one.key) for one in sections for unit in one.units)
+
+    def folders(self) -> Sequence[str]:
+        """Evidence, objects, tables and files, classified points, bare earth."""
+        return (
+            "tables/intensity_samples", "tables/intensity_gains", "tables/asset_evidence", "tables/asset_objects",
+            "tables/asset_screens", "tables/asset_visibility", "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,
+            "products/classified_points", "products/ground_sections", "products/bare_earth",
+        )  # fmt: skip

@@ -1,0 +1,294 @@
+"""Evidence: returns of a square and its halo → its scene → pieces of each kind, classified points, bare earth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.assets.files.bare_earth import within, write_bare_earth
+from roadscan.assets.files.classified_points import classified_points, write_classified
+from roadscan.assets.intensity import calibrated_scene
+from roadscan.assets.kind import AssetKind, Evidence, Marked, asset_kinds
+from roadscan.assets.make_scene import make_scene
+from roadscan.assets.scene import Scene
+from roadscan.assets.screens import screens_of
+from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_squares
+from roadscan.assets.tasks.plan import AssetPlan
+from roadscan.assets.visibility import CELL_M, passes_in_sight
+from roadscan.core.errors import SchemaError
+from roadscan.core.ids import TileId
+from roadscan.core.settings.asset_ground import GroundSettings
+from roadscan.core.strict import Strict
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.compute import reason_of
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+from roadscan.store.writer import parquet_bytes
+from roadscan.tiles.blocks import Block
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.tasks.tile_files import publish_file
+from roadscan.tiles.tasks.tiles import TaskResult
+
+EVIDENCE: Final = "asset_evidence"
+"""Manifest name of the pieces of a kind in a square."""
+CLASSIFIED: Final = "classified_points"
+BARE_EARTH: Final = "bare_earth"
+SCREENS: Final = "asset_screens"
+"""Manifest name of what hides things from cameras."""
+VISIBILITY: Final = "asset_visibility"
+"""Cells of a square, and how many passes had them in sight."""
+OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, VISIBILITY)
+
+
+def evidence_unit(kind: str, square: TileId) -> str:
+    """Name of a kind's evidence of a square in the manifest."""
+    return f"{kind}/{square}"
+
+
+@dataclass(frozen=True)
+class SquareWork:
+    """What is due of a square; empty keys stand for what is not."""
+
+    square: TileId
+    kinds: tuple[tuple[str, str], ...]
+    """Names of the kinds whose evidence is due, with its key."""
+    beside: Mapping[str, str]
+    """What else is due: the key of each of :data:`OF_SQUARES` by its name."""
+
+
+@dataclass(frozen=True)
+class EvidenceTask:
+    """Some neighbouring squares to be searched. Sent to workers: it holds no data."""
+
+    load: ReturnsTask
+    work: tuple[SquareWork, ...]
+    kinds: tuple[tuple[str, Strict], ...]
+    """All kinds of the survey with their settings: the classes of points come from all of them."""
+    ground: GroundSettings
+    gains: OutputRecord | None
+    """Table that intensities are calibrated by; None where they are taken as recorded."""
+    context: ProductContext
+
+    @property
+    def block(self) -> Block:
+        """The squares."""
+        return Block(self.load.squares)
+
+    @property
+    def store(self) -> Store:
+        """Where the survey lies."""
+        return self.load.readings.store
+
+
+def due_squares(
+    plan: AssetPlan, manifest: Manifest, gains: OutputRecord | None, forced: Sequence[TileId] = ()
+) -> list[SquareWork]:
+    """What is missing or stale of each square, and all of those that are forced."""
+    calibrated = "" if gains is None else gains.digest
+    kind_keys = {one.name: key_of(one.evidence_key(), calibrated) for one in plan.kinds}
+    code = code_digest("roadscan.assets.tasks.evidence:find_evidence")
+    anew = set(forced)
+    found: list[SquareWork] = []
+    for square, key in plan.keys.items():
+        unit = str(square)
+        keys = {name: key_of(own, key) for name, own in kind_keys.items()}
+        beside = {VISIBILITY: key_of(code, key)}
+        if plan.config.classified:
+            beside[CLASSIFIED] = key_of(code, key, sorted(keys.items()), plan.context.survey_id)
+        if plan.config.bare_earth:
+            beside[BARE_EARTH] = key_of(code, key, plan.context.survey_id)
+        if plan.wants_pictures:
+            beside[SCREENS] = key_of(code, key, SCREENS)
+        if square not in anew:
+            keys = {n: k for n, k in keys.items() if not manifest.is_current(EVIDENCE, evidence_unit(n, square), k)}
+            beside = {name: k for name, k in beside.items() if not manifest.is_current(name, unit, k)}
+        if keys or beside:
+            found.append(SquareWork(square, tuple(keys.items()), beside))
+    return found
+
+
+def evidence_tasks(
+    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, workers: int = 1
+) -> list[EvidenceTask]:
+    """Tasks over the squares of which anything is due."""
+    return [_task(plan, due, gains, squares) for squares in plan.blocks([one.square for one in due], workers)]
+
+
+def singly(
+    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, squares: Sequence[TileId]
+) -> list[EvidenceTask]:
+    """A task for each square."""
+    return [_task(plan, due, gains, (square,)) for square in squares]
+
+
+def _task(
+    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, squares: tuple[TileId, ...]
+) -> EvidenceTask:
+    chosen = set(squares)
+    return EvidenceTask(
+        plan.load(squares), tuple(one for one in due if one.square in chosen),
+        tuple((one.name, one.options) for one in plan.kinds), plan.config.ground, gains, plan.context,
+    )  # fmt: skip
+
+
+def find_evidence(task: EvidenceTask) -> TaskResult:
+    """Search the squares of a task and write what is due of them (runs on a worker)."""
+    records: list[OutputRecord] = []
+    failures: list[tuple[str, str]] = []
+    due = {one.square: one for one in task.work}
+    store, gains = task.store, None
+    search: _Search | None = None
+    if task.gains is not None:
+        gains = store.parse_table(read_recorded(store, task.gains), task.gains.path)
+    with store.scratch() as folder:
+        for loaded in load_squares(task.load):
+            work = due[loaded.square]
+            try:
+                search = _Search(task, work, loaded, folder, gains)
+                records += search.records()
+                failures += search.failures
+            except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
+                failures.append((str(work.square), reason_of(error)))
+            search = loaded = None  # type: ignore[assignment]  # noqa: PLW2901  the next square takes their room
+    return TaskResult.of(records, failures)
+
+
+class _Search:
+    """A square on its way from returns to files."""
+
+    def __init__(
+        self, task: EvidenceTask, work: SquareWork, loaded: LoadedSquare, folder: Path, gains: pa.Table | None
+    ) -> None:
+        self._task, self._work, self._loaded, self._folder, self._gains = task, work, loaded, folder, gains
+        self.failures: list[tuple[str, str]] = []
+
+    def records(self) -> Iterator[OutputRecord]:
+        """Write what is due, kind by kind."""
+        if not len(self._loaded.returns):
+            yield from self._nothing()
+            return
+        grid = self._task.load.grid
+        scene = make_scene(
+            self._loaded.returns, grid.own_box, grid.window_box, self._loaded.drive_xyh_m, self._task.ground
+        )
+        seen = scene if self._gains is None else calibrated_scene(scene, self._gains)
+        keys = dict(self._work.kinds)
+        marked: list[Marked] = []
+        for name, options in self._task.kinds:
+            if name not in keys and CLASSIFIED not in self._work.beside:
+                continue
+            try:
+                kind = asset_kinds()[name]
+                found = kind.evidence(seen, options)
+                if name in keys:
+                    yield self._write_pieces(kind, found, keys[name])
+                marked += found.marked
+            except Exception as error:  # noqa: BLE001  one kind's fault must not stop the others
+                self.failures.append((evidence_unit(name, self._work.square), reason_of(error)))
+        writers = {BARE_EARTH: self._write_bare_earth, SCREENS: self._write_screens, VISIBILITY: self._write_visibility}
+        for product, write in writers.items():
+            if product in self._work.beside:
+                yield write(scene, self._work.beside[product])
+        if CLASSIFIED in self._work.beside and not self.failures:
+            yield self._write_classified(scene, marked, self._work.beside[CLASSIFIED])
+
+    def _nothing(self) -> Iterator[OutputRecord]:
+        """Records of a square without returns: finished, and no file."""
+        for name, key in self._work.kinds:
+            yield OutputRecord(EVIDENCE, evidence_unit(name, self._work.square), key, "", 0, "", _told(0))
+        for product, key in self._work.beside.items():
+            yield OutputRecord(product, str(self._work.square), key, "", 0, "", _told(0))
+
+    def _write_pieces(self, kind: AssetKind, found: Evidence, key: str) -> OutputRecord:
+        unit = evidence_unit(kind.name, self._work.square)
+        return self._write_rows(EVIDENCE, unit, key, conformed(found.pieces, kind), found.counts)
+
+    def _write_rows(
+        self, product: str, unit: str, key: str, rows: pa.Table, counts: Mapping[str, int] | None = None
+    ) -> OutputRecord:
+        """Keep rows as the table of that name; without any there is no file. The record keeps `counts`, too."""
+        told = _told(rows.num_rows, **(counts or {}))
+        if not rows.num_rows:
+            return OutputRecord(product, unit, key, "", 0, "", told)
+        path = self._folder / f"{product}.parquet"
+        pq.write_table(rows, path, compression="zstd", write_page_checksum=True, version="2.6")
+        target = f"tables/{product}/{unit}.parquet"
+        return publish_file(self._task.store, path, target, product, unit, key, told)
+
+    def _write_bare_earth(self, scene: Scene, key: str) -> OutputRecord:
+        grid, square = self._task.load.grid, self._work.square
+        model = within(scene.ground, grid.own_box)
+        known = 0 if model is None else int(np.count_nonzero(~np.isnan(model.height_m)))
+        if model is None or not known:
+            return OutputRecord(BARE_EARTH, str(square), key, "", 0, "", _told(0))
+        path = self._folder / "bare_earth.tif"
+        write_bare_earth(path, model, grid.corner_m(square), self._task.context)
+        detail = json.dumps({"cells": known, "seen": int(np.count_nonzero(model.seen))})
+        target = f"products/{BARE_EARTH}/{square}.tif"
+        return publish_file(self._task.store, path, target, BARE_EARTH, str(square), key, detail)
+
+    def _write_screens(self, scene: Scene, key: str) -> OutputRecord:
+        return self._write_rows(SCREENS, str(self._work.square), key, screens_of(scene))
+
+    def _write_visibility(self, scene: Scene, key: str) -> OutputRecord:
+        unit, schema = str(self._work.square), table_schema(VISIBILITY)
+        rows = visibility_rows(scene)
+        if not rows.num_rows:
+            return OutputRecord(VISIBILITY, unit, key, "", 0, "", _told(0))
+        path = self._folder / "visibility.parquet"
+        path.write_bytes(parquet_bytes(rows, schema))
+        target = f"{schema.location}/{unit}.parquet"
+        return publish_file(self._task.store, path, target, VISIBILITY, unit, key, _told(rows.num_rows))
+
+    def _write_classified(self, scene: Scene, marked: Sequence[Marked], key: str) -> OutputRecord:
+        square = self._work.square
+        own = np.flatnonzero(scene.tile.holds(scene.returns.x_m, scene.returns.y_m))
+        if not own.size:
+            return OutputRecord(CLASSIFIED, str(square), key, "", 0, "", _told(0))
+        classes = marked_classes(scene, marked)
+        points = classified_points(scene.returns.at(own), classes[own], square)
+        path = self._folder / "points.laz"
+        write_classified(path, points, self._task.load.grid.squares, self._task.context)
+        target = f"products/{CLASSIFIED}/{square}.laz"
+        return publish_file(self._task.store, path, target, CLASSIFIED, str(square), key, _told(len(points)))
+
+
+def visibility_rows(scene: Scene) -> pa.Table:
+    """Cells that passes had in sight, as the table `asset_visibility` has them; its metadata says their edge."""
+    schema = table_schema(VISIBILITY).arrow()
+    return passes_in_sight(scene).cast(schema).replace_schema_metadata({"edge_m": str(CELL_M)})
+
+
+def marked_classes(scene: Scene, marked: Sequence[Marked]) -> npt.NDArray[np.uint8]:
+    """Classes (n,) of the scene's returns, with those that kinds give to the returns of their pieces.
+
+    A return that two kinds mark has the class of the last one.
+    """
+    classes = scene.classes.copy()
+    for one in marked:
+        classes[one.rows] = one.code
+    return classes
+
+
+def conformed(pieces: pa.Table, kind: AssetKind) -> pa.Table:
+    """Pieces as the kind's schema says; SchemaError where they are not."""
+    if pieces.schema.names != kind.piece_schema.names:
+        raise SchemaError(
+            f"pieces of '{kind.name}' have the columns {', '.join(pieces.schema.names)}",
+            expected=", ".join(kind.piece_schema.names),
+        )
+    return pieces.cast(kind.piece_schema)
+
+
+def _told(count: int, **more: Any) -> str:
+    return json.dumps({"count": count, **more})

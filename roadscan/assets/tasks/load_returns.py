@@ -1,0 +1,331 @@
+"""Returns of squares and their halos: read by row group, placed with corrected poses, in canonical order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.assets.bins import distinct_steps
+from roadscan.assets.kernels.buckets import rows_within
+from roadscan.assets.returns import Returns
+from roadscan.assets.tiling import AssetGrid
+from roadscan.core.ids import TileId
+from roadscan.core.rig import UNMOUNTED, Mountings
+from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.navigation.trajectory import Trajectory
+from roadscan.tiles.georeferencing.centre_line import CentreLineBuffer
+from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M, QUANTUM_M
+from roadscan.tiles.georeferencing.place import EIGHT_TO_SIXTEEN_BITS, Located, Window, passes_of
+from roadscan.tiles.georeferencing.sensor_places import sensor_places
+from roadscan.tiles.plan.centre_line import load_buffer
+from roadscan.tiles.tasks.readings import (
+    Placer,
+    RawSlice,
+    ReadingSource,
+    TrajectorySource,
+    geometry_of,
+    load_trajectory,
+)
+from roadscan.tiles.tasks.tile_plan import TileTask
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+_RETURN_COLUMNS: Final = [
+    "epoch_gps_ns", "pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m", "intensity", "laser",
+]  # fmt: skip
+_SCAN_COLUMNS: Final = ["epoch_gps_ns", "range", "intensity"]
+_DRIVE_TICK_NS: Final = 50_000_000
+_DRIVE_STEP_M: Final = 0.25
+"""A place of a drive is kept where it lies in another square of this edge than the one before."""
+
+
+@dataclass(frozen=True)
+class ReturnsTask:
+    """What loads the returns of some squares. Sent to workers: it holds no data."""
+
+    grid: AssetGrid
+    squares: tuple[TileId, ...]
+    readings: TileTask
+    """Row groups that may touch them."""
+    sensors: tuple[str, ...]
+    """All sensors that the survey looks for assets with, by name."""
+    ways: tuple[tuple[str, TrajectorySource], ...]
+    """Trajectories of runs whose clouds are looked at, by run."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedSquare:
+    """What was seen in a square and its halo."""
+
+    square: TileId
+    returns: Returns
+    drive_xyh_m: Float64
+    """(p, 4) drives through the window, as :class:`roadscan.assets.scene.Scene` has them."""
+
+
+def load_squares(task: ReturnsTask) -> Iterator[LoadedSquare]:
+    """Returns of each square, in the order of the task; one without any comes with none."""
+    block = _Block(task)
+    for square in task.squares:
+        yield block.square(square)
+
+
+class _Columns(NamedTuple):
+    """Returns (n,) of a block of squares; x, y from the block's corner and height in quanta."""
+
+    source: npt.NDArray[np.uint16]
+    epoch_gps_ns: Int64
+    laser: npt.NDArray[np.uint16]
+    x: npt.NDArray[np.int32]
+    y: npt.NDArray[np.int32]
+    height: npt.NDArray[np.int32]
+    intensity: npt.NDArray[np.uint16]
+    pass_id: npt.NDArray[np.uint16]
+    return_number: npt.NDArray[np.uint8]
+    number_of_returns: npt.NDArray[np.uint8]
+
+    def at(self, rows: Any) -> _Columns:
+        """Some of them; columns without values stay so."""
+        return _Columns._make(column[rows] if column.size else column for column in self)
+
+
+class _Block:
+    """Returns of some neighbouring squares, placed at once."""
+
+    def __init__(self, task: ReturnsTask) -> None:
+        self._task, readings = task, task.readings
+        self._store, self._ground = readings.store, readings.ground
+        self._centre: CentreLineBuffer | None = None
+        if readings.centre_lines is not None:
+            self._centre = load_buffer(readings.centre_lines, self._ground.map)
+        self._placer = Placer(self._store, self._ground, readings.slices)
+        self._sources = _numbered([one.source for one in readings.slices])
+        box = readings.block.box() if readings.block.tiles else (0, 0, 1, 1)
+        self._corner, self._window = (box[0], box[1]), Window(*box)
+        parts = [part for one in readings.slices for part in self._parts(one)]
+        self._columns = in_order(_joined(parts))
+        self._trajectories = [self._trajectory(source) for source in self._sources]
+
+    def square(self, square: TileId) -> LoadedSquare:
+        """Returns of a square and its halo, and the drives through it."""
+        grid, size = self._task.grid, self._ground.grid.size_quanta
+        west, south = ((n * grid.per_edge - first) * size for n, first in zip(square, self._corner, strict=True))
+        halo, edge = round(grid.halo_m * QUANTA_PER_M), grid.per_edge * size
+        c = self._columns
+        ends = np.array([west - halo, south - halo, west + edge + halo, south + edge + halo], np.int64)
+        rows = np.empty(c.x.size, np.int64)
+        rows = rows[: rows_within(c.x, c.y, ends, rows)]
+        corner = grid.corner_m(square)
+        x, y = _metres(c.x[rows] - np.int32(west)), _metres(c.y[rows] - np.int32(south))
+        if self._centre is not None:
+            w = grid.window(square)
+            box = (w.easting_min_m, w.northing_min_m, w.easting_max_m, w.northing_max_m)
+            near = self._centre.keeps(corner[0] + x, corner[1] + y, box)
+            rows, x, y = rows[near], x[near], y[near]
+        height, nothing = _metres(c.height[rows]), np.zeros(0, np.int32)
+        own = c._replace(x=nothing, y=nothing, height=nothing).at(rows)
+        places = self._sensor_places(own)
+        returns = Returns(
+            corner_m=corner,
+            x_m=x,
+            y_m=y,
+            height_m=height,
+            intensity=own.intensity.astype(np.float32),
+            epoch_gps_ns=own.epoch_gps_ns,
+            pass_id=own.pass_id,
+            sensor=self._sensor_of_source[own.source],
+            laser=own.laser,
+            return_number=own.return_number,
+            number_of_returns=own.number_of_returns,
+            sensor_x_m=places[:, 0] - corner[0],
+            sensor_y_m=places[:, 1] - corner[1],
+            sensor_height_m=np.ascontiguousarray(places[:, 2]),
+            sensors=self._task.sensors,
+        )
+        return LoadedSquare(square, returns, self._drives(own, square))
+
+    @property
+    def _sensor_of_source(self) -> npt.NDArray[np.uint8]:
+        return np.array([self._task.sensors.index(s.sensor) for s in self._sources], np.uint8)
+
+    def _parts(self, one: RawSlice) -> Iterator[_Columns]:
+        """Returns of a slice, chunk by chunk."""
+        number = self._sources.index(one.source)
+        passes = [p for p in self._task.readings.passes if p.run == one.source.run]
+        found = self._of_cloud(one) if one.source.table == "cloud" else self._of_sensor(one)
+        for part in found:
+            ids = passes_of(part.epoch_gps_ns, passes)
+            part = part._replace(pass_id=ids, source=np.full(ids.size, number, np.uint16))  # noqa: PLW2901
+            yield part if (ids > 0).all() else part.at(ids > 0)
+
+    def _of_sensor(self, one: RawSlice) -> Iterator[_Columns]:
+        geometry = geometry_of(one.source)
+        wanted = _RETURN_COLUMNS if geometry is None else _SCAN_COLUMNS
+        for batch, found in self._placer.located(one, self._window, wanted):
+            if found.row.size:
+                epochs, intensity, laser = _recorded(batch, geometry, found)
+                single = np.ones(found.row.size, np.uint8)
+                yield self._placed(found.tiles, found.quanta, epochs, intensity, laser, (single, single))
+
+    def _of_cloud(self, one: RawSlice) -> Iterator[_Columns]:
+        for _, found in self._placer.place(one, self._window):
+            size = found.epoch_gps_ns.size
+            if size:
+                numbers = tuple(
+                    found.extra.get(name, np.ones(size, np.uint8)) for name in ("return_number", "number_of_returns")
+                )
+                laser = np.zeros(size, np.uint16)
+                yield self._placed(found.tiles, found.quanta, found.epoch_gps_ns, found.intensity, laser, numbers)
+
+    def _placed(
+        self,
+        tiles: npt.NDArray[np.int32],
+        quanta: npt.NDArray[np.int32],
+        epochs: Int64,
+        intensity: npt.NDArray[np.uint16],
+        laser: npt.NDArray[np.uint16],
+        numbers: Sequence[npt.NDArray[Any]],
+    ) -> _Columns:
+        """Columns of placed readings, pass and source still to be told."""
+        size = self._ground.grid.size_quanta
+        x, y = ((tiles[:, k] - self._corner[k]) * np.int32(size) + quanta[:, k] for k in range(2))
+        unset = np.zeros(0, np.uint16)
+        return _Columns(
+            unset, epochs, laser, x, y, np.ascontiguousarray(quanta[:, 2]), intensity, unset,
+            numbers[0].astype(np.uint8), numbers[1].astype(np.uint8),
+        )  # fmt: skip
+
+    def _trajectory(self, source: ReadingSource) -> Trajectory | None:
+        """Poses that tell where a source's sensor stood; None where that is not known."""
+        known = self._placer.trajectory(source)
+        way = dict(self._task.ways).get(source.run)
+        if known is not None or way is None:
+            return known
+        spans = [span for one in self._task.readings.slices if one.source == source for span in one.spans]
+        return load_trajectory(self._store, way, spans, self._ground.max_gap_s)
+
+    def _sensor_places(self, own: _Columns) -> Float64:
+        """(n, 3) easting, northing, height of the sensor; NaN where it is not known."""
+        parts = [self._places(k, own.epoch_gps_ns[rows]) for k, rows in _by_source(own.source, len(self._sources))]
+        return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, 3)), *parts])
+
+    def _places(self, number: int, epochs_gps_ns: Int64) -> Float64:
+        trajectory, source = self._trajectories[number], self._sources[number]
+        if trajectory is None or trajectory.epochs_gps_ns.size < 2:
+            return np.full((epochs_gps_ns.size, 3), np.nan)
+        mountings = Mountings.one(UNMOUNTED) if source.table == "cloud" else source.adjusted_mountings
+        return sensor_places(trajectory, self._ground.map, mountings, epochs_gps_ns)
+
+    def _drives(self, own: _Columns, square: TileId) -> Float64:
+        """(p, 4) places of the first sensor of each pass within the window while it looked there, and the pass."""
+        grid = self._task.grid
+        found = [np.zeros((0, 4))]
+        seen: set[int] = set()
+        for number, rows in _by_source(own.source, len(self._sources)):
+            ids = own.pass_id[rows]
+            held = [int(ids[0])] if ids.min() == ids.max() else np.flatnonzero(np.bincount(ids)).tolist()
+            for one in held:
+                if one in seen:
+                    continue
+                epochs = own.epoch_gps_ns[rows]
+                tick = distinct_steps(epochs if len(held) == 1 else epochs[ids == one], _DRIVE_TICK_NS)
+                places = self._places(number, tick * _DRIVE_TICK_NS + _DRIVE_TICK_NS // 2)
+                places[:, :2] -= grid.corner_m(square)
+                places = places[grid.window_box.holds(places[:, 0], places[:, 1])]
+                if len(places):
+                    seen.add(one)
+                    found.append(np.column_stack([thinned(places), np.full(len(thinned(places)), float(one))]))
+        drives = np.concatenate(found)
+        return drives[np.argsort(drives[:, 3], kind="stable")]
+
+
+def _metres(quanta: npt.NDArray[np.integer[Any]]) -> Float64:
+    return np.asarray(quanta * QUANTUM_M, np.float64)
+
+
+def _numbered(sources: Sequence[ReadingSource]) -> list[ReadingSource]:
+    """Each source once, in an order that does not depend on which others there are."""
+    held = {one.key: one for one in sources}
+    return sorted(held.values(), key=lambda s: (s.run, s.sensor, s.table, s.key))
+
+
+def _recorded(
+    batch: pa.RecordBatch, geometry: ScanGeometry | None, found: Located
+) -> tuple[Int64, npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
+    """Epoch, intensity and laser (n,) of located readings."""
+    epochs = batch.column("epoch_gps_ns").to_numpy()
+    if geometry is None:
+        intensity, laser = (batch.column(name).to_numpy()[found.row] for name in ("intensity", "laser"))
+        return epochs[found.row], intensity.astype(np.uint16), laser.astype(np.uint16)
+    own = geometry.reading_epochs(epochs[found.row], found.reading)
+    laser = np.zeros(found.row.size, np.uint16)
+    recorded = batch.column("intensity")
+    if recorded.null_count:
+        return own, np.zeros(found.row.size, np.uint16), laser
+    digital = recorded.flatten().to_numpy(zero_copy_only=False).reshape(batch.num_rows, geometry.readings)
+    scaled = digital[found.row, found.reading].astype(np.uint16) * np.uint16(EIGHT_TO_SIXTEEN_BITS)
+    return own, scaled, laser
+
+
+def _joined(parts: list[_Columns]) -> _Columns:
+    """All parts as one; they are given up."""
+    kinds = (np.uint16, np.int64, np.uint16, np.int32, np.int32, np.int32, np.uint16, np.uint16, np.uint8, np.uint8)
+    if not parts:
+        return _Columns._make(np.zeros(0, kind) for kind in kinds)
+    joined = _Columns._make(np.concatenate(column) for column in zip(*parts, strict=True))
+    parts.clear()
+    return joined
+
+
+def in_order(c: _Columns) -> _Columns:
+    """Returns by source, epoch and laser; where these repeat, by their places and intensities.
+
+    Logs come so ordered, but for repeats, so as a rule little is moved.
+    """
+    if _falls(c).any():
+        c = c.at(np.lexsort((c.laser, c.epoch_gps_ns, c.source)))
+    same = (c.source[1:] == c.source[:-1]) & (c.epoch_gps_ns[1:] == c.epoch_gps_ns[:-1]) & (c.laser[1:] == c.laser[:-1])
+    if not same.any():
+        return c
+    tied = np.zeros(c.x.size, bool)
+    tied[1:] |= same
+    tied[:-1] |= same
+    rows = np.flatnonzero(tied)
+    group = np.concatenate([[0], np.cumsum(~same)])[rows]
+    t = c.at(rows)
+    order = np.lexsort((t.number_of_returns, t.return_number, t.intensity, t.height, t.y, t.x, group))
+    if (order == np.arange(order.size)).all():
+        return c
+    moved = np.arange(c.x.size)
+    moved[rows] = rows[order]
+    return c.at(moved)
+
+
+def _falls(c: _Columns) -> Bool:
+    source = np.diff(c.source.astype(np.int32))
+    epoch, laser = np.diff(c.epoch_gps_ns), np.diff(c.laser.astype(np.int32))
+    falls: Bool = (source < 0) | ((source == 0) & ((epoch < 0) | ((epoch == 0) & (laser < 0))))
+    return falls
+
+
+def _by_source(source: npt.NDArray[np.uint16], count: int) -> Iterator[tuple[int, slice]]:
+    """Rows of each source, which are ascending."""
+    ends = np.searchsorted(source, np.arange(count + 1, dtype=source.dtype))
+    for number in range(count):
+        if ends[number] < ends[number + 1]:
+            yield number, slice(int(ends[number]), int(ends[number + 1]))
+
+
+def thinned(places_m: Float64) -> Float64:
+    """Places (k, 3) of a drive without those where it has hardly moved."""
+    cell = np.floor(places_m[:, :2] / _DRIVE_STEP_M)
+    moved = np.ones(len(places_m), bool)
+    moved[1:] = (np.diff(cell, axis=0) != 0).any(axis=1)
+    return places_m[moved]

@@ -1,0 +1,193 @@
+"""Objects: pieces of neighbouring squares, joined kind after kind; only what changed is joined again."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.assets.calibration import curve_named
+from roadscan.assets.kind import AssetObject, asset_kinds
+from roadscan.assets.object_table import objects_of_table, table_of_objects
+from roadscan.assets.tasks.evidence import EVIDENCE
+from roadscan.assets.tasks.kinds import WantedKind
+from roadscan.assets.tiling import AssetGrid
+from roadscan.core.ids import TileId
+from roadscan.core.strict import Strict
+from roadscan.run.engine.compute import damaged_file, reason_of
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.asset_schema import asset_schema
+from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.store import Store, bytes_digest
+from roadscan.tiles.tasks.tiles import TaskResult
+
+OBJECTS: Final = "asset_objects"
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Squares that touch one another and hold pieces of a kind: an object lies within one of these."""
+
+    kind: str
+    squares: tuple[TileId, ...]
+    """By row and column."""
+
+    @property
+    def unit(self) -> str:
+        """Its name in the manifest."""
+        return f"{self.kind}/{self.squares[0]}"
+
+    def meets(self, squares: set[TileId]) -> bool:
+        """Whether one of its squares is among others."""
+        return not squares.isdisjoint(self.squares)
+
+    def near(self) -> set[TileId]:
+        """Its squares and those around them."""
+        around = (-1, 0, 1)
+        return {TileId(s.column + c, s.row + r) for s in self.squares for c in around for r in around}
+
+
+@dataclass(frozen=True)
+class JoinTask:
+    """A cluster of pieces to be joined. Sent to workers: it holds no data."""
+
+    store: Store
+    grid: AssetGrid
+    cluster: Cluster
+    options: Strict
+    pieces: tuple[OutputRecord, ...]
+    """Evidence of its squares, in their order."""
+    others: tuple[tuple[str, tuple[OutputRecord, ...]], ...]
+    """Objects of other kinds near it, which this one looks at."""
+    key: str
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Its one unit."""
+        return (self.cluster.unit,)
+
+    def singly(self) -> list[JoinTask]:
+        """It cannot be cut."""
+        return [self]
+
+
+@dataclass(frozen=True)
+class JoinPlan:
+    """Clusters of a kind."""
+
+    tasks: tuple[JoinTask, ...] = ()
+    gone: tuple[OutputRecord, ...] = field(default=())
+    """Objects of clusters that are no more."""
+
+    def due(self, manifest: Manifest) -> list[JoinTask]:
+        """Those that are missing or stale."""
+        return [t for t in self.tasks if not manifest.is_current(OBJECTS, t.cluster.unit, t.key)]
+
+
+def plan_joins(
+    store: Store, grid: AssetGrid, wanted: WantedKind, manifest: Manifest, clusters: dict[str, list[Cluster]]
+) -> JoinPlan:
+    """Clusters of a kind, from the evidence that there is; they join `clusters`, which holds those of kinds before."""
+    held = {
+        TileId.parse(r.unit.partition("/")[2]): r
+        for r in manifest.of(EVIDENCE).values()
+        if r.path and r.unit.startswith(f"{wanted.name}/")
+    }
+    own = clusters[wanted.name] = [Cluster(wanted.name, squares) for squares in clustered(held)]
+    objects, code = manifest.of(OBJECTS), wanted.objects_key()
+    tasks = []
+    for cluster in own:
+        near = cluster.near()
+        others = tuple(
+            (
+                name,
+                tuple(objects[c.unit] for c in clusters[name] if c.unit in objects and c.meets(near)),
+            )
+            for name in wanted.kind.after
+            if name in clusters
+        )
+        pieces = tuple(held[square] for square in cluster.squares)
+        read = [[name, [(r.unit, r.digest) for r in records]] for name, records in others]
+        key = key_of(code, grid.edge_m, [(r.unit, r.digest) for r in pieces], read)
+        tasks.append(JoinTask(store, grid, cluster, wanted.options, pieces, others, key))
+    units = {cluster.unit for cluster in own}
+    gone = tuple(r for u, r in objects.items() if u.startswith(f"{wanted.name}/") and u not in units)
+    return JoinPlan(tuple(tasks), gone)
+
+
+def clustered(squares: Mapping[TileId, object]) -> list[tuple[TileId, ...]]:
+    """Squares that touch one another, also at a corner, together; each cluster and all of them by row and column."""
+    waiting = dict.fromkeys(sorted(squares, key=lambda t: (t.row, t.column)))
+    found: list[tuple[TileId, ...]] = []
+    while waiting:
+        first = next(iter(waiting))
+        del waiting[first]
+        own, front = [first], [first]
+        while front:
+            at = front.pop()
+            for one in _around(at):
+                if one in waiting:
+                    del waiting[one]
+                    own.append(one)
+                    front.append(one)
+        found.append(tuple(sorted(own, key=lambda t: (t.row, t.column))))
+    return found
+
+
+def _around(square: TileId) -> Iterator[TileId]:
+    for c in (-1, 0, 1):
+        for r in (-1, 0, 1):
+            if c or r:
+                yield TileId(square.column + c, square.row + r)
+
+
+def join_objects(task: JoinTask) -> TaskResult:
+    """Join the pieces of a cluster and write its objects (runs on a worker)."""
+    try:
+        return TaskResult.of([_joined(task)])
+    except Exception as error:  # noqa: BLE001  one cluster's fault must not stop the others
+        return TaskResult.of((), [(task.cluster.unit, reason_of(error))], {damaged_file(error)})
+
+
+def _joined(task: JoinTask) -> OutputRecord:
+    name = task.cluster.kind
+    kind, schema = asset_kinds()[name], asset_schema(name).arrow()
+    pieces = pa.concat_tables([kind.piece_schema.empty_table(), *(_read(task.store, r) for r in task.pieces)])
+    near = task.cluster.near()
+    others = {other: _near(task, records, near) for other, records in task.others}
+    curve = curve_named(kind.curve)
+    found = [
+        replace(one, probability=curve.stated(one.probability))
+        for one in kind.objects(pieces.combine_chunks(), task.options, others)
+    ]
+    rows = table_of_objects(name, found, schema)
+    unit = task.cluster.unit
+    if not rows.num_rows:
+        return OutputRecord(OBJECTS, unit, task.key, "", 0, "", '{"objects": 0}')
+    stream = io.BytesIO()
+    pq.write_table(rows, stream, compression="zstd", write_page_checksum=True, version="2.6")
+    content, target = stream.getvalue(), f"tables/{OBJECTS}/{unit}.parquet"
+    task.store.write_bytes(target, content, lasting=False)
+    detail = f'{{"objects": {rows.num_rows}}}'
+    return OutputRecord(OBJECTS, unit, task.key, target, len(content), bytes_digest(content), detail)
+
+
+def _near(task: JoinTask, records: Sequence[OutputRecord], near: set[TileId]) -> list[AssetObject]:
+    """Objects of another kind whose place lies in the cluster or in the squares around it."""
+    found: list[AssetObject] = []
+    for record in records:
+        rows = _read(task.store, record) if record.path else None
+        if rows is None:
+            continue
+        places = zip(rows["easting_m"].to_pylist(), rows["northing_m"].to_pylist(), strict=True)
+        held = [task.grid.squares.tile_at(e, n) in near for e, n in places]
+        found += objects_of_table(rows.filter(pa.array(held, pa.bool_())))
+    return found
+
+
+def _read(store: Store, record: OutputRecord) -> pa.Table:
+    return store.parse_table(read_recorded(store, record), record.path)

@@ -1,0 +1,16 @@
+"""Which of a survey's pictures may show assets."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from roadscan.core.settings.asset_pictures import AssetPicturesSettings
+from roadscan.surface.views import PictureRule
+
+_ANY_ANGLE_DEG: Final = -90.0
+_BORDER_PX: Final = 1
+
+
+def picture_rule(settings: AssetPicturesSettings) -> PictureRule:
+    """Pictures of the cameras that are asked for, within reach, at any angle."""
+    return PictureRule(tuple(settings.cameras), settings.reach_m, _ANY_ANGLE_DEG, _BORDER_PX)

@@ -1,0 +1,204 @@
+"""What pictures tell of assets: the best of them, cut-outs of signs, colours of paint."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.assets.kind import AssetObject
+from roadscan.assets.object_table import objects_of_table
+from roadscan.assets.pictures.reader import ColourReader, CutOut, CutOutReader, picture_readers, sight_of
+from roadscan.assets.screens import SCREENS
+from roadscan.assets.tasks.picture_work import CUT_OUTS, SEEN, PictureTask, SquareObjects, around, rows_by_square
+from roadscan.assets.tasks.recognition import recognition_of
+from roadscan.assets.tasks.sights import best_sights, named
+from roadscan.run.engine.compute import reason_of
+from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.store.store import bytes_digest
+from roadscan.surface.tasks.picture_colours import ColourSource, world_places
+from roadscan.surface.tasks.pictures import Pictures
+from roadscan.surface.views import NO_VIEW, WIDTH, Sights, best_views
+from roadscan.tiles.grid import Bounds
+from roadscan.tiles.tasks.tiles import TaskResult
+
+Float64 = npt.NDArray[np.float64]
+
+TOLD: Final = pa.schema([("object", pa.string()), ("pictures", pa.string()), ("told", pa.string())])
+"""What pictures tell of objects: `told` holds columns of the kind as JSON."""
+FOLDER: Final = "products/asset_pictures"
+_JPEG: Final = [int(cv2.IMWRITE_JPEG_QUALITY), 90]
+_LEAST_MARGIN_PX: Final = 6.0
+_GREY_STEP: Final = 16
+_GREY_WITHIN: Final = 3
+
+
+def find_pictures(task: PictureTask) -> TaskResult:
+    """Hold the objects of a task against its pictures, and write what they tell (runs on a worker)."""
+    records: list[OutputRecord] = []
+    failures: list[tuple[str, str]] = []
+    source = ColourSource(task.pictures)
+    search = _Search(task, source)
+    for one in task.work:
+        try:
+            records += search.records(one)
+        except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
+            failures.append((one.unit, reason_of(error)))
+    return TaskResult.of(records, failures)
+
+
+@dataclass
+class _Answer:
+    """What pictures told of the objects of a square."""
+
+    pictures: list[str | None]
+    told: list[dict[str, Any]]
+    files: list[OutputRecord] = field(default_factory=list)
+    unreadable: set[str] = field(default_factory=set)
+
+
+class _Search:
+    """Objects on their way from places to what pictures tell of them."""
+
+    def __init__(self, task: PictureTask, source: ColourSource) -> None:
+        self._task, self._source = task, source
+        self._recognition = recognition_of(task.settings.text, task.recogniser)
+        self._screens = {square: self._read(record) for square, record in task.screens}
+
+    def records(self, one: SquareObjects) -> list[OutputRecord]:
+        """Records of what is told of the objects of a square, and of the files cut out of pictures."""
+        grid = self._task.grid
+        parts = [dict(rows_by_square(self._read(r), grid))[one.square] for r in one.objects]
+        rows = pa.concat_tables(parts)
+        objects = objects_of_table(rows)
+        answer = self._answer(one, objects, rows["object"].to_pylist())
+        table = pa.table([rows["object"], answer.pictures, [json.dumps(t, ensure_ascii=False) for t in answer.told]],
+                         schema=TOLD)  # fmt: skip
+        stream = io.BytesIO()
+        pq.write_table(table, stream, compression="zstd", write_page_checksum=True, version="2.6")
+        detail = {
+            "objects": len(objects), "shown": sum(p is not None for p in answer.pictures),
+            "cut_outs": [record.unit for record in answer.files], "unreadable": sorted(answer.unreadable),
+        }  # fmt: skip
+        content, target = stream.getvalue(), f"tables/{SEEN}/{one.unit}.parquet"
+        self._task.store.write_bytes(target, content, lasting=False)
+        seen = OutputRecord(
+            SEEN, one.unit, one.key, target, len(content), bytes_digest(content), json.dumps(detail, ensure_ascii=False)
+        )
+        return [*answer.files, seen]
+
+    def _answer(self, one: SquareObjects, objects: Sequence[AssetObject], names: Sequence[str]) -> _Answer:
+        settings, near = self._task.settings, self._task.pictures.near(one.box)
+        if not len(near):
+            return _Answer([None] * len(objects), [{} for _ in objects])
+        hides = around(one.square, dict(self._task.screens), self._task.grid, settings.reach_m)
+        screens = pa.concat_tables([SCREENS.empty_table(), *(self._screens[square] for square, _ in hides)])
+        found = best_sights([sight_of(one.kind, o) for o in objects], near, screens)
+        answer = _Answer(named(found, near, len(objects), settings.most), [{} for _ in objects])
+        reader = picture_readers().get(one.kind)
+        if isinstance(reader, CutOutReader):
+            self._cut(one, reader, objects, names, _Shown(near, found), answer)
+        elif isinstance(reader, ColourReader):
+            for number, asset in enumerate(objects):
+                answer.told[number] = dict(self._coloured(reader, asset, answer))
+        return answer
+
+    def _cut(
+        self,
+        one: SquareObjects,
+        reader: CutOutReader,
+        objects: Sequence[AssetObject],
+        names: Sequence[str],
+        shown: _Shown,
+        answer: _Answer,
+    ) -> None:
+        """Cut objects out of the pictures that show them best, and read them."""
+        for number, asset in enumerate(objects):
+            outline = reader.outline_m(asset)
+            if outline is None:
+                continue
+            cut = self._cut_outs(outline, shown.of(number), shown.pictures, answer)
+            if not cut:
+                continue
+            told = dict(reader.read(asset, cut, self._recognition))
+            if self._task.settings.cut_outs:
+                files = [self._kept(one, f"{names[number]}_{n}", c) for n, c in enumerate(cut, 1)]
+                answer.files += files
+                told["cut_out"] = files[0].path
+            answer.told[number] = told
+
+    def _cut_outs(self, outline_m: Float64, found: Sights, pictures: Pictures, answer: _Answer) -> list[CutOut]:
+        """Cut-outs of the best pictures that can be read."""
+        worlds = [world_places(pictures, world, outline_m) for world in pictures.worlds]
+        cut: list[CutOut] = []
+        for view, resolution in zip(found.view.tolist(), found.resolution_m.tolist(), strict=True):
+            pixels = best_views(worlds, pictures.views.picked(np.array([view])), pictures.rule)
+            lens = pictures.views.lenses[pictures.views.lens[view]]
+            torn = lens.is_around and np.ptp(pixels.pixel[:, 0]) > lens.parameters[WIDTH] / 2  # by the picture's ends
+            if torn or (pixels.view == NO_VIEW).any():
+                continue
+            picture = self._source.picture(pictures, view)
+            if picture is None:
+                answer.unreadable.add(pictures.name(view))
+                continue
+            cut.append(_cut_out(picture, pixels.pixel, resolution, self._task.settings.margin))
+            if len(cut) == self._task.settings.most:
+                break
+        return cut
+
+    def _kept(self, one: SquareObjects, name: str, cut: CutOut) -> OutputRecord:
+        """Write a cut-out."""
+        done, encoded = cv2.imencode(".jpg", np.ascontiguousarray(cut.pixels[:, :, ::-1]), _JPEG)
+        if not done:
+            raise OSError(f"the cut-out {name} cannot be encoded")
+        content, target = encoded.tobytes(), f"{FOLDER}/{one.kind}/{name}.jpg"
+        self._task.store.write_bytes(target, content, lasting=False)
+        unit = f"{one.kind}/{name}"
+        return OutputRecord(CUT_OUTS, unit, one.key, target, len(content), bytes_digest(content))
+
+    def _coloured(self, reader: ColourReader, asset: AssetObject, answer: _Answer) -> Mapping[str, Any]:
+        """What colours of an object and beside it tell."""
+        places = reader.places(asset)
+        every = np.vstack([places.own_m, places.beside_m])
+        if not len(every):
+            return {}
+        (west, south), (east, north) = every[:, :2].min(axis=0).tolist(), every[:, :2].max(axis=0).tolist()
+        found = self._source.colours(self._task.pictures.near(Bounds(west, south, east, north)), every)
+        answer.unreadable.update(found.unreadable)
+        is_own = np.arange(len(every)) < len(places.own_m)
+        return reader.read(found.colour[is_own & found.seen], found.colour[~is_own & found.seen])
+
+    def _read(self, record: OutputRecord) -> pa.Table:
+        return self._task.store.parse_table(read_recorded(self._task.store, record), record.path)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """Sights of objects, and the pictures that they count."""
+
+    pictures: Pictures
+    sights: Sights
+
+    def of(self, item: int) -> Sights:
+        """Those of one object."""
+        return self.sights.at(np.flatnonzero(self.sights.item == item))
+
+
+def _cut_out(picture: npt.NDArray[np.uint8], outline_px: Float64, resolution_m: float, margin: float) -> CutOut:
+    """The part of a picture around an outline (k, 2)."""
+    low, high = outline_px.min(axis=0), outline_px.max(axis=0)
+    beyond = np.maximum(margin * (high - low), _LEAST_MARGIN_PX)
+    height, width = picture.shape[:2]
+    left, top = np.maximum(np.floor(low - beyond), 0).astype(int).tolist()
+    right, bottom = np.minimum(np.ceil(high + beyond) + 1, [width, height]).astype(int).tolist()
+    sample = picture[::_GREY_STEP, ::_GREY_STEP].astype(np.int16)
+    is_grey = bool(np.quantile(np.ptp(sample, axis=2), 0.99) <= _GREY_WITHIN)
+    return CutOut(picture[top:bottom, left:right].copy(), outline_px - [left, top], resolution_m, is_grey)

@@ -1,0 +1,180 @@
+"""What assets are sought in: squares that a sensor with a wide view saw, their keys, and tasks over them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from roadscan.assets.tasks.kinds import WantedKind, wanted_kinds
+from roadscan.assets.tasks.load_returns import ReturnsTask
+from roadscan.assets.tasks.picture_rule import picture_rule
+from roadscan.assets.tasks.recognition import check_recognition
+from roadscan.assets.tiling import AssetGrid
+from roadscan.core.errors import ConfigError, nearest
+from roadscan.core.ids import TileId
+from roadscan.core.settings.assets import AssetsConfig
+from roadscan.core.survey import Survey
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.store import bytes_digest
+from roadscan.surface.tasks.pictures import rule_cameras
+from roadscan.tiles.blocks import Block, cut_blocks
+from roadscan.tiles.footprints.footprints import FootprintRanges
+from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import SurveyPlan, trajectory_source
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.tasks.readings import ReadingSource, TrajectorySource, geometry_of
+from roadscan.tiles.tasks.tile_plan import TilePlan, plan_tiles
+
+_BLOCK_SQUARES: Final = 16
+"""Edge of the largest block of squares that one task searches: a lidar sees 100 m to both sides, and row groups that
+touch several blocks are read for each."""
+
+
+@dataclass(frozen=True)
+class AssetPlan:
+    """Squares of a survey, and what is sought in them."""
+
+    survey: SurveyPlan
+    config: AssetsConfig
+    grid: AssetGrid
+    tiles: TilePlan
+    """The survey's tiles that the chosen sensors may have seen."""
+    sensors: tuple[str, ...]
+    ways: tuple[tuple[str, TrajectorySource], ...]
+    kinds: tuple[WantedKind, ...]
+    keys: Mapping[TileId, str]
+    """Key of what was seen in each square, by row and column."""
+    readings: Mapping[TileId, int]
+    """About how many returns each square holds."""
+
+    @property
+    def context(self) -> ProductContext:
+        """What files need to know of the survey."""
+        return self.tiles.context
+
+    @property
+    def wants_pictures(self) -> bool:
+        """Whether pictures of assets are wanted, and the rig has a camera that could take them."""
+        settings = self.config.pictures
+        cameras = [one for one in self.survey.survey.rig.sensors.values() if one.kind == "camera"]
+        return settings.on and bool(settings.cameras or any(one.interior is not None for one in cameras))
+
+    def blocks(self, squares: Sequence[TileId], workers: int = 1) -> list[tuple[TileId, ...]]:
+        """Neighbouring squares that fit into memory together; fewer where there are few for that many workers."""
+        readings = {square: self.readings[square] for square in squares}
+        edge = _BLOCK_SQUARES
+        blocks = cut_blocks(readings, edge, self.config.max_block_returns)
+        while edge > 1 and workers > 1 and len(blocks) < 2 * workers:
+            edge //= 2
+            blocks = cut_blocks(readings, edge, self.config.max_block_returns)
+        return [b.tiles for b in blocks]
+
+    def load(self, squares: tuple[TileId, ...]) -> ReturnsTask:
+        """What loads the returns of some squares."""
+        known = self.tiles.tiles.number
+        under = dict.fromkeys(t for square in squares for t in self.grid.tiles_under(square) if t in known)
+        own = tuple(sorted(under, key=lambda t: (t.row, t.column)))
+        return ReturnsTask(self.grid, squares, self.tiles.task(Block(own)), self.sensors, self.ways)
+
+    def near(self, chosen: Sequence[TileId]) -> set[TileId]:
+        """Squares that see one of some of the survey's tiles, in themselves or in their halo."""
+        near = set(chosen)
+        return {square for square in self.keys if not near.isdisjoint(self.grid.tiles_under(square))}
+
+
+def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
+    """The squares that the sensors which are looked at may have seen.
+
+    Raises
+    ------
+    ConfigError
+        where the survey's settings of assets do not fit it.
+    """
+    config = plan.survey.config.assets
+    if config is None:
+        raise ConfigError("the survey file has no section [assets]")
+    grid = asset_grid(plan.survey, config)
+    chosen = sorted({source.sensor for source, _ in plan.sources if is_looked_at(source, config)})
+    ways = _ways(plan, config)
+    common = key_of(
+        grid, chosen, config.ground.model_dump(mode="json"), None if plan.centre_lines is None else
+        plan.centre_lines.key(), [[w.world, [f.digest for f in w.files], _corrections(plan, run)] for run, w in ways],
+    )  # fmt: skip
+    own = _looked_at(footprints, config)
+    tiles = plan_tiles(own, replace(plan, tile_key=common))
+    held = TilePlan(plan, own, tiles, (), product_context(plan))
+    keys: dict[TileId, str] = {}
+    readings: dict[TileId, int] = {}
+    squares = {grid.of_tile(tile) for tile in tiles.ids}
+    for square in sorted(squares, key=lambda t: (t.row, t.column)):
+        under = [t for t in grid.tiles_under(square) if t in tiles.number]
+        keys[square] = key_of(common, [(str(t), tiles.keys[tiles.number[t]]) for t in under])
+        readings[square] = sum(int(tiles.readings[tiles.number[t]]) for t in under if grid.of_tile(t) == square)
+    return AssetPlan(plan, config, grid, held, tuple(chosen), ways, wanted_kinds(config), keys, readings)
+
+
+def asset_grid(survey: Survey, config: AssetsConfig) -> AssetGrid:
+    """Squares of a survey."""
+    tiles = survey.config.tiles
+    edge_m = config.edge_m(tiles.size_m)
+    return AssetGrid(TileGrid(tiles.size_m, tiles.cell_m), round(edge_m / tiles.size_m), config.halo_m)
+
+
+def is_looked_at(source: ReadingSource, config: AssetsConfig) -> bool:
+    """Whether assets are sought in a source's readings."""
+    if config.sensors is not None:
+        return source.sensor in config.sensors
+    geometry = geometry_of(source)
+    return geometry is None or geometry.kind == "polar"
+
+
+def check_assets(survey: Survey) -> None:
+    """Raise :class:`ConfigError` where the section [assets] names what there is not; reads nothing."""
+    config = survey.config.assets
+    if config is None:
+        return
+    wanted_kinds(config)
+    pictures = config.pictures
+    check_recognition(pictures, None if pictures.recogniser is None else survey.resolve(pictures.recogniser))
+    if pictures.on and pictures.cameras:
+        rule_cameras(survey.rig, picture_rule(pictures))
+    named = {log.sensor for run in survey.config.runs for log in run.logs if log.sensor is not None}
+    known = sorted({*survey.rig.sensors, *named, "cloud"})
+    for name in config.sensors or ():
+        if name not in known:
+            raise ConfigError(
+                f"assets.sensors names the unknown sensor '{name}'{nearest(name, known)}",
+                expected="a sensor of the rig: " + ", ".join(known),
+            )
+
+
+def _looked_at(footprints: FootprintRanges, config: AssetsConfig) -> FootprintRanges:
+    """Footprints of the sources that are looked at; nothing of their profiles is left out for not being road."""
+    held = np.array([is_looked_at(one.source, config) for one in footprints.slices], bool)
+    rows = held[footprints.slice_index] if held.size else np.zeros(0, bool)
+    slices = tuple(replace(one, source=replace(one.source, road=None)) for one in footprints.slices)
+    return FootprintRanges(
+        footprints.tile_column[rows], footprints.tile_row[rows], footprints.slice_index[rows],
+        footprints.first_group[rows], footprints.last_group[rows], footprints.readings[rows],
+        footprints.first_epoch_gps_ns[rows], footprints.last_epoch_gps_ns[rows], slices,
+    )  # fmt: skip
+
+
+def _ways(plan: SurveyPlan, config: AssetsConfig) -> tuple[tuple[str, TrajectorySource], ...]:
+    """Trajectories of the runs of clouds, as far as they have one: they tell where the sensor stood."""
+    runs = sorted({s.run for s, _ in plan.sources if s.table == "cloud" and is_looked_at(s, config)})
+    held = {r.run for r in plan.records if r.tables.get("trajectory")}
+    return tuple((run, trajectory_source(run, plan.records)) for run in runs if run in held)
+
+
+def _corrections(plan: SurveyPlan, run: str) -> str:
+    own, mounted = plan.corrections.by_run.get(run), plan.corrections.mountings
+    if own is None and not mounted:
+        return ""
+    arrays = [] if own is None else [own.epochs_gps_ns, own.north_east_down_m, own.roll_pitch_heading_rad]
+    arrays += [mounted[sensor].values for sensor in sorted(mounted)]
+    return bytes_digest(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays))

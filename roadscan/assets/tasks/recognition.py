@@ -1,0 +1,164 @@
+"""Recognisers of signs: text by an OCR package, types by a user's ONNX model. Both are extras."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.assets.pictures.reader import CutOut, Recognition
+from roadscan.core.errors import ConfigError
+from roadscan.core.settings.asset_pictures import AssetPicturesSettings
+from roadscan.store.store import file_digest
+
+Float32 = npt.NDArray[np.float32]
+
+_LEAST_TEXT_PX: Final = 24
+_TEXT_PX: Final = 320
+"""Cut-outs are enlarged to this height before text is sought."""
+_LEAST_TEXT: Final = 0.75
+_SQUARE_PX: Final = 64
+_ONE_THREAD: Final = {
+    "EngineConfig.onnxruntime.intra_op_num_threads": 1, "EngineConfig.onnxruntime.inter_op_num_threads": 1,
+}  # fmt: skip
+"""Edge of the input of a model that takes any size."""
+
+
+class SignRecognition(Recognition):
+    """Reads text and types of signs with what the survey asks for."""
+
+    def __init__(self, text: bool, model: Path | None) -> None:
+        self._ocr = _ocr() if text else None
+        self._model = None if model is None else OnnxModel(model)
+
+    def text(self, cut_out: CutOut) -> tuple[str, float] | None:
+        """Lines of text joined by blanks, with the least probability of them."""
+        if self._ocr is None or min(cut_out.pixels.shape[:2]) < _LEAST_TEXT_PX:
+            return None
+        scale = max(_TEXT_PX / cut_out.pixels.shape[0], 1.0)
+        large = cv2.resize(cut_out.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        found = self._ocr(np.ascontiguousarray(large[:, :, ::-1]))
+        lines = [] if found.txts is None else list(zip(found.txts, found.scores, strict=True))
+        kept = [(str(words).strip(), float(score)) for words, score in lines if score >= _LEAST_TEXT]
+        kept = [(words, score) for words, score in kept if words]
+        return (" ".join(words for words, _ in kept), min(score for _, score in kept)) if kept else None
+
+    def label(self, cut_out: CutOut) -> tuple[str, float] | None:
+        """The most probable label of the model."""
+        return None if self._model is None else self._model.label(cut_out)
+
+
+class OnnxModel:
+    """A classifier of signs in the form of ONNX.
+
+    It takes one input, float32 (1, 3, height, width): red, green, blue from 0 to 1 of the cut-out, upright and without
+    margin. Where height or width are not fixed they are 64. Its first output holds a value a label, (1, labels):
+    probabilities, or values that a softmax makes such. The labels stand in the model's metadata under `labels`, or in
+    a text file of its name with the ending `.txt`, a line a label. A label that is empty stands for none.
+
+    Raises
+    ------
+    ConfigError
+        where the file is no such model, or the package onnxruntime is not there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if importlib.util.find_spec("onnxruntime") is None:
+            raise ConfigError(
+                "assets.pictures.recogniser needs the package onnxruntime", change='pip install "roadscan[onnx]"'
+            )
+        if not path.is_file():
+            raise ConfigError("the recogniser is not there", expected="a file of ONNX", file=path)
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # the same sums in the same order
+        try:
+            self._session: Any = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's errors have no class of their own in common
+            raise ConfigError(
+                f"the recogniser cannot be loaded: {error}", expected="an ONNX model", file=path
+            ) from error
+        (taken, *more), outputs = self._session.get_inputs(), self._session.get_outputs()
+        shape = taken.shape
+        if more or len(shape) != 4 or shape[1] != 3 or taken.type != "tensor(float)":
+            raise ConfigError(
+                f"the recogniser takes {taken.type} {shape}{' and more' if more else ''}",
+                expected="one input, float32 (1, 3, height, width)", file=path,
+            )  # fmt: skip
+        self._name, self._output = taken.name, outputs[0].name
+        self._size = tuple(n if isinstance(n, int) else _SQUARE_PX for n in shape[2:])
+        self._labels = _labels(path, self._session)
+        self._path = path
+
+    def label(self, cut_out: CutOut) -> tuple[str, float] | None:
+        """The most probable label of a cut-out and its probability; None where that is the empty one."""
+        (values,) = self._session.run([self._output], {self._name: upright(cut_out, self._size)})
+        values = np.asarray(values, np.float64).reshape(-1)
+        if values.size != len(self._labels):
+            raise ConfigError(
+                f"the recogniser gives {values.size} values for {len(self._labels)} labels",
+                expected="a value for each label", file=self._path,
+            )  # fmt: skip
+        if values.min() < 0.0 or abs(values.sum() - 1.0) > 1e-3:
+            values = np.exp(values - values.max())
+            values /= values.sum()
+        best = int(np.argmax(values))
+        return (self._labels[best], float(values[best])) if self._labels[best] else None
+
+
+def upright(cut_out: CutOut, size: Sequence[int]) -> Float32:
+    """A cut-out as a model takes it (1, 3, height, width): the box of the plate, upright, 0 … 1, red first.
+
+    The first four points of the outline are the corners of the box: lower left, lower right, upper right, upper left.
+    """
+    height, width = size
+    corners = np.array([[0, height], [width, height], [width, 0], [0, 0]], np.float32) - 0.5
+    turn = cv2.getPerspectiveTransform(cut_out.outline_px[:4].astype(np.float32), corners.astype(np.float32))
+    flat = cv2.warpPerspective(cut_out.pixels, turn, (width, height), flags=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(flat.astype(np.float32).transpose(2, 0, 1)[None] / np.float32(255.0))
+
+
+def recognition_of(text: bool, model: Path | None) -> Recognition:
+    """What reads signs, loaded once a worker."""
+    return _recognition(text, model, "" if model is None else file_digest(model))
+
+
+def check_recognition(settings: AssetPicturesSettings, model: Path | None) -> None:
+    """Raise :class:`ConfigError` where the survey asks for what is not installed, or a model that is not one."""
+    if settings.text and importlib.util.find_spec("rapidocr") is None:
+        raise ConfigError("assets.pictures.text needs the package rapidocr", change='pip install "roadscan[ocr]"')
+    if model is not None:
+        OnnxModel(model)
+
+
+@functools.lru_cache(maxsize=2)
+def _recognition(text: bool, model: Path | None, _content: str) -> Recognition:
+    return SignRecognition(text, model)
+
+
+def _ocr() -> Any:
+    """The OCR package with the models that it ships."""
+    if importlib.util.find_spec("rapidocr") is None:
+        raise ConfigError("assets.pictures.text needs the package rapidocr", change='pip install "roadscan[ocr]"')
+    import rapidocr
+
+    return rapidocr.RapidOCR(params={"Global.log_level": "error", **_ONE_THREAD})
+
+
+def _labels(path: Path, session: Any) -> list[str]:
+    beside = path.with_suffix(".txt")
+    told = session.get_modelmeta().custom_metadata_map.get("labels")
+    if told is None and not beside.is_file():
+        raise ConfigError(
+            "the recogniser has no labels", expected=f"metadata `labels`, or the file {beside.name}: a line a label",
+            file=path,
+        )  # fmt: skip
+    words = beside.read_text(encoding="utf-8") if told is None else str(told)
+    return [line.strip() for line in words.removesuffix("\n").split("\n")]

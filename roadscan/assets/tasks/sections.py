@@ -1,0 +1,165 @@
+"""Cross-sections of bare earth by station: a file a road for CAD, and one for spreadsheets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+
+from roadscan.assets.files.bare_earth import read_bare_earth
+from roadscan.assets.files.layers import Layer, write_dxf
+from roadscan.assets.ground.cross_sections import CrossSections, cross_sections
+from roadscan.assets.tasks.evidence import BARE_EARTH
+from roadscan.assets.tiling import AssetGrid
+from roadscan.condition.road_line import RoadLine
+from roadscan.condition.tasks.lines import Roads
+from roadscan.core.ids import TileId
+from roadscan.core.settings.assets import GroundSectionsConfig
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.store import Store
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.tasks.tile_files import publish_file
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SECTIONS: Final = "ground_sections"
+_SUFFIXES: Final = (".csv", ".dxf")
+
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SectionTask:
+    """Cross-sections of a road."""
+
+    line: RoadLine
+    config: GroundSectionsConfig
+    ground: Mapping[TileId, OutputRecord]
+    """Bare earth of the squares near it."""
+    key: str
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Its files."""
+        return tuple(f"{self.line.road}{suffix}" for suffix in _SUFFIXES)
+
+
+def plan_sections(
+    roads: Roads, config: GroundSectionsConfig | None, grid: AssetGrid, manifest: Manifest, context: ProductContext
+) -> list[SectionTask]:
+    """Cross-sections of every road; none where they are not asked for."""
+    if config is None:
+        return []
+    code = code_digest("roadscan.assets.tasks.sections:write_sections")
+    held = {TileId.parse(r.unit): r for r in manifest.of(BARE_EARTH).values() if r.path}
+    tasks = []
+    for road, line in sorted(roads.lines.items()):
+        strip = shapely.LineString(line.nodes_m).buffer(config.half_width_m + 1.0)
+        shapely.prepare(strip)
+        near = {square: r for square, r in held.items() if strip.intersects(_box(grid, square))}
+        shape = [line.first_m, line.nodes_m.tolist()]
+        read = [(r.unit, r.digest) for r in near.values()]
+        key = key_of(code, road, config.model_dump(mode="json"), shape, read, context.map)
+        tasks.append(SectionTask(line, config, near, key))
+    return tasks
+
+
+def _box(grid: AssetGrid, square: TileId) -> shapely.Polygon:
+    (east, north), edge = grid.corner_m(square), grid.edge_m
+    return shapely.box(east, north, east + edge, north + edge)
+
+
+def write_sections(task: SectionTask, grid: AssetGrid, store: Store, context: ProductContext) -> list[OutputRecord]:
+    """Write both files of a road."""
+    rows = _rows(task, grid, store, context)
+    writers: dict[str, Callable[[Path, pd.DataFrame, ProductContext], None]] = {
+        ".csv": _write_csv, ".dxf": _write_drawing
+    }  # fmt: skip
+    records = []
+    with store.scratch() as folder:
+        for unit, (suffix, write) in zip(task.units, writers.items(), strict=True):
+            path = folder / f"sections{suffix}"
+            write(path, rows, context)
+            records.append(publish_file(store, path, f"products/{SECTIONS}/{unit}", SECTIONS, unit, task.key))
+    return records
+
+
+def _rows(task: SectionTask, grid: AssetGrid, store: Store, context: ProductContext) -> pd.DataFrame:
+    """A row a height that is known, by station and offset."""
+    import pandas as pd  # slow to import
+
+    line, config = task.line, task.config
+    first = np.ceil(line.first_m / config.spacing_m)
+    last = np.floor((line.first_m + line.length_m) / config.spacing_m)
+    station = np.arange(first, last + 1) * config.spacing_m
+    half = int(config.half_width_m / config.step_m + 1e-9)
+    offset = np.arange(-half, half + 1, dtype=np.float64) * config.step_m
+    shape = (station.size, offset.size)
+    height, sigma, seen = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, bool)
+    for square, record in sorted(task.ground.items(), key=lambda one: (one[0].row, one[0].column)):
+        corner = grid.corner_m(square)
+        model = read_bare_earth(read_recorded(store, record), corner, context)
+        near = _near(line, station, config, _box(grid, square))
+        if near.size:
+            found = cross_sections(model, line.nodes_m - corner, station[near] - line.first_m, offset)
+            _take(found, near, height, sigma, seen)
+    at, across = np.nonzero(np.isfinite(height))
+    place = line.places(station[at], offset[across])
+    return pd.DataFrame(
+        {
+            "road": line.road,
+            "station_m": station[at],
+            "offset_m": offset[across],
+            "easting_m": place[:, 0],
+            "northing_m": place[:, 1],
+            "height_m": height[at, across],
+            "sigma_height_m": sigma[at, across],
+            "seen": seen[at, across].astype(int),
+        }
+    )
+
+
+def _near(
+    line: RoadLine, station: Float64, config: GroundSectionsConfig, box: shapely.Polygon
+) -> npt.NDArray[np.int64]:
+    """Cross-sections that reach into a square."""
+    middle = line.places(station, 0.0)[:, :2]
+    away = shapely.distance(shapely.points(middle), box)
+    return np.flatnonzero(away <= config.half_width_m + 1.0)
+
+
+def _take(
+    found: CrossSections, near: npt.NDArray[np.int64], height: Float64, sigma: Float64, seen: npt.NDArray[np.bool_]
+) -> None:
+    """Heights that a square knows, where none was known or seen before."""
+    better = np.isfinite(found.height_m) & (np.isnan(height[near]) | (found.seen & ~seen[near]))
+    for whole, own in ((height, found.height_m), (sigma, found.sigma_m), (seen, found.seen)):
+        whole[near] = np.where(better, own, whole[near])
+
+
+def _write_csv(path: Path, rows: pd.DataFrame, context: ProductContext) -> None:
+    rows.to_csv(path, index=False, float_format="%.4f", lineterminator="\n")
+
+
+def _write_drawing(path: Path, rows: pd.DataFrame, context: ProductContext) -> None:
+    """A 3D line a section, interrupted where nothing is known."""
+    shapes = np.array([*_drawn(rows), None], object)[:-1]
+    write_dxf(path, [Layer(SECTIONS, "LineStringZ", pa.table({}), shapes)], context)
+
+
+def _drawn(rows: pd.DataFrame) -> Iterator[shapely.LineString]:
+    step = rows["offset_m"].diff()
+    usual = step[step > 0].min() if len(rows) > 1 else 0.0
+    broken = (rows["station_m"].diff() != 0) | (step > 1.5 * usual)
+    for _, own in rows.groupby(broken.cumsum()):
+        if len(own) > 1:
+            yield shapely.LineString(own[["easting_m", "northing_m", "height_m"]].to_numpy())

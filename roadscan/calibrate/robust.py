@@ -1,0 +1,161 @@
+"""How much each observation counts: Huber weights, rejection, variance factor by kind.
+
+All of it takes many observations of a kind, most of them right; orientations are not such
+(:mod:`roadscan.calibrate.orientations`).
+
+The variance factor of a kind is that of an M-estimator (Huber 1981, eq. 7.6.5): mean square of the clipped residuals
+over the squared share of those that are not clipped. It is applied where it is significantly above 1, never below:
+residuals that are better than stated may have errors in common that they do not show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import chdtrc, chdtri, gammaincinv
+
+from roadscan.calibrate.observations import Observations
+from roadscan.core.settings.calibration import CalibrationSettings
+
+Float64 = npt.NDArray[np.float64]
+
+_ENOUGH: Final = 30
+"""Observations from which on their median tells how large they are."""
+_SIGNIFICANT: Final = 0.95
+
+
+@dataclass(frozen=True)
+class Scales:
+    """How large the residuals of each kind are, and how much the kind counts."""
+
+    spread: Mapping[str, float]
+    """In units of the stated σ, at least 1; limits are multiples of it."""
+    variance_factor: Mapping[str, float]
+    share: Mapping[str, float]
+    """Independent observations to observations."""
+    robust_limit: float
+    reject_limit: float
+
+    def gain(self, kind: str) -> float:
+        """What the normal equations of a kind are multiplied by."""
+        return self.share[kind] / self.variance_factor[kind]
+
+    def limits(self, kind: str, rows: int) -> tuple[float, float]:
+        """Robust and reject limit of the length of `rows` residuals: as rare as those of one."""
+        spread = self.spread[kind]
+        return spread * length_limit(self.robust_limit, rows), spread * length_limit(self.reject_limit, rows)
+
+    def with_factors(self, factors: Mapping[str, float], share: Mapping[str, float]) -> Scales:
+        """The same limits with other weights of the kinds."""
+        return replace(self, variance_factor=dict(factors), share=dict(share))
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """Observations with their residuals at one place, and what each counts."""
+
+    observations: Observations
+    residuals: Float64
+    """(n, k)"""
+    length: Float64
+    """(n,)"""
+    weight: Float64
+    """(n,) in [0, 1]; 0: rejected."""
+
+    @property
+    def kind(self) -> str:
+        """Kind of evidence."""
+        return self.observations.kind
+
+
+def scales_of(found: Sequence[Observations], residuals: Sequence[Float64], settings: CalibrationSettings) -> Scales:
+    """Spread of each kind from the median of its residuals, robust against half of them."""
+    normed: dict[str, list[Float64]] = {}
+    for one, residual in zip(found, residuals, strict=True):
+        normed.setdefault(one.kind, []).append(np.sum(residual**2, axis=1) / _median(one.rows))
+    spread = {}
+    for kind, parts in normed.items():
+        values = np.concatenate(parts)
+        spread[kind] = max(1.0, float(np.sqrt(np.median(values)))) if values.size >= _ENOUGH else 1.0
+    squares = {kind: value**2 for kind, value in spread.items()}
+    share = dict.fromkeys(spread, 1.0)
+    return Scales(spread, squares, share, settings.robust_limit, settings.reject_limit)
+
+
+def weigh(one: Observations, residuals: Float64, scales: Scales, *, reject: bool) -> Weighed:
+    """Huber's weights; with `reject`, nothing beyond the reject limit."""
+    robust, limit = scales.limits(one.kind, one.rows)
+    length = np.linalg.norm(residuals, axis=1)
+    if one.fixed_weight is not None:
+        return Weighed(one, residuals, length, np.full(len(length), one.fixed_weight))
+    weight = np.minimum(1.0, robust / np.maximum(length, 1e-300))
+    if reject:
+        weight[length > limit] = 0.0
+    return Weighed(one, residuals, length, weight)
+
+
+def loss(one: Weighed, scales: Scales, *, reject: bool) -> float:
+    """Sum of Huber's function, constant beyond the reject limit with `reject`."""
+    if one.observations.fixed_weight is not None:
+        return float((one.weight * one.length**2).sum())
+    robust, limit = scales.limits(one.kind, one.observations.rows)
+    length = np.minimum(one.length, limit) if reject else one.length
+    return float(np.where(length <= robust, length**2, 2 * robust * length - robust**2).sum())
+
+
+def independent_share(weighed: Sequence[Weighed], most: float) -> dict[str, float]:
+    """By kind: at most so many independent observations, as a share of those that count."""
+    counted: dict[str, float] = {}
+    for one in weighed:
+        counted[one.kind] = counted.get(one.kind, 0.0) + float(one.weight.sum())
+    return {kind: min(1.0, most / max(count, 1.0)) for kind, count in counted.items()}
+
+
+def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: float) -> float:
+    """Factor of one kind's variances.
+
+    Parameters
+    ----------
+    weighed : all observations of the kind.
+    parameters : how many unknowns they determine, as the trace of their share of the solution.
+    """
+    squares = rows = whole = used = total_weight = 0.0
+    for one in weighed:
+        if one.observations.fixed_weight is not None:
+            # A handful of numbers that the solution mostly follows has no spread of its own to be told.
+            continue
+        k = one.observations.rows
+        kept = one.weight > 0
+        robust, _ = scales.limits(one.kind, k)
+        squares += float((np.minimum(one.length[kept], robust) ** 2).sum())
+        rows += k * int(kept.sum())
+        used += int(kept.sum())
+        whole += int((one.length[kept] <= robust).sum())
+        total_weight += float(one.weight.sum())
+    redundancy = rows - parameters
+    if redundancy < 1.0 or whole == 0:
+        return 1.0
+    if squares <= 2.0 * gammaincinv(redundancy / 2.0, _SIGNIFICANT):
+        return 1.0
+    # Normal equations hold the mean weight where Huber's formula has the squared share of whole residuals.
+    clipped = (total_weight / used) / (whole / used) ** 2
+    return max(1.0, squares / redundancy * clipped)
+
+
+@cache
+def length_limit(limit: float, rows: int) -> float:
+    """Length of `rows` standard normal numbers that is exceeded as rarely as `limit` by one."""
+    # Farther out probabilities have no number.
+    usual = min(limit, 30.0)
+    return float(np.sqrt(chdtri(rows, chdtrc(1, usual**2)))) + limit - usual
+
+
+@cache
+def _median(rows: int) -> float:
+    """Median of the squared length of `rows` standard normal numbers."""
+    return float(2.0 * gammaincinv(rows / 2.0, 0.5))

@@ -1,0 +1,272 @@
+"""Calibrate: evidence of the survey file → mountings with covariance, in the table ``mountings``."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from roadscan.calibrate.estimator import Calibration, Prior, calibrate
+from roadscan.calibrate.evidence import Directions, Evidence, Orientation, Ties, Traverse
+from roadscan.calibrate.in_words import mounting_rows, report
+from roadscan.calibrate.picture import CalibrationPicture, draw_calibration
+from roadscan.calibrate.tasks.calibration_evidence import Collected, collect
+from roadscan.calibrate.unknowns import Estimate, ObjectPose
+from roadscan.core.errors import ConfigError, DamagedError, RunError, nearest
+from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.core.ids import ALL_RUNS
+from roadscan.core.settings.calibration import CalibrationSettings, ObjectEvidence, OverlapEvidence
+from roadscan.core.survey import Survey
+from roadscan.navigation.tasks.recorded_pictures import CALIBRATION, keep_file, picture_key
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.held import held_path, read_held, write_held
+from roadscan.store.manifest import Manifest
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+from roadscan.tiles.plan.plan import DatedMountings, SurveyPlan, plan_survey
+from roadscan.tiles.tasks.readings import load_mountings
+
+Report = Callable[[str], None]
+
+_HELD: Final = 0.9
+"""A σ above this share of the prior's is the prior's."""
+PICTURE: Final = "products/calibration/calibration.png"
+TEXT: Final = "products/calibration/calibration.txt"
+_PICTURE, _TEXT = "picture", "report"
+"""Units of their records."""
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What a calibration wrote."""
+
+    calibration: Calibration
+    rows: list[dict[str, Any]]
+    """Of the table ``mountings``."""
+    text: str
+    """The report."""
+
+
+def calibrate_survey(survey: Survey, store: Store, say: Report = lambda _: None) -> Calibrated:
+    """Estimate the mountings of all sensors that the survey's evidence names, and write them to the store.
+
+    The rig file stays as it is; from now on readings are placed by the table. A report and a picture lie in
+    ``products/calibration/``.
+
+    Raises
+    ------
+    ConfigError
+        where the survey file names no evidence, or sensors that are not of the rig.
+    RunError
+        where a log is not ingested, or a sensor has no readings there.
+    """
+    config = survey.config
+    if not config.calibration:
+        raise ConfigError(
+            "the survey file names no evidence for a calibration",
+            expected='[[calibration]] with kind = "overlap", "object", "stop_and_go" or "reference"',
+        )
+    settings = config.navigation.calibration
+    calibrated = _sound_mountings(store, say)
+    plan = plan_survey(survey, store, calibrated)
+    collected: list[Collected] = []
+    for entry in config.calibration:
+        say(f"evidence: {entry.kind}")
+        collected.append(collect(plan, entry, settings))
+    sensors = list(dict.fromkeys(sensor for one in collected for sensor in one.sensors))
+    priors = {name: _prior(survey, name) for name in sensors}
+    traverses = {number: t for one in collected for number, t in one.traverses.items()}
+    objects = _objects(collected, priors, traverses, settings, say)
+    say(f"estimating: {', '.join(sensors)}")
+    finder = _Finder(collected, say)
+    calibration = calibrate(priors, finder, traverses, settings, objects)
+    _refuse_empty(finder, [entry.kind for entry in config.calibration])
+    known = _determined(calibration)
+    if not known:
+        raise RunError(
+            "the evidence determines no part of any mounting; nothing is written:\n" + report(calibration),
+            change="see docs/calibration.md, what to drive",
+        )
+    for name in sensors:
+        if name not in known:
+            say(f"not determined at all, not written: {name}")
+    since = 0 if settings.valid_from is None else gps_ns_from_utc(settings.valid_from)
+    rows = mounting_rows(
+        replace(calibration, sensors={name: calibration.sensors[name] for name in known}),
+        run=ALL_RUNS,
+        valid_from_gps_ns=since,
+        estimated_at=dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
+        key=_key(plan, sensors),
+    )
+    _keep(store, rows, say)
+    text = report(calibration)
+    _keep_report(store, rows[0]["calibration"], text, CalibrationPicture.of(calibration, config.id))
+    return Calibrated(calibration, rows, text)
+
+
+def _keep_report(store: Store, calibration: str, text: str, picture: CalibrationPicture) -> None:
+    """Write report and picture; their records hold all that it takes to write them again."""
+    manifest = Manifest(store)
+    _write_report(store, manifest, _TEXT, {"calibration": calibration, "text": text})
+    _write_report(store, manifest, _PICTURE, {"calibration": calibration, "picture": picture.as_values()})
+
+
+def _write_report(store: Store, manifest: Manifest, unit: str, values: dict[str, Any]) -> None:
+    def write(path: Path) -> None:
+        if unit == _TEXT:
+            path.write_text(values["text"], encoding="utf-8", newline="\n")
+        else:
+            draw_calibration(path, CalibrationPicture.of_values(values["picture"]))
+
+    detail = json.dumps(values, sort_keys=True)
+    key, target = picture_key(detail), TEXT if unit == _TEXT else PICTURE
+    keep_file(store, manifest, (CALIBRATION, unit), key, target, write, detail)
+
+
+def renew_reports(store: Store, say: Report = lambda _: None) -> None:
+    """Write again what is missing or damaged of the last calibration's report and picture."""
+    if not store.exists(held_path("mountings")):
+        return
+    manifest = Manifest(store)
+    for unit, record in manifest.of(CALIBRATION).items():
+        if not manifest.is_current(CALIBRATION, unit, picture_key(record.detail)):
+            _write_report(store, manifest, unit, record.figures())
+            say(f"drawn: {record.path}")
+
+
+class _Finder:
+    """All evidence as one; it says how much each round finds, and remembers what found nothing."""
+
+    def __init__(self, collected: Sequence[Collected], say: Report) -> None:
+        self._collected = collected
+        self._say = say
+        self._round = 0
+        self.counts: list[int] = [0] * len(collected)
+        """Observations of each entry in the last round."""
+
+    def __call__(self, estimate: Estimate) -> list[Evidence]:
+        self._round += 1
+        found = [list(one.find(estimate)) for one in self._collected]
+        self.counts = [sum(_size(evidence) for evidence in one) for one in found]
+        self._say(f"round {self._round}: {', '.join(f'{count:,}' for count in self.counts)} observations")
+        return [evidence for one in found for evidence in one]
+
+
+def _size(evidence: Evidence) -> int:
+    match evidence:
+        case Ties():
+            return len(evidence.weight)
+        case Directions():
+            return len(evidence.sigma_rad)
+        case Orientation():
+            return 1
+
+
+def _refuse_empty(finder: _Finder, kinds: Sequence[str]) -> None:
+    """Evidence that was asked for and holds nothing is an error, and not a smaller calibration."""
+    counted = enumerate(zip(kinds, finder.counts, strict=True), 1)
+    empty = [f"number {number} ({kind})" for number, (kind, count) in counted if not count]
+    if empty:
+        raise RunError(
+            f"of the [[calibration]] entries, {', '.join(empty)} found not one place that was seen twice; "
+            "nothing is written",
+            change="check its area, runs and object; profiles have to be dense (2.5 mm along and across for overlap)",
+        )
+
+
+def _determined(calibration: Calibration) -> list[str]:
+    """Sensors of which the evidence determines any part."""
+    return [n for n, one in calibration.sensors.items() if (one.sigma < _HELD * one.prior_sigma).any()]
+
+
+def _objects(
+    collected: Sequence[Collected],
+    priors: dict[str, Prior],
+    traverses: dict[int, Traverse],
+    settings: CalibrationSettings,
+    say: Report,
+) -> dict[str, ObjectPose]:
+    """Where the calibration objects lie, as seen with the mountings that all other evidence gives by itself."""
+    locating = [one.locate for one in collected if one.locate is not None]
+    if not locating:
+        return {}
+    others = [one for one in collected if one.locate is None]
+    mountings = {name: prior.mounting for name, prior in priors.items()}
+    if others:
+        say("estimating without the objects")
+        mountings |= calibrate(priors, _Finder(others, say), traverses, settings).mountings
+    estimate = Estimate(mountings, dict.fromkeys(mountings, 0.0), {}, {})
+    return {name: pose for locate in locating for name, pose in locate(estimate).items()}
+
+
+def _prior(survey: Survey, name: str) -> Prior:
+    """What the rig file knows of a sensor."""
+    if name not in survey.rig.sensors:
+        known = survey.rig.sensors
+        raise ConfigError(
+            f"calibration names the unknown sensor '{name}'{nearest(name, known)}", expected=", ".join(known)
+        )
+    settings = survey.config.navigation.calibration
+    return Prior.of(survey.rig.sensors[name], settings, settings.range_offset_sigma_m.get(name, 0.0))
+
+
+def outdated_calibrations(plan: SurveyPlan) -> list[str]:
+    """In words, the calibrations of the table that were made from other logs, rig, settings or code than there are."""
+    by_key: dict[str, dict[str, str]] = {}
+    table = read_held(plan.store, "mountings")
+    for row in () if table is None else table.to_pylist():
+        if row["calibration"]:
+            by_key.setdefault(row["calibration"], {})[row["sensor"]] = row["estimated_at"] or ""
+    return [
+        f"the mountings of {', '.join(sensors)} (calibrated {max(sensors.values())}) stand above the rig file, and "
+        "were made from other logs, rig, settings or code; `roadscan calibrate` makes them anew"
+        for key, sensors in by_key.items()
+        if not all(s in plan.survey.rig.sensors for s in sensors) or _key(plan, _asked(plan)) != key
+    ]
+
+
+def _asked(plan: SurveyPlan) -> list[str]:
+    """Sensors that the survey file's evidence names and the rig has."""
+    named: list[str] = []
+    for entry in plan.survey.config.calibration:
+        named += entry.sensors if isinstance(entry, OverlapEvidence | ObjectEvidence) else [entry.sensor]
+    return [name for name in named if name in plan.survey.rig.sensors]
+
+
+def _key(plan: SurveyPlan, sensors: Iterable[str]) -> str:
+    """What the calibration was made from: logs, rig, settings, code."""
+    config = plan.survey.config
+    return key_of(
+        code_digest("roadscan.calibrate.tasks.calibration_evidence", "roadscan.calibrate.estimator"),
+        [r.key for r in plan.records],
+        {name: plan.survey.rig.sensors[name].model_dump(mode="json") for name in sorted(set(sensors))},
+        [entry.model_dump(mode="json") for entry in config.calibration],
+        config.navigation.calibration.model_dump(mode="json"),
+    )
+
+
+def _sound_mountings(store: Store, say: Report) -> DatedMountings:
+    """What the table holds; where it is damaged, readings are found by the rig file's mountings meanwhile."""
+    try:
+        return load_mountings(store)
+    except DamagedError as error:
+        say(f"the table `mountings` is damaged ({error.arrived}): the rig file's mountings are taken to begin with")
+        return {}
+
+
+def _keep(store: Store, rows: list[dict[str, Any]], say: Report) -> None:
+    """Put rows into the table; those of the same run, sensor and instant are replaced, all others stay."""
+    sort = table_schema("mountings").sort
+    try:
+        table = read_held(store, "mountings")
+    except DamagedError:
+        table = None
+        aside = store.set_aside(held_path("mountings"))
+        say(f"the damaged table was set aside ({aside}): mountings that only it held have to be calibrated again")
+    known = [] if table is None else table.to_pylist()
+    places = {tuple(row[c] for c in sort) for row in rows}
+    write_held(store, "mountings", [*(row for row in known if tuple(row[c] for c in sort) not in places), *rows])

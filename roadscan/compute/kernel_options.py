@@ -1,0 +1,112 @@
+"""The kinds of kernels there are; parallelism comes from Dask over blocks, never from inside a kernel."""
+
+from __future__ import annotations
+
+import ast
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
+
+from roadscan.compute.compiler import cache_folder, compiled
+
+Kernel = Callable[..., Any]
+
+
+def kernel(function: Kernel) -> Kernel:
+    """Compile a loop over arrays."""
+    return compiled(function, _folder_of(function), counted=True)
+
+
+def inner(function: Kernel) -> Kernel:
+    """Compile a loop that kernels alone call: an entry for Python takes as long to make as a small function."""
+    return compiled(function, _folder_of(function), counted=True, entry=False)
+
+
+def bare(function: Kernel) -> Kernel:
+    """Compile a kernel that makes no array and hands none back: it counts no references to those that it is given.
+
+    To count a reference to and fro takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
+    take as long for that as for the readings.
+    """
+    return compiled(function, _folder_of(function), counted=False)
+
+
+def bare_inner(function: Kernel) -> Kernel:
+    """Compile a loop that `bare` kernels alone call; it makes no array either."""
+    return compiled(function, _folder_of(function), counted=False, entry=False)
+
+
+def inlined(function: Kernel) -> Kernel:
+    """Compile a piece of a kernel into its callers; it takes numbers and tuples, no arrays in hot loops."""
+    return compiled(function, _folder_of(function), counted=True, entry=False, inlined=True)
+
+
+def bare_inlined(function: Kernel) -> Kernel:
+    """Compile a piece of a `bare` kernel into it; it makes no array either."""
+    return compiled(function, _folder_of(function), counted=False, entry=False, inlined=True)
+
+
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The same array, not to be written to.
+
+    What Arrow decoded is so already, what NumPy computed is not; a kernel that can get either, array by array, would
+    be compiled for each mixture.
+    """
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _folder_of(function: Kernel) -> str:
+    return _folder_of_source(function.__code__.co_filename)
+
+
+@functools.cache
+def _folder_of_source(source: str) -> str:
+    """Folder for the compiled kernels of a source file: it changes with the file and the kernels that it imports."""
+    unseen, seen = [Path(source), Path(__file__)], set[Path]()
+    while unseen:
+        file = unseen.pop()
+        if file not in seen:
+            seen.add(file)
+            unseen += _imported_kernels(file)
+    return cache_folder("kernels", seen)
+
+
+@functools.cache
+def _imported_kernels(file: Path) -> list[Path]:
+    """Files of this package that a file imports, anywhere in it, whatever form the import has."""
+    here = Path(__file__).parent
+    within = ("roadscan", "kernels", *file.parent.relative_to(here).parts) if file.is_relative_to(here) else ()
+    found = []
+    for node in _statements(ast.parse(file.read_bytes())):
+        for name in _imported_names(node, within):
+            if name[:2] == ("roadscan", "kernels"):
+                module = here.joinpath(*name[2:])
+                found += [file for file in (module.with_suffix(".py"), module / "__init__.py") if file.is_file()]
+    return found
+
+
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements below a node. Expressions, which hold no import, are most of a tree, and are passed over."""
+    for below in ast.iter_child_nodes(node):
+        if isinstance(below, ast.stmt | ast.excepthandler | ast.match_case):
+            yield below
+            yield from _statements(below)
+
+
+def _imported_names(node: ast.AST, within: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """What a statement may import, as parts of dotted names: modules, and what may be one inside them.
+
+    within : package that relative imports start from.
+    """
+    if isinstance(node, ast.Import):
+        return [tuple(alias.name.split(".")) for alias in node.names]
+    if not isinstance(node, ast.ImportFrom):
+        return []
+    own = tuple(node.module.split(".")) if node.module else ()
+    package = (*within[: len(within) + 1 - node.level], *own) if node.level else own
+    return [package, *((*package, alias.name) for alias in node.names)]

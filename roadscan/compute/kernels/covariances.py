@@ -1,0 +1,117 @@
+"""Covariances of heights on a surface, for eight groups of points side by side (a group a lane, see ``factorisation``).
+
+The covariance of two heights falls with their distance by Wendland's C⁴ function, which is positive definite in the
+plane (Wendland 1995, "Piecewise polynomial, positive definite and compactly supported radial functions of minimal
+degree").
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from roadscan.compute.kernel_options import Kernel, bare
+from roadscan.compute.kernels import vectors
+from roadscan.compute.kernels.factorisation import ROW, rows_of
+from roadscan.compute.kernels.vectors import instruction
+
+REACH = 12.0
+"""Distance at which heights are not related any more."""
+RISE = REACH**5 / 448.0
+"""So the covariance falls by distance⁵ beyond what is even in distance, as that of a quintic spline."""
+PEAK = 3.0 * RISE
+STEEPEST = 56.0 * RISE / REACH**2
+
+
+def _constant(value):
+    return ir.Constant(ROW, [value] * ROW.count)
+
+
+def _shares(b, u, v):
+    """Distance over the reach, and what is left to it (0 beyond)."""
+    square = b.fadd(b.fmul(u, u), b.fmul(v, v))
+    d = b.fmul(instruction(b, "llvm.sqrt.v8f64", ROW, square), _constant(1.0 / REACH))
+    left = b.fsub(_constant(1.0), d)
+    return d, b.select(b.fcmp_ordered(">", left, _constant(0.0)), left, _constant(0.0))
+
+
+@intrinsic
+def _rows(typingctx, u, v, out, size, width):
+    def write(context, builder, signature, arguments):
+        b = builder
+        us, vs, data = (rows_of(context, b, signature, arguments, k) for k in range(3))
+        size, width = arguments[3:]
+        with cgutils.for_range(b, size) as outer:
+            own = [vectors.load(b, b.gep(at, [outer.index]), ROW) for at in (us, vs)]
+            start = b.mul(outer.index, width)
+            with cgutils.for_range(b, outer.index) as inner:
+                other = [vectors.load(b, b.gep(at, [inner.index]), ROW) for at in (us, vs)]
+                d, left = _shares(b, *(b.fsub(one, two) for one, two in zip(own, other, strict=True)))
+                cube = b.fmul(b.fmul(left, left), left)
+                form = b.fadd(b.fmul(_constant(35.0), d), _constant(18.0))
+                form = b.fadd(b.fmul(form, d), _constant(3.0))
+                value = b.fmul(b.fmul(b.fmul(cube, cube), _constant(RISE)), form)
+                vectors.store(b, value, b.gep(data, [b.add(start, inner.index)]))
+        return context.get_dummy_value()
+
+    return types.void(u, v, out, size, width), write
+
+
+@intrinsic
+def _slopes(typingctx, u, v, along_u, along_v, size):
+    def write(context, builder, signature, arguments):
+        b = builder
+        us, vs, *outs = (rows_of(context, b, signature, arguments, k) for k in range(4))
+        with cgutils.for_range(b, arguments[4]) as loop:
+            own = [vectors.load(b, b.gep(at, [loop.index]), ROW) for at in (us, vs)]
+            d, left = _shares(b, *own)
+            square = b.fmul(left, left)
+            steep = b.fadd(b.fmul(_constant(5.0), d), _constant(1.0))
+            steep = b.fmul(b.fmul(b.fmul(b.fmul(square, square), left), _constant(STEEPEST)), steep)
+            for offset, out in zip(own, outs, strict=True):
+                vectors.store(b, b.fmul(steep, offset), b.gep(out, [loop.index]))
+        return context.get_dummy_value()
+
+    return types.void(u, v, along_u, along_v, size), write
+
+
+def _covariances(u, v, out, size):
+    _rows(u, v, out, size, out.shape[1])
+
+
+def _slope_covariances(u, v, along_u, along_v, size):
+    _slopes(u, v, along_u, along_v, size)
+
+
+def _shares_by_numpy(u, v):
+    d = np.sqrt(u * u + v * v) * (1.0 / REACH)
+    return d, np.maximum(1.0 - d, 0.0)
+
+
+def _covariances_by_numpy(u, v, out, size):
+    for p in range(size):
+        for q in range(p):
+            d, left = _shares_by_numpy(u[p] - u[q], v[p] - v[q])
+            cube = left * left * left
+            out[p, q] = cube * cube * RISE * ((35.0 * d + 18.0) * d + 3.0)
+
+
+def _slope_covariances_by_numpy(u, v, along_u, along_v, size):
+    d, left = _shares_by_numpy(u[:size], v[:size])
+    square = left * left
+    steep = square * square * left * STEEPEST * (5.0 * d + 1.0)
+    along_u[:size], along_v[:size] = steep * u[:size], steep * v[:size]
+
+
+covariances: Kernel = _covariances_by_numpy if numba.config.DISABLE_JIT else bare(_covariances)
+"""Of all pairs of the first `size` points at (u, v), as the lower triangle of `out`, without the diagonal (PEAK).
+
+Parameters
+----------
+u, v : (n, LANES) float64; out : (n or more, n or more, LANES) float64.
+"""
+slope_covariances: Kernel = _slope_covariances_by_numpy if numba.config.DISABLE_JIT else bare(_slope_covariances)
+"""Of the heights of the first `size` points at (u, v) with the slopes along u and v at the origin; all (n, LANES)."""

@@ -1,0 +1,191 @@
+"""Statistics of sixteen cells of one slot each, two heights of a cell to a lane.
+
+The heights of a slot are differences of 16 bits, and sorting is comparing: with 16 bits a register compares 32 at
+once. The heights with even numbers of a cell stand in the lower half of its lane, those with odd numbers in the upper
+one. Both halves are sorted apart by one network; the element in the middle of two sorted lists a and b of r each is
+the largest of min(aᵢ, bᵣ₋₁₋ᵢ) (the first step of Batcher's 1968 bitonic merge). Places without a height are filled so
+that the lower median stands in the middle: as many small numbers as bring it there, large ones for the rest.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
+
+from roadscan.compute.kernel_options import Kernel, bare
+from roadscan.compute.kernels.column_statistics import (
+    LANES,
+    exchanges,
+    generator,
+    reach_of,
+    statistics_by_numpy,
+    write_statistics,
+)
+from roadscan.compute.kernels.processor import compiles_for
+from roadscan.compute.kernels.vectors import I16, I32, constant, everywhere, instruction
+
+SMALLEST, LARGEST = -(1 << 15), (1 << 15) - 1
+"""Of 16 bits; no height stands so far from its base (``height_slots.FARTHEST``)."""
+APART = (1 << 16) - 1
+"""Distance from the median in places without a height: more than any has."""
+
+_F64 = ir.DoubleType()
+_ROW = ir.VectorType(I32, LANES)
+_PAIRS = ir.VectorType(I16, 2 * LANES)
+_MULTIPLIES = compiles_for("avx512bw")
+"""Whether the processor adds the products of two numbers of 16 bits each in an instruction."""
+
+
+class Pairs:
+    """Instructions on rows of sixteen lanes of two heights each."""
+
+    def __init__(self, lanes, rows, counts):
+        """`rows`, of int32, from memory; `counts`, a row of int32, heights of each lane."""
+        self.lanes, self.b = lanes, lanes.b
+        self.rows = [self.b.bitcast(row, _PAIRS) for row in rows]
+        counts = self.both(counts)
+        slots = [constant(_PAIRS, [2 * k, 2 * k + 1] * LANES) for k in range(len(rows))]
+        self.there = [self.b.icmp_signed("<", slot, counts) for slot in slots]
+        rank = self.b.ashr(self.b.sub(counts, self.all(1)), self.all(1))
+        filled = self.b.add(counts, self.b.sub(self.all(len(rows) - 1), rank))
+        self.before = [self.b.icmp_signed("<", slot, filled) for slot in slots]
+        self.network = exchanges(len(rows))
+
+    def all(self, value):
+        """The same number in both halves of every lane."""
+        return ir.Constant(_PAIRS, [value] * _PAIRS.count)
+
+    def both(self, row):
+        """The lower half of each lane in both halves."""
+        row = self.b.and_(row, self.lanes.all(0xFFFF))
+        return self.b.bitcast(self.b.or_(row, self.b.shl(row, self.lanes.all(16))), _PAIRS)
+
+    def split(self, pairs):
+        """Lower and upper halves as rows of int32."""
+        row, half = self.b.bitcast(pairs, _ROW), self.lanes.all(16)
+        return self.b.ashr(self.b.shl(row, half), half), self.b.ashr(row, half)
+
+    def turned(self, pairs):
+        """Both halves of each lane exchanged."""
+        row, half = self.b.bitcast(pairs, _ROW), self.lanes.all(16)
+        return self.b.bitcast(self.b.or_(self.b.shl(row, half), self.b.lshr(row, half)), _PAIRS)
+
+    def lower(self, first, second, signed):
+        """The smaller of two."""
+        compare = self.b.icmp_signed if signed else self.b.icmp_unsigned
+        return self.b.select(compare("<", first, second), first, second)
+
+    def upper(self, first, second, signed):
+        """The larger of two."""
+        compare = self.b.icmp_signed if signed else self.b.icmp_unsigned
+        return self.b.select(compare(">", first, second), first, second)
+
+    def middle(self, rows, least, most, *, signed):
+        """Of each lane the lower median of its heights, in both halves."""
+        b = self.b
+        rows = [
+            b.select(there, row, b.select(before, self.all(least), self.all(most)))
+            for row, there, before in zip(rows, self.there, self.before, strict=True)
+        ]
+        for i, j in self.network:
+            rows[i], rows[j] = self.lower(rows[i], rows[j], signed), self.upper(rows[i], rows[j], signed)
+        found = None
+        for first, second in zip(rows, reversed(rows), strict=True):
+            pair = self.lower(first, self.turned(second), signed)
+            found = pair if found is None else self.upper(found, pair, signed)
+        return found
+
+    def sum_of_products(self, first, second):
+        """The products of two numbers, added for both halves of each lane (int32)."""
+        if _MULTIPLIES:
+            return instruction(self.b, "llvm.x86.avx512.pmaddw.d.512", _ROW, first, second)
+        parts = [self.b.mul(one, other) for one, other in zip(self.split(first), self.split(second), strict=True)]
+        return self.b.add(*parts)
+
+
+def _spread(pairs):
+    """Lowest and highest height of each lane (int32); places without a height count as the first."""
+    first = pairs.both(pairs.b.bitcast(pairs.rows[0], _ROW))
+    low, high = first, first
+    for row, there in zip(pairs.rows, pairs.there, strict=True):
+        own = pairs.b.select(there, row, first)
+        low, high = pairs.lower(low, own, True), pairs.upper(high, own, True)
+    lows, highs = pairs.split(low), pairs.split(high)
+    return pairs.lanes.least(*lows), pairs.lanes.most(*highs)
+
+
+def _write_for(rows):
+    def write(lanes):
+        b = lanes.b
+        double = ir.VectorType(_F64, LANES // 2)
+        floor, quantum = (everywhere(b, double, lanes.data[k]) for k in (4, 5))
+        size = lanes.load(1)
+        pairs = Pairs(lanes, [lanes.load(0, k) for k in range(rows)], size)
+        median = pairs.middle(pairs.rows, SMALLEST, LARGEST, signed=True)
+        away = [b.sub(pairs.upper(row, median, True), pairs.lower(row, median, True)) for row in pairs.rows]
+        away = [b.select(there, row, pairs.all(APART)) for there, row in zip(pairs.there, away, strict=True)]
+        deviation = pairs.middle(away, 0, APART, signed=False)
+        far = reach_of(lanes, b.and_(b.bitcast(deviation, _ROW), lanes.all(0xFFFF)), floor)
+        far = pairs.both(lanes.least(far, lanes.all(APART - 1)))
+        total, near, used = (lanes.all(0) for _ in range(3))
+        squares = [lanes.all(0, half.type) for half in lanes.halves(total)]
+        for row, there, distance in zip(pairs.rows, pairs.there, away, strict=True):
+            own = b.select(there, row, pairs.all(0))
+            inside = b.icmp_unsigned("<=", distance, far)
+            ones = b.select(inside, pairs.all(1), pairs.all(0))
+            total = b.add(total, pairs.sum_of_products(own, pairs.all(1)))
+            near = b.add(near, pairs.sum_of_products(row, ones))
+            used = b.add(used, pairs.sum_of_products(ones, ones))
+            square = lanes.halves(pairs.sum_of_products(own, own))
+            squares = [b.add(s, t) for s, t in zip(squares, square, strict=True)]
+        centre = pairs.split(median)[0]
+        low, high = (b.sub(row, centre) for row in _spread(pairs))
+        middles, sizes, totals, nears, useds = (lanes.halves(row) for row in (centre, size, total, near, used))
+        sums = [], [], []
+        for k in range(2):
+            middle, away_from_base = middles[k], b.add(totals[k], totals[k])
+            sums[0].append(b.sub(totals[k], b.mul(sizes[k], middle)))
+            sums[1].append(b.add(squares[k], b.mul(middle, b.sub(b.mul(sizes[k], middle), away_from_base))))
+            sums[2].append(b.sub(nears[k], b.mul(useds[k], middle)))
+        write_statistics(lanes, 6, quantum, lanes.load(3), size, lanes.load(2), centre, low, high, used, sums)
+
+    return write
+
+
+def _compiled(rows):
+    @intrinsic
+    def written(typingctx, pairs, counts, light, bases, floor, quantum_m, out):
+        return types.void(pairs, counts, light, bases, floor, quantum_m, out), generator(_write_for(rows))
+
+    def statistics(pairs, counts, light, bases, floor, quantum_m, out):
+        written(pairs, counts, light, bases, floor, quantum_m, out)
+
+    return bare(statistics)
+
+
+def _by_numpy(pairs, counts, light, bases, floor, quantum_m, out):
+    statistics_by_numpy(heights_of(pairs), counts, light, bases, floor, quantum_m, out)
+
+
+def heights_of(pairs):
+    """Heights (2 r, 16) int32 of pairs (r, 16) int32, by NumPy."""
+    return (
+        np.ascontiguousarray(pairs.view(np.int16).reshape(len(pairs), LANES, 2).transpose(0, 2, 1))
+        .reshape(-1, LANES)
+        .astype(np.int32)
+    )
+
+
+def slot_statistics_of(rows: int) -> Kernel:
+    """The kernel that finds the statistics of up to 2 · `rows` heights a cell.
+
+    Its arguments: pairs (rows, 16) int32, heights 2 k and 2 k + 1 of a cell as the lower and the upper 16 bits of row
+    k, relative to bases, each no more than 32,000 away; the others are those of ``column_statistics.statistics_of``.
+    """
+    return _by_numpy if numba.config.DISABLE_JIT else _compiled(rows)
+
+
+slot_statistics_of_8, slot_statistics_of_28 = (slot_statistics_of(rows) for rows in (4, 14))

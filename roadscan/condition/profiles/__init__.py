@@ -1,0 +1,1 @@
+"""Indices of longitudinal profiles, wherever these come from: roughness, texture, spectra, straightedges."""

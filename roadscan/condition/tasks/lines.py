@@ -1,0 +1,317 @@
+"""Reference lines and lanes of a survey: found from its drives or a layer, kept as two small tables."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+
+from roadscan.condition.pose_wander import height_wander
+from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.roads import Drive, StatedLine, find_roads
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError
+from roadscan.core.ids import LanePass, PassId
+from roadscan.core.settings.condition import ConditionConfig
+from roadscan.core.survey import Survey
+from roadscan.formats.vectors.road_lines import LineLayer, RoadLinesOptions, place_in_map, read_lines, sidecars
+from roadscan.ingest.format import Reject
+from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store, file_digest
+from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import SurveyPlan, trajectory_source
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
+from roadscan.tiles.tasks.readings import TrajectorySource, read_groups
+
+LINES: Final = "reference_lines"
+LANES: Final = "lanes"
+_UNIT: Final = "all"
+_STEP_M: Final = 0.25
+"""A position is kept where it lies in another cube of this edge than the one before."""
+_POSITION: Final = ["epoch_gps_ns", *(f"{a}_world_m" for a in "xyz")]
+_LINE_SETTINGS: Final = (
+    "reference", "layer_crs", "layer_options", "lanes", "same_road_m", "smoothing_m", "lane_smoothing_m",
+    "lane_width_m",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Roads:
+    """Lines and lanes as they are stored."""
+
+    lines: dict[str, RoadLine]
+    """By road."""
+    lanes: tuple[Lane, ...]
+
+
+def lines_key(plan: SurveyPlan, config: ConditionConfig) -> str:
+    """Key of the two tables: ways of the passes, settings, layer and code."""
+    drives = [[[f.digest for f in source.files], _stated(one)] for one, source in _driven(plan)]
+    accuracy = [f.digest for r in plan.records for f in r.tables.get("trajectory_accuracy", ())]
+    layer = _layer_file(plan, config)
+    files = [] if layer is None else [file_digest(file) for file in (layer, *sidecars(layer))]
+    settings = {name: config.model_dump(mode="json")[name] for name in _LINE_SETTINGS}
+    code = code_digest("roadscan.condition.tasks.lines:write_lines")
+    context = product_context(plan)
+    return key_of(code, drives, accuracy, files, settings, context.survey_id, context.map)
+
+
+def _stated(one: LanePass) -> list[object]:
+    return [one.pass_id, one.run, one.start_gps_ns, one.end_gps_ns, one.lane]
+
+
+def _driven(plan: SurveyPlan) -> Iterator[tuple[LanePass, TrajectorySource]]:
+    """Passes whose run has a trajectory, by number."""
+    placed = {s.run for s, _ in plan.sources if s.trajectory is not None}
+    for one in sorted(plan.passes, key=lambda p: p.pass_id):
+        if one.run in placed:
+            yield one, trajectory_source(one.run, plan.records)
+
+
+def _layer_file(plan: SurveyPlan, config: ConditionConfig) -> Path | None:
+    return None if config.layer is None else plan.survey.resolve(config.layer)
+
+
+def find_lines(plan: SurveyPlan, config: ConditionConfig) -> Roads:
+    """Find the lines and lanes: from the drives, or those of the layer that were driven."""
+    drives = [Drive(one.pass_id, _path_m(plan, one, source), one.lane) for one, source in _driven(plan)]
+    lines, lanes = find_roads(drives, stated_lines(plan, config), config)
+    return Roads({line.road: line for line in lines}, tuple(_with_roll(plan, lanes)))
+
+
+def roads_key(plan: SurveyPlan) -> str:
+    """Key of the lines and lanes of :func:`survey_roads`."""
+    return lines_key(plan, plan.survey.config.condition or ConditionConfig())
+
+
+def survey_roads(plan: SurveyPlan, manifest: Manifest) -> tuple[Roads, str]:
+    """Lines and lanes of a survey, and their key: as the stage `condition` stored them, or found now.
+
+    A survey without a section `[condition]` has those of its drives.
+    """
+    config, key = plan.survey.config.condition or ConditionConfig(), roads_key(plan)
+    if current_lines(manifest, key):
+        return load_roads(plan.store, manifest, product_context(plan)), key
+    return find_lines(plan, config), key
+
+
+def write_lines(plan: SurveyPlan, config: ConditionConfig, key: str) -> list[OutputRecord]:
+    """Find the lines and lanes and write their tables."""
+    roads, context = find_lines(plan, config), product_context(plan)
+    return [
+        _write_lines(plan.store, list(roads.lines.values()), config.reference, key, context),
+        _write_lanes(plan.store, roads.lines, roads.lanes, key, context),
+    ]
+
+
+def _with_roll(plan: SurveyPlan, lanes: Sequence[Lane]) -> list[Lane]:
+    """The lanes with the standard deviations of roll and height of their drives, and how these heights wander."""
+    settings = plan.survey.config.navigation.calibration
+    known = {
+        one.pass_id: (*usual_pose_sigma(plan.store, plan.records, source, settings), _wander(plan, one, source))
+        for one, source in _driven(plan)
+    }
+
+    def greatest(lane: Lane, number: int) -> float:
+        own = [known[PassId(p)] for p in lane.passes] or list(known.values())
+        return max((float(sigma[number]) for sigma in own), default=0.0)
+
+    return [
+        replace(
+            lane, sigma_roll_deg=math.degrees(greatest(lane, 3)), sigma_height_m=greatest(lane, 2),
+            wander_m2_per_m=greatest(lane, 6),
+        )
+        for lane in lanes
+    ]  # fmt: skip
+
+
+def _wander(plan: SurveyPlan, one: LanePass, source: TrajectorySource) -> float:
+    """Variance a metre of travel by which the heights of a pass's poses wander at random (m²/m)."""
+    rows = list(_rows(plan.store, one, source))
+    if not rows:
+        return 0.0
+    epoch, world = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    return height_wander(epoch, plan.ground.map.map_from_world(source.world, world))
+
+
+def check_layer(survey: Survey) -> None:
+    """Open the layer of reference lines, where the survey file states one.
+
+    Raises
+    ------
+    FormatError, ConfigError, CrsError
+        if it does not exist, cannot be read as stated, or cannot be brought into the map.
+    """
+    config = survey.config.condition
+    if config is not None and config.layer is not None:
+        path = survey.resolve(config.layer)
+        layer = LineLayer.of(path, RoadLinesOptions.parse(config.layer_options, file=path), config.layer_crs)
+        place_in_map(layer.crs, survey.frame(), path)
+
+
+def stated_lines(plan: SurveyPlan, config: ConditionConfig) -> list[StatedLine]:
+    """Lines of the survey file's layer; none where it has none.
+
+    Raises
+    ------
+    FormatError, ConfigError, CrsError
+        if the layer cannot be read as stated, or a feature cannot be used.
+    """
+    path = _layer_file(plan, config)
+    if path is None:
+        return []
+    layer = LineLayer.of(path, RoadLinesOptions.parse(config.layer_options, file=path), config.layer_crs)
+    found: list[StatedLine] = []
+    for item in read_lines(layer, place_in_map(layer.crs, plan.ground.map, path), need_widths=False):
+        if isinstance(item, Reject):
+            raise ConfigError(
+                f"feature {item.record} of the layer (counted from 0) cannot be used: {item.reason}",
+                expected="lines that lie in the map",
+                change="mend the feature, or take it out of the layer",
+                file=path,
+            )
+        parts = zip(item.shapes, item.ids, item.parts, item.names, strict=True)
+        for number, (shape, line, part, name) in enumerate(parts):
+            first, last = item.measures[number].tolist()
+            known = not np.isnan(first + last)
+            found.append(
+                StatedLine(
+                    line if part == 0 else f"{line}.{part}", shapely.get_coordinates(shape), name,
+                    first if known else None, last if known else None,
+                )
+            )  # fmt: skip
+    return found
+
+
+def _path_m(plan: SurveyPlan, one: LanePass, source: TrajectorySource) -> npt.NDArray[np.float64]:
+    """(k, 2) easting and northing along a pass."""
+    parts = [np.zeros((0, 3)), *_positions(plan.store, one, source)]
+    world = np.concatenate(parts)
+    frame: MapFrame = plan.ground.map
+    return frame.map_from_world(source.world, world)[:, :2] if len(world) else np.zeros((0, 2))
+
+
+def _positions(store: Store, one: LanePass, source: TrajectorySource) -> Iterator[npt.NDArray[np.float64]]:
+    for _, place in _rows(store, one, source):
+        moved = np.ones(len(place), bool)
+        moved[1:] = (np.diff(np.floor(place / _STEP_M), axis=0) != 0).any(axis=1)
+        yield place[moved]
+
+
+def _rows(
+    store: Store, one: LanePass, source: TrajectorySource
+) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
+    """Epochs (n,) and positions (n, 3) in the world frame, row group by row group."""
+    for file in sorted(source.files, key=lambda f: f.span or (0, 0)):
+        if file.span is not None and (file.span[1] < one.start_gps_ns or file.span[0] >= one.end_gps_ns):
+            continue
+        for group in range(len(file.group_rows)):
+            rows = read_groups(store, file.path, [group], _POSITION)
+            epoch = rows.column("epoch_gps_ns").to_numpy()
+            own = (epoch >= one.start_gps_ns) & (epoch < one.end_gps_ns)
+            place = np.stack([rows.column(name).to_numpy()[own] for name in _POSITION[1:]], axis=-1)
+            if len(place):
+                yield epoch[own], place
+
+
+def _write_lines(
+    store: Store, lines: Sequence[RoadLine], source: str, key: str, context: ProductContext
+) -> OutputRecord:
+    columns = {
+        "road": [line.road for line in lines],
+        "name": [line.name for line in lines],
+        "source": [source] * len(lines),
+        "first_station_m": [line.first_m for line in lines],
+        "length_m": [line.length_m for line in lines],
+        "measure_from": [line.measure_from for line in lines],
+        "measure_per_m": [line.measure_per_m for line in lines],
+    }
+    return _write(store, LINES, columns, [line.nodes_m for line in lines], key, context)
+
+
+def _write_lanes(
+    store: Store, lines: dict[str, RoadLine], lanes: Sequence[Lane], key: str, context: ProductContext
+) -> OutputRecord:
+    columns = {
+        "road": [lane.road for lane in lanes],
+        "lane": [lane.name for lane in lanes],
+        "direction": [lane.direction for lane in lanes],
+        "station_from_m": [lane.first_m for lane in lanes],
+        "station_to_m": [lane.last_m for lane in lanes],
+        "width_m": [lane.width_m for lane in lanes],
+        "width_from": [lane.width_from for lane in lanes],
+        "offset_mean_m": [float(np.mean(lane.offset_m)) for lane in lanes],
+        "sigma_roll_deg": [lane.sigma_roll_deg for lane in lanes],
+        "sigma_height_m": [lane.sigma_height_m for lane in lanes],
+        "wander_m2_per_m": [lane.wander_m2_per_m for lane in lanes],
+        "passes": [" ".join(map(str, lane.passes)) for lane in lanes],
+        "offset_m": [lane.offset_m for lane in lanes],
+    }
+    shapes = []
+    for lane in lanes:
+        station = np.arange(lane.first_m, lane.last_m + 1, dtype=np.float64)
+        shapes.append(lines[lane.road].places(station, lane.offset_m)[:, :2])
+    return _write(store, LANES, columns, shapes, key, context)
+
+
+def _write(
+    store: Store,
+    name: str,
+    columns: dict[str, Any],
+    shapes_m: Sequence[npt.NDArray[np.float64]],
+    key: str,
+    context: ProductContext,
+) -> OutputRecord:
+    schema = table_schema(name)
+    target = f"{schema.location}/{name}.parquet"
+    table = pa.table(columns, schema=schema.arrow())
+    shapes = np.array([*map(shapely.LineString, shapes_m), None], object)[:-1]
+    with store.scratch() as folder:
+        path = folder / f"{name}.parquet"
+        write_geo_table(path, table, "line", shapes, ["LineString"], context)
+        size, digest = path.stat().st_size, file_digest(path)
+        store.publish(path, target)
+    return OutputRecord(name, _UNIT, key, target, size, digest, json.dumps({"rows": table.num_rows}))
+
+
+def current_lines(manifest: Manifest, key: str) -> bool:
+    """Whether both tables are there and up to date."""
+    return all(manifest.is_current(name, _UNIT, key) for name in (LINES, LANES))
+
+
+def load_roads(store: Store, manifest: Manifest, context: ProductContext) -> Roads:
+    """Lines and lanes as they were stored; none where there are no tables yet."""
+    records = [manifest.get(name, _UNIT) for name in (LINES, LANES)]
+    if records[0] is None or records[1] is None:
+        return Roads({}, ())
+    rows, shapes = read_geo_table(read_recorded(store, records[0]), context)
+    lines = {
+        row["road"]: RoadLine(
+            row["road"], shapely.get_coordinates(shape), row["first_station_m"], row["name"], row["measure_from"],
+            row["measure_per_m"],
+        )
+        for row, shape in zip(rows.to_pylist(), shapes, strict=True)
+    }  # fmt: skip
+    held, _ = read_geo_table(read_recorded(store, records[1]), context)
+    lanes = tuple(
+        Lane(
+            row["road"], row["lane"], 1 if row["direction"] == "forward" else -1, row["station_from_m"],
+            np.array(row["offset_m"]), row["width_m"], row["width_from"], tuple(map(int, row["passes"].split())),
+            row["sigma_roll_deg"], row["sigma_height_m"], row["wander_m2_per_m"],
+        )
+        for row in held.to_pylist()
+    )  # fmt: skip
+    return Roads(lines, lanes)

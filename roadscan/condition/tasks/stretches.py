@@ -1,0 +1,282 @@
+"""Stretches of lanes: cells of the tiles on the way → profiles, cross-sections, texture and painted lines.
+
+What a row says depends on the cells around its place and on the line there, so it has the same bits whatever the
+stretches.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+
+from roadscan.condition.cell_table import cell_table
+from roadscan.condition.on_lane.squares import SQUARE_M
+from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.survey_lane import LaneHeights, reach_m, survey_lane
+from roadscan.condition.tasks.lines import Roads
+from roadscan.condition.tasks.surface_cells import read_surface
+from roadscan.core.ids import TileId
+from roadscan.core.settings.condition import SectionConfig
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.compute import damaged_file, reason_of
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store, bytes_digest
+from roadscan.store.writer import parquet_bytes
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.grid import Bounds, TileGrid
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.tasks.tiles import TaskResult
+
+PROFILES: Final = "profiles_longitudinal"
+SURFACE_FILES: Final = "surface"
+"""Product whose files hold the reconstructed surface."""
+CROSS_SECTIONS: Final = "cross_sections"
+LANE_TEXTURE: Final = "lane_texture"
+LANE_LINES: Final = "lane_line_offsets"
+OF_STRETCHES: Final = (CROSS_SECTIONS, PROFILES, LANE_TEXTURE, LANE_LINES)
+"""Tables of which a stretch has a file each."""
+STRETCH_M: Final = 50
+"""Length of a stretch; changes no height."""
+_TASK_STRETCHES: Final = 8
+_TILES_KEPT: Final = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A stretch of a lane, from one station to the next; it holds no heights."""
+
+    line: RoadLine
+    lane: Lane
+    from_m: float
+    to_m: float
+    cells: tuple[OutputRecord, ...]
+    """Records of the tiles on its way that hold cells."""
+    key: str
+
+    @property
+    def unit(self) -> str:
+        """Its name in the manifest."""
+        return unit_of(self.lane, int(self.from_m) // STRETCH_M)
+
+
+def unit_of(lane: Lane, number: int) -> str:
+    """Name of a stretch in the manifest."""
+    return f"{lane.road}/{lane.name}/{number:06d}"
+
+
+@dataclass(frozen=True, eq=False)
+class StretchTask:
+    """Some stretches one after another. Sent to workers: it holds no data."""
+
+    store: Store
+    grid: TileGrid
+    config: SectionConfig
+    context: ProductContext
+    stretches: tuple[Stretch, ...]
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Names of the stretches."""
+        return tuple(s.unit for s in self.stretches)
+
+    def singly(self) -> list[StretchTask]:
+        """A task for each stretch."""
+        return [replace(self, stretches=(one,)) for one in self.stretches]
+
+
+def plan_stretches(
+    roads: Roads, tiles: Mapping[TileId, OutputRecord], grid: TileGrid, config: SectionConfig
+) -> list[Stretch]:
+    """All stretches that have a tile with cells on their way, lane by lane."""
+    code = code_digest("roadscan.condition.tasks.stretches:survey_stretches")
+    names = set(SectionConfig.model_fields) - {"section_m", "largest_gap_m", "least_share", "lane_width_m"}
+    settings = {name: value for name, value in config.model_dump(mode="json").items() if name in names}
+    common = key_of(code, settings, grid)
+    found: list[Stretch] = []
+    for lane in roads.lanes:
+        whole = roads.lines[lane.road]
+        for number in range(lane.first_m // STRETCH_M, lane.last_m // STRETCH_M + 1):
+            from_m, to_m = float(number * STRETCH_M), float((number + 1) * STRETCH_M)
+            line, part = whole.stretch(from_m, to_m), lane.stretch(from_m, to_m)
+            own = tuple(tiles[t] for t in _on_the_way(line, part, from_m, to_m, grid, config) if t in tiles)
+            if own:
+                shape = [line.first_m, line.nodes_m.tolist(), part.first_m, part.offset_m.tolist()]
+                shape += [lane.sign, lane.width_m]
+                key = key_of(common, shape, lane.first_m, lane.last_m, [(r.unit, r.digest) for r in own])
+                found.append(Stretch(line, part, max(from_m, lane.first_m), min(to_m, lane.last_m + 1.0), own, key))
+    return found
+
+
+def _on_the_way(
+    line: RoadLine, lane: Lane, from_m: float, to_m: float, grid: TileGrid, config: SectionConfig
+) -> list[TileId]:
+    station = np.arange(max(from_m, lane.first_m), min(to_m, lane.last_m) + 1.0)
+    if station.size < 2:
+        station = np.array([station[0], station[0] + 1.0]) if station.size else np.array([from_m, from_m + 1.0])
+    middle = line.places(station, lane.offsets(station))[:, :2]
+    strip = shapely.LineString(middle).buffer(lane.width_m / 2 + reach_m(config, grid.cell_m) + 0.2)
+    west, south, east, north = strip.bounds
+    return [t for t in grid.tiles_in(Bounds(west, south, east, north)) if strip.intersects(_box(grid.bounds(t)))]
+
+
+def _box(b: Bounds) -> shapely.Polygon:
+    return shapely.box(b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m)
+
+
+def due_stretches(stretches: Sequence[Stretch], manifest: Manifest) -> list[Stretch]:
+    """Those that are missing or stale."""
+    return [s for s in stretches if not all(manifest.is_current(n, s.unit, s.key) for n in OF_STRETCHES)]
+
+
+def stretch_tasks(
+    due: Sequence[Stretch], store: Store, context: ProductContext, config: SectionConfig
+) -> list[StretchTask]:
+    """Tasks of neighbouring stretches of a lane."""
+    tasks: list[StretchTask] = []
+    for _, own in itertools.groupby(due, key=lambda s: (s.lane.road, s.lane.name)):
+        tasks += [StretchTask(store, context.grid, config, context, some) for some in _batches(list(own))]
+    return tasks
+
+
+def _batches(own: Sequence[Stretch]) -> Iterator[tuple[Stretch, ...]]:
+    for first in range(0, len(own), _TASK_STRETCHES):
+        yield tuple(own[first : first + _TASK_STRETCHES])
+
+
+def survey_stretches(task: StretchTask) -> TaskResult:
+    """Write the tables of the stretches of a task (runs on a worker)."""
+    tiles = _Tiles(task.store, task.context)
+    records: list[OutputRecord] = []
+    failures: list[tuple[str, str]] = []
+    damaged: set[str] = set()
+    for one in task.stretches:
+        try:
+            table = cell_table([tiles.read(r) for r in one.cells], task.grid.cell_m)
+            heights = survey_lane(table, one.line, one.lane, (one.from_m, one.to_m), task.config)
+            records += _write(task.store, one, heights)
+        except Exception as error:  # noqa: BLE001  one stretch's fault must not stop the others
+            failures.append((one.unit, reason_of(error)))
+            damaged.add(damaged_file(error))
+    return TaskResult.of(records, failures, damaged)
+
+
+class _Tiles:
+    """Cells of the tiles of some stretches, the last ones kept."""
+
+    def __init__(self, store: Store, context: ProductContext) -> None:
+        self._store, self._context = store, context
+        self._kept: dict[str, TileCells] = {}
+
+    def read(self, record: OutputRecord) -> TileCells:
+        """Cells of a tile."""
+        cells = self._kept.pop(record.unit, None)
+        if cells is None:
+            edge = self._context.grid.cells_per_edge
+            of_surface = record.product == SURFACE_FILES
+            cells = (
+                read_surface(self._store, record, edge, self._context)
+                if of_surface
+                else read_cells(self._store, record, edge)
+            )
+        self._kept[record.unit] = cells
+        while len(self._kept) > _TILES_KEPT:
+            del self._kept[next(iter(self._kept))]
+        return cells
+
+
+def _write(store: Store, one: Stretch, held: LaneHeights) -> Iterator[OutputRecord]:
+    """The files of a stretch."""
+    columns_of = (_cross_columns, _profile_columns, _texture_columns, _line_columns)
+    for name, columns in zip(OF_STRETCHES, (make(one, held) for make in columns_of), strict=True):
+        schema = table_schema(name)
+        rows = pa.table(columns, schema=schema.arrow())
+        content, target = parquet_bytes(rows, schema), f"{schema.location}/{one.unit}.parquet"
+        store.write_bytes(target, content, lasting=False)
+        yield OutputRecord(name, one.unit, one.key, target, len(content), bytes_digest(content))
+
+
+def _profile_columns(one: Stretch, held: LaneHeights) -> dict[str, pa.Array]:
+    paths = held.paths
+    station = np.concatenate([p.station_m for p in paths.values()])
+    values = np.concatenate([p.values for p in paths.values()])
+    places = np.concatenate([p.places for p in paths.values()])
+    return {
+        "road": pa.array([one.lane.road] * station.size, pa.string()),
+        "lane": pa.array([one.lane.name] * station.size, pa.string()),
+        "path": pa.array([name for name, p in paths.items() for _ in p.station_m], pa.string()),
+        "station_m": pa.array(station),
+        "offset_m": pa.array(np.concatenate([p.offset_m for p in paths.values()])),
+        "easting_m": pa.array(places[:, 0]),
+        "northing_m": pa.array(places[:, 1]),
+        "height_m": pa.array(values[:, 0], from_pandas=True),
+        "sigma_height_m": pa.array(values[:, 1].astype(np.float32), from_pandas=True),
+        "share": pa.array(values[:, 2].astype(np.float32)),
+    }
+
+
+def _cross_columns(one: Stretch, held: LaneHeights) -> dict[str, pa.Array]:
+    c = held.cross
+    rows = len(c.height_m)
+    return {
+        "road": pa.array([one.lane.road] * rows, pa.string()),
+        "lane": pa.array([one.lane.name] * rows, pa.string()),
+        "station_m": pa.array(c.station_m),
+        "offset_m": pa.array(c.middle_offset_m),
+        "easting_m": pa.array(c.places[:, 0]),
+        "northing_m": pa.array(c.places[:, 1]),
+        "first_m": pa.array(np.full(rows, c.offset_m[0])),
+        "step_m": pa.array(np.full(rows, c.offset_m[1] - c.offset_m[0])),
+        "height_m": pa.array(c.base_m),
+        "relative_height_m": _lists(c.height_m),
+        "sigma_height_m": _lists(c.sigma_m),
+    }
+
+
+def _texture_columns(one: Stretch, held: LaneHeights) -> dict[str, pa.Array]:
+    t = held.texture
+    rows = t.station_m.size
+    return {
+        "road": pa.array([one.lane.road] * rows, pa.string()),
+        "lane": pa.array([one.lane.name] * rows, pa.string()),
+        "station_m": pa.array(t.station_m),
+        "first_m": pa.array(np.full(rows, t.offset_m[0])),
+        "step_m": pa.array(np.full(rows, SQUARE_M)),
+        "texture_mm": _lists(t.texture_mm),
+        "loss_mm": _lists(t.loss_mm),
+        "mpd_mm": _lists(t.mpd_mm),
+        "intensity": _lists(t.intensity),
+        "passes_share": _lists(t.passes_share),
+    }
+
+
+def _line_columns(one: Stretch, held: LaneHeights) -> dict[str, pa.Array]:
+    seen = held.lines
+    rows = seen.station_m.size
+    return {
+        "road": pa.array([one.lane.road] * rows, pa.string()),
+        "lane": pa.array([one.lane.name] * rows, pa.string()),
+        "station_m": pa.array(seen.station_m),
+        "side": pa.array(seen.side, pa.string()),
+        "own_offset_m": pa.array(seen.own_m),
+        "width_m": pa.array(seen.width_m),
+        "contrast": pa.array(seen.contrast),
+    }
+
+
+def _lists(values: npt.NDArray[np.float64]) -> pa.Array:
+    """A list of 32-bit floats for each row of values (rows, count)."""
+    rows, count = values.shape
+    ends = np.arange(0, rows * count + 1, max(count, 1), dtype=np.int32)[: rows + 1]
+    element = pa.field("element", pa.float32(), nullable=False)
+    flat = pa.array(np.ascontiguousarray(values, np.float32).ravel(), pa.float32())
+    return pa.ListArray.from_arrays(ends, flat, type=pa.list_(element))

@@ -1,0 +1,97 @@
+"""Tasks that each make some files: their records are kept as they end, and a task that dies is tried once more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, Protocol, Self, TypeVar
+
+from roadscan.core.strict import Strict
+from roadscan.run.engine.compute import Compute, reason_of
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
+from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.tasks.tiles import TaskResult
+
+
+class Splittable(Protocol):
+    """A task over some units."""
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Names of its units."""
+
+    def singly(self) -> list[Self]:
+        """A task for each unit."""
+
+
+T = TypeVar("T", bound=Splittable)
+
+
+class RoadPiece(Protocol):
+    """A piece of a road."""
+
+    @property
+    def unit(self) -> str:
+        """Its name in the manifest."""
+
+
+P = TypeVar("P", bound=RoadPiece)
+S = TypeVar("S", bound=Strict)
+
+
+@dataclass(frozen=True, eq=False)
+class PieceTask(Generic[P, S]):
+    """Pieces of roads and the settings with which they are looked through. Sent to workers: it holds no data."""
+
+    store: Store
+    grid: TileGrid
+    context: ProductContext
+    settings: S
+    pieces: tuple[P, ...]
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Names of the pieces."""
+        return tuple(p.unit for p in self.pieces)
+
+    def singly(self) -> list[Self]:
+        """A task for each piece."""
+        return [replace(self, pieces=(one,)) for one in self.pieces]
+
+
+def run_units(
+    function: Callable[[T], TaskResult],
+    tasks: Sequence[T],
+    manifest: Manifest,
+    compute: Compute,
+    report: Callable[[int, int], None],
+) -> list[tuple[str, str]]:
+    """Do all tasks and keep their records; returns units that failed, with the reason."""
+    total = sum(len(task.units) for task in tasks)
+    failures: list[tuple[str, str]] = []
+    again: list[T] = []
+    finished = 0
+    report(0, total)
+
+    def rounds() -> Iterator[Sequence[T]]:
+        yield tasks
+        if again:
+            yield again
+
+    for some in rounds():
+        for done in compute.map(function, some):
+            if done.result is not None:
+                manifest.add_packed(done.result.records)
+                manifest.doubt_files(done.result.damaged)
+                failures += done.result.failures
+            elif len(done.task.units) > 1:
+                again += done.task.singly()
+                continue
+            else:
+                failures.append((done.task.units[0], reason_of(done.error)))
+            finished += len(done.task.units)
+            report(finished, total)
+    manifest.settle()
+    return failures

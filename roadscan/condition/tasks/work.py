@@ -1,0 +1,118 @@
+"""What the stage `condition` has to do: lines, stretches and values there are against those there should be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from roadscan.condition.tasks.lines import LANES, LINES, Roads, current_lines, lines_key, load_roads
+from roadscan.condition.tasks.pictures import PICTURES, PictureTask, due_pictures, plan_pictures
+from roadscan.condition.tasks.ravelling import RAVELLING, RAVELLING_PICTURES, PatchTask, due_patches, plan_patches
+from roadscan.condition.tasks.road_edges import EDGES, SURFACES, EdgePiece, due_edges, plan_edges, stated_surface
+from roadscan.condition.tasks.roughness_regions import (
+    REGION_PICTURES,
+    REGION_SECTIONS,
+    REGIONS,
+    Piece,
+    due_pieces,
+    plan_pieces,
+)
+from roadscan.condition.tasks.sections import SECTIONS, SectionFiles, due_files, plan_sections
+from roadscan.condition.tasks.stretches import (
+    OF_STRETCHES,
+    SURFACE_FILES,
+    Stretch,
+    due_stretches,
+    plan_stretches,
+)
+from roadscan.condition.tasks.tile_summary import TILES, due_tiles
+from roadscan.condition.tasks.values import VALUES, Group, GroupTask, due_groups, plan_groups
+from roadscan.core.ids import TileId
+from roadscan.core.settings.condition import ConditionConfig
+from roadscan.run.session import Session
+from roadscan.store.manifest import OutputRecord
+from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.tasks.tile_plan import TILE
+
+MADE = (
+    LINES, LANES, *OF_STRETCHES, EDGES, SURFACES, VALUES, SECTIONS, TILES, PICTURES, RAVELLING, RAVELLING_PICTURES,
+    REGIONS, REGION_SECTIONS, REGION_PICTURES,
+)  # fmt: skip
+"""Names of all outputs in the manifest."""
+
+
+@dataclass(frozen=True)
+class ConditionWork:
+    """What there is to do, as far as that can be told before the parts before it are done."""
+
+    lines_key: str = ""
+    lines_due: bool = False
+    stretches: Sequence[Stretch] = ()
+    due_stretches: Sequence[Stretch] = ()
+    groups: Sequence[Group] = ()
+    due_groups: Sequence[Group] = ()
+    files: SectionFiles | None = None
+    due_files: Sequence[str] = ()
+    due_tiles: str = ""
+    """Key of the table by tile where it is missing or stale."""
+    due_pictures: Sequence[PictureTask] = ()
+    patches: Sequence[PatchTask] = ()
+    """Groups of sections whose ravelled patches are written."""
+    due_patches: Sequence[PatchTask] = ()
+    edges: Sequence[EdgePiece] = ()
+    """Pieces of roads whose edges are sought."""
+    due_edges: Sequence[EdgePiece] = ()
+    pieces: Sequence[Piece] = ()
+    """Of roads, to be looked through for roughness regions."""
+    due_pieces: Sequence[Piece] = ()
+    gone: Sequence[OutputRecord] = field(default=())
+    """Outputs that are no longer due."""
+
+    @property
+    def values_due(self) -> int:
+        """How many indices of groups are due."""
+        return sum(len(one.indices) for one in self.due_groups)
+
+
+def plan_condition(session: Session) -> ConditionWork:
+    """Compare what there is with what there should be; what waits for the lines is not told yet."""
+    config, manifest = session.survey.config.condition, session.manifest
+    if config is None:
+        return ConditionWork(gone=manifest.beside(set(MADE), ()))
+    key = lines_key(session.plan, config)
+    if not current_lines(manifest, key):
+        return ConditionWork(lines_key=key, lines_due=True)
+    return _along_lines(session, config, key)
+
+
+def _along_lines(session: Session, config: ConditionConfig, key: str) -> ConditionWork:
+    plan, manifest = session.plan, session.manifest
+    context = product_context(plan)
+    roads: Roads = load_roads(session.store, manifest, context)
+    made = manifest.of(TILE if config.heights == "cells" else SURFACE_FILES)
+    tiles = {TileId.parse(unit): r for unit, r in made.items() if r.path}
+    settings, grid = config.sections(), plan.ground.grid
+    stretches = plan_stretches(roads, tiles, grid, settings)
+    measured = {TileId.parse(r.unit): r for r in manifest.of(TILE).values() if r.path}
+    stated = stated_surface(plan, config.road_edges)
+    edges = plan_edges(roads, measured, grid, config.road_edges, stated)
+    groups = plan_groups(roads, manifest, settings, grid.cell_m, with_edges=config.road_edges is not None)
+    units = [one.unit(name) for one in groups for name, _ in one.indices]
+    tasks = [GroupTask(session.store, settings, grid.cell_m, context, one) for one in groups]
+    pictures = plan_pictures(tasks, manifest)
+    patches = plan_patches(tasks)
+    files = plan_sections(session.store, manifest, roads, units, context)
+    pieces = plan_pieces(roads, measured, grid, config.roughness_regions)
+    gone = [
+        *manifest.beside(set(OF_STRETCHES), {s.unit for s in stretches}),
+        *manifest.beside({RAVELLING, RAVELLING_PICTURES}, {unit for one in patches for unit in one.units}),
+        *manifest.beside({EDGES, SURFACES}, {one.unit for one in edges}),
+        *manifest.beside({VALUES}, set(units)),
+        *manifest.beside({PICTURES}, {one.unit for one in pictures}),
+        *manifest.beside({REGIONS, REGION_SECTIONS, REGION_PICTURES}, {one.unit for one in pieces}),
+    ]
+    return ConditionWork(
+        key, False, stretches, due_stretches(stretches, manifest), groups, due_groups(groups, manifest), files,
+        due_files(files, manifest), due_tiles(files, manifest), due_pictures(pictures, manifest), patches,
+        due_patches(patches, manifest), edges, due_edges(edges, manifest), pieces, due_pieces(pieces, manifest), gone,
+    )  # fmt: skip

@@ -1,0 +1,201 @@
+"""Errors that say what arrived, what was expected and what to change.
+
+Every error a user can meet derives from :class:`RoadscanError`. The message is
+one sentence a part; file and record are added where they are known.
+"""
+
+from __future__ import annotations
+
+import difflib
+import errno
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self, TypeAlias
+
+from roadscan.core.toml_text import toml
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A setting of a log that has to be stated, or stated otherwise, before the log can be read."""
+
+    key: str
+    """clock, crs, height, geoid, sensor, or options.NAME, as in the survey file."""
+    proposed: Any = None
+    """A value that would do, as far as is known; None where nothing is."""
+    choices: tuple[Any, ...] = ()
+    """All values that it may take, where they are few."""
+    is_example: bool = False
+    """`proposed` shows the form alone: the log says nothing for it."""
+
+    def __str__(self) -> str:
+        """As an error asks for it."""
+        if self.choices:
+            words = [toml(value) for value in self.choices]
+            return f"{self.key} = " + " or ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+        return self.key if self.proposed is None else f"{self.key} = {toml(self.proposed)}"
+
+
+Alternatives: TypeAlias = tuple[tuple[Missing, ...], ...]
+"""Groups of settings; any one group, stated whole, is enough."""
+
+
+class RoadscanError(Exception):
+    """Base of all errors raised on purpose.
+
+    Parameters
+    ----------
+    arrived : what was found.
+    expected : what should have been there.
+    change : what the user can do about it.
+    file, record : where it was found (record number or byte offset).
+    missing : settings of the log that would mend it: one, or alternatives, each a setting or several together.
+        `expected` and `change` follow from them where they are not given.
+    """
+
+    def __init__(
+        self,
+        arrived: str,
+        *,
+        expected: str = "",
+        change: str = "",
+        file: str | Path | None = None,
+        record: int | str | None = None,
+        missing: Missing | Sequence[Missing | Sequence[Missing]] = (),
+    ) -> None:
+        alternatives = [missing] if isinstance(missing, Missing) else missing
+        self.missing: Alternatives = tuple((one,) if isinstance(one, Missing) else tuple(one) for one in alternatives)
+        self.arrived = arrived
+        self.expected = expected or _wanted(self.missing)
+        self.change = change or self.advice
+        self.file = None if file is None else str(file)
+        self.record = record
+        super().__init__(arrived, expected, change, self.file, record)
+
+    def __str__(self) -> str:
+        place = ""
+        if self.file is not None:
+            place = self.file
+            if self.record is not None:
+                place += f", record {self.record}"
+            place += ": "
+        parts = [self.arrived]
+        if self.expected:
+            parts.append(f"expected {self.expected}")
+        if self.change:
+            parts.append(self.change)
+        return place + "; ".join(parts)
+
+    @property
+    def advice(self) -> str:
+        """The line to add, where all that is missing has a proposal; empty otherwise."""
+        if len(self.missing) != 1 or any(one.proposed is None for one in self.missing[0]):
+            return ""
+        lines = [f"{one.key} = {toml(one.proposed)}" for one in self.missing[0]]
+        return f"add {' and '.join(lines)} to this log"
+
+    def asks_for(self, key: str) -> Iterator[Missing]:
+        """The settings of this key, or of options where it ends in a dot, that would mend it."""
+        for one in (one for group in self.missing for one in group):
+            if one.key == key or (key.endswith(".") and one.key.startswith(key)):
+                yield one
+
+    def at(self, file: str | Path | None = None, record: int | str | None = None) -> Self:
+        """The same error, found in another file, at another record."""
+        return type(self)(
+            self.arrived, expected=self.expected, change=self.change, file=file, record=record, missing=self.missing
+        )
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Keep the keyword parts when a worker sends the error to the scheduler."""
+        state = (self.arrived, self.expected, self.change, self.file, self.record, self.missing)
+        return (_rebuild, (type(self), state))
+
+
+def _rebuild(kind: type[RoadscanError], state: tuple[Any, ...]) -> RoadscanError:
+    arrived, expected, change, file, record, missing = state
+    return kind(arrived, expected=expected, change=change, file=file, record=record, missing=missing)
+
+
+def _wanted(missing: Alternatives) -> str:
+    groups = [" with ".join(map(str, group)) for group in missing]
+    return ("one of " if groups[1:] else "") + ", ".join(groups)
+
+
+class ConfigError(RoadscanError):
+    """A survey file, rig file or option is wrong."""
+
+
+class FormatError(RoadscanError):
+    """A log cannot be read as the format it is said to be."""
+
+
+class TimeSystemError(RoadscanError):
+    """A time stamp has no, or an impossible, time system."""
+
+
+class CrsError(RoadscanError):
+    """A coordinate reference system, datum or geoid is missing or does not fit."""
+
+
+class SchemaError(RoadscanError):
+    """Rows do not fit the table's schema."""
+
+
+class NavigationError(RoadscanError):
+    """A pose was asked for where the trajectory has none."""
+
+
+class ProfileError(RoadscanError):
+    """A profile of a road cannot be given the index that was asked for."""
+
+
+class StoreError(RoadscanError):
+    """The store is damaged, locked or not a roadscan store."""
+
+
+class DamagedError(StoreError):
+    """A file of the store can be read, and does not hold what was written."""
+
+
+class FullDiskError(StoreError):
+    """A file could not be written for want of room."""
+
+
+class AnswerError(DamagedError):
+    """A file that an answer is made of is damaged."""
+
+
+class RunError(RoadscanError):
+    """Some units of a run failed; the rest is finished and kept."""
+
+
+def in_words(error: OSError) -> RoadscanError:
+    """The error of a file, as one that a user can mend: which file, what is wrong with it, and what to change."""
+    if error.filename is None:  # libraries say in their own words which file it is
+        return RoadscanError(error.strerror or str(error) or type(error).__name__)
+    arrived, change = _OF_FILES.get(error.errno or 0, (error.strerror or str(error), ""))
+    return RoadscanError(arrived, change=change, file=error.filename)
+
+
+_OF_FILES = {
+    errno.EACCES: ("permission denied", "name another place, or change its rights"),
+    errno.EPERM: ("permission denied", "name another place, or change its rights"),
+    errno.EROFS: ("the file system is read-only", "name another place"),
+    errno.ENOENT: ("no such file or folder", "see to its name"),
+    errno.EISDIR: ("a folder stands where a file was expected", "name a file"),
+    errno.ENOTDIR: ("a file stands where a folder was expected", "name another place"),
+    errno.EEXIST: ("it is there already", "name another place"),
+    errno.ENOSPC: ("no room is left on the disk", "make room, or name a place on another disk"),
+    errno.EDQUOT: ("no room is left in your quota", "make room, or name a place on another disk"),
+    errno.EMFILE: ("too many files are open", "raise the limit (`ulimit -n`)"),
+    errno.ENAMETOOLONG: ("the name is too long", "shorten it"),
+    errno.ELOOP: ("links lead in a circle", "see to its name"),
+}
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return `` (did you mean 'x'?)`` for the closest of `known`, or an empty string."""
+    found = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
+    return f" (did you mean '{found[0]}'?)" if found else ""

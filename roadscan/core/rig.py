@@ -1,0 +1,192 @@
+"""The rig: sensors and how they are mounted on the vehicle (``RIG.toml``)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from roadscan.core.camera import Interior
+from roadscan.core.frames import BODY_FROM_AXES, body_from_axes, rotation_from_rph
+from roadscan.core.imu import IMU_GRADES, ImuErrors, ImuGrade
+from roadscan.core.strict import Strict, load_toml
+
+Float64 = npt.NDArray[np.float64]
+
+SensorKind = Literal["profiler", "lidar", "camera", "gnss", "imu", "encoder"]
+
+
+_MOUNTING_KEYS: Final = ("axes", "boresight", "body_from_sensor", "lever_arm_body_m")
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Lever arm and boresight: p_body = body_from_sensor · p_sensor + lever_arm_body_m."""
+
+    lever_arm_body_m: tuple[float, float, float]
+    """IMU reference point to sensor origin, body axes (forward, right, down), metres."""
+    body_from_sensor: tuple[tuple[float, float, float], ...]
+    """(3, 3) rotation, sensor frame to body."""
+
+    def arrays(self) -> tuple[Float64, Float64]:
+        """Rotation (3, 3) and lever arm (3,)."""
+        return np.array(self.body_from_sensor), np.array(self.lever_arm_body_m)
+
+
+UNMOUNTED: Final = Mounting((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+"""What measures in body axes, from the reference point."""
+
+
+@dataclass(frozen=True)
+class Mountings:
+    """Mountings of one sensor, each from an epoch on: a head was taken off and put back, a calibration repeated."""
+
+    since_gps_ns: tuple[int, ...]
+    """Ascending; before the first the first holds."""
+    mountings: tuple[Mounting, ...]
+
+    @classmethod
+    def one(cls, mounting: Mounting) -> Self:
+        """The same mounting at all times."""
+        return cls((0,), (mounting,))
+
+    def longest_lever_m(self) -> float:
+        """Length of the longest lever arm."""
+        return max(math.hypot(*mounting.lever_arm_body_m) for mounting in self.mountings)
+
+    def pieces(self, epochs_gps_ns: npt.NDArray[np.int64]) -> Iterator[tuple[slice, Mounting]]:
+        """Runs of readings under one mounting, in their order, for epochs (n,) in any order."""
+        if len(self.mountings) == 1:
+            yield slice(0, epochs_gps_ns.size), self.mountings[0]
+            return
+        index = np.searchsorted(np.array(self.since_gps_ns[1:]), epochs_gps_ns, side="right")
+        ends = [*(np.flatnonzero(np.diff(index)) + 1).tolist(), index.size]
+        start = 0
+        for end in ends:
+            if end > start:
+                yield slice(start, end), self.mountings[int(index[start])]
+            start = end
+
+
+class Boresight(Strict):
+    """Small rotation between the sensor's nominal axes and its true ones (degrees, Z-Y-X)."""
+
+    roll_deg: float = 0.0
+    """Rotation about body x (forward); positive lowers the right side."""
+    pitch_deg: float = 0.0
+    """Rotation about body y (right); positive raises the front."""
+    heading_deg: float = 0.0
+    """Rotation about body z (down); positive turns clockwise seen from above."""
+
+
+class Sensor(Strict):
+    """One sensor of the rig."""
+
+    kind: SensorKind
+    """What it is: profiler, lidar, camera, gnss, imu or encoder. A log that it cannot have written is refused: scans
+    are of a profiler or lidar, returns of a lidar, images of a camera, clouds of any of these three."""
+    model: str = ""
+    """Maker's name, for the reader of the file only."""
+    axes: str = "frd"
+    """Where the sensor's x, y, z point when it is mounted without misalignment: three letters of f(orward) b(ack)
+    r(ight) l(eft) u(p) d(own), right-handed: one of 24 codes such as frd, flu or urf. Ignored with
+    `body_from_sensor`. Where it is left out, the log's own statement holds, if its format makes one."""
+    lever_arm_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """From the IMU reference point to the sensor's origin, body axes forward, right, down (m)."""
+    boresight: Boresight = Boresight()
+    """Misalignment: body_from_sensor = R(roll, pitch, heading) · body_from_axes."""
+    body_from_sensor: tuple[tuple[float, float, float], ...] | None = None
+    """The whole 3 × 3 rotation as rows, in place of `axes` and `boresight` (from a calibration sheet)."""
+    mounts_vehicle_frame: bool = False
+    """Confirms a lever arm or axes for readings that are in the vehicle's frame already, which are refused otherwise:
+    the maker's vehicle frame is then mounted in the body, because it is not the one that the trajectory holds."""
+    range_min_m: float = Field(default=0.0, ge=0.0)
+    """Returns and readings of profiles nearer than this are left out (own vehicle); points of clouds have no range."""
+    range_max_m: float = Field(default=float("inf"), gt=0.0, allow_inf_nan=True)
+    """Returns and readings of profiles farther than this are left out."""
+    metres_per_tick: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    """Nominal way of one tick of an encoder (m): its wheel's circumference over its ticks a turn."""
+    lever_arm_sigma_m: tuple[float, float, float] | None = None
+    """1 σ of `lever_arm_body_m`, as good as it was measured (forward, right, down; m); a calibration starts from it."""
+    boresight_sigma_deg: tuple[float, float, float] | None = None
+    """1 σ of the boresight's roll, pitch, heading (degrees); a calibration starts from it."""
+    range_scale_sigma: float | None = Field(default=None, ge=0.0, le=0.1)
+    """1 σ of the scale of its ranges, as a share: the accuracy that its maker states for a measured range. The
+    adjustment starts from it."""
+    imu: ImuErrors | ImuGrade | None = None
+    """Errors of an IMU: a grade ("navigation", "tactical", "industrial", "mems"), or a table from its data sheet."""
+    interior: Interior | None = None
+    """Interior orientation of a camera, as `roadscan camera` finds it."""
+    own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
+    """Polygons in a camera's pictures that show its own vehicle, each a list of corners (u, v), in pixels from the
+    centre of the upper left one: no colour is taken from there."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.axes not in BODY_FROM_AXES:
+            raise ValueError(
+                f"axes '{self.axes}' are no right-handed set of directions, expected one of {', '.join(BODY_FROM_AXES)}"
+            )
+        if self.range_max_m <= self.range_min_m:
+            raise ValueError(f"range_max_m {self.range_max_m:g} is not above range_min_m {self.range_min_m:g}")
+        if any(len(polygon) < 3 for polygon in self.own_vehicle_px):
+            raise ValueError("own_vehicle_px holds a polygon of fewer than three corners")
+        if self.body_from_sensor is not None:
+            matrix = np.array(self.body_from_sensor, dtype=np.float64)
+            if matrix.shape != (3, 3) or np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-4:
+                raise ValueError("body_from_sensor is not a 3 × 3 rotation (rows do not make an orthonormal set)")
+            if np.linalg.det(matrix) < 0:
+                raise ValueError("body_from_sensor mirrors (determinant −1): an axis points the wrong way")
+        return self
+
+    def stated_mounting(self) -> list[str]:
+        """Keys by which the rig file says how the sensor is mounted."""
+        return [key for key in _MOUNTING_KEYS if key in self.model_fields_set]
+
+    def mounted_as(self, known: Mapping[str, Any]) -> Self:
+        """The sensor with what its log says of its mounting, where the rig file states nothing.
+
+        Parameters
+        ----------
+        known : values by key, of those that :meth:`stated_mounting` may name.
+        """
+        stated = self.stated_mounting()
+        turned = {"axes", "boresight"} if "body_from_sensor" in stated else set()
+        added = {key: value for key, value in known.items() if key not in {*stated, *turned}}
+        return self.parse({**self.model_dump(exclude_unset=True), **added}) if added else self
+
+    def imu_errors(self) -> ImuErrors | None:
+        """Errors of an IMU, None where the rig file states none."""
+        return IMU_GRADES[self.imu] if isinstance(self.imu, str) else self.imu
+
+    def mounting(self) -> Mounting:
+        """Mounting as stated in the rig file."""
+        if self.body_from_sensor is not None:
+            rotation = np.array(self.body_from_sensor)
+        else:
+            b = self.boresight
+            rotation = rotation_from_rph(*np.radians([b.roll_deg, b.pitch_deg, b.heading_deg])) @ body_from_axes(
+                self.axes
+            )
+        rows = tuple((float(r[0]), float(r[1]), float(r[2])) for r in rotation)
+        return Mounting(self.lever_arm_body_m, rows)
+
+
+class Rig(Strict):
+    """A vehicle and its sensors."""
+
+    name: str = ""
+    """Name of the rig."""
+    sensors: dict[str, Sensor] = {}
+    """Sensors by name; logs refer to them by this name."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read ``RIG.toml``."""
+        return cls.parse(load_toml(path), file=path)

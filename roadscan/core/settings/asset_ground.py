@@ -1,0 +1,25 @@
+"""Settings of bare earth (``[assets.ground]``)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from roadscan.core.strict import Strict
+
+
+class GroundSettings(Strict):
+    """How returns on bare earth are told from all others."""
+
+    method: Literal["morphological", "planes"] = "morphological"
+    """The filter: "morphological" opens the surface of lowest returns with growing windows; "planes" fits planes to
+    the returns again and again (RANSAC), each to what the planes before left over."""
+    cell_m: float = Field(default=0.25, ge=0.05, le=2.0)
+    """Edge of a cell of the bare-earth raster (m)."""
+    steepest: float = Field(default=0.15, gt=0.0, le=1.0)
+    """Slope of the terrain above which a step over a window's width counts as an object's (m/m)."""
+    largest_object_m: float = Field(default=18.0, gt=0.0, le=100.0)
+    """Greatest half-width of an object that stands on the ground (m)."""
+    reach_m: float = Field(default=10.0, ge=0.0, le=1000.0)
+    """How far from ground that was seen its height is interpolated; beyond, it is not known (m)."""

@@ -1,0 +1,68 @@
+"""Settings of assets (section ``[assets]`` of the survey file)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from roadscan.core.settings.asset_ground import GroundSettings
+from roadscan.core.settings.asset_pictures import AssetPicturesSettings
+from roadscan.core.strict import Strict
+
+
+class GroundSectionsConfig(Strict):
+    """Cross-sections of bare earth."""
+
+    spacing_m: float = Field(default=10.0, ge=0.5, le=1000.0)
+    """Distance between cross-sections along the road (m); they stand at its multiples."""
+    half_width_m: float = Field(default=15.0, ge=1.0, le=100.0)
+    """How far they reach to both sides of the reference line (m)."""
+    step_m: float = Field(default=0.25, ge=0.05, le=5.0)
+    """Distance between the heights of a cross-section (m)."""
+
+
+class AssetsConfig(Strict):
+    """What stands on, beside and over the road. Without this section no asset is sought."""
+
+    kinds: list[str] | None = None
+    """Kinds of assets to find; those that they need are found with them. Left out, all kinds."""
+    sensors: list[str] | None = None
+    """Sensors whose returns are looked at. Left out, all lidars, line scanners with a turning mirror and clouds;
+    profilers that measure by triangulation see the pavement alone."""
+    tile_m: float = Field(default=40.0, ge=5.0, le=500.0)
+    """Edge of the squares that are searched one by one (m); the next multiple of `tiles.size_m` is taken."""
+    halo_m: float = Field(default=8.0, ge=0.0, le=100.0)
+    """How far beyond its square a search looks (m)."""
+    max_block_returns: int = Field(default=6_000_000, ge=1)
+    """Squares that are expected to hold more returns together are not searched by one task; a worker needs about
+    400 MB and 120 bytes a return. Changes no result."""
+    intensity: Literal["calibrated", "raw"] = "calibrated"
+    """Intensities that kinds look at: calibrated by gains for each laser, range and angle of incidence, which some
+    squares tell (table `intensity_gains`), or as recorded. Classified points always hold recorded ones."""
+    ground: GroundSettings = GroundSettings()
+    """Bare earth."""
+    pictures: AssetPicturesSettings = AssetPicturesSettings()
+    """Pictures of assets."""
+    options: dict[str, dict[str, Any]] = {}
+    """Settings by kind, for example { pole = { least_height_m = 1.5 } }."""
+    exports: list[Literal["gpkg", "geojson", "dxf"]] = ["gpkg", "geojson", "dxf"]
+    """Files beside the GeoParquet tables: one GeoPackage with a layer a kind, a GeoJSON file a kind, one DXF drawing
+    with a layer a kind."""
+    classified: bool = True
+    """Write the returns of each square with their classes (LAZ)."""
+    bare_earth: bool = True
+    """Write the bare earth of each square as a GeoTIFF."""
+    cross_sections: GroundSectionsConfig | None = None
+    """Cross-sections of bare earth by station (CSV, DXF); left out, none."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.cross_sections is not None and not self.bare_earth:
+            raise ValueError("cross_sections are made of bare earth: bare_earth = false leaves them without it")
+        return self
+
+    def edge_m(self, tile_size_m: float) -> float:
+        """Edge of the squares (m): the least multiple of the survey's tiles that is no shorter than `tile_m`."""
+        return tile_size_m * max(1, math.ceil(self.tile_m / tile_size_m - 1e-9))

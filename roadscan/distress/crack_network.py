@@ -1,0 +1,271 @@
+"""Pieces of cracks joined over all tiles to networks, and these parted into cracks with their figures and types."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from roadscan.core.settings.distress import CrackJoining
+from roadscan.distress.crack_gaps import bridges_of, outwards
+from roadscan.distress.crack_parts import Network, components, grouped, parts_of, united
+from roadscan.distress.cracks import CrackPiece
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+CrackType = Literal["longitudinal", "transverse", "diagonal", "alligator", "unknown"]
+
+_KINDS: Final[tuple[CrackType, ...]] = ("longitudinal", "transverse", "diagonal", "alligator", "unknown")
+"""By the types of ``crack_parts``."""
+_CHORD_M = 0.1
+"""Directions are those of chords about this long."""
+_BESIDE_NET_M = 0.25
+"""What hangs on a net and has its middle no farther from the net's hull is its fringe."""
+_LEAST_SHARE = 0.6
+"""What has the cross-section of a crack over less of its length, gaps left out, is an edge or a row of pits."""
+LEAST_SEEN: Final = 0.8
+"""Where a crack's middle has a smaller share of the readings than the ground beside it, its bottom was not seen."""
+_NARROW_CELLS, _WIDE_CELLS = 0.8, 1.6
+"""Widths at which a crack shows least of its bottom, and all of it."""
+_SIGMA_NARROW, _SIGMA_WIDE = 0.2, 0.05
+"""Standard deviations of depths at these widths, shares of the depth."""
+_SIGMA_READING = 0.1
+"""The same where a cell has one reading; it falls with the root of their number."""
+_SIGMA_M = 0.0005
+"""What noise and texture leave of a depth."""
+_ONE_NODE_CELLS = 4.0
+"""Junctions closer than this are one: thinning makes two of a crossing."""
+
+
+@dataclass(frozen=True)
+class Crack:
+    """A crack: a part of a network of one type, with its branches."""
+
+    network: int
+    """Number of the network that it is a part of, from 1; parts that meet have the same."""
+    kind: CrackType
+    length_m: float
+    """Along all branches (m)."""
+    width_mean_m: float
+    """At half the depth, mean over the length (m); NaN where it is nowhere known."""
+    width_max_m: float
+    depth_mean_m: float
+    depth_max_m: float
+    seen_share: float
+    """Readings in its middle over those beside it; 1 where none are counted."""
+    sigma_depth_mean_m: float
+    """NaN where the bottom was not seen."""
+    area_m2: float
+    """Length times width (m²)."""
+    covered_m2: float
+    """Convex hull of its line (m²)."""
+    junctions: int
+    """Places on it where three or more branches meet, of whatever type."""
+    ends: int
+    """Places where it ends free."""
+    measured_share: float
+    """Share of the length that has the cross-section of a crack."""
+    polygons: int
+    """Pieces of ground that it closes in by itself."""
+    azimuth_deg: float
+    """Mean direction, clockwise from map north, 0 to 180 (degrees)."""
+    lane_angle_deg: float
+    """Between that and the lane, 0 to 90 (degrees), where it is known; NaN where it is nowhere."""
+    longitudinal_m: float
+    """Length within `lane_angle_deg` of the lane's direction (m)."""
+    transverse_m: float
+    diagonal_m: float
+    line: Any
+    """shapely MultiLineString on the map (m)."""
+    pieces: Int64
+    """Which pieces it is made of, gaps left out."""
+
+
+def join_cracks(
+    pieces: Sequence[CrackPiece], lane_azimuth_rad: npt.ArrayLike, cell_m: float, config: CrackJoining
+) -> list[Crack]:
+    """Cracks of all networks that are long and deep enough, each as parts of one type, from south to north.
+
+    Parameters
+    ----------
+    pieces : of all tiles; their order does not matter but for the last bit of sums.
+    lane_azimuth_rad : direction of the lane, clockwise from map north: one for all pieces or one for each (n,); NaN
+        where it is not known.
+    """
+    if not pieces:
+        return []
+    azimuth = np.broadcast_to(np.asarray(lane_azimuth_rad, np.float64), (len(pieces),))
+    seen, bridges = len(pieces), bridges_of(pieces, config.bridge_m, cell_m)
+    beside = {name: k for k, one in enumerate(pieces) for name in (one.start, one.end)}
+    azimuth = np.concatenate([azimuth, azimuth[[beside[one.start] for one in bridges]]])
+    pieces = [*pieces, *bridges]
+    names = sorted({node for one in pieces for node in (one.start, one.end)})
+    number = {name: k for k, name in enumerate(names)}
+    ends = np.array([[number[one.start], number[one.end]] for one in pieces])
+    nodes = _Nodes.of(ends, np.array([p.length_m for p in pieces]), len(names), cell_m)
+    turned = _Turned.of(pieces, azimuth, config)
+    bridged_m = np.array([0.0] * seen + [one.length_m for one in bridges])
+    networks = grouped(np.arange(len(pieces)), components(ends))
+    whole = [
+        own for own in networks if _is_crack([pieces[k] for k in own[own < seen].tolist()], bridged_m[own], config)
+    ]
+    parted = [_parts(own, pieces, nodes, turned, config) for own in whole]
+    found = [deep for parts in parted if (deep := [c for c in parts if not c.depth_mean_m < config.min_depth_m])]
+    found.sort(key=lambda parts: min(c.line.bounds[1::-1] for c in parts))
+    numbered = [
+        replace(c, network=k, pieces=c.pieces[c.pieces < seen]) for k, parts in enumerate(found, start=1) for c in parts
+    ]
+    return sorted(numbered, key=lambda c: c.line.bounds[1::-1])
+
+
+def _is_crack(network: Sequence[CrackPiece], bridged_m: Float64, config: CrackJoining) -> bool:
+    """Whether pieces are a crack, with gaps between them of so many metres in all."""
+    length, measured = sum(p.length_m for p in network), sum(p.measured_m for p in network)
+    long = length + float(bridged_m.sum()) >= config.min_length_m
+    return long and measured > 0.0 and measured >= _LEAST_SHARE * length
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """Nodes where pieces end; junctions closer than a few cells are one."""
+
+    ends: Int64
+    """(n, 2) of each piece."""
+    apart: Int64
+    """(n, 2) the same with all junctions apart."""
+    degree: Int64
+    """Ends that meet at a node, those of pieces within it left out."""
+    cell_m: float
+
+    @classmethod
+    def of(cls, ends: Int64, length_m: Float64, nodes: int, cell_m: float) -> _Nodes:
+        degree = np.bincount(ends.ravel(), minlength=nodes)
+        inner = (length_m < _ONE_NODE_CELLS * cell_m) & (degree[ends] >= 3).all(axis=1)
+        merged = united(ends[inner], nodes)
+        return cls(merged[ends], ends, np.bincount(merged[ends[~inner]].ravel(), minlength=nodes), cell_m)
+
+    def figures(self, own: Int64) -> tuple[int, int, int]:
+        """Junctions and free ends on some pieces, and polygons that they close."""
+        nodes = np.unique(self.ends[own])
+        degree = self.degree[nodes]
+        apart = self.apart[own]
+        polygons = own.size - np.unique(apart).size + np.unique(components(apart)).size
+        return int((degree >= 3).sum()), int((degree == 1).sum()), polygons
+
+
+@dataclass(frozen=True)
+class _Turned:
+    """Directions of each piece (n,)."""
+
+    turning: npt.NDArray[np.complex128]
+    """Sum of the lengths of its chords, each with twice its azimuth."""
+    to_lane: npt.NDArray[np.complex128]
+    """The same with twice the angle to the lane; 0 where it is not known."""
+    parts_m: Float64
+    """(n, 3) lengths along, across and aslant the lane; 0 where it is not known."""
+
+    @classmethod
+    def of(cls, pieces: Sequence[CrackPiece], azimuth: Float64, config: CrackJoining) -> _Turned:
+        rows = [_directions(p, lane, config) for p, lane in zip(pieces, azimuth.tolist(), strict=True)]
+        turning, to_lane, parts = (np.array(column) for column in zip(*rows, strict=True))
+        return cls(turning, to_lane, parts)
+
+
+def _parts(
+    own: Int64, pieces: Sequence[CrackPiece], nodes: _Nodes, turned: _Turned, config: CrackJoining
+) -> list[Crack]:
+    """Cracks of a network."""
+    lines = [pieces[k].line_m for k in own.tolist()]
+    shapes = np.array([shapely.LineString(line) for line in lines], object)
+    out = np.array([[outwards(line[::-1]), outwards(line)] for line in lines])
+    length = np.array([pieces[k].length_m for k in own.tolist()])
+    whole = Network(nodes.ends[own], length, out, turned.parts_m[own])
+
+    def is_net(rows: Int64) -> bool:
+        junctions, _, polygons = nodes.figures(own[rows])
+        covered = shapely.convex_hull(shapely.multilinestrings(shapes[rows])).area
+        return polygons >= config.alligator_polygons and junctions >= config.alligator_nodes_per_m2 * covered
+
+    def within(net: Int64, rows: Int64) -> npt.NDArray[np.bool_]:
+        ground = shapely.buffer(shapely.convex_hull(shapely.multilinestrings(shapes[net])), _BESIDE_NET_M)
+        middle = np.array([pieces[k].middle_m for k in own[rows].tolist()])
+        return np.asarray(shapely.intersects_xy(ground, *middle.T))
+
+    found = parts_of(whole, is_net, within, config.min_length_m)
+    return [_crack(own[rows], _KINDS[kind], pieces, nodes, turned) for kind, rows in found]
+
+
+def _crack(own: Int64, kind: CrackType, pieces: Sequence[CrackPiece], nodes: _Nodes, turned: _Turned) -> Crack:
+    mine = [pieces[k] for k in own.tolist()]
+    length, measured = sum(p.length_m for p in mine), sum(p.measured_m for p in mine)
+    width_sum, depth_sum = sum(p.width_sum_m2 for p in mine), sum(p.depth_sum_m2 for p in mine)
+    width, depth = (total / measured if measured > 0 else math.nan for total in (width_sum, depth_sum))
+    beside = sum(p.beside_sum_m for p in mine)
+    seen = sum(p.seen_sum_m for p in mine) / beside if beside > 0.0 else 1.0
+    line = shapely.line_merge(shapely.multilinestrings([shapely.LineString(p.line_m) for p in mine]))
+    line = line if line.geom_type == "MultiLineString" else shapely.multilinestrings([line])
+    parts = turned.parts_m[own].sum(axis=0)
+    junctions, ends, polygons = nodes.figures(own)
+    return Crack(
+        network=0,
+        kind=kind,
+        length_m=length,
+        width_mean_m=width,
+        width_max_m=max(p.width_max_m for p in mine),
+        depth_mean_m=depth,
+        depth_max_m=max(p.depth_max_m for p in mine),
+        seen_share=seen,
+        sigma_depth_mean_m=depth_sigma_m(
+            depth, width / nodes.cell_m, seen, beside / measured if beside > 0.0 else math.inf
+        ),
+        area_m2=width_sum * (length / measured) if measured > 0 else math.nan,
+        covered_m2=float(shapely.convex_hull(line).area),
+        junctions=junctions,
+        ends=ends,
+        measured_share=measured / length if length > 0 else 0.0,
+        polygons=polygons,
+        azimuth_deg=math.degrees(np.angle(turned.turning[own].sum()) / 2) % 180.0,
+        lane_angle_deg=abs(math.degrees(np.angle(turned.to_lane[own].sum()) / 2)) if parts.any() else math.nan,
+        longitudinal_m=float(parts[0]),
+        transverse_m=float(parts[1]),
+        diagonal_m=float(parts[2]),
+        line=line,
+        pieces=own,
+    )
+
+
+def depth_sigma_m(depth_m: float, width_cells: float, seen_share: float, readings: float) -> float:
+    """Standard deviation (m) of the mean depth of a crack; NaN where its bottom was not seen.
+
+    width_cells : its width at half the depth. What is narrow shows its walls more than its bottom.
+    seen_share : readings in its middle over those beside it.
+    readings : of a cell beside it; infinite where none are counted.
+    """
+    if not seen_share >= LEAST_SEEN:
+        return math.nan
+    narrow = min(max((_WIDE_CELLS - width_cells) / (_WIDE_CELLS - _NARROW_CELLS), 0.0), 1.0)
+    share = _SIGMA_WIDE + narrow * (_SIGMA_NARROW - _SIGMA_WIDE)
+    return math.hypot(share * depth_m, _SIGMA_READING * depth_m / math.sqrt(readings), _SIGMA_M)
+
+
+def _directions(one: CrackPiece, lane: float, config: CrackJoining) -> tuple[complex, complex, list[float]]:
+    """Sums over the chords of a piece, of :class:`_Turned`."""
+    count = max(1, round(one.length_m / _CHORD_M))
+    picked = one.line_m[np.unique(np.linspace(0, len(one.line_m) - 1, count + 1).round().astype(np.int64))]
+    chord = np.diff(picked, axis=0)
+    size = np.hypot(*chord.T)
+    angle = np.arctan2(chord[:, 0], chord[:, 1])
+    off = np.abs((angle - lane + np.pi / 2) % np.pi - np.pi / 2)
+    limit = math.radians(config.lane_angle_deg)
+    along, across = off <= limit, off >= np.pi / 2 - limit
+    share = size * (one.length_m / max(size.sum(), 1e-12))
+    known = 0.0 if math.isnan(lane) else 1.0
+    parts = [known * float(share[own].sum()) for own in (along, across, ~along & ~across)]
+    turning = complex((size * np.exp(2j * angle)).sum())
+    return turning, turning * cmath.exp(-2j * lane) if known else 0j, parts

@@ -1,0 +1,224 @@
+"""Cracks of a window of surface as pieces of line, which join over tiles (``crack_network.py``).
+
+The skeleton comes from ``valleys.py``. At each of its cells a cross-section is measured on heights *before*
+smoothing (impulses left out): all cells up to 4.5 cells along the crack are sorted by their distance from its line into
+bins of half a cell. Because a line rarely runs along the grid, the section is finer than a cell; nothing is
+interpolated between cells and nothing is smoothed across the crack. Ground is the straight line between the flanks.
+Where that shows no crack, or one less than half as deep, the section is that of heights lowered to the lowest readings,
+as ``valleys.py`` asks them.
+
+- *depth*: of the bottom below the ground: from robust heights, where cells lie in the crack alone, and from the lowest
+  readings of cells, where it is narrower (``crack_depths.py``). Where these are not known, robust heights show
+  a crack narrower than two cells shallower than it is.
+- *width*: between the places of half that depth.
+- *line*: through the middles of the sections, which is good to a fraction of a cell, so that its length is that of the
+  crack and not that of steps from cell to cell.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.compute.ways import way_along
+from roadscan.core.settings.distress import CrackDetection
+from roadscan.distress import valleys
+from roadscan.distress.crack_depths import ValleyCells, blended, bottom_depths
+from roadscan.distress.kernels.cross_sections import cross_sections
+from roadscan.distress.kernels.quantiles_along import HALF_ALONG
+from roadscan.distress.skeleton_graph import PRUNINGS, SkeletonGraph, pruned, trimmed
+from roadscan.distress.valley_lines import DIRECTIONS, flank_cells
+from roadscan.distress.valleys import Valleys, bridge_cells, find_valleys
+from roadscan.surface.heights import HeightWindow
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_SMOOTHINGS = 3
+_LOWER_FLANK = 0.5
+"""A section whose lower flank stands less than this share as high as the line between both is that of an edge."""
+_FARTHEST_CELLS = 1.5
+"""A middle farther from its cell of the skeleton is not believed."""
+_BLUR_CELLS = 0.98
+"""Width at half its height of a cell folded with a bin and with the spread of directions (7.5°)."""
+_MOST_RAISED = 1.6
+_LOWERED_M = 0.002
+"""Heights of sections are lowered to the lowest readings by so much at most."""
+_SHOWN_SHARE = 0.5
+"""A section of robust heights less than this share as deep as that of lowered ones is noise: heights do not show the
+crack there."""
+
+
+@dataclass(frozen=True)
+class CrackPiece:
+    """A stretch of crack from node to node. All sums can be added."""
+
+    line_m: Float64
+    """(n, 2) easting and northing (m)."""
+    start: tuple[int, int]
+    """Row and column on the map of the cell where it begins: an end, a junction or the border of a tile."""
+    end: tuple[int, int]
+    length_m: float
+    measured_m: float
+    """Length over which it has the cross-section of a crack, and depth and width are known (m)."""
+    width_sum_m2: float
+    """Integral of the width along the piece (m²): the crack's area."""
+    width_max_m: float
+    depth_sum_m2: float
+    """Integral of the depth along the piece (m²)."""
+    depth_max_m: float
+    seen_sum_m: float = 0.0
+    """Integral along the piece of the readings that the cells in its middle hold (m) …"""
+    beside_sum_m: float = 0.0
+    """… and of those that a cell beside it holds (m)."""
+
+    @property
+    def middle_m(self) -> Float64:
+        """(2,) halfway along its line (m): a straight line that was simplified has no vertex there."""
+        along = way_along(self.line_m)
+        return np.array([np.interp(0.5 * along[-1], along, axis) for axis in self.line_m.T])
+
+
+@dataclass(frozen=True)
+class Sections:
+    """Figures of each cell of a skeleton (n,)."""
+
+    place: Float64
+    """(n, 2) column and row on the map, in cells; .5 is a cell's middle."""
+    width_m: Float64
+    """NaN where it cannot be told."""
+    depth_m: Float64
+    seen: Float64
+    """(n, 2) readings of the cell in the crack's middle, and of a cell beside the crack; 0 where none are counted."""
+
+
+def halo_cells(config: CrackDetection, cell_m: float) -> int:
+    """Cells that a window needs beyond those of which cracks are wanted."""
+    reach = math.ceil(math.hypot(4.5, section_cells(config, cell_m))) + 1
+    walked = bridge_cells() + 2 + PRUNINGS * (_spur_cells(config, cell_m) + 2) + _SMOOTHINGS + 2
+    return valleys.halo_cells(config, cell_m) + max(HALF_ALONG + reach, walked)
+
+
+def crack_pieces(window: HeightWindow, config: CrackDetection) -> list[CrackPiece]:
+    """Pieces of the cracks whose edges begin at the window's inner cells.
+
+    Neighbouring windows give pieces that meet at common cells and do not overlap. None is left out for its length:
+    that is known when all are joined.
+    """
+    window = needed_part(window, config)
+    if not window.raw_m.size:
+        return []
+    found = find_valleys(window, config)
+    graph = pruned(trimmed(found.skeleton, found.bridge, bridge_cells()), _spur_cells(config, window.cell_m))
+    if not graph.edges.size:
+        return []
+    sections = _sections(window, found, graph, config)
+    first = graph.edges[:, 0]
+    own = window.is_inner(graph.row[first], graph.column[first])
+    return [_piece(path, graph, sections, window) for path in graph.paths(own)]
+
+
+def needed_part(window: HeightWindow, config: CrackDetection) -> HeightWindow:
+    """The part of a window on which its pieces depend: near its inner cells, and near what was measured there."""
+    halo = halo_cells(config, window.cell_m)
+    own = window.inner()
+    part = window.part(*((max(s.start - halo, 0), s.stop + halo) for s in own))
+    known = ~np.isnan(part.raw_m)
+    border = valleys.border_cells(config, window.cell_m)
+    spans = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
+    return part.part(*((int(at[0]) - border, int(at[-1]) + 1 + border) if at.size else (0, 0) for at in spans))
+
+
+def sharpened(width_cells: Float64, depth_m: Float64) -> tuple[Float64, Float64]:
+    """Width and depth of sections (n,) before they were seen through cells and bins.
+
+    A section is the crack's, folded with a cell and with a bin. That adds the squares of widths and keeps the area:
+    exact for bells, and good to some per cent for other forms. Depth is raised 1.6 times at most, where the crack is
+    as wide as 0.8 cells at half its depth: what is narrower leaves no trace of how deep it is.
+    """
+    width = np.maximum(np.sqrt(np.maximum(width_cells**2 - _BLUR_CELLS**2, 0.0)), width_cells / _MOST_RAISED)
+    return width, depth_m * (width_cells / width)
+
+
+def section_cells(config: CrackDetection, cell_m: float) -> int:
+    """Cells to either side that a cross-section takes in."""
+    flank = flank_cells(config, cell_m)[-1]
+    return flank + max(flank // 2, 2) + 1
+
+
+def _spur_cells(config: CrackDetection, cell_m: float) -> int:
+    return round(config.spur_m / cell_m)
+
+
+def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config: CrackDetection) -> Sections:
+    cells = _valley_cells(found)
+    row, column = cells.row, cells.column
+    out = _valley_sections(window.cleaned_m(), cells, window, config)
+    hidden = np.zeros(row.size, bool)
+    if window.lowest is not None:  # what robust heights do not show, lowest readings may
+        lowered = _valley_sections(window.lowered_m(_LOWERED_M), cells, window, config)
+        hidden = np.isnan(out[:, 0]) | (out[:, 0] < _SHOWN_SHARE * lowered[:, 0])
+        out[hidden, :4] = lowered[hidden, :4]
+    right = np.where(np.abs(out[:, 2]) <= _FARTHEST_CELLS, out[:, 2], 0.0)
+    width, depth = sharpened(out[:, 1], out[:, 0])
+    bottom, seen = bottom_depths(window, cells, right, np.where(np.isnan(depth), np.nan, out[:, 4]))
+    depth = blended(bottom, depth, np.where(hidden, 0.0, out[:, 1]))
+    columns = found.skeleton.shape[1]
+    own = np.searchsorted(row * columns + column, graph.row * columns + graph.column)
+    east = column + window.first_column + 0.5 + right * cells.north
+    north = row + window.first_row + 0.5 - right * cells.east
+    place = np.stack([east, north], axis=-1)[own]
+    for _ in range(_SMOOTHINGS):
+        place = graph.smoothed(place)
+    return Sections(place, width[own] * window.cell_m, depth[own], seen[own])
+
+
+def _valley_sections(heights: Float64, cells: ValleyCells, window: HeightWindow, config: CrackDetection) -> Float64:
+    """(n, 5) of :func:`cross_sections`; where one is not that of a crack NaN but for the height of the ground."""
+    out = np.empty((cells.row.size, 5))
+    reach = section_cells(config, window.cell_m)
+    cross_sections(heights, cells.row, cells.column, cells.north, cells.east, cells.flank, reach, out)
+    with np.errstate(invalid="ignore"):
+        is_valley = (out[:, 1] * window.cell_m <= config.max_width_m) & (out[:, 3] >= _LOWER_FLANK * out[:, 0])
+    out[~is_valley, :4] = np.nan
+    return out
+
+
+def _valley_cells(found: Valleys) -> ValleyCells:
+    """All cells of the skeleton, those that are pruned later included: what is pruned depends on cells far away."""
+    row, column = np.nonzero(found.skeleton)
+    angle = found.direction[row, column] * (np.pi / DIRECTIONS)
+    flank = np.maximum(found.flank[row, column], 2).astype(np.int64)
+    return ValleyCells(row, column, np.sin(angle), np.cos(angle), flank)
+
+
+def _piece(path: Sequence[int], graph: SkeletonGraph, sections: Sections, window: HeightWindow) -> CrackPiece:
+    cells = np.asarray(path)
+    line_m = sections.place[cells] * window.cell_m
+    step = np.hypot(*np.diff(line_m, axis=0).T)
+    width, depth = sections.width_m[cells], sections.depth_m[cells]
+    known = ~np.isnan(width[:-1] + width[1:])
+    seen, beside = sections.seen[cells].T
+    width_step, depth_step, seen, beside = (
+        (0.5 * (a[:-1] + a[1:]) * step)[known] for a in (width, depth, seen, beside)
+    )
+    start, end = (
+        (int(graph.row[k]) + window.first_row, int(graph.column[k]) + window.first_column) for k in cells[[0, -1]]
+    )
+    return CrackPiece(
+        line_m,
+        start,
+        end,
+        float(step.sum()),
+        float(step[known].sum()),
+        float(width_step.sum()),
+        float(np.nanmax(width, initial=0.0)),
+        float(depth_step.sum()),
+        float(np.nanmax(depth, initial=0.0)),
+        float(seen.sum()),
+        float(beside.sum()),
+    )

@@ -1,0 +1,258 @@
+"""Potholes of a window of surface: where it lies well below all that stands around, in a compact form.
+
+1. *Blocks* (5 cm) of cells have mean heights, depths below what stands around, and ground
+   (``surfaces/hole_blocks.py``). Where what was measured ends before a hole's rim, the hole is not known.
+2. *Outline*: cells that lie `edge_depth_m` or more below the ground, near a block that is `min_depth_m` deep, and not
+   in a thin line; cells without a height between others (up to 2 cm) have the mean depth of those. Ground is bilinear
+   between blocks.
+3. *Rim*: what lies between the outline and the rim is less deep than `edge_depth_m`. Its area follows from how fast the
+   area of the hole shrinks with depth, A(d) ~ (D − d)^k with the greatest depth D: of a hole with a paraboloid's form k
+   is 1, of a cone 2, of one with upright walls 0, and mean depth over the outline's area says what it is.
+4. Each tile has the pieces of its own cells; :func:`join_potholes` unites those that touch and judges the whole: area,
+   depth, elongation (length over the diameter of the largest circle in it).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import shapely
+from rasterio.features import shapes
+from scipy.ndimage import label
+
+from roadscan.core.settings.distress import PotholeDetection, PotholeJoining
+from roadscan.distress.kernels.crack_response import fill_holes
+from roadscan.surface.heights import HEIGHT_STEP_M, HeightWindow
+from roadscan.surface.hole_blocks import Blocks, block_cells, blocks_around
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+_THIN_M = 0.03
+"""Parts narrower than this are no pothole (cracks that meet it)."""
+_MOST_POWER = 2.0
+"""Power of a cone: nothing opens wider towards its rim."""
+_ROUNDED = 1.5
+"""Standard deviation of what lies between outline and rim (a share of it): rounded rims reach farther than the power
+law, by 1.1 to 2 times of it in the simulator's potholes of 30 to 100 mm."""
+
+
+_HIDDEN_PER_M = 0.8
+"""Floor that a wall hides, for a metre of depth: heads look at their lines under angles of 15 to 35 degrees (m/m)."""
+_MOST_HIDDEN_M = 0.15
+_SIGMA_HIDDEN = 0.3
+"""Standard deviation of the area that walls hide, as a share of it."""
+_SIGMA_OUTLINE_M = 0.003
+"""Standard deviation of the place of an outline: half a cell of 5 mm and the spot of a reading."""
+_SIGMA_DEPTH = 0.03
+"""Standard deviation of a greatest depth, as a share of it: the lowest of many cells lies below their floor."""
+_SIGMA_GROUND_M = 0.002
+"""Standard deviation of the ground above a hole: texture and unevenness of what stands around."""
+
+
+@dataclass(frozen=True)
+class PotholePiece:
+    """The part of a pothole in a tile, or one that may be none."""
+
+    outline: Any
+    """shapely Polygon along the sides of cells on the map (m)."""
+    area_m2: float
+    volume_m3: float
+    depth_max_m: float
+    """Of a cell (m)."""
+    block_depth_max_m: float
+    """Of a block, that is the mean of its cells, below the lowest that stands around (m)."""
+    edge_depth_m: float
+    """Depth at which its outline runs (m)."""
+    hidden_m2: float = 0.0
+    """Of its area where no reading is: a wall hides it from the sensor."""
+
+
+@dataclass(frozen=True)
+class Pothole:
+    """A pothole, over all tiles."""
+
+    area_m2: float
+    """Inside the outline, where the hole is `edge_depth_m` or more deep."""
+    sigma_area_m2: float
+    hidden_m2: float
+    """Of that area without a reading, which its walls hide."""
+    rim_area_m2: float
+    """Inside the rim, estimated."""
+    sigma_rim_area_m2: float
+    depth_mean_m: float
+    depth_max_m: float
+    sigma_depth_max_m: float
+    volume_m3: float
+    sigma_volume_m3: float
+    length_m: float
+    """Longer side of the smallest rectangle around it (m)."""
+    breadth_m: float
+    outline: Any
+    """shapely Polygon on the map (m)."""
+    pieces: Int64
+    """Which pieces it is made of."""
+
+
+def halo_cells(config: PotholeDetection, cell_m: float) -> int:
+    """Smoothed cells that a window needs beyond those of which potholes are wanted."""
+    return 3 * _thin_cells(cell_m) + _hidden_cells(cell_m)
+
+
+def around_cells(config: PotholeDetection, cell_m: float) -> int:
+    """Cells before smoothing that a window needs beyond those of which potholes are wanted."""
+    return halo_cells(config, cell_m) + (blocks_around(config) + 2) * block_cells(config, cell_m)
+
+
+def pothole_pieces(window: HeightWindow, config: PotholeDetection) -> list[PotholePiece]:
+    """What may be potholes, of the window's inner cells."""
+    blocks = Blocks.of(_measured_part(window, block_cells(config, window.cell_m)), config)
+    if not (blocks.depth_m > 0.0).any():
+        return []
+    margin = halo_cells(config, window.cell_m)
+    part = window.part(*((own.start - margin, own.stop + margin) for own in window.inner()))
+    cells = _bridged(blocks.below_ground_m(part), _thin_cells(window.cell_m) // 3)
+    hidden = _hidden(cells, config.edge_depth_m, window.cell_m)
+    with np.errstate(invalid="ignore"):
+        low = (cells >= config.edge_depth_m).astype(np.uint8)
+    thin = _thin_cells(window.cell_m)
+    low = cv2.morphologyEx(low, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (thin, thin)))
+    own = np.zeros(low.shape, np.bool_)
+    own[part.inner()] = low[part.inner()] > 0
+    return _pieces(part, own, cells, hidden, blocks.of_cells(blocks.depth_m, part), config.edge_depth_m)
+
+
+def _hidden(depth_m: Float64, edge_depth_m: float, cell_m: float) -> Bool:
+    """Cells without a reading that the walls of a hole hide, which get its depth.
+
+    A triangulating head sees no floor behind a wall: up to `_HIDDEN_PER_M` metres of it a metre of depth. Ground beside
+    a hole is seen, so what has no reading there and touches the hole is a part of it.
+    """
+    void = np.isnan(depth_m)
+    reach = np.where(depth_m >= edge_depth_m, np.minimum(_HIDDEN_PER_M * depth_m, _MOST_HIDDEN_M), 0.0)
+    floor = np.where(depth_m >= edge_depth_m, depth_m, 0.0)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    for _ in range(_hidden_cells(cell_m)):
+        reach = np.where(void, np.maximum(reach, cv2.dilate(reach, cross) - cell_m), reach)
+        floor = np.where(void & (reach > 0.0), np.maximum(floor, cv2.dilate(floor, cross)), floor)
+    hidden = np.asarray(void & (reach > 0.0))
+    depth_m[hidden] = floor[hidden]
+    return hidden
+
+
+def _measured_part(window: HeightWindow, size: int) -> HeightWindow:
+    """Whole blocks from the first to the last with a reading, both ways."""
+    known = ~np.isnan(window.raw_m)
+    spans = []
+    for axis, first in ((1, window.first_row), (0, window.first_column)):
+        at = np.flatnonzero(known.any(axis=axis)) + first
+        low, high = (int(at[0]) // size, int(at[-1]) // size + 1) if at.size else (0, 0)
+        spans.append((low * size - first, high * size - first))
+    return window.part(*spans)
+
+
+def _bridged(depth_m: Float64, reach: int) -> Float64:
+    """Depths with holes up to 2 · `reach` cells wide filled from their rims: a cell without a reading is no ground."""
+    known = (~np.isnan(depth_m)).astype(np.uint8)
+    holes = cv2.morphologyEx(known, cv2.MORPH_CLOSE, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > known
+    row, column = np.nonzero(holes[1:-1, 1:-1])
+    fill_holes(depth_m, row + 1, column + 1, reach)
+    return depth_m
+
+
+def join_potholes(pieces: Sequence[PotholePiece], config: PotholeJoining) -> list[Pothole]:
+    """Potholes of the pieces of all tiles, from south to north."""
+    if not pieces:
+        return []
+    outlines = [one.outline for one in pieces]
+    united = shapely.get_parts(shapely.union_all(outlines))
+    inside = [one.representative_point() for one in outlines]
+    whole, piece = shapely.STRtree(inside).query(united, predicate="intersects")
+    found = []
+    for k, outline in enumerate(united):
+        own = np.sort(piece[whole == k])
+        one = _pothole(outline, [pieces[p] for p in own.tolist()], own)
+        deep = max((pieces[p].block_depth_max_m for p in own.tolist()), default=0.0) >= config.min_depth_m
+        compact = one.length_m <= config.max_elongation * _widest_m(outline)
+        if deep and one.area_m2 >= config.min_area_m2 and compact:
+            found.append(one)
+    return sorted(found, key=lambda p: p.outline.bounds[1::-1])
+
+
+def _widest_m(outline: Any) -> float:
+    """Diameter of the largest circle in an outline, islands counted: a strip along a bent kerb is narrow."""
+    return 2.0 * float(shapely.maximum_inscribed_circle(shapely.Polygon(outline.exterior)).length)
+
+
+def _pothole(outline: Any, pieces: Sequence[PotholePiece], own: Int64) -> Pothole:
+    area, volume = sum(p.area_m2 for p in pieces), sum(p.volume_m3 for p in pieces)
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(outline))
+    sides = sorted(float(np.hypot(*(corners[k + 1] - corners[k]))) for k in range(2))
+    depth = max((p.depth_max_m for p in pieces), default=0.0)
+    mean = volume / area if area else 0.0
+    rim = rim_area_m2(area, mean, depth, max((p.edge_depth_m for p in pieces), default=0.0))
+    hidden = sum(p.hidden_m2 for p in pieces)
+    sigma_area = math.hypot(_SIGMA_OUTLINE_M * float(outline.length), _SIGMA_HIDDEN * hidden)
+    sigma_rim = math.hypot(_ROUNDED * (rim - area), sigma_area)
+    sigma_depth = math.hypot(_SIGMA_DEPTH * depth, _SIGMA_GROUND_M)
+    sigma_volume = math.hypot(sigma_depth / max(depth, 1e-9) * volume, sigma_area * mean)
+    return Pothole(
+        area, sigma_area, hidden, rim, sigma_rim, mean, depth, sigma_depth, volume, sigma_volume, sides[1], sides[0],
+        outline, own,
+    )  # fmt: skip
+
+
+def rim_area_m2(area_m2: float, depth_mean_m: float, depth_max_m: float, edge_depth_m: float) -> float:
+    """Area (m²) inside the rim of a hole from that inside its outline, which runs at `edge_depth_m`."""
+    below, mean = depth_max_m - edge_depth_m, depth_mean_m - edge_depth_m
+    if below <= 0.0 or mean <= 0.0:
+        return area_m2
+    power = min(max(below / mean - 1.0, 0.0), _MOST_POWER)
+    return float(area_m2 * (depth_max_m / below) ** power)
+
+
+def _hidden_cells(cell_m: float) -> int:
+    return math.ceil(_MOST_HIDDEN_M / cell_m)
+
+
+def _thin_cells(cell_m: float) -> int:
+    return max(3, math.ceil(_THIN_M / cell_m) | 1)
+
+
+def _pieces(
+    window: HeightWindow, low: Bool, depth_m: Float64, hidden: Bool, block_depth_m: Float64, edge_depth_m: float
+) -> list[PotholePiece]:
+    numbers, count = label(low)
+    if not count:
+        return []
+    outlines: dict[int, Any] = {}
+    for shape, number in shapes(numbers.astype(np.int32), mask=low, connectivity=4):
+        rings = [window.map_m(*np.array(ring, np.float64).T[::-1]) for ring in shape["coordinates"]]
+        outlines[int(number)] = shapely.normalize(shapely.Polygon(rings[0], rings[1:]))
+    own = numbers[low]
+    area = np.bincount(own, minlength=count + 1) * window.cell_m**2
+    unseen = np.bincount(own, hidden[low], count + 1) * window.cell_m**2
+    steps = np.rint(depth_m[low] / HEIGHT_STEP_M)
+    volume = np.bincount(own, steps, count + 1) * (HEIGHT_STEP_M * window.cell_m**2)
+    deepest, block = np.zeros(count + 1), np.zeros(count + 1)
+    np.maximum.at(deepest, own, depth_m[low])
+    np.fmax.at(block, own, block_depth_m[low])
+    return [
+        PotholePiece(
+            outlines[k],
+            float(area[k]),
+            float(volume[k]),
+            float(deepest[k]),
+            float(block[k]),
+            edge_depth_m,
+            float(unseen[k]),
+        )
+        for k in range(1, count + 1)
+    ]

@@ -1,0 +1,58 @@
+"""What every export needs: the readings of one sensor in one run, and files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from roadscan.core.errors import ConfigError, nearest
+from roadscan.store.logs import DataFile
+from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.tasks.readings import ReadingSource
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an export wrote."""
+
+    files: tuple[Path, ...]
+    notes: tuple[str, ...]
+    """What the user should know of them."""
+
+
+def source_in(plan: SurveyPlan, run: str, sensor: str) -> tuple[ReadingSource, list[DataFile]]:
+    """The readings of a sensor in a run, and their files in the order of time."""
+    found = [(s, f) for s, f in plan.sources if (s.run, s.sensor) == (run, sensor)]
+    if not found:
+        known = sorted({f"{s.run}/{s.sensor}" for s, _ in plan.sources})
+        raise ConfigError(
+            f"there are no readings of '{sensor}' in run '{run}'{nearest(f'{run}/{sensor}', known)}",
+            expected="run and sensor of: " + ", ".join(known),
+        )
+    if len({(s.table, s.key) for s, _ in found}) > 1:
+        raise ConfigError(
+            f"the logs of '{sensor}' in run '{run}' are placed in different ways", expected="one geometry"
+        )
+    files = sorted((f for _, own in found for f in own), key=lambda f: (f.span or (0, 0), f.path))
+    return found[0][0], files
+
+
+@contextlib.contextmanager
+def published(out: Path) -> Iterator[Path]:
+    """A scratch folder beside `out` that takes its name at the end; `out` must not hold anything yet."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"{out} is there already", expected="a new or empty folder", change="choose another --out")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    scratch = out.parent / f".{out.name}-{uuid.uuid4().hex}"
+    scratch.mkdir()
+    try:
+        yield scratch
+        if out.exists():
+            out.rmdir()
+        scratch.rename(out)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)

@@ -1,0 +1,199 @@
+"""Heights of a pass as an OpenCRG grid."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan import __version__
+from roadscan.compute.reference_line import ReferenceLine
+from roadscan.core.errors import ConfigError, RunError
+from roadscan.core.ids import LanePass
+from roadscan.core.survey import Survey
+from roadscan.export.export import Exported, published, source_in
+from roadscan.formats.clouds.opencrg_file import CurvedRegularGrid, write_crg
+from roadscan.formats.clouds.opencrg_header import encoding_named
+from roadscan.store.logs import DataFile
+from roadscan.store.store import Store
+from roadscan.tiles.georeferencing.cloud import QUANTUM_M
+from roadscan.tiles.georeferencing.curved_grid import CurvedHeights, fill_holes, inner_holes
+from roadscan.tiles.georeferencing.place import EVERYWHERE
+from roadscan.tiles.plan.plan import SurveyPlan, plan_survey
+from roadscan.tiles.tasks.readings import Placer, RawSlice, ReadingSource, load_trajectory
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_MOST_NODES: Final = 1 << 28
+
+
+@dataclass(frozen=True)
+class CrgSettings:
+    """How a pass's heights become an OpenCRG grid."""
+
+    pass_id: int | None = None
+    """Pass; not needed where the run has one."""
+    u_step_m: float = 0.05
+    """Distance from row to row."""
+    v_step_m: float = 0.05
+    """Distance from column to column."""
+    left_m: float = 2.0
+    """Reach of the grid to the left of the vehicle's path."""
+    right_m: float = 2.0
+    """Reach of the grid to its right."""
+    smoothing_m: float = 10.0
+    """Length over which the path is smoothed into the reference line."""
+    hole_m: float = 0.25
+    """Longest hole that is closed by straight lines between its neighbours."""
+    encoding: str = "KRBI"
+    """KRBI, KDBI, LRFI or LDFI."""
+
+
+def export_opencrg(
+    survey: Survey, store: Store, run: str, sensor: str, out: Path, settings: CrgSettings = CrgSettings()
+) -> Exported:
+    """Write the heights that a sensor measured in a pass as one OpenCRG grid along the vehicle's smoothed path.
+
+    Points are placed as for tiles, and averaged at the node nearest to them.
+
+    Raises
+    ------
+    ConfigError
+        if run, sensor or pass are unknown, a step is not above 0, or `out` is not empty.
+    RunError
+        if no point falls into the grid.
+    """
+    columns, encoding = _columns(settings), encoding_named(settings.encoding)
+    plan = plan_survey(survey, store)
+    source, files = source_in(plan, run, sensor)
+    lane_pass = _pass(plan, run, settings.pass_id)
+    if source.trajectory is None:
+        raise ConfigError(
+            f"'{sensor}' in run '{run}' is a cloud without a trajectory", expected="a profiler or lidar of the rig"
+        )
+    line, knots_gps_ns, steps = _driven_line(plan, source, lane_pass, settings)
+    first = -math.floor(settings.right_m / settings.v_step_m + 1e-9) * settings.v_step_m
+    if len(line.vertices_m) * columns > _MOST_NODES:
+        raise ConfigError(
+            f"the grid would have {len(line.vertices_m):,} × {columns:,} nodes",
+            expected=f"at most {_MOST_NODES:,}",
+            change="widen the steps, or cut the pass",
+        )
+    sums = CurvedHeights(line, first, settings.v_step_m, columns)
+    with published(out) as folder:
+        points = 0
+        for epochs, easting, northing, quanta in _placed(plan, source, files, lane_pass):
+            near = steps[np.clip(np.searchsorted(knots_gps_ns, epochs), 0, steps.size - 1)]
+            points += epochs.size - sums.add(easting, northing, quanta, near)
+        if not points:
+            raise RunError(f"no point of '{sensor}' in pass {lane_pass.pass_id} falls into the grid")
+        grid, notes = _grid(sums, settings, _comments(plan, source, lane_pass))
+        name = f"{run}_{sensor}_pass{lane_pass.pass_id}.crg"
+        write_crg(grid, folder / name, encoding)
+    return Exported((out / name,), (f"{points:,} points at {grid.rows:,} × {grid.v_m.size:,} nodes", *notes))
+
+
+def _columns(settings: CrgSettings) -> int:
+    s = settings
+    if not (s.u_step_m > 0 and s.v_step_m > 0 and s.left_m + s.right_m >= s.v_step_m and s.hole_m >= 0):
+        raise ConfigError(
+            f"steps of {s.u_step_m:g} × {s.v_step_m:g} m, reach {s.left_m:g} + {s.right_m:g} m, holes {s.hole_m:g} m",
+            expected="steps above 0, two columns or more, and no negative hole",
+        )
+    return math.floor(s.right_m / s.v_step_m + 1e-9) + math.floor(s.left_m / s.v_step_m + 1e-9) + 1
+
+
+def _pass(plan: SurveyPlan, run: str, pass_id: int | None) -> LanePass:
+    own = [p for p in plan.passes if p.run == run]
+    chosen = [p for p in own if pass_id in {None, int(p.pass_id)}]
+    if len(chosen) != 1:
+        raise ConfigError(
+            f"run '{run}' has {len(own)} passes" if pass_id is None else f"run '{run}' has no pass {pass_id}",
+            expected="--pass, one of " + ", ".join(str(p.pass_id) for p in own),
+        )
+    return chosen[0]
+
+
+def _driven_line(
+    plan: SurveyPlan, source: ReadingSource, lane_pass: LanePass, settings: CrgSettings
+) -> tuple[ReferenceLine, Int64, Int64]:
+    """The reference line of a pass, the trajectory's epochs in it (k,), and the line's step beside each of them."""
+    if source.trajectory is None:
+        raise ConfigError(f"run '{source.run}' has no trajectory")
+    span = (lane_pass.start_gps_ns, lane_pass.end_gps_ns)
+    trajectory = load_trajectory(plan.store, source.trajectory, [span], plan.ground.max_gap_s)
+    inside = (trajectory.epochs_gps_ns >= span[0]) & (trajectory.epochs_gps_ns < span[1])
+    if not inside.any():
+        raise RunError(f"the trajectory has no pose in pass {lane_pass.pass_id}")
+    enh = plan.ground.map.map_from_world(trajectory.world, trajectory.position_world_m[inside])
+    line, steps = ReferenceLine.smoothed(np.ascontiguousarray(enh[:, :2]), settings.u_step_m, settings.smoothing_m)
+    return line, trajectory.epochs_gps_ns[inside], steps
+
+
+def _placed(
+    plan: SurveyPlan, source: ReadingSource, files: list[DataFile], lane_pass: LanePass
+) -> Iterator[tuple[Int64, Float64, Float64, npt.NDArray[np.int32]]]:
+    """Epochs (n,), easting and northing (m), and heights (quanta) of a pass's points, chunk by chunk."""
+    first, end = lane_pass.start_gps_ns, lane_pass.end_gps_ns
+    slices = []
+    for file in files:
+        spans = source.spans(file.group_spans)
+        groups = tuple(k for k, span in enumerate(spans) if span[0] < end and span[1] >= first)
+        if groups:
+            slices.append(RawSlice(source, file.path, groups, tuple(spans[k] for k in groups), file.bytes))
+    placer = Placer(plan.store, plan.ground, slices)
+    tile_quanta = plan.ground.grid.size_quanta
+    for one in slices:
+        for _, points in placer.place(one, EVERYWHERE):
+            own = (points.epoch_gps_ns >= first) & (points.epoch_gps_ns < end)
+            whole = points.tiles[own].astype(np.int64) * tile_quanta + points.quanta[own, :2]
+            easting, northing = (whole * np.float64(QUANTUM_M)).T
+            yield points.epoch_gps_ns[own], easting, northing, points.quanta[own, 2]
+
+
+def _comments(plan: SurveyPlan, source: ReadingSource, lane_pass: LanePass) -> tuple[str, ...]:
+    frame = plan.ground.map
+    return (
+        f"written by roadscan {__version__}",
+        f"survey {plan.survey.config.id}, run {source.run}, pass {lane_pass.pass_id}, sensor {source.sensor}",
+        f"x, y: easting, northing in metres of {frame.crs or frame.local_name or 'local'}",
+        f"z: {frame.height} heights in metres" + (f", geoid {frame.geoid.grid}" if frame.geoid else ""),
+    )
+
+
+def _grid(sums: CurvedHeights, settings: CrgSettings, comments: tuple[str, ...]) -> tuple[CurvedRegularGrid, list[str]]:
+    """The grid of all rows and columns that hold a point, and notes on its holes."""
+    line = sums.line
+    heights, filled = fill_holes(
+        sums.heights_m(), int(settings.hole_m / settings.v_step_m), int(settings.hole_m / settings.u_step_m)
+    )
+    rows, columns = (np.flatnonzero(~np.isnan(heights).all(axis=a)) for a in (1, 0))
+    if rows[-1] - rows[0] < 1 or columns[-1] - columns[0] < 1:
+        raise RunError("the points fill a single row or column of the grid", change="make the steps smaller")
+    first, last = int(rows[0]), int(rows[-1])
+    kept = heights[first : last + 1, columns[0] : columns[-1] + 1]
+    inner = inner_holes(kept)
+    notes = [f"{filled:,} nodes in holes of up to {settings.hole_m:g} m lie on straight lines between their neighbours"]
+    if inner:
+        notes.append(
+            f"{inner:,} nodes in wider holes stay open: OpenCRG's own tools accept holes at the road's borders only"
+        )
+    base = float(np.floor(np.nanmin(kept)))
+    x, y = line.vertices_m[first].tolist()
+    grid = CurvedRegularGrid(
+        v_m=sums.v_first_m + sums.v_step_m * np.arange(columns[0], columns[-1] + 1),
+        z_m=kept - base,
+        u_step_m=line.step_m,
+        x_start_m=x,
+        y_start_m=y,
+        z_start_m=base,
+        phi_rad=line.phi_rad[first:last],
+        comments=(*comments, f"{filled} of {kept.size} nodes are interpolated"),
+    )
+    return grid, notes

@@ -1,0 +1,332 @@
+"""KITTI raw: a folder of spinning-lidar sweeps, one stamp a sweep.
+
+``velodyne_points/data/NNNNNNNNNN.bin`` holds little-endian float32 x (forward), y (left), z (up) in
+metres and intensity 0–1, 16 bytes a return (Geiger et al. 2013, section 3). The axes are ``flu``; a
+record of 0, 0, 0 is no return. Intensity is scaled to 16 bits: 1.0 becomes 65,535. The rows carry no
+laser number.
+
+A sweep's stamp is the instant at which the head faces forward, the middle of a turn that begins and
+ends behind. KITTI raw sweeps are *not* compensated for motion during the turn. Measured on drive
+2011_09_26_0005 (52 sweeps, 3–6 m/s, planes of consecutive sweeps compared, moving objects masked): planes
+coincide if returns are moved by −1.0 ± 0.05 of v · period · azimuth / 360° (azimuth counter-clockwise seen
+from above), that is, if what lies to the left was measured before the stamp. So the head turns
+**clockwise**, although each laser's returns are sorted counter-clockwise in the file. ``turn = "azimuth"``
+therefore is the default, and gives every return the epoch
+
+    epoch = stamp − period · atan2(y, x) / 2π.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import datetime as dt
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import ClassVar, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from pydantic import Field
+
+from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
+from roadscan.core.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
+from roadscan.core.strict import Strict
+from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
+from roadscan.ingest.reading.records import Sieve, options_of
+
+RECORD_BYTES: Final = 16
+_CHUNK_RETURNS: Final = 1 << 18
+_FARTHEST_M: Final = 10_000.0
+_SHORTEST_TURN_S: Final = 0.01
+_LONGEST_TURN_S: Final = 1.0
+_SWEEP: Final = re.compile(r"^\d{6,10}\.bin$")
+_CALENDAR: Final = re.compile(r"^(\d{4}-\d\d-\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?\s*$")
+_LARGEST_STAMPS_BYTES: Final = 256 << 20
+_MOST_DAYS: Final = 100_000  # 273 years: beyond them int64 nanoseconds end
+_LONGEST_LOG_NS: Final = 30 * 86_400 * NS_PER_S
+
+
+class KittiOptions(Strict):
+    """Settings of a KITTI raw log."""
+
+    stamps: Path | None = None
+    """CSV with the sweeps' stamps in the log's clock, relative to the log's folder; KITTI's own
+    `velodyne_points/timestamps.txt` (calendar time, UTC) where left out."""
+    frame_column: str = "frame"
+    """Column of that CSV with the sweep's number, the name of its file."""
+    stamp_column: str = "stamp"
+    """Column of that CSV with the stamp."""
+    turn: Literal["azimuth", "compensated"] = "azimuth"
+    """azimuth: sweeps are as recorded, each return gets its own epoch from its azimuth;
+    compensated: the maker has already moved all returns to the sweep's stamp. They stay in the scanner's own axes, so
+    that its mounting applies in both cases."""
+    rotation: Literal["clockwise", "counterclockwise"] = "clockwise"
+    """Sense in which the head turns, seen from above."""
+    period_s: float | None = Field(default=None, gt=_SHORTEST_TURN_S, lt=_LONGEST_TURN_S)
+    """Duration of a turn (s); from the stamps' mean spacing where left out."""
+
+
+class Kitti(LogFormat):
+    """KITTI raw folders."""
+
+    name: ClassVar[str] = "kitti"
+    title: ClassVar[str] = "KITTI raw folder: velodyne_points/data/*.bin with one stamp a sweep"
+    yields: ClassVar[tuple[str, ...]] = ("returns",)
+    axes_on_sensor: ClassVar[str] = "x points ahead, y left and z up, as KITTI defines them"
+    usual_axes: ClassVar[Mapping[str, str]] = {"flu": "it stands upright and faces ahead, as on KITTI's car"}
+    time: ClassVar[str] = (
+        "timestamps.txt is calendar time, UTC, and needs no clock; stamps of a CSV are in the clock that the "
+        "survey file states"
+    )
+    options: ClassVar[type[Strict]] = KittiOptions
+
+    def sniff(self, path: Path) -> bool:
+        """True for a folder with numbered .bin files of whole records under (velodyne_points/)data."""
+        try:
+            first = next(_sweeps(path), None)
+            return first is not None and first.stat().st_size >= RECORD_BYTES
+        except OSError:
+            return False
+
+    def files(self, path: Path) -> list[Path]:
+        """Sweeps, KITTI's stamps, and CSV files beside them."""
+        texts = [p for pattern in ("timestamps*.txt", "*.csv") for p in _points_folder(path).glob(pattern)]
+        texts += [p for p in path.glob("*.csv") if p not in texts]
+        return sorted([*_sweeps(path), *texts])
+
+    def companions(self, path: Path, options: Strict) -> list[Path]:
+        """The CSV of stamps, wherever it is."""
+        stamps = options.stamps if isinstance(options, KittiOptions) else None
+        return [] if stamps is None else [beside(path, stamps)]
+
+    def header(self, source: LogSource) -> LogHeader:
+        """Number of sweeps and the period of a turn."""
+        options = options_of(source, KittiOptions)
+        if next(_sweeps(source.path), None) is None:
+            raise FormatError("the folder holds no sweep", expected="velodyne_points/data/*.bin", file=source.path)
+        epochs = _stamps(source, options)
+        attributes: dict[str, str | float | int] = {"frame": "sensor", "turn": options.turn}
+        if options.turn == "azimuth":
+            attributes |= {"rotation": options.rotation, "period_ns": _period_ns(epochs, options, source.path)}
+        return LogHeader(attributes)
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream sweep by sweep."""
+        options = options_of(source, KittiOptions)
+        epochs = _stamps(source, options)
+        period_ns = float(header.attributes.get("period_ns", 0.0))
+        turn_ns = period_ns if options.rotation == "counterclockwise" else -period_ns
+        for file in sorted(_sweeps(source.path)):
+            name = file.relative_to(source.path).as_posix()
+            sweep = _Sweep(file, name, int(file.stem))
+            if sweep.number not in epochs:
+                yield Reject("the sweep has no stamp", 0, 0, max(1, file.stat().st_size // RECORD_BYTES), name)
+                continue
+            yield from sweep.items(epochs[sweep.number], turn_ns)
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    file: Path
+    name: str
+    number: int
+
+    def items(self, stamp_gps_ns: int, turn_ns: float) -> Iterator[Item]:
+        """Rows and rejects; `turn_ns` is the signed duration of a turn counter-clockwise, 0 if compensated."""
+        size = self.file.stat().st_size
+        whole = size // RECORD_BYTES
+        for first in range(0, whole, _CHUNK_RETURNS):
+            count = min(_CHUNK_RETURNS, whole - first)
+            xyzi = np.fromfile(self.file, "<f4", 4 * count, offset=first * RECORD_BYTES)
+            yield from self._chunk(xyzi.reshape(-1, 4), stamp_gps_ns, turn_ns, first)
+        if size % RECORD_BYTES:
+            yield Reject("the record is cut off", whole, whole * RECORD_BYTES, 1, self.name)
+
+    def _chunk(self, xyzi: npt.NDArray[np.float32], stamp_gps_ns: int, turn_ns: float, first: int) -> Iterator[Item]:
+        sieve = _sieve(xyzi)
+        records = first + np.arange(len(xyzi))
+        for reject in sieve.rejects(records, records * RECORD_BYTES):
+            yield dataclasses.replace(reject, file=self.name)
+        kept = xyzi[sieve.kept]
+        if not len(kept):
+            return
+        x, y, z, intensity = kept.T
+        pose_epochs = np.full(len(kept), stamp_gps_ns, dtype=np.int64)
+        epochs = pose_epochs
+        if turn_ns:
+            turned = np.arctan2(y.astype(np.float64), x) * (turn_ns / (2 * np.pi))
+            epochs = pose_epochs = pose_epochs + np.rint(turned).astype(np.int64)
+        columns = {
+            "epoch_gps_ns": epochs,
+            "pose_epoch_gps_ns": pose_epochs,
+            "x_sensor_m": np.ascontiguousarray(x),
+            "y_sensor_m": np.ascontiguousarray(y),
+            "z_sensor_m": np.ascontiguousarray(z),
+            "intensity": np.rint(intensity * np.float32(65_535)).astype(np.uint16),
+            "laser": np.zeros(len(kept), dtype=np.uint8),
+            "sweep": np.full(len(kept), self.number, dtype=np.int32),
+        }
+        batch = pa.RecordBatch.from_pydict({k: pa.array(v) for k, v in columns.items()})
+        start = int(records[np.argmax(sieve.good)])
+        yield Rows("returns", batch, self.name, start, start * RECORD_BYTES, RECORD_BYTES)
+
+
+def _sieve(xyzi: npt.NDArray[np.float32]) -> Sieve:
+    """Sieve of (n, 4) x, y, z, intensity."""
+    xyz, intensity = xyzi[:, :3], xyzi[:, 3]
+    sieve = Sieve(len(xyzi))
+    sieve.drop((xyz == 0.0).all(axis=1), "0, 0, 0 is no return")
+    with np.errstate(invalid="ignore"):  # comparisons are false for NaN: each says what is right
+        sieve.drop(
+            np.asarray(~(np.abs(xyz) <= _FARTHEST_M).all(axis=1)), "the position is not a number or beyond 10 km"
+        )
+        sieve.drop(~((intensity >= 0.0) & (intensity <= 1.0)), "the intensity is outside 0–1")
+    return sieve
+
+
+def _points_folder(path: Path) -> Path:
+    inner = path / "velodyne_points"
+    return inner if inner.is_dir() else path
+
+
+def _sweeps(path: Path) -> Iterator[Path]:
+    """Files of the sweeps, in no order."""
+    data = _points_folder(path) / "data"
+    if data.is_dir():
+        yield from (p for p in data.iterdir() if _SWEEP.match(p.name) and p.is_file())
+
+
+def _stamps(source: LogSource, options: KittiOptions) -> dict[int, int]:
+    """Epoch (GPS ns) by number of the sweep."""
+    if options.stamps is not None:
+        clock = source.need_clock("unix_utc", unit="s")
+        file = beside(source.path, options.stamps)
+        numbers, stamps_ns = _stamps_of_csv(file, options, UNIT_NS[clock.unit])
+    else:
+        clock = source.clock or Clock(TimeSystem.UNIX_UTC)
+        if clock.system not in {TimeSystem.UNIX_UTC, TimeSystem.UNIX_GPS, TimeSystem.UNIX_TAI}:
+            raise TimeSystemError(
+                f"timestamps.txt holds calendar time, and clock.system is '{clock.system}'",
+                expected="no clock (UTC), or unix_utc, unix_gps or unix_tai, whose days are calendar days",
+                file=source.path,
+                missing=Missing("clock", {"system": "unix_utc"}),
+            )
+        file = _points_folder(source.path) / "timestamps.txt"
+        numbers, stamps_ns = _stamps_of_calendar(file)
+    stamps = np.array(stamps_ns, dtype=np.int64)
+    # A mistyped stamp costs its sweep; the middle one tells whether the statement is wrong.
+    likely = np.abs(stamps - np.sort(stamps)[stamps.size // 2]) < _LONGEST_LOG_NS
+    try:
+        epochs = dataclasses.replace(clock, unit="ns").to_epoch_gps_ns(stamps[likely])
+    except TimeSystemError as error:
+        raise error.at(file) from error
+    return dict(zip(np.array(numbers)[likely].tolist(), epochs.tolist(), strict=True))
+
+
+def _stamps_of_csv(file: Path, options: KittiOptions, unit_ns: int) -> tuple[list[int], list[int]]:
+    """Numbers and stamps (ns of the clock's own count); lines that hold none are left out."""
+    rows = _rows(file)
+    names = [name.strip() for name in next(rows, [])]
+    for wanted in (options.frame_column, options.stamp_column):
+        if wanted not in names:
+            raise ConfigError(
+                f"there is no column '{wanted}'{nearest(wanted, names)}",
+                expected="one of: " + ", ".join(names)[:500],
+                change="set options.frame_column and options.stamp_column",
+                file=file,
+                missing=[[Missing("options.frame_column"), Missing("options.stamp_column")]],
+            )
+    frame, stamp = names.index(options.frame_column), names.index(options.stamp_column)
+    numbers: list[int] = []
+    stamps_ns: list[int] = []
+    for row in rows:
+        try:
+            value = Decimal(row[stamp].strip()) * unit_ns
+            number = int(row[frame])
+            ns = round(value) if abs(value) < 2**61 and abs(number) < 2**31 else None
+        except (IndexError, ValueError, ArithmeticError):
+            continue
+        if ns is not None:
+            numbers.append(number)
+            stamps_ns.append(ns)
+    return _found(numbers, stamps_ns, file)
+
+
+def _rows(file: Path) -> Iterator[list[str]]:
+    try:
+        yield from csv.reader(_lines(file, "options.stamps"))
+    except csv.Error as error:
+        raise FormatError(f"the file is not CSV: {error}", expected="options.stamps", file=file) from error
+
+
+def _stamps_of_calendar(file: Path) -> tuple[list[int], list[int]]:
+    """Line k holds the stamp of sweep k as calendar time; ns since 1970 as if there were no leap seconds."""
+    numbers: list[int] = []
+    stamps_ns: list[int] = []
+    for number, line in enumerate(_lines(file, "KITTI's stamps, or options.stamps")):
+        ns = _calendar_ns(line)
+        if ns is not None:
+            numbers.append(number)
+            stamps_ns.append(ns)
+    return _found(numbers, stamps_ns, file)
+
+
+def _found(numbers: list[int], stamps_ns: list[int], file: Path) -> tuple[list[int], list[int]]:
+    if not numbers:
+        raise FormatError("the file holds no stamp", expected="one stamp a sweep", file=file)
+    return numbers, stamps_ns
+
+
+def _calendar_ns(line: str) -> int | None:
+    found = _CALENDAR.match(line)
+    if found is None:
+        return None
+    day, hour, minute, second, fraction = found.groups()
+    try:
+        days = (dt.date.fromisoformat(day) - dt.date(1970, 1, 1)).days
+    except ValueError:
+        return None
+    if abs(days) > _MOST_DAYS:
+        return None
+    seconds = days * 86_400 + int(hour) * 3600 + int(minute) * 60 + int(second)
+    return seconds * NS_PER_S + int((fraction or "").ljust(9, "0"))
+
+
+def _lines(file: Path, what: str) -> list[str]:
+    try:
+        if file.stat().st_size > _LARGEST_STAMPS_BYTES:
+            raise FormatError("the file is far larger than stamps of sweeps", expected=what, file=file)
+        return file.read_text(encoding="utf-8-sig", errors="replace").replace("\0", "").splitlines()
+    except OSError as error:
+        raise FormatError(
+            f"the sweeps' stamps cannot be read: {error.strerror or error}",
+            expected=what,
+            change="set options.stamps (and frame_column, stamp_column) to a CSV, relative to the log's folder",
+            file=file,
+            missing=Missing("options.stamps"),
+        ) from error
+
+
+def _period_ns(epochs: dict[int, int], options: KittiOptions, path: Path) -> float:
+    """Mean duration of a turn: spacings within 30 % of their median, so that gaps do not count."""
+    if options.period_s is not None:
+        return options.period_s * NS_PER_S
+    numbers = np.array(sorted(epochs))
+    stamps = np.array([epochs[n] for n in numbers.tolist()])
+    spacing = np.diff(stamps) / np.diff(numbers) if numbers.size > 1 else np.empty(0)
+    middle = float(np.median(spacing)) if spacing.size else 0.0
+    near = np.abs(spacing - middle) <= 0.3 * middle
+    if not near.any() or not _SHORTEST_TURN_S < middle / NS_PER_S < _LONGEST_TURN_S:
+        raise ConfigError(
+            "the duration of a turn does not follow from the stamps",
+            expected="stamps of two sweeps or more, 0.01 s to 1 s a turn",
+            change="state options.period_s",
+            file=path,
+            missing=Missing("options.period_s"),
+        )
+    return float(spacing[near].mean())

@@ -1,0 +1,268 @@
+"""UDP packets of a network capture (PCAP): what lidar makers' own recorders write.
+
+The file is read a few megabytes at a time. A record that is cut off or that is no record costs itself:
+reading goes on at the next record that looks like one of the sensor's data packets.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, Final, NamedTuple, TypeAlias
+
+from roadscan.core.errors import FormatError
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.ingest.format import Reject
+
+PCAPNG: Final = b"\x0a\x0d\x0d\x0a"
+MAGICS: Final = {
+    b"\xd4\xc3\xb2\xa1": ("<", 1000),
+    b"\xa1\xb2\xc3\xd4": (">", 1000),
+    b"\x4d\x3c\xb2\xa1": ("<", 1),
+    b"\xa1\xb2\x3c\x4d": (">", 1),
+}
+"""Byte order, and ns of a unit of the records' fractional seconds, by the file's first four bytes."""
+
+_LINK_HEADERS: Final = {0: 4, 1: 14, 101: 0, 113: 16, 228: 0, 276: 20}
+"""Bytes before the IP header by link type: BSD loopback, Ethernet, raw IP, Linux cooked, IPv4, Linux cooked 2."""
+_ETHERNET: Final = 1
+_VLAN_TAGS: Final = (b"\x81\x00", b"\x88\xa8")
+_UDP: Final = 17
+_IPV4_WITHOUT_OPTIONS: Final = b"\x45"
+_MOST_ROUTES: Final = 4096
+_READ_BYTES: Final = 4 << 20
+_LARGEST_RECORD: Final = 262_144
+_RECORD_HEADER: Final = 16
+_FILE_HEADER: Final = 24
+_YEAR_S: Final = 365 * 86_400
+
+
+class Datagram(NamedTuple):
+    """A UDP packet of the capture."""
+
+    number: int
+    """Number of the record, from 0."""
+    offset: int
+    """Byte at which the record starts."""
+    capture_ns: int
+    """Time by the recording computer's clock, POSIX ns."""
+    sender: str
+    """IP address."""
+    port: int
+    """Port it was sent to."""
+    payload: bytes
+
+
+_Record: TypeAlias = tuple[int, int, int, bytes]
+"""Number, byte offset, capture time (POSIX ns), frame as captured."""
+_Route: TypeAlias = tuple[str, int, int, int]
+"""Sender, port, and where the payload starts and ends in the frame."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which packets of a capture belong to the log."""
+
+    port: int
+    """Port of the data packets."""
+    data_bytes: int
+    """Length of a sound data packet."""
+    other_port: int
+    """Port of the sensor's other packets."""
+    sender: str | None
+    """The sensor's IP address; None for any."""
+    sole: bool = False
+    """True where no other sensor is expected: packets that look like its own and are not are rejected."""
+
+
+def datagrams(path: Path, wanted: Wanted) -> Iterator[Datagram | Reject]:
+    """Packets wanted, in file order, and rejects for damaged ones; other traffic is passed over.
+
+    Raises
+    ------
+    FormatError
+        if the file is no capture that can be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            yield from _wanted_of(_Capture.of(stream, path), wanted)
+    except OSError as error:
+        raise FormatError(f"the capture cannot be read: {error.strerror or error}", file=path) from error
+
+
+def _wanted_of(capture: _Capture, wanted: Wanted) -> Iterator[Datagram | Reject]:
+    route_of = _Routes(capture.link).of
+    for item in capture.records():
+        if isinstance(item, Reject):
+            yield item
+            continue
+        number, offset, capture_ns, frame = item
+        route = route_of(frame)
+        if route is None:
+            if len(frame) == capture.usual_bytes:
+                yield Reject("as long as a data packet, and not a UDP packet", number, offset)
+            continue
+        sender, port, start, end = route
+        payload = frame[start:end]
+        if wanted.sender is not None and sender != wanted.sender:
+            if wanted.sole and port == wanted.port and len(payload) == wanted.data_bytes:
+                yield Reject("a data packet came from another sender", number, offset)
+            continue
+        if port == wanted.port and len(payload) == wanted.data_bytes:
+            capture.usual_bytes = len(frame)
+        elif port == wanted.port:
+            yield Reject(f"a data packet is not {wanted.data_bytes:,} bytes long", number, offset)
+            continue
+        elif port != wanted.other_port:
+            if wanted.sender is not None and len(payload) == wanted.data_bytes:
+                yield Reject("a data packet was sent to another port", number, offset)
+            continue
+        yield Datagram(number, offset, capture_ns, sender, port, payload)
+
+
+@dataclass
+class _Capture:
+    """Records of a PCAP file (IETF draft-ietf-opsawg-pcap)."""
+
+    stream: BinaryIO
+    order: str
+    tick_ns: int
+    link: int
+    usual_bytes: int = 0
+    """Captured length of a data packet, once known: the mark at which reading goes on after damage."""
+    _seconds: int = -1
+    """Capture time of the last sound record."""
+    _buffer: bytes = b""
+    _at: int = 0
+    """Place in the buffer."""
+    _base: int = _FILE_HEADER
+    """File offset of the buffer."""
+
+    @classmethod
+    def of(cls, stream: BinaryIO, path: Path) -> _Capture:
+        """Read the file header."""
+        head = stream.read(_FILE_HEADER)
+        if head[:4] == PCAPNG:
+            raise FormatError(
+                "the capture is PCAPNG",
+                expected="PCAP",
+                change="convert it: editcap -F pcap in.pcapng out.pcap",
+                file=path,
+            )
+        if head[:4] not in MAGICS or len(head) < _FILE_HEADER:
+            raise FormatError("the file is not a PCAP capture", expected="a PCAP file header", file=path)
+        order, tick_ns = MAGICS[head[:4]]
+        link = struct.unpack(order + "I", head[20:24])[0] & 0xFFFF
+        if link not in _LINK_HEADERS:
+            raise FormatError(
+                f"the capture's link type is {link}",
+                expected="Ethernet (1), raw IP (101, 228), Linux cooked (113, 276) or loopback (0)",
+                file=path,
+            )
+        return cls(stream, order, tick_ns, link)
+
+    def records(self) -> Iterator[_Record | Reject]:
+        """All records in file order; bytes that are no record are skipped to the next data packet."""
+        unpack = struct.Struct(self.order + "IIII").unpack_from
+        number = 0
+        while self._fill():
+            at, start = self._at, self._base + self._at
+            if len(self._buffer) - at < _RECORD_HEADER:
+                yield Reject("the record is cut off", number, start)
+                return
+            seconds, ticks, kept, whole = unpack(self._buffer, at)
+            body = at + _RECORD_HEADER
+            if kept > whole or kept > _LARGEST_RECORD or ticks * self.tick_ns >= NS_PER_S:
+                self._resynchronise()
+                yield Reject("no packet record; bytes skipped to the next data packet", number, start)
+            elif body + kept > len(self._buffer):
+                yield Reject("the record is cut off", number, start)
+                return
+            else:
+                self._seconds, self._at = seconds, body + kept
+                yield number, start, seconds * NS_PER_S + ticks * self.tick_ns, self._buffer[body : self._at]
+            number += 1
+
+    def _fill(self) -> bool:
+        """Have the next record in the buffer, as far as the file goes; False at the file's end."""
+        if len(self._buffer) - self._at < _RECORD_HEADER + _LARGEST_RECORD:
+            more = self.stream.read(_READ_BYTES)
+            if more:
+                self._drop(self._at)
+                self._buffer += more
+        return self._at < len(self._buffer)
+
+    def _drop(self, count: int) -> None:
+        """Forget the buffer's first `count` bytes."""
+        self._buffer = self._buffer[count:]
+        self._base += count
+        self._at -= count
+
+    def _resynchronise(self) -> None:
+        """Go to the next record of a data packet, or to the file's end."""
+        self._at += 1
+        if not self.usual_bytes:
+            self._at = len(self._buffer)  # no mark is known yet: the buffer is lost
+            return
+        lengths = struct.pack(self.order + "II", self.usual_bytes, self.usual_bytes)
+        while True:
+            found = self._buffer.find(lengths, self._at + 8)
+            if found >= 0:
+                self._at = found - 8
+                seconds = struct.unpack_from(self.order + "I", self._buffer, self._at)[0]
+                if abs(seconds - self._seconds) < _YEAR_S:
+                    return
+                self._at += 1
+                continue
+            self._at = max(self._at, len(self._buffer) - _RECORD_HEADER)
+            more = self.stream.read(_READ_BYTES)
+            if not more:
+                self._at = len(self._buffer)
+                return
+            self._drop(self._at)
+            self._buffer += more
+
+
+@dataclass
+class _Routes:
+    """Finds UDP payloads in frames; frames that differ in their payload alone are looked at once."""
+
+    link: int
+    _known: dict[tuple[int, bytes, bytes, bytes], _Route | None] = field(default_factory=dict)
+
+    def of(self, frame: bytes) -> _Route | None:
+        """Route of a frame, None for anything but UDP."""
+        ip = _LINK_HEADERS[self.link]
+        # Link header and version; protocol; addresses, ports and length: all that decides on the route.
+        key = (len(frame), frame[: ip + 1], frame[ip + 9 : ip + 10], frame[ip + 12 : ip + 26])
+        if key in self._known:
+            return self._known[key]
+        route = _route(frame, self.link)
+        plain = frame[ip : ip + 1] == _IPV4_WITHOUT_OPTIONS and frame[max(0, ip - 2) : ip] not in _VLAN_TAGS
+        if plain and len(self._known) < _MOST_ROUTES:
+            self._known[key] = route
+        return route
+
+
+def _route(frame: bytes, link: int) -> _Route | None:
+    at = _LINK_HEADERS[link]
+    if link == _ETHERNET:
+        while frame[at - 2 : at] in _VLAN_TAGS:
+            at += 4
+    if len(frame) < at + 28:
+        return None
+    version = frame[at] >> 4
+    if version == 4 and frame[at + 9] == _UDP:
+        sender = ".".join(map(str, frame[at + 12 : at + 16]))
+        at += 4 * (frame[at] & 0x0F)
+    elif version == 6 and frame[at + 6] == _UDP:
+        sender = frame[at + 8 : at + 24].hex(":", 2)
+        at += 40
+    else:
+        return None
+    if len(frame) < at + 8:
+        return None
+    port, length = struct.unpack_from(">HH", frame, at + 2)
+    return sender, port, at + 8, at + max(8, length)

@@ -1,0 +1,530 @@
+"""Velodyne HDL-32E and VLP-16: network captures (PCAP) of the sensor's UDP packets.
+
+One data packet is one record: :mod:`roadscan.formats.lidars.velodyne_packets` says how it is decoded, and a
+damaged one is rejected whole. Position packets of 512 bytes hold the lidar's stamp and a GPRMC sentence.
+Coordinates have axes ``flu``; `laser` is the maker's own number (its place in the firing sequence);
+reflectivity is scaled to 16 bits (255 becomes 65,535); a sweep ends where the azimuth passes 360°. In dual
+return mode both returns are kept, and one that is written twice is kept once.
+
+**Which hour** it is the data packets do not say. It comes from a valid GPRMC in the capture, or from
+`options.hour` with the clock's date; from the capture's own clock only when `options.hour = "capture"`.
+See :mod:`roadscan.formats.lidars.velodyne_hours`.
+
+**A clock that steps.** Where the stamps step against the capture's own clock, the capture is divided, and each part is
+compared with GPRMC and the PPS byte (2: locked): parts that cannot be put on GPS time are rejected, packet by packet,
+and named. A capture without position packets has only its own clock to compare with. Packets that stand twice count
+once. See `docs/clocks.md`, "Clocks that step".
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
+from roadscan.core.gpstime import NS_PER_S, TimeSystem
+from roadscan.core.strict import Strict
+from roadscan.core.witness import Finding, Witness
+from roadscan.formats.lidars.pcap import MAGICS, PCAPNG, Datagram, Wanted, datagrams
+from roadscan.formats.lidars.velodyne_hours import Hours, Start, first_hour_unix_s, leaps
+from roadscan.formats.lidars.velodyne_packets import (
+    BLOCKS,
+    DATA_BYTES,
+    DUAL,
+    FLAG,
+    LATEST_STAMP_US,
+    MODELS,
+    MODES,
+    PACKET,
+    Model,
+    decode,
+    faults,
+)
+from roadscan.formats.lidars.velodyne_segments import (
+    STEPPED,
+    Parts,
+    StepWatch,
+    Verdict,
+    hours_later,
+    judged,
+    reference,
+)
+from roadscan.formats.lidars.velodyne_sentences import SENTENCES, Sentences
+from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
+from roadscan.ingest.reading.records import Sieve, options_of
+
+_CHUNK_PACKETS: Final = 640  # 245,760 slots
+_HEADER_PACKETS: Final = 1_000
+_HEADER_CHUNK: Final = 500
+_HOUR_NS: Final = 3_600 * NS_PER_S
+_RECENT_PACKETS: Final = 64
+"""Packets behind which a copy of one arrives, by a mirrored port."""
+_FASTEST_DRIFT: Final = 6e-4
+"""NTP moves a computer's clock by up to 500 ppm, and a quartz drifts by up to 100."""
+_LEAST_DRIFT_S: Final = 0.05
+_NAMES_IN_RIG_FILES: Final = ("HDL32", "VLP16", "HDL64", "VLP32", "VLS128", "PUCKHIRES")
+_OTHER_PRODUCTS: Final = {0x23: "VLP-32A/B", 0x24: "Puck Hi-Res", 0x28: "VLP-32C", 0x31: "Velarray", 0xA1: "VLS-128"}
+
+
+TWICE: Final = Witness(
+    "lidar_packets_twice",
+    input="lidar",
+    fault="Packets stand twice in a capture, or out of order: a mirrored port, captures that were joined.",
+    asks="stamps and bytes of neighbouring data packets",
+    does="a packet counts once; packets out of order are put into the order of their stamps, and named",
+    told=("rejects", "findings"),
+)
+
+TWO_HEADS: Final = Witness(
+    "lidar_heads_mixed",
+    input="lidar",
+    fault="The packets of two heads stand in one capture under one address: an address translation, or a merge of two "
+    "captures.",
+    asks="the azimuth of each packet, against that of the packet before it and the rate at which the head turns",
+    does="the capture is refused where more than a tenth of the packets begin elsewhere than the head can have turned",
+    told=("error",),
+)
+
+_ASTRAY_CENTIDEG: Final = 500
+"""A head does not turn so far (0.01°) besides what its rate says: it holds that to some per cent."""
+_MIXED_SHARE: Final = 0.1
+_MIXED_LEAST: Final = 50
+"""Packets that tell it."""
+_TURNED_PAUSE_US: Final = 5_000
+"""Over a longer pause the rate does not say where the azimuth is."""
+
+
+class VelodyneOptions(Strict):
+    """Settings of a Velodyne capture."""
+
+    hour: Literal["capture"] | int | None = None
+    """UTC hour (0–23) of the first data packet, on the clock's date, where the capture holds no valid GPRMC;
+    "capture" takes it from the recording computer's clock, and the date too where the clock states none."""
+    model: Literal["HDL-32E", "VLP-16"] | None = None
+    """Sensor, where its firmware is too old to write it into the packets."""
+    stamp: Literal["first_firing", "packet_end"] = "first_firing"
+    """first_firing: a packet's stamp is the time of its first firing (application note 63-9277);
+    packet_end: of its end, 542.592 µs later, as early HDL-32E manuals say (63-9113, appendix E)."""
+    port: int = Field(default=2368, ge=1, le=65_535)
+    """UDP port of the data packets."""
+    position_port: int = Field(default=8308, ge=1, le=65_535)
+    """UDP port of the position packets."""
+    sender: str | None = None
+    """IP address of the sensor, where several send to the same port."""
+
+
+class VelodynePcap(LogFormat):
+    """Captures of Velodyne packets."""
+
+    name: ClassVar[str] = "velodyne_pcap"
+    title: ClassVar[str] = "Velodyne HDL-32E or VLP-16 packets in a PCAP capture, a stamp per return"
+    yields: ClassVar[tuple[str, ...]] = ("returns",)
+    version: ClassVar[int] = 2
+    suffixes: ClassVar[tuple[str, ...]] = (
+        ".pcap",
+        ".pcapng",
+    )
+    axes_on_sensor: ClassVar[str] = "x points along azimuth 0° (the maker's y), y along azimuth 270°, z out of the top"
+    usual_axes: ClassVar[Mapping[str, str]] = {"flu": "it stands upright and azimuth 0° lies ahead"}
+    time: ClassVar[str] = (
+        "microseconds past the UTC hour; the hour comes from GPRMC position packets in the capture, or from "
+        'clock = { system = "utc_hour", date = … } with options.hour'
+    )
+    options: ClassVar[type[Strict]] = VelodyneOptions
+
+    def sniff(self, path: Path) -> bool:
+        """True for a capture (PCAP or PCAPNG) that begins with Velodyne data packets."""
+        try:
+            if not path.is_file():
+                return False
+            with path.open("rb") as stream:
+                start = stream.read(1 << 20)
+        except OSError:
+            return False
+        return start[:4] in {*MAGICS, PCAPNG} and _has_data_packet(start)
+
+    def header(self, source: LogSource) -> LogHeader:
+        """Model, return mode, sender and first hour."""
+        options = options_of(source, VelodyneOptions)
+        known = _survey_capture(source.path, options)
+        model = _model(source, options, known)
+        start = known.start(_has_hours(source))
+        first_hour = first_hour_unix_s(source, options.hour, start)
+        attributes: dict[str, Any] = {
+            "frame": "sensor",
+            "model": model.name,
+            "lasers": model.lasers,
+            "return_mode": MODES.get(known.modes.most_common(1)[0][0], "strongest"),
+            "sender": known.senders.most_common(1)[0][0],
+            "first_hour_unix_s": first_hour,
+        }
+        if first_hour is not None:
+            first_s = first_hour + start.stamp_us / 1e6
+            attributes["capture_minus_sensor_s"] = round(start.capture_ns / NS_PER_S - first_s, 6)
+        if len(known.parts.found) > 1:
+            attributes["clock_steps"] = len(known.parts.found) - 1
+        return LogHeader(attributes)
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream packets, decoded some hundreds at a time."""
+        options = options_of(source, VelodyneOptions)
+        model = next(m for m in MODELS if m.name == header.attributes["model"])
+        sender = str(header.attributes["sender"])
+        hours = Hours(source, header.attributes["first_hour_unix_s"])
+        decoder = _Decoder(model, options, hours, source, sender)
+        if "clock_steps" in header.attributes:
+            decoder.judge()
+        packets: list[Datagram] = []
+        positions: list[Datagram] = []
+        for item in datagrams(source.path, _wanted(options, sender)):
+            if isinstance(item, Reject):
+                yield item
+            elif item.port == options.position_port:
+                positions.append(item)
+            else:
+                packets.append(item)
+            if len(packets) == _CHUNK_PACKETS or len(positions) == _CHUNK_PACKETS:
+                yield from decoder.items(packets, positions)
+                packets, positions = [], []
+        yield from decoder.items(packets, positions)
+        yield from decoder.findings()
+
+
+def _has_hours(source: LogSource) -> bool:
+    """False for a sensor without GPS, whose stamps count from no hour."""
+    return source.clock is None or source.clock.system is not TimeSystem.FREE
+
+
+@dataclass
+class _Decoder:
+    """Turns data packets into rows; keeps the azimuth and the sweep from chunk to chunk."""
+
+    model: Model
+    options: VelodyneOptions
+    hours: Hours
+    source: LogSource
+    sender: str
+    """Address of the sensor."""
+    _sweep: int = 0
+    _azimuth: int = -1
+    _watch: StepWatch = field(default_factory=StepWatch)
+    _verdicts: list[Verdict] = field(default_factory=list)
+    """What was found of the capture's parts, once a step of the clock was seen."""
+    _left_out: Counter[int] = field(default_factory=Counter)
+    """Data packets that were left out, by part."""
+    _part: int = -1
+    """Part of the last packet that was used."""
+    _stamp_us: int | None = None
+    """Last sound stamp."""
+    _recent: dict[bytes, int] = field(default_factory=dict)
+    """Capture times (ns) of the last packets, by their bytes."""
+    _disordered: int = 0
+    _sentences: Sentences = field(default_factory=Sentences)
+
+    def items(self, packets: list[Datagram], positions: list[Datagram]) -> Iterator[Item]:
+        """Rows of sound data packets, and rejects for damaged ones; position packets confirm the hour."""
+        if packets:
+            yield from self._returns(packets)
+        for packet in positions:
+            if self._verdicts and not self._verdict_of(packet).kept:
+                continue
+            fix = self._sentences.take(packet)
+            if fix is not None:
+                self.hours.check(fix, packet.number)
+
+    def judge(self) -> None:
+        """Look through the whole capture for steps of the sensor's clock, and judge its parts."""
+        known = _survey_capture(self.source.path, self.options, whole_of=self.sender)
+        self._verdicts = judged(known.parts.found, _has_hours(self.source))
+
+    def findings(self) -> Iterator[Finding]:
+        """What is doubtful of the capture, once it is read."""
+        for number, verdict in enumerate(self._verdicts):
+            yield from verdict.findings(self._left_out[number])
+        for set_us in self._watch.set_us:
+            yield STEPPED.finds(
+                "",
+                f"the capture's own clock was set by {set_us / 1e6:+.1f} s while the packets went on evenly; the "
+                "stamps are used",
+            )
+        if _has_hours(self.source):
+            yield from self._sentences.findings()
+        gained_s, rate = self._watch.drift
+        if abs(rate) > _FASTEST_DRIFT and abs(gained_s) > _LEAST_DRIFT_S:
+            yield SENTENCES.finds(
+                "",
+                f"the stamps drift by {-gained_s:+.2f} s ({-rate * 1e6:+.0f} ppm) against the capture's clock; they "
+                "are used as they are",
+            )
+        if self._disordered:
+            yield TWICE.finds(
+                "",
+                f"{self._disordered:,} data packets stand out of order in the capture; they were put into the order of "
+                "their stamps",
+            )
+
+    def _returns(self, packets: list[Datagram]) -> Iterator[Item]:
+        raw = np.frombuffer(b"".join([p.payload for p in packets]), dtype=PACKET)
+        numbers = np.array([p.number for p in packets])
+        sieve = self._sifted(packets, raw, numbers)
+        yield from sieve.rejects(numbers, np.array([p.offset for p in packets]))
+        if not sieve.good.any():
+            return
+        raw, numbers = raw[sieve.kept], numbers[sieve.kept]
+        capture_ns = np.array([p.capture_ns for p in packets])[sieve.kept]
+        epochs = self._epochs(raw["stamp_us"].astype(np.int64), capture_ns, numbers)
+        if (epochs[1:] < epochs[:-1]).any():
+            self._disordered += int((epochs < np.maximum.accumulate(epochs)).sum())
+            order = np.argsort(epochs, kind="stable")
+            raw, numbers, epochs = raw[order], numbers[order], epochs[order]
+        if self.options.stamp == "packet_end":
+            epochs = epochs - self.model.slot_times_ns(dual=False)[-1, -1]
+        sweeps = self._sweeps(raw["blocks"]["azimuth"])
+        is_dual = raw["mode"] == DUAL
+        for dual in (False, True):
+            part = np.flatnonzero(is_dual == dual)
+            if part.size:
+                rows = slice(None) if part.size == len(raw) else part
+                batch = decode(raw[rows], epochs[rows], sweeps[rows], self.model, dual)
+                yield Rows("returns", batch, first_record=int(numbers[part[0]]))
+
+    def _sifted(self, packets: list[Datagram], raw: npt.NDArray[np.void], numbers: npt.NDArray[np.int64]) -> Sieve:
+        """Which packets are sound, stand once, and are of a part of the capture that is on GPS time."""
+        sieve = Sieve(len(packets))
+        for bad, reason in faults(raw, self.model, unstated=self.options.model is not None):
+            sieve.drop(bad, reason)
+        stamps_us = raw["stamp_us"].astype(np.int64)
+        leaping = np.zeros(len(packets), dtype=bool)
+        leaping[sieve.kept] = leaps(stamps_us[sieve.kept], self._stamp_us)
+        sieve.drop(leaping, "the stamp leaps out of the log's order and back")
+        sieve.drop(self._copies(packets, stamps_us), "the packet stands twice in the capture")
+        if not sieve.good.any():
+            return sieve
+        sound = stamps_us[sieve.kept]
+        self._stamp_us = int(sound[-1])
+        capture_us = np.array([p.capture_ns for p in packets])[sieve.kept] // 1000
+        if self._watch.steps(sound, capture_us) and not self._verdicts:
+            self._judge_on_the_way()
+        if self._verdicts:
+            parts = self._part_of(numbers)
+            for number in np.unique(parts[sieve.kept]).tolist():
+                if not self._verdicts[number].kept:
+                    self._left_out[number] += int((sieve.good & (parts == number)).sum())
+                    sieve.drop(parts == number, self._verdicts[number].reason)
+        return sieve
+
+    def _judge_on_the_way(self) -> None:
+        """Judge the capture at the first step; packets before it were taken already."""
+        self.judge()
+        if self._verdicts and not self._verdicts[0].kept:
+            later = next((v.part for v in self._verdicts if v.part is v.base), self._verdicts[0].part)
+            raise TimeSystemError(
+                f"the sensor's clock steps at record {self._verdicts[1].part.first:,}; not the stamps before it but "
+                f"those from record {later.first:,} on are on GPS time ({self._verdicts[0].reason})",
+                expected="a capture that begins on GPS time",
+                change="split the capture there",
+                file=self.source.path,
+            )
+
+    def _verdict_of(self, position: Datagram) -> Verdict:
+        """Of the part to which a position packet belongs: the one in which it lies, or the next, by its stamp."""
+        part = int(self._part_of(np.array([position.number]))[0])
+        return min(self._verdicts[part : part + 2], key=lambda one: one.part.misses_us(position))
+
+    def _part_of(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Part (n,) of the capture in which records lie."""
+        firsts = [v.part.first for v in self._verdicts]
+        return np.clip(np.searchsorted(firsts, numbers, side="right") - 1, 0, None)
+
+    def _epochs(
+        self, stamps_us: npt.NDArray[np.int64], capture_ns: npt.NDArray[np.int64], numbers: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.int64]:
+        """GPS ns (n,) of the packets that are used."""
+        if not self._verdicts:
+            self.hours.capture_set_s = sum(self._watch.set_us) / 1e6
+            return self.hours.epochs(stamps_us, capture_ns)
+        parts = self._part_of(numbers)
+        out = np.empty(stamps_us.size, dtype=np.int64)
+        for number in np.unique(parts).tolist():
+            if number != self._part:
+                self.hours.resume(self._verdicts[number].start_us)
+                self._part = number
+            own = parts == number
+            out[own] = self.hours.epochs(stamps_us[own], capture_ns[own])
+        return out
+
+    def _copies(self, packets: list[Datagram], stamps_us: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """Packets (n,) whose bytes stand just before already; in another hour they may mean another time."""
+        copies = np.zeros(len(packets), dtype=bool)
+        if not (stamps_us[1:] > stamps_us[:-1]).all() or packets[0].payload in self._recent:
+            seen = self._recent
+            for k, packet in enumerate(packets):
+                copies[k] = abs(packet.capture_ns - seen.get(packet.payload, -_HOUR_NS)) < _HOUR_NS // 2
+                seen[packet.payload] = packet.capture_ns
+        self._recent = {p.payload: p.capture_ns for p in packets[-_RECENT_PACKETS:]}
+        return copies
+
+    def _sweeps(self, azimuth: npt.NDArray[np.uint16]) -> npt.NDArray[np.int32]:
+        """(n, 12) sweep of each block: one more wherever the azimuth passes 360°."""
+        flat = azimuth.reshape(-1).astype(np.int32)
+        before = flat[0] if self._azimuth < 0 else self._azimuth
+        sweeps = self._sweep + np.cumsum(np.diff(flat, prepend=before) < -18_000)
+        self._sweep, self._azimuth = int(sweeps[-1]), int(flat[-1])
+        return np.asarray(sweeps.reshape(-1, BLOCKS), dtype=np.int32)
+
+
+@dataclass
+class _Known:
+    """What a first look at the capture tells."""
+
+    senders: Counter[str] = field(default_factory=Counter)
+    products: Counter[int] = field(default_factory=Counter)
+    modes: Counter[int] = field(default_factory=Counter)
+    parts: Parts = field(default_factory=Parts)
+    turned: int = 0
+    astray: int = 0
+    """Packets whose azimuth was compared with that of the packet before, and those that begin elsewhere."""
+    _before: tuple[int, int, float] | None = None
+    """Stamp (µs), first azimuth (0.01°) and rate (0.01° a µs) of the last packet."""
+
+    def take(self, packet: Datagram) -> None:
+        """Learn from a data packet that begins well."""
+        self.senders[packet.sender] += 1
+        self.products[packet.payload[1205]] += 1
+        self.modes[packet.payload[1204]] += 1
+        stamp_us = int.from_bytes(packet.payload[1200:1204], "little")
+        self.parts.data(packet.number, stamp_us, packet.capture_ns // 1000)
+        self._turn(packet.payload, stamp_us)
+
+    def _turn(self, payload: bytes, stamp_us: int) -> None:
+        """Compare where a packet begins with where the one before it leads."""
+        azimuth = int.from_bytes(payload[2:4], "little")
+        if self._before is not None:
+            passed_us = stamp_us - self._before[0]
+            if abs(passed_us) <= _TURNED_PAUSE_US:
+                off = azimuth - self._before[1] - self._before[2] * passed_us
+                self.turned += 1
+                self.astray += abs((off + 18_000) % 36_000 - 18_000) > _ASTRAY_CENTIDEG
+        model = next((m for m in MODELS if m.product == payload[1205]), MODELS[0])
+        span_us = float(model.slot_times_ns(payload[1204] == DUAL)[-1, 0]) / 1e3
+        inside = int.from_bytes(payload[100 * (BLOCKS - 1) + 2 : 100 * (BLOCKS - 1) + 4], "little") - azimuth
+        self._before = stamp_us, azimuth, ((inside + 18_000) % 36_000 - 18_000) / span_us
+
+    def start(self, sentences: bool) -> Start:
+        """Time of the first packet that is on GPS time, and of a sentence that belongs to it."""
+        found = self.parts.found
+        base = reference(found, sentences)
+        return Start(base.stamp_us, base.capture_us * 1000, base.fix, base.fix_hours, hours_later(found[0], base))
+
+
+def _wanted(options: VelodyneOptions, sender: str | None) -> Wanted:
+    return Wanted(options.port, DATA_BYTES, options.position_port, sender, sole=options.sender is None)
+
+
+def _has_data_packet(start: bytes) -> bool:
+    at = start.find(FLAG)
+    while 0 <= at < len(start) - DATA_BYTES:
+        if all(start[at + 100 * k : at + 100 * k + 2] == FLAG for k in range(1, BLOCKS)):
+            return True
+        at = start.find(FLAG, at + 1)
+    return False
+
+
+def _survey_capture(path: Path, options: VelodyneOptions, whole_of: str | None = None) -> _Known:
+    """Look at the first packets, and on to a GPRMC that agrees unless the hour is stated; at all where the clock steps.
+
+    Parameters
+    ----------
+    whole_of : look at all packets of this sender in any case.
+    """
+    known = _Known()
+    for item in datagrams(path, _wanted(options, whole_of or options.sender)):
+        if isinstance(item, Reject):
+            continue
+        if item.port == options.position_port:
+            known.parts.position(item)
+        elif _begins_well(item.payload):
+            known.take(item)
+            if known.parts.seen % _HEADER_CHUNK:
+                continue
+            known.parts.flush()
+            found = known.parts.found
+            heard = options.hour is not None or any(p.confirmed for p in found)
+            if whole_of is None and known.parts.seen >= _HEADER_PACKETS and heard and len(found) == 1:
+                break
+    known.parts.flush(last=True)
+    if not known.parts.seen:
+        raise FormatError(
+            f"no Velodyne data packet was sent to port {options.port}",
+            expected=f"UDP packets of {DATA_BYTES} bytes",
+            change="state options.port (and options.sender)",
+            file=path,
+            missing=Missing("options.port"),
+        )
+    if options.sender is None and len(known.senders) > 1:
+        raise FormatError(
+            f"{len(known.senders)} sensors sent to port {options.port}: {', '.join(sorted(known.senders))}",
+            expected="one sensor a log",
+            change="list the capture once a sensor, each with its address as options.sender",
+            file=path,
+            missing=Missing("options.sender", choices=tuple(sorted(known.senders))),
+        )
+    if known.turned >= _MIXED_LEAST and known.astray > _MIXED_SHARE * known.turned:
+        raise FormatError(
+            f"{known.astray:,} of {known.turned:,} packets begin at another azimuth than the packet before them leads "
+            f"to: two heads sent to port {options.port} from one address",
+            expected="one head a log",
+            change="give each head an address or a port of its own, or split the capture by what tells the heads apart "
+            "(their Ethernet addresses), and list each part with its own sensor",
+            file=path,
+        )
+    return known
+
+
+def _begins_well(payload: bytes) -> bool:
+    """True for a data packet with sound first and last flags and a possible stamp."""
+    stamp_us = int.from_bytes(payload[1200:1204], "little")
+    return payload[:2] == FLAG and payload[1100:1102] == FLAG and stamp_us <= LATEST_STAMP_US
+
+
+def _model(source: LogSource, options: VelodyneOptions, known: _Known) -> Model:
+    """Model by the packets' product byte; options and rig file must not contradict it."""
+    product = known.products.most_common(1)[0][0]
+    written = next((m for m in MODELS if m.product == product), None)
+    stated = next((m for m in MODELS if m.name == options.model), None)
+    if written is None and not (product == 0 and stated is not None):
+        name = _OTHER_PRODUCTS.get(product, f"of product byte 0x{product:02x}")
+        raise FormatError(
+            f"the packets are {name}",
+            expected="HDL-32E (0x21) or VLP-16 (0x22)",
+            change="state options.model if the firmware writes no product byte (0x00)",
+            file=source.path,
+            missing=Missing("options.model"),
+        )
+    model = written or stated
+    if model is None or (stated is not None and stated is not model):
+        raise ConfigError(f"options.model is {options.model}, the packets say {written and written.name}")
+    said = "".join(c for c in (source.sensor.model if source.sensor else "").upper() if c.isalnum())
+    own = model.name.replace("-", "")[:5]
+    other = [n for n in _NAMES_IN_RIG_FILES if n in said and not n.startswith(own)]
+    if other and own not in said:
+        raise ConfigError(
+            f"the rig's sensor is '{source.sensor.model if source.sensor else ''}', the packets are {model.name}",
+            expected="the sensor that wrote the log",
+            change="name the right sensor for this log, or correct its model in the rig file",
+            file=source.path,
+        )
+    if options.stamp == "packet_end" and model.name != "HDL-32E":
+        raise ConfigError(
+            f'options.stamp = "packet_end" with a {model.name}',
+            expected='"first_firing": only early HDL-32E stamp the end of a packet',
+            file=source.path,
+        )
+    return model

@@ -1,0 +1,280 @@
+"""Line scanners: roadscan's own ``scans`` table as Parquet or Arrow IPC (Feather).
+
+The open way in for profilers whose own files only the vendor's library reads: whoever can call that
+library writes one row a profile from it, and this reader takes it from there.
+
+========================================  ==============================================================
+column                                    content
+========================================  ==============================================================
+``epoch_gps_ns`` (int64)                  GPS time of the profile's first reading, ns since 1980-01-06;
+or ``time`` (integer or float)            or the stamp in the clock that the survey file states
+``range`` (list of uint16)                raw ranges, all of one length; 0 is no return
+``intensity`` (list of uint8, optional)   raw intensities, as many as ranges
+``encoder_ticks`` (integer, optional)     wheel encoder
+========================================  ==============================================================
+
+Other columns are ignored. Lists may be fixed-size or not. The geometry of the readings
+(:class:`roadscan.core.scan_geometry.ScanGeometry`) stands as JSON in the file's schema metadata under
+``roadscan.scan_geometry``, or in the log's options.
+
+A capture program that has to keep up with a line-rate head writes Arrow IPC without compression, lists of fixed
+size without nulls, some hundred profiles a record batch: no byte of it is changed on the way to the disk, and it
+is read without a copy (shorter batches cost one). Compressed IPC and Parquet are read as well, for logs that are to
+be kept or sent; reading them takes many times as long.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from roadscan.core.errors import ConfigError, FormatError, Missing
+from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.strict import Strict
+from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
+from roadscan.ingest.reading.column_table import UNREADABLE, Lost, brief, open_table
+from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
+from roadscan.ingest.reading.table_stamps import EPOCH, column_stamps, refuse_clock
+
+GEOMETRY_KEY: Final = "roadscan.scan_geometry"
+"""Key of the schema metadata that holds the geometry as JSON."""
+
+_STAMP: Final = "time"
+_CHUNK_BYTES: Final = 8 << 20
+_COLUMNS: Final = (EPOCH, _STAMP, "range", "intensity", "encoder_ticks")
+_SUFFIXES: Final = (".parquet", ".arrow", ".feather", ".ipc")
+
+
+class ScansOptions(Strict):
+    """Settings of a ``scans`` log."""
+
+    scan_geometry: ScanGeometry | None = None
+    """Geometry of the readings, where the file's schema metadata (`roadscan.scan_geometry`) does not state it."""
+
+
+class Scans(LogFormat):
+    """Profiles as Parquet or Arrow IPC, one file or a folder of them."""
+
+    axes_on_sensor: ClassVar[str] = "y runs across the profile as its geometry counts, z along the ranges"
+    usual_axes: ClassVar[Mapping[str, str]] = {
+        "frd": "it looks down at the road, with growing y to the right",
+        "bld": "it looks down at the road, with growing y to the left",
+        "urf": "it stands upright and looks ahead",
+    }
+    name: ClassVar[str] = "scans"
+    title: ClassVar[str] = "roadscan's own profiles table (Parquet or Arrow IPC) for line scanners of any maker"
+    yields: ClassVar[tuple[str, ...]] = ("scans",)
+    time: ClassVar[str] = (
+        "column epoch_gps_ns is GPS time and needs no clock; column time is in the clock that the survey file states"
+    )
+    options: ClassVar[type[Strict]] = ScansOptions
+
+    def sniff(self, path: Path) -> bool:
+        """True for a file (or a folder whose first file) that has a stamp column and lists of ranges."""
+        try:
+            files = self.files(path)
+            return bool(files) and _is_scans(open_table(files[0]).schema)
+        except (*UNREADABLE, FormatError):
+            return False
+
+    def files(self, path: Path) -> list[Path]:
+        """The file, or all Parquet and Arrow files of the folder by name."""
+        if not path.is_dir():
+            return [path]
+        return sorted(p for p in path.rglob("*") if p.suffix.lower() in _SUFFIXES and p.is_file())
+
+    def header(self, source: LogSource) -> LogHeader:
+        """Geometry and time column; all files of a folder must agree."""
+        files = self.files(source.path)
+        schemas = [(file, schema) for file in files if (schema := _schema_or_none(file)) is not None]
+        if not schemas:
+            raise FormatError(
+                "no file can be read" if files else "the folder holds no table",
+                expected="Parquet or Arrow IPC files with one profile a row",
+                file=source.path,
+            )
+        for file, schema in schemas:
+            _check_columns(schema, file)
+        _check_clock(source, schemas[0][1])
+        geometry = _geometry(source, schemas)
+        return LogHeader({"scan_geometry": geometry.model_dump(mode="json")}, list_size=geometry.readings)
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream profiles file by file."""
+        readings = header.list_size
+        if readings is None:
+            raise FormatError("the log's header has no list size", file=source.path)
+        rows = max(1, _CHUNK_BYTES // (3 * readings + 16))
+        epochs = EpochReader(_clock(source, self.files(source.path)), source.path)
+        for file in self.files(source.path):
+            name = file.relative_to(source.path).as_posix() if file != source.path else ""
+            for first, part in _parts(file, rows):
+                if isinstance(part, pa.RecordBatch):
+                    yield from _profiles(part, readings, epochs, name, first)
+                elif part.whole and not name:
+                    raise FormatError(part.reason, expected="a Parquet or Arrow IPC file", file=source.path)
+                else:
+                    yield Reject(part.reason, first, -1, max(part.records, 1), name)
+
+    def ending(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Epochs of the last profiles, after one of the first, from which the GPS week is counted."""
+        files = self.files(source.path)
+        epochs = EpochReader(_clock(source, files), source.path)
+        try:
+            first, last = open_table(files[0]), open_table(files[-1])
+            stamp = EPOCH if EPOCH in first.schema.names else _STAMP
+            ends = [next((part for _, part in first.parts(1, [stamp])), None), last.ending(stamp)]
+        except (*UNREADABLE, FormatError):
+            return
+        batches = [batch for batch in ends if isinstance(batch, pa.RecordBatch)]
+        for batch in batches if len(batches) == len(ends) else ():
+            sieve = Sieve(batch.num_rows)
+            stamps = column_stamps(batch.column(stamp), sieve, is_epoch=stamp == EPOCH)
+            found = epochs.epochs(stamps, sieve, np.arange(batch.num_rows)) if sieve.good.any() else np.empty(0)
+            if sieve.good.any():
+                yield Rows("scans", pa.RecordBatch.from_pydict({EPOCH: pa.array(found[sieve.kept])}))
+
+
+def _parts(file: Path, rows: int) -> Iterator[tuple[int, pa.RecordBatch | Lost]]:
+    try:
+        table = open_table(file)
+        _check_columns(table.schema, file)
+    except (*UNREADABLE, FormatError) as error:
+        yield 0, Lost(f"the file cannot be read: {brief(error)}", 1, whole=True)
+        return
+    yield from table.parts(rows, _COLUMNS)
+
+
+def _schema_or_none(file: Path) -> pa.Schema | None:
+    try:
+        return open_table(file).schema
+    except (*UNREADABLE, FormatError):
+        return None
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
+
+
+def _is_scans(schema: pa.Schema) -> bool:
+    names = schema.names
+    return "range" in names and (EPOCH in names or _STAMP in names) and _is_list(schema.field("range").type)
+
+
+def _check_columns(schema: pa.Schema, file: Path) -> None:
+    if not _is_scans(schema):
+        raise FormatError(
+            "the table has the columns " + ", ".join(schema.names),
+            expected=f"'{EPOCH}' (or '{_STAMP}') and 'range', a list of uint16",
+            file=file,
+        )
+    for name, inner in (("range", pa.uint16()), ("intensity", pa.uint8())):
+        if name in schema.names:
+            kind = schema.field(name).type
+            if not _is_list(kind) or kind.value_type != inner:
+                raise FormatError(f"column '{name}' is {kind}", expected=f"a list of {inner}", file=file)
+    integer, floating = pa.types.is_integer, pa.types.is_floating
+    stamp = EPOCH if EPOCH in schema.names else _STAMP
+    kind = schema.field(stamp).type
+    if not (kind == pa.int64() if stamp == EPOCH else integer(kind) or floating(kind)):
+        raise FormatError(
+            f"column '{stamp}' is {kind}",
+            expected="int64" if stamp == EPOCH else "a number in the unit of the log's clock",
+            file=file,
+        )
+    if "encoder_ticks" in schema.names and not integer(schema.field("encoder_ticks").type):
+        raise FormatError(
+            f"column 'encoder_ticks' is {schema.field('encoder_ticks').type}", expected="int64", file=file
+        )
+
+
+def _clock(source: LogSource, files: list[Path]) -> Clock:
+    """Clock of the stamps, by the first file that can be read."""
+    schema = next((schema for file in files if (schema := _schema_or_none(file)) is not None), None)
+    stamped = schema is not None and EPOCH not in schema.names
+    return (source.any_clock if stamped else None) or Clock(TimeSystem.GPS, unit="ns")
+
+
+def _check_clock(source: LogSource, schema: pa.Schema) -> None:
+    if EPOCH in schema.names:
+        refuse_clock(source)
+    else:
+        source.need_clock("gps", unit="s")
+
+
+def _geometry(source: LogSource, schemas: list[tuple[Path, pa.Schema]]) -> ScanGeometry:
+    """The one geometry that options and files state."""
+    options = options_of(source, ScansOptions)
+    stated: list[tuple[str | Path, ScanGeometry]] = []
+    if options.scan_geometry is not None:
+        stated.append(("the log's options", options.scan_geometry))
+    for file, schema in schemas:
+        text = (schema.metadata or {}).get(GEOMETRY_KEY.encode())
+        if text is not None:
+            stated.append((file, ScanGeometry.parse(_json(text, file), file=file)))
+    if not stated:
+        raise ConfigError(
+            "the geometry of the readings is not stated",
+            expected=f"schema metadata '{GEOMETRY_KEY}' (JSON), or options.scan_geometry",
+            change='for example options.scan_geometry = { kind = "cartesian", readings = 4000, first = -2.0, '
+            "step = 0.001, range_offset_m = 1.7, range_step_m = 0.0001 }",
+            file=source.path,
+            missing=Missing("options.scan_geometry"),
+        )
+    for where, other in stated[1:]:
+        if other != stated[0][1]:
+            raise ConfigError(
+                f"{where} states another scan geometry than {stated[0][0]}",
+                expected="one geometry a log",
+                change="split the log, or correct the one that is wrong",
+                file=source.path,
+            )
+    return stated[0][1]
+
+
+def _json(text: bytes, file: Path) -> dict[str, Any]:
+    try:
+        values = json.loads(text)
+    except ValueError as error:
+        raise ConfigError(f"schema metadata '{GEOMETRY_KEY}' is not JSON: {error}", file=file) from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"schema metadata '{GEOMETRY_KEY}' is not a JSON object", file=file)
+    return values
+
+
+def _profiles(batch: pa.RecordBatch, readings: int, epochs: EpochReader, name: str, first: int) -> Iterator[Item]:
+    """Check a batch's rows and bring them to the schema's columns."""
+    lists = [n for n in ("range", "intensity") if n in batch.schema.names]
+    sieve = Sieve(batch.num_rows)
+    for column in lists:
+        lengths = pc.list_value_length(batch.column(column))
+        sieve.drop(np.asarray(lengths.is_null()), f"{column} is missing")
+        wrong = lengths.fill_null(readings).to_numpy(zero_copy_only=False) != readings
+        sieve.drop(wrong, f"{column} does not hold {readings} readings")
+    stamp = EPOCH if EPOCH in batch.schema.names else _STAMP
+    records = first + np.arange(batch.num_rows)
+    stamps = column_stamps(batch.column(stamp), sieve, is_epoch=stamp == EPOCH)
+    epochs_gps_ns = epochs.epochs(stamps, sieve, records) if sieve.good.any() else np.empty(0)
+    for reject in sieve.rejects(records, np.full(batch.num_rows, -1)):
+        yield dataclasses.replace(reject, file=name)
+    if not sieve.good.any():
+        return
+    kept = batch if sieve.good.all() else batch.filter(pa.array(sieve.good))
+    columns = {EPOCH: pa.array(epochs_gps_ns[sieve.kept])} | {n: _fixed(kept.column(n), readings) for n in lists}
+    if "encoder_ticks" in kept.schema.names:
+        columns["encoder_ticks"] = kept.column("encoder_ticks").cast(pa.int64(), safe=False)
+    yield Rows("scans", pa.RecordBatch.from_pydict(columns), name, int(records[np.argmax(sieve.good)]))
+
+
+def _fixed(column: pa.Array, readings: int) -> pa.Array:
+    """Lists of `readings` values as a fixed-size list; a null reading is 0, no return."""
+    values = column.flatten()
+    return pa.FixedSizeListArray.from_arrays(values.fill_null(0) if values.null_count else values, readings)

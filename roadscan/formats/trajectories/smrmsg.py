@@ -1,0 +1,293 @@
+"""SMRMSG, the accuracy file that Applanix POSPac writes beside an SBET trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.core.errors import FormatError
+from roadscan.core.gpstime import WEEK_S, Clock
+from roadscan.core.toml_text import toml
+from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject
+from roadscan.ingest.reading.poses import SIGMA_MAX_DEG, SIGMA_MAX_M, block_rows, check_sigmas
+from roadscan.ingest.reading.records import LEAP_NS, EpochReader, Sieve
+from roadscan.ingest.reading.text_table import byte_pieces, head_of
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+FIELDS: Final = 10
+RECORD_BYTES: Final = 8 * FIELDS
+CLOCK_EXAMPLE: Final[dict[str, Any]] = {"system": "gps_week_seconds", "week": 2405}
+
+SIGMAS: Final = {
+    "sigma_north_m": 1.0,
+    "sigma_east_m": 1.0,
+    "sigma_down_m": 1.0,
+    "sigma_velocity_north_m_per_s": 1.0,
+    "sigma_velocity_east_m_per_s": 1.0,
+    "sigma_velocity_down_m_per_s": 1.0,
+    "sigma_roll_deg": 1 / 60,
+    "sigma_pitch_deg": 1 / 60,
+    "sigma_heading_deg": 1 / 60,
+}
+"""Columns in the order of a record's fields behind the time, and their size in the column's unit: arc minutes
+become degrees."""
+CARRIED: Final = tuple(name for name in SIGMAS if "velocity" not in name)
+"""Those that a pose has a column for."""
+
+GAP_INTERVALS: Final = 2.5
+"""Between records more than so many usual intervals apart σ is not known: one lost record is bridged, two are not."""
+USUAL_RECORDS: Final = 1_000
+"""The usual interval is the median one of so many first records."""
+
+_LIMITS: Final = np.array([SIGMA_MAX_M] * 6 + [SIGMA_MAX_DEG * 60] * 3)
+
+
+class Smrmsg(LogFormat):
+    """Little-endian records of 10 doubles without a header.
+
+    Time (s), 1 σ of the position north, east, down (m), of the velocity north, east, down (m/s), of
+    roll, pitch, heading (arc minutes; roadscan keeps degrees). Read as a log of its own it fills
+    `trajectory_accuracy`. To carry its σ with the poses, name it in the SBET log instead: options =
+    { accuracy = "smrmsg_mission.out" }. A file packed with gzip, bzip2 or xz is read as it is.
+    """
+
+    name = "smrmsg"
+    title = "Applanix SMRMSG accuracy (POSPac): σ of a trajectory, 10 doubles a record"
+    yields = ("trajectory_accuracy",)
+    suffixes: ClassVar[tuple[str, ...]] = (".smrmsg",)
+    accompanies: ClassVar[Mapping[str, str]] = {"sbet": "accuracy"}
+    time = (
+        "as SBET: seconds of the GPS week; the week is not in the file: "
+        f"state clock = {toml(CLOCK_EXAMPLE)} or date = …"
+    )
+
+    def sniff(self, path: Path) -> bool:
+        """True if the first records are plausible σ and their times grow."""
+        if not path.is_file():
+            return False
+        head = head_of(path, 8 * RECORD_BYTES)
+        records = np.frombuffer(head[: len(head) // RECORD_BYTES * RECORD_BYTES], dtype="<f8").reshape(-1, FIELDS)
+        if records.size == 0 or not np.all(np.isfinite(records)):
+            return False
+        time, sigmas = records[:, 0], records[:, 1:]
+        # Other binary data read as doubles is full of numbers next to nothing.
+        ordinary = np.all((sigmas == 0) | (sigmas > 1e-9)) and np.all(sigmas <= _LIMITS) and np.all(sigmas >= 0)
+        known = np.all(sigmas[:, :3] > 0)  # no solution is without error
+        growing = np.all(time[1:] > time[:-1]) and time[0] >= 0 and time[-1] <= 2 * WEEK_S
+        return bool(ordinary and known and growing and np.all((time == 0) | (time > 1e-6)))
+
+    def header(self, source: LogSource) -> LogHeader:
+        """Check the clock."""
+        source.need_file()
+        EpochReader(source.need_clock(**CLOCK_EXAMPLE), source.path)
+        return LogHeader()
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream σ; a damaged record is rejected, and so is a truncated last one."""
+        for block in accuracy_blocks(source.path, source.need_clock(**CLOCK_EXAMPLE)):
+            if isinstance(block, Reject):
+                yield block
+                continue
+            columns = {"epoch_gps_ns": pa.array(block.epochs)}
+            columns |= {name: pa.array(v.astype(np.float32)) for name, v in zip(SIGMAS, block.sigmas, strict=True)}
+            yield block_rows("trajectory_accuracy", columns, block.records, block.records * RECORD_BYTES, RECORD_BYTES)
+
+
+@dataclass(frozen=True)
+class AccuracyBlock:
+    """Sound records, one after another."""
+
+    records: Int64
+    """(n,) record numbers."""
+    epochs: Int64
+    """(n,) GPS nanoseconds."""
+    sigmas: Float64
+    """(9, n) in the order and units of :data:`SIGMAS`."""
+
+
+def accuracy_blocks(path: Path, clock: Clock, near_s: float | None = None) -> Iterator[AccuracyBlock | Reject]:
+    """Stream an SMRMSG file.
+
+    Parameters
+    ----------
+    near_s : a stamp of the trajectory it belongs to, see :class:`EpochReader`.
+
+    Raises
+    ------
+    FormatError
+        if there is no whole record.
+    TimeSystemError
+        if the clock fits no stamp of the file's first block.
+    """
+    reader = EpochReader(clock, path, near_s)
+    first, carry = 0, b""
+    for piece in byte_pieces(path):
+        if isinstance(piece, Reject):
+            yield replace(piece, record=first, offset=first * RECORD_BYTES)
+            carry = b""
+            break
+        data = carry + piece
+        whole = len(data) // RECORD_BYTES
+        if whole:
+            fields = np.frombuffer(data, dtype="<f8", count=whole * FIELDS).reshape(-1, FIELDS).T
+            yield from _block(np.ascontiguousarray(fields, dtype=np.float64), first, reader)
+        first, carry = first + whole, data[whole * RECORD_BYTES :]
+    if first == 0:
+        raise FormatError(f"the file has {len(carry)} bytes", expected=f"records of {RECORD_BYTES} bytes", file=path)
+    if carry:
+        reason = f"the file ends inside a record: {len(carry)} bytes of {RECORD_BYTES}"
+        yield Reject(reason, first, first * RECORD_BYTES)
+
+
+def _block(fields: Float64, first: int, reader: EpochReader) -> Iterator[AccuracyBlock | Reject]:
+    """Sound records of the fields (10, n), then the rejects."""
+    records = np.arange(first, first + fields.shape[1], dtype=np.int64)
+    sieve = Sieve(records.size)
+    with np.errstate(over="ignore", invalid="ignore"):  # damaged records, dropped below
+        sigmas = fields[1:] * np.array(list(SIGMAS.values()))[:, None]
+    for name, values in zip(SIGMAS, sigmas, strict=True):
+        sieve.drop(~np.isfinite(values), f"{name} is missing or not a number")
+    check_sigmas(dict(zip(SIGMAS, sigmas, strict=True)), sieve)
+    epochs = reader.epochs(fields[0], sieve, records)
+    if sieve.good.any():
+        good = sieve.kept
+        yield AccuracyBlock(records[good], epochs[good], sigmas[:, good])
+    yield from sieve.rejects(records, records * RECORD_BYTES)
+
+
+class CarriedAccuracy:
+    """The σ of an SMRMSG file at the epochs of the poses it belongs to.
+
+    Both files are read side by side, in order of time: only the records about the poses at hand are
+    held. Between two records σ is linear in time; there is none beyond the file's span, and in a gap,
+    where two records are more than 2.5 usual intervals apart (:data:`GAP_INTERVALS`; the usual interval is the
+    median of the file's first 1,000).
+
+    Parameters
+    ----------
+    path : the SMRMSG file.
+    name : how rejects name it.
+    clock, near_s : of the trajectory, see :func:`accuracy_blocks`.
+    """
+
+    def __init__(self, path: Path, name: str, clock: Clock, near_s: float | None) -> None:
+        if not path.is_file():
+            raise FormatError("the accuracy file does not exist", change="check options.accuracy", file=path)
+        self._path = path
+        self._name = name
+        self._blocks = accuracy_blocks(path, clock, near_s)
+        self._ended = False
+        self._rejects: list[Reject] = []
+        self._epochs = np.empty(0, dtype=np.int64)
+        self._sigmas = np.empty((len(SIGMAS), 0))
+        self._gap_ns: float | None = None
+        self._asked = self._answered = self._held = 0
+        self._first_reject = ""
+
+    def at(self, epochs: Int64) -> dict[str, Float64]:
+        """σ by column name (:data:`CARRIED`), (n,) with NaN beyond the file's span and in its gaps, at epochs (n,)."""
+        if self._gap_ns is None:
+            self._gap_ns = self._measured_gap_ns()
+        self._advance(int(epochs.min()), int(epochs.max()))
+        unknown = self._in_gap(epochs, self._gap_ns)
+        origin = self._epochs[0] if self._epochs.size else 0
+        known, wanted = (self._epochs - origin).astype(np.float64), (epochs - origin).astype(np.float64)
+        out: dict[str, Float64] = {}
+        for name, sigma in zip(SIGMAS, self._sigmas, strict=True):
+            if name in CARRIED:
+                out[name] = (
+                    np.where(unknown, np.nan, np.interp(wanted, known, sigma, left=np.nan, right=np.nan))
+                    if known.size
+                    else np.full(epochs.size, np.nan)
+                )
+        self._asked += epochs.size
+        self._answered += int(np.isfinite(out["sigma_north_m"]).sum())
+        return out
+
+    def rejects(self) -> Iterator[Reject]:
+        """Damaged records met since the last call."""
+        yield from self._rejects
+        self._rejects = []
+
+    def finish(self) -> Iterator[Reject]:
+        """Read the file to its end, for its damaged records.
+
+        Raises
+        ------
+        FormatError
+            if the file holds no σ for any of the poses.
+        """
+        while self._next() is not None:
+            yield from self.rejects()
+        yield from self.rejects()
+        if self._asked and not self._held and self._first_reject:
+            raise FormatError(
+                f"no record of it is sound: {self._first_reject}",
+                expected="σ of positions and angles, none of them negative",
+                change="export the accuracy file anew, or leave out options.accuracy of the SBET log",
+                file=self._path,
+            )
+        if self._asked and not self._answered:
+            raise FormatError(
+                f"no record lies within the time of the trajectory's {self._asked} poses",
+                expected="the accuracy file of the same mission",
+                change="check options.accuracy of the SBET log",
+                file=self._path,
+            )
+
+    def _next(self) -> AccuracyBlock | None:
+        """The next sound records, None at the file's end; rejects are kept."""
+        while not self._ended:
+            block = next(self._blocks, None)
+            if isinstance(block, Reject):
+                self._rejects.append(replace(block, file=self._name))
+                self._first_reject = self._first_reject or block.reason
+                continue
+            self._ended = block is None
+            return block
+        return None
+
+    def _advance(self, first: int, last: int) -> None:
+        """Hold the records about the span of epochs, with one on either side."""
+        while (not self._epochs.size or self._epochs[-1] < last) and (block := self._next()) is not None:
+            self._hold(block)
+            self._forget(first)
+        self._forget(first)
+
+    def _hold(self, block: AccuracyBlock) -> None:
+        self._held += block.epochs.size
+        self._epochs = np.concatenate([self._epochs, block.epochs])
+        self._sigmas = np.concatenate([self._sigmas, block.sigmas], axis=1)
+        if np.any(np.diff(self._epochs) < 0):
+            order = np.argsort(self._epochs, kind="stable")
+            self._epochs, self._sigmas = self._epochs[order], self._sigmas[:, order]
+
+    def _measured_gap_ns(self) -> float:
+        """Time between two records from which on they have a gap between them, from the file's first records."""
+        while self._epochs.size < USUAL_RECORDS and (block := self._next()) is not None:
+            self._hold(block)
+        intervals = np.diff(self._epochs[:USUAL_RECORDS])
+        intervals = intervals[intervals > 0]
+        return GAP_INTERVALS * float(np.median(intervals)) if intervals.size else np.inf
+
+    def _in_gap(self, epochs: Int64, gap_ns: float) -> Bool:
+        """Epochs (n,) that lie in a gap, and on no record."""
+        if self._epochs.size < 2:
+            return np.zeros(epochs.size, dtype=bool)
+        behind = np.clip(np.searchsorted(self._epochs, epochs), 1, self._epochs.size - 1)
+        after, before = self._epochs[behind], self._epochs[behind - 1]
+        return np.asarray((after - before > gap_ns) & (epochs != after) & (epochs != before))
+
+    def _forget(self, first: int) -> None:
+        """Let go of the records long before `first`; poses may be a little out of order."""
+        start = max(int(np.searchsorted(self._epochs, first - LEAP_NS)) - 1, 0)
+        self._epochs, self._sigmas = self._epochs[start:], self._sigmas[:, start:]

@@ -1,0 +1,234 @@
+"""Pairs of stamps of the survey file: read, fitted, and put into the clock of their log."""
+
+from __future__ import annotations
+
+import csv
+import datetime as dt
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.clock_evidence import PairEvidence
+from roadscan.core.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
+from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem
+from roadscan.core.survey import ClockConfig, LogConfig, Survey
+from roadscan.ingest.reading.stamps import CALENDAR_SCALES, parse_calendar
+from roadscan.navigation.clocks.pairs import PairFit, Pairs, clock_from_arrivals, clock_from_pairs
+from roadscan.store.store import file_digest
+
+Int64 = npt.NDArray[np.int64]
+
+_WEEK_NS: Final = WEEK_S * NS_PER_S
+_MOST_NS: Final = 1 << 61
+_DELIMITERS: Final = ",;\t"
+
+Written = int | float | str | dt.datetime
+
+
+@dataclass(frozen=True)
+class LogPairs:
+    """Pairs of one log with what they say."""
+
+    fit: PairFit
+    faults: tuple[str, ...]
+    """Records of the table that cannot be read, with the reason."""
+
+
+def log_clock(survey: Survey, log: LogConfig) -> Clock | None:
+    """Clock of a log as the survey file states it, with what its pairs of stamps say; None where none is stated.
+
+    Raises
+    ------
+    RoadscanError
+        where the pairs cannot be read.
+    """
+    if log.clock is None:
+        return None
+    found = log_pairs(survey, log)
+    if found is None:
+        return log.clock.clock()
+    fit = found.fit
+    return replace(log.clock.clock(), offset_s=fit.offset_s, drift_ppm=fit.drift * 1e6, reference_s=fit.reference_s)
+
+
+def log_pairs(survey: Survey, log: LogConfig) -> LogPairs | None:
+    """Pairs of a log and the line through them; None where the survey file gives none."""
+    if log.clock is None or log.clock.pairs is None:
+        return None
+    table = log.clock.pairs.table
+    if table is None:
+        return _fitted(log.clock.model_dump_json(), None, "")
+    path = survey.resolve(table)
+    try:
+        content = file_digest(path)
+    except OSError as error:
+        raise FormatError(f"the table of pairs cannot be opened: {error.strerror}", file=path) from error
+    return _fitted(log.clock.model_dump_json(), path, content)
+
+
+@functools.lru_cache(maxsize=64)
+def _fitted(clock_json: str, path: Path | None, _content: str) -> LogPairs:
+    """Fit of a clock's pairs, remembered from one stage to the next for as long as the table's content stays."""
+    clock = ClockConfig.model_validate_json(clock_json)
+    if clock.pairs is None:
+        raise ConfigError("the clock has no pairs")
+    rows = _typed(clock.pairs) if path is None else _listed(path)
+    pairs, faults = _pairs(clock, clock.pairs, rows, path)
+    fit = clock_from_arrivals if clock.pairs.arrivals else clock_from_pairs
+    return LogPairs(fit(pairs, clock.pairs.drift), tuple(faults))
+
+
+def _typed(evidence: PairEvidence) -> Iterator[tuple[int, Written, Written, float | None]]:
+    for number, pair in enumerate(evidence.typed, 1):
+        yield number, pair.stamp, pair.time, pair.sigma_s
+
+
+def _listed(path: Path) -> Iterator[tuple[int, Written, Written, float | None]]:
+    """Records of a text table with a line of names: stamp, time and, if it has one, sigma_s."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise FormatError(f"the table of pairs cannot be read as text: {error}", file=path) from error
+    lines = text.splitlines()
+    delimiter = max(_DELIMITERS, key=lines[0].count) if lines else ","
+    try:
+        records = list(csv.reader(lines, delimiter=delimiter))
+    except csv.Error as error:
+        raise FormatError(f"the table of pairs is no text table: {error}", file=path) from error
+    names = [name.strip().lower() for name in (records[0] if records else [])]
+    missing = [name for name in ("stamp", "time") if name not in names]
+    if missing:
+        raise FormatError(
+            f"the table of pairs has no column '{missing[0]}' (it has: {', '.join(names) or 'none'})",
+            expected="a first line with the names stamp and time, and sigma_s if the pairs differ",
+            file=path,
+        )
+    stamp, time = names.index("stamp"), names.index("time")
+    sigma = names.index("sigma_s") if "sigma_s" in names else None
+    for number, fields in enumerate(records[1:], 1):
+        if not any(field.strip() for field in fields):
+            continue
+        full = [*fields, *[""] * (len(names) - len(fields))]
+        yield number, full[stamp].strip(), full[time].strip(), _sigma(full[sigma]) if sigma is not None else None
+
+
+def _sigma(word: str) -> float | None:
+    try:
+        return float(word) if word.strip() else None
+    except ValueError:
+        return -1.0
+
+
+def _pairs(
+    clock: ClockConfig,
+    evidence: PairEvidence,
+    rows: Iterator[tuple[int, Written, Written, float | None]],
+    path: Path | None,
+) -> tuple[Pairs, list[str]]:
+    """Pairs on GPS time; a record that cannot be read is named, and the others are kept."""
+    stamps, times, sigmas, faults = [], [], [], []
+    first_error: RoadscanError | None = None
+    stated = clock.clock()
+    for number, stamp, time, sigma in rows:
+        try:
+            if sigma is not None and not 0.0 < sigma < float("inf"):
+                raise FormatError("sigma_s is no positive number", file=path, record=number)
+            nanoseconds = _stamp_ns(stated, stamp)
+            times.append(_time_ns(evidence, time))
+        except RoadscanError as error:
+            error.file, error.record = None if path is None else str(path), number
+            first_error = first_error or error
+            faults.append(str(error))
+            continue
+        stamps.append(nanoseconds)
+        sigmas.append(sigma or evidence.sigma_s)
+    if first_error is not None and (path is None or not stamps):
+        raise first_error  # what was typed is to be corrected; a damaged line of a file costs itself
+    if not stamps:
+        raise FormatError("the table holds no pair", expected="at least one", file=path)
+    time_gps = _whole_weeks(np.array(times, dtype=np.int64), evidence)
+    stamp_ns = np.array(stamps, dtype=np.int64)
+    own, nominal = replace(stated, unit="ns").counted_ns(stamp_ns)
+    if stated.system is TimeSystem.GPS_WEEK:  # the week is the one that comes nearest: a log may have begun before
+        weeks = np.rint((time_gps - nominal) / _WEEK_NS).astype(np.int64)
+        own, nominal = own + weeks * _WEEK_NS, nominal + weeks * _WEEK_NS
+    latency_ns = round(evidence.least_latency_s * NS_PER_S)
+    return Pairs(own, nominal, time_gps - latency_ns, np.array(sigmas)), faults
+
+
+def _stamp_ns(clock: Clock, written: Written) -> int:
+    """Nanoseconds of the clock's own count."""
+    number = _number_ns(written, UNIT_NS[clock.unit])
+    if number is not None:
+        return number
+    word = written.isoformat() if isinstance(written, dt.datetime) else str(written)
+    zoned = parse_calendar([word], zoned=True)
+    if zoned is not None and clock.system is TimeSystem.UNIX_UTC:
+        return int(zoned[0])
+    plain = parse_calendar([word], zoned=False)
+    if zoned is None and plain is not None and clock.system in CALENDAR_SCALES:
+        return int(plain[0])
+    raise TimeSystemError(
+        f"stamp '{word[:40]}' of a pair does not fit the clock, which is {clock.system}",
+        expected=f"a number in {clock.unit}, or for unix_utc, unix_gps, unix_tai a calendar time (a zone: UTC only)",
+    )
+
+
+def _time_ns(evidence: PairEvidence, written: Written) -> int:
+    """GPS time in nanoseconds; for seconds of the week, in the week or on the date that is stated."""
+    word = written.isoformat() if isinstance(written, dt.datetime) else str(written)
+    number = _number_ns(written, UNIT_NS[evidence.unit])
+    if number is not None:
+        if evidence.system is None:
+            raise TimeSystemError(
+                f"time '{word[:40]}' of a pair is a number, and its system is not stated",
+                expected='pairs.system, such as "gps_week_seconds" or "gps"',
+            )
+        return _gps_ns(Clock(evidence.system, "ns", evidence.week, evidence.date), number)
+    zoned = parse_calendar([word], zoned=True)
+    if zoned is not None:
+        return _gps_ns(Clock(TimeSystem.UNIX_UTC, "ns"), int(zoned[0]))
+    plain = parse_calendar([word], zoned=False)
+    if plain is not None and evidence.system in CALENDAR_SCALES:
+        return _gps_ns(Clock(evidence.system, "ns"), int(plain[0]))
+    raise TimeSystemError(
+        f"time '{word[:40]}' of a pair is "
+        + ("without a zone" if plain is not None else "neither number nor ISO 8601"),
+        expected="such as 2026-05-04T09:30:00.2Z, or a number with pairs.system",
+        change='state pairs.system = "unix_utc" (or unix_gps, unix_tai) if it is written in that scale',
+    )
+
+
+def _gps_ns(clock: Clock, nanoseconds: int) -> int:
+    if clock.system is TimeSystem.GPS_WEEK and not 0 <= nanoseconds <= _WEEK_NS:
+        raise TimeSystemError(
+            f"time {nanoseconds / NS_PER_S:.3f} s is not seconds of the GPS week", expected="0 to 604800"
+        )
+    return int(clock.to_epoch_gps_ns(np.array([nanoseconds], dtype=np.int64))[0])
+
+
+def _whole_weeks(times: Int64, evidence: PairEvidence) -> Int64:
+    """Seconds of the week growing over a week's end: each less than half a week from the one before."""
+    if evidence.system is not TimeSystem.GPS_WEEK:
+        return times
+    back = np.concatenate([[0], np.cumsum(np.rint(np.diff(times) / _WEEK_NS))]).astype(np.int64)
+    return times - back * _WEEK_NS
+
+
+def _number_ns(written: Written, unit_ns: int) -> int | None:
+    """A number in nanoseconds, exactly as it is written; None for what is no number."""
+    if isinstance(written, dt.datetime):
+        return None
+    try:
+        value = Decimal(str(written)) * unit_ns
+    except InvalidOperation:
+        return None
+    if not value.is_finite() or abs(value) > _MOST_NS:
+        raise TimeSystemError(f"'{str(written)[:40]}' is no possible stamp", expected="a finite number")
+    return round(value)

@@ -1,0 +1,307 @@
+"""Ingest: raw logs → tables. A log read once is not read again; a damaged record costs itself alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from roadscan.core.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
+from roadscan.core.gpstime import TimeSystem
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding
+from roadscan.ingest.epoch_order import EpochOrder
+from roadscan.ingest.format import Item, LogHeader, LogSource, Reject
+from roadscan.ingest.laser_ranges import LaserRanges
+from roadscan.ingest.log_check import LogCheck, Refuses
+from roadscan.ingest.motion_checks import MotionCheck
+from roadscan.ingest.overlap import reject_words
+from roadscan.ingest.place_checks import PLACED, place_faults
+from roadscan.ingest.planned_logs import Logs, PlannedLog, plan_logs
+from roadscan.ingest.pose_checks import PoseRecords
+from roadscan.ingest.reading.future_times import FutureTimes
+from roadscan.ingest.repeated_profiles import RepeatedProfiles
+from roadscan.ingest.resolution import resolution_findings
+from roadscan.ingest.sources import stamp_of
+from roadscan.ingest.stray_points import CloudPoints
+from roadscan.run.engine.compute import Compute, Done, Inline
+from roadscan.store.logs import (
+    DataFile,
+    LogRecord,
+    has_log,
+    read_log_records,
+    record_path,
+    retire_log,
+    write_log_record,
+)
+from roadscan.store.store import Store
+from roadscan.store.writer import LogWriter
+
+DATA_TABLES: Final = ("scans", "returns", "cloud")
+"""Tables whose readings become points."""
+
+_SMALL_BYTES: Final = 64 << 20
+"""Logs that are smaller together are read in this process: to start workers takes longer."""
+
+
+@dataclass(frozen=True)
+class IngestResult:
+    """What came of one log."""
+
+    record: LogRecord
+    fresh: bool
+    """False where the store already held it."""
+
+
+@dataclass(frozen=True)
+class IngestTask:
+    """One log to be read, by any worker that sees the log and the store."""
+
+    store: Store
+    log: PlannedLog
+    replaces: tuple[LogRecord, ...] = ()
+    """The same bytes read before under other settings; no two tasks replace the same."""
+
+
+def ingest(
+    survey: Survey,
+    store: Store,
+    report: Callable[[str], None] = lambda _: None,
+    compute: Compute | None = None,
+    logs: Logs | None = None,
+) -> list[IngestResult]:
+    """Bring every log of the survey file into the tables: a task a log, trajectories before the others.
+
+    Parameters
+    ----------
+    report : hears of each log, in the order of :func:`plan_logs` whichever ends first.
+    compute : where logs are read; this process by default.
+    logs : what :func:`plan_logs` says, where that is known.
+
+    Raises
+    ------
+    RunError
+        after all logs were tried, if any could not be read; the others are kept.
+    """
+    planned, unplanned = plan_logs(survey, store) if logs is None else logs
+    failures = [str(u.error) for u in unplanned]
+    for failure in failures:
+        report(f"failed: {failure}")
+    results: list[IngestResult] = []
+    spans: dict[str, tuple[int, int]] = {}
+    listed = frozenset(p.key for p in planned)
+    held = frozenset(key for key in listed if has_log(store, key))
+    for first in (True, False):
+        now = [with_span(p, spans.get(p.run)) for p in planned if p.is_trajectory == first]
+        tasks = _tasks(store, now, listed, held)
+        for done in _ingested(tasks, held, compute or Inline()):
+            if done.result is None:
+                failures.append(_reason(done))
+                report(f"failed: {failures[-1]}")
+                continue
+            results.append(done.result)
+            _widen(spans, done.result.record)
+            report(_line(done.result))
+    if failures:
+        raise RunError(
+            f"{len(failures)} of {len(failures) + len(results)} logs could not be ingested: " + " | ".join(failures),
+            change="correct the survey file or the logs; the next run reads only what is missing",
+        )
+    return results
+
+
+def ingest_log(task: IngestTask) -> IngestResult:
+    """Bring one log into the tables, unless it is there already (runs on a worker)."""
+    store, log = task.store, task.log
+    if has_log(store, log.key):
+        return IngestResult(read_log_records(store, [log.key])[0], fresh=False)
+    _check_there(task)
+    with store.scratch() as folder:
+        writer, header = read_log(task, folder)
+        for old in task.replaces:
+            retire_log(store, old)
+        tables = writer.publish(store, log.run, log.sensor, log.key)
+    record = record_of(log, header, writer, tables)
+    write_log_record(store, record)
+    return IngestResult(record, fresh=True)
+
+
+def record_of(
+    log: PlannedLog, header: LogHeader, writer: LogWriter, tables: dict[str, tuple[DataFile, ...]]
+) -> LogRecord:
+    """The record of a log that was read."""
+    return LogRecord(
+        key=log.key,
+        run=log.run,
+        sensor=log.sensor,
+        format=log.format.name,
+        path=str(log.config.path),
+        content=log.content,
+        source_bytes=log.bytes,
+        tables=tables,
+        attributes=header.attributes,
+        rows=sum(n for t, n in writer.rows.items() if t != "rejects"),
+        rejected=sum(writer.reject_reasons.values()),
+        reject_reasons=dict(writer.reject_reasons),
+        findings=tuple(one if one.subject else replace(one, subject=str(log.config.path)) for one in writer.findings),
+    )
+
+
+def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
+    """The rows of a log, finished in a scratch folder, and what its header says."""
+    header = task.log.format.header(task.log.source)
+    writer, checks = LogWriter(folder, header.list_size), _checks(task.log.source, header)
+    for item in _items(task.log, header):
+        _take(writer, item, checks)
+    writer.finish()
+    for check in checks:
+        check.finish(writer, header)
+        writer.finish()
+    writer.findings += resolution_findings(writer, header, task.log.source)
+    _check_unchanged(task.log)
+    return writer, header
+
+
+def _check_there(task: IngestTask) -> None:
+    """A log that was ingested and moved away is planned as it was; it is missed where the store lost its record."""
+    if task.log.source.path.exists():
+        return
+    aside = f"damaged/{record_path(task.log.key)}"
+    why = f": its record was damaged ({aside})" if task.store.exists(aside) else ""
+    raise FormatError(
+        f"the log does not exist, and the store holds it no more{why}",
+        change="put the log back for one run",
+        file=task.log.source.path,
+    )
+
+
+def _check_unchanged(log: PlannedLog) -> None:
+    """Its key is that of the bytes that were fingerprinted: rows of others must not go by it."""
+    path, options = log.source.path, log.source.options
+    try:
+        same = stamp_of(path, log.format, log.format.companions(path, options)) == log.stamp
+    except OSError:
+        same = False
+    if not same:
+        raise FormatError("the log changed while it was read", change="run again when its upload has ended", file=path)
+
+
+def survey_records(survey: Survey, store: Store, logs: Logs | None = None) -> list[LogRecord]:
+    """Records of the survey file's logs; a log that was never ingested is an error."""
+    planned, unplanned = plan_logs(survey, store) if logs is None else logs
+    missing = [str(u.error) for u in unplanned]
+    missing += [f"{p.config.path} is not ingested, or has changed since" for p in planned if not has_log(store, p.key)]
+    if missing:
+        raise RunError(
+            f"{len(missing)} logs are not in the store: " + " | ".join(missing),
+            change="run `roadscan ingest` (or `roadscan run`) first",
+        )
+    return read_log_records(store, [p.key for p in planned])
+
+
+def _tasks(store: Store, logs: Sequence[PlannedLog], listed: frozenset[str], held: frozenset[str]) -> list[IngestTask]:
+    """A task a log. What the survey file still lists (`listed` keys: two layers of one file, say) is not replaced."""
+    missing = [log for log in logs if log.key not in held]
+    older: dict[tuple[str, str, str], list[LogRecord]] = {}
+    for old in read_log_records(store) if missing else ():
+        if old.key not in listed:
+            older.setdefault((old.run, old.sensor, old.content), []).append(old)
+    replaced = {log.key: tuple(older.pop((log.run, log.sensor, log.content), ())) for log in missing}
+    return [IngestTask(store, log, replaced.get(log.key, ())) for log in logs]
+
+
+def _ingested(
+    tasks: Sequence[IngestTask], held: frozenset[str], compute: Compute
+) -> Iterator[Done[IngestTask, IngestResult]]:
+    """What came of each task, in their order; logs that the store holds (`held` keys) are sent nowhere."""
+    missing = [t for t in tasks if t.log.key not in held]
+    if len(missing) < 2 or sum(t.log.bytes for t in missing) < _SMALL_BYTES:
+        yield from Inline().map(ingest_log, tasks)
+        return
+    arriving = compute.map(ingest_log, sorted(missing, key=lambda t: -t.log.bytes))
+    arrived: dict[str, Done[IngestTask, IngestResult]] = {}
+    for task in tasks:
+        if task.log.key in held:
+            yield from Inline().map(ingest_log, [task])
+            continue
+        while task.log.key not in arrived:
+            done = next(arriving)
+            arrived[done.task.log.key] = done
+        yield arrived.pop(task.log.key)
+
+
+def _reason(done: Done[IngestTask, IngestResult]) -> str:
+    """Why a log failed; what is no fault of a log or of its worker goes on."""
+    error = done.error or StoreError("no result", file=done.task.log.source.path)
+    if isinstance(error, FullDiskError):
+        return f"{done.task.log.source.path}: its rows cannot be kept: {error}"
+    if isinstance(error, RoadscanError):
+        return str(error)
+    if isinstance(error, OSError):  # of reading, a format has told
+        return f"{done.task.log.source.path}: its rows cannot be kept: {error}; see to the store's disk"
+    if type(error).__name__ == "KilledWorker":
+        return f"{done.task.log.source.path}: the worker process died twice while it read this log"
+    raise error
+
+
+def _widen(spans: dict[str, tuple[int, int]], record: LogRecord) -> None:
+    """Take the record's trajectory into the span of its run."""
+    span = record.span("trajectory")
+    if span is not None:
+        before = spans.get(record.run, span)
+        spans[record.run] = (min(before[0], span[0]), max(before[1], span[1]))
+
+
+def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
+    try:
+        yield from log.format.read(log.source, header)
+    except RoadscanError as error:
+        if error.file is None:
+            error.file = str(log.source.path)
+        raise
+    except OSError as error:
+        raise FormatError(f"the log cannot be read: {error.strerror or error}", file=log.source.path) from error
+
+
+def _checks(source: LogSource, header: LogHeader) -> list[LogCheck]:
+    """All that follow the rows of a log, in the order in which they are asked."""
+    free = source.clock is not None and source.clock.system is TimeSystem.FREE
+    poses = PoseRecords()
+    return [
+        Refuses(lambda rows: place_faults(rows.table, rows.batch, header) if rows.table in PLACED else ()),
+        Refuses(FutureTimes.of(source, header).refused),
+        EpochOrder(free=free),
+        RepeatedProfiles(),
+        poses,
+        CloudPoints(),
+        LaserRanges(in_sensor_frame=header.attributes.get("frame") == "sensor"),
+        MotionCheck(poses),
+    ]
+
+
+def _take(writer: LogWriter, item: Item, checks: Sequence[LogCheck]) -> None:
+    if isinstance(item, Finding):
+        writer.findings.append(item)
+        return
+    if isinstance(item, Reject):
+        writer.reject(item.file, item.record, item.offset, item.records, item.reason)
+        return
+    refused = writer.add(item.table, item.batch, [one for check in checks for one in check.refused(item)])
+    for check in checks:
+        check.take(item, [rows for rows, _ in refused])
+    for rows, reason in refused:
+        for record, offset, count in item.places(rows):
+            writer.reject(item.file, record, offset, count, reason)
+
+
+def with_span(log: PlannedLog, span: tuple[int, int] | None) -> PlannedLog:
+    """The log with the span of its run's trajectory (first and last GPS ns), which readers of short stamps need."""
+    return replace(log, source=replace(log.source, trajectory_span_gps_ns=span))
+
+
+def _line(result: IngestResult) -> str:
+    r = result.record
+    state = "read" if result.fresh else "known"
+    rejected = f", {r.rejected:,} rejected: {reject_words(r)}" if r.rejected else ""
+    return f"{state}: {r.run}/{r.sensor} {r.path} ({r.format}) {r.rows:,} rows{rejected}"

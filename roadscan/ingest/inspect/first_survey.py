@@ -1,0 +1,471 @@
+"""A first survey from a folder of logs: which logs there are, which belong to one drive, which sensors wrote them.
+
+Every file is told by its content and looked into as `roadscan inspect` does. What the logs say is filled in; what
+they do not say becomes a question of the written file (:mod:`roadscan.ingest.inspect.first_survey_text`), never a guess.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+from collections.abc import Iterator, Set
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import NS_PER_S, WEEK_S, TimeSystem
+from roadscan.core.rig import SensorKind
+from roadscan.ingest.format import LogFormat
+from roadscan.ingest.inspect.diagnosis import formats_of, specific_fault
+from roadscan.ingest.inspect.file_kinds import FileKind, kind_of
+from roadscan.ingest.inspect.inspect import Inspection, LogReport, Progress, inspect
+from roadscan.ingest.inspect.provisional import Need, raw_stamps_ns, sensor_kind
+
+Int64 = npt.NDArray[np.int64]
+
+WHOLE_BYTES: Final = 1 << 28
+"""A log up to this size is read to its end, so that its time span is known; of others only the beginning."""
+
+_SAMPLED: Final = 40
+_MOSTLY: Final = 0.5
+"""Companions of one mission share more than this of their time; those of missions one after another do not."""
+_DIGITS: Final = re.compile(r"\d+")
+_NOT_IN_A_NAME: Final = re.compile(r"[^A-Za-z0-9_.-]+")
+_NAME_LENGTH: Final = 64
+
+
+@dataclass
+class FoundLog:
+    """A log that roadscan can read, once all is stated."""
+
+    path: Path
+    """File or folder, absolute."""
+    inspection: Inspection
+    sensor: str = ""
+    """Name of the sensor of the rig that wrote it; "" for none."""
+    companions: dict[str, FoundLog] = field(default_factory=dict)
+    """Logs that belong to this one, by the setting of its format that names them."""
+
+    @property
+    def report(self) -> LogReport:
+        """What was read."""
+        if self.inspection.log is None:
+            raise ConfigError("the log was not read", file=self.path)
+        return self.inspection.log
+
+    @property
+    def format(self) -> LogFormat:
+        """Its format."""
+        return self.report.opened.format
+
+    @property
+    def needs(self) -> list[Need]:
+        """What the survey file has to state, but for the sensor, which has its name already."""
+        needs = [need for need in self.report.opened.needs if need.key != "sensor"]
+        keys = {need.key for need in needs}
+        if self.is_control:
+            said = (("crs", "CRS of its coordinates"), ("height", "kind of its heights"))
+            needs += [Need(key, f'{key} = "????"', what) for key, what in said if key not in keys]
+        return needs
+
+    @property
+    def is_assumed(self) -> bool:
+        """True if settings were assumed that decide on more than its time: what the log says of itself may change."""
+        return any(need.key.startswith("options.") and not need.is_of_time for need in self.report.opened.needs)
+
+    @property
+    def sensor_kind(self) -> SensorKind | None:
+        """Kind of the sensor that wrote it."""
+        return sensor_kind(self.format)
+
+    @property
+    def is_control(self) -> bool:
+        """True for ground control."""
+        return "control_points" in self.format.yields
+
+    @property
+    def is_road_lines(self) -> bool:
+        """True for lines of roads."""
+        return "road_lines" in self.format.yields
+
+    @property
+    def is_trajectory(self) -> bool:
+        """True for poses."""
+        return "trajectory" in self.format.yields
+
+    @property
+    def is_reference(self) -> bool:
+        """True for a cloud without times of its own: a scan of a place, not of a drive."""
+        return "cloud" in self.format.yields and self.report.is_time_assumed and self.report.time is None
+
+    @property
+    def stem(self) -> str:
+        """Name without suffixes."""
+        return self.path.name if self.path.is_dir() else self.path.name.split(".")[0]
+
+
+@dataclass
+class FoundRun:
+    """Logs of one drive."""
+
+    id: str
+    logs: list[FoundLog] = field(default_factory=list)
+
+
+@dataclass
+class FoundFolder:
+    """All that lies in a folder of logs."""
+
+    folder: Path
+    runs: list[FoundRun] = field(default_factory=list)
+    control: list[FoundLog] = field(default_factory=list)
+    references: list[FoundLog] = field(default_factory=list)
+    lines: list[Path] = field(default_factory=list)
+    """Vector layers with lines: perhaps centre lines."""
+    settings: list[tuple[Path, FileKind]] = field(default_factory=list)
+    """Survey, rig and scene files that are there already."""
+    unknown: list[tuple[Path, str]] = field(default_factory=list)
+    """Files that were not understood, and what they seem to be."""
+
+    @property
+    def logs(self) -> list[FoundLog]:
+        """Logs of all runs."""
+        return [log for run in self.runs for log in run.logs]
+
+    @property
+    def pairs(self) -> list[tuple[FoundLog, FoundLog, str]]:
+        """Logs that belong to another one: the other, the log, and the setting of the other that names it."""
+        return [(log, one, setting) for log in self.logs for setting, one in log.companions.items()]
+
+    @property
+    def further(self) -> list[FoundRun]:
+        """What belongs to no run, grouped by what it is."""
+        groups = (FoundRun("(control)", self.control), FoundRun("(reference)", self.references))
+        return [group for group in groups if group.logs]
+
+    @property
+    def sensors(self) -> dict[str, FoundLog]:
+        """One log of each sensor, by the sensor's name."""
+        return {log.sensor: log for log in reversed(self.logs) if log.sensor}
+
+
+def need_folder(folder: Path) -> None:
+    """ConfigError where `folder` is none."""
+    if not folder.is_dir():
+        raise ConfigError("there is no such folder", expected="a folder of logs", file=folder)
+
+
+def find_logs(folder: Path, progress: Progress = lambda rows, share: None) -> FoundFolder:
+    """Look through a folder, recursively, and order what is found.
+
+    Parameters
+    ----------
+    progress : hears of each log how far it is read.
+
+    Raises
+    ------
+    ConfigError
+        if `folder` is none.
+    """
+    need_folder(folder)
+    found = FoundFolder(folder.resolve())
+    logs: list[FoundLog] = []
+    for path in _candidates(found.folder):
+        _sort_in(path, found, logs, progress)
+    found.runs = _runs(_pair(logs, found.folder), found.folder)
+    for run in found.runs:
+        _name_sensors(run)
+    return found
+
+
+def _pair(logs: list[FoundLog], folder: Path) -> list[FoundLog]:
+    """Give each log that accompanies another to the one it fits best; those that are left, in their order."""
+    pairs = [
+        (score, log, main, log.format.accompanies[main.format.name])
+        for log in logs
+        for main in logs
+        if main.format.name in log.format.accompanies and (score := _closeness(log, main, folder)) is not None
+    ]
+    paired: set[Path] = set()
+    for _, log, main, setting in sorted(pairs, key=lambda pair: pair[0], reverse=True):
+        if log.path not in paired and setting not in main.companions:
+            main.companions[setting] = log
+            paired.add(log.path)
+    return [log for log in logs if log.path not in paired]
+
+
+def _closeness(log: FoundLog, main: FoundLog, folder: Path) -> tuple[bool, int, int, float] | None:
+    """How well a companion fits a log: most of their time in common, folders, words of the names, share of time.
+
+    None where their times are apart, or cannot be compared.
+    """
+    share = shared_time(log.report, main.report)
+    if share == 0:
+        return None
+    _, _, depth, words = _fit(log, main, folder)
+    return share > _MOSTLY, depth, words, share
+
+
+# --- what is a log --------------------------------------------------------------------------------
+
+
+def _candidates(folder: Path, taken: frozenset[Path] = frozenset()) -> Iterator[Path]:
+    """Folder logs and files, in order of name; stores, products' folders and hidden ones are left out.
+
+    Parameters
+    ----------
+    taken : files that belong to a folder log further up.
+    """
+    own = _taken_by_folder_log(folder) - taken
+    if own:
+        yield folder
+    taken |= own
+    for entry in _entries(folder):
+        if entry.name.startswith("."):
+            continue
+        if entry.is_file():
+            if entry not in taken:
+                yield entry
+        elif entry.is_dir() and not entry.is_symlink() and not _is_store(entry):
+            yield from _candidates(entry, taken)
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What lies in a folder, by name; nothing where it may not be read."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
+
+
+def _is_store(folder: Path) -> bool:
+    return folder.name.startswith("survey=") or any(child.name.startswith("survey=") for child in _entries(folder))
+
+
+def _taken_by_folder_log(folder: Path) -> frozenset[Path]:
+    """Files of the folder log that the folder is; empty if it is none.
+
+    A folder is a log if a format claims it and its files are no logs by themselves, or are parts of one: of the
+    same format, in one folder, with names that differ in digits only.
+    """
+    for log_format in formats_of(folder):
+        own = log_format.files(folder)
+        singly = {path: {f.name for f in formats_of(path)} for path in own[:_SAMPLED]}
+        others = {path for path, names in singly.items() if names and log_format.name not in names}
+        parts = [path for path, names in singly.items() if log_format.name in names]
+        is_one = not parts or (len(parts) > 1 and len({_pattern(path) for path in parts}) == 1)
+        if is_one and len(others) < len(singly) and (parts or not _holds_logs(folder, set(own) - others)):
+            return frozenset(own) - others
+    return frozenset()
+
+
+def _holds_logs(folder: Path, own: Set[Path]) -> bool:
+    """True if a deeper folder claims to be a log too, and holds all files of this one: it is the log then."""
+    below = [child for child in _entries(folder) if child.is_dir() and not child.is_symlink()]
+    return any(formats_of(child) and all(child in path.parents for path in own) for child in below)
+
+
+def _pattern(path: Path) -> tuple[Path, str]:
+    return path.parent, _DIGITS.sub("#", path.name)
+
+
+def _sort_in(path: Path, found: FoundFolder, logs: list[FoundLog], progress: Progress) -> None:
+    size = path.stat().st_size if path.is_file() else 0
+    inspection = inspect(path, quick=size > WHOLE_BYTES, progress=progress) if formats_of(path) else None
+    if inspection is not None and inspection.readable:
+        log = FoundLog(path, inspection)
+        if log.is_control:
+            found.control.append(log)
+        elif log.is_road_lines:
+            found.lines.append(path)
+        elif log.is_reference:
+            found.references.append(log)
+        else:
+            logs.append(log)
+        return
+    kind = kind_of(path)
+    if kind.role in {"survey", "rig", "scene"}:
+        found.settings.append((path, kind))
+    elif kind.role == "lines":
+        found.lines.append(path)
+    elif inspection is not None:
+        found.unknown.append((path, f"{inspection.what}, which cannot be read: {inspection.error}"))
+    elif kind.role != "product":
+        fault = None if kind.role == "archive" else specific_fault(path)
+        words = kind.words if fault is None else f"{fault.arrived}; {fault.change}".removesuffix("; ")
+        found.unknown.append((path, words + (" (unpack it first)" if kind.role == "archive" else "")))
+
+
+# --- which logs belong together -------------------------------------------------------------------
+
+
+def _runs(logs: list[FoundLog], folder: Path) -> list[FoundRun]:
+    """Runs: one a trajectory, or, without any, one a folder; every other log joins the run it fits best.
+
+    A log that has neither time, folder nor a word of its name in common with any trajectory makes a run of its own.
+    """
+    seeds = [log for log in logs if log.is_trajectory]
+    if not seeds:
+        return _runs_by_folder(logs, folder)
+    ids = _run_ids(seeds, folder)
+    runs = [FoundRun(name, [seed]) for name, seed in zip(ids, seeds, strict=True)]
+    lonely: list[FoundLog] = []
+    for log in logs:
+        if log.is_trajectory:
+            continue
+        scores = [_fit(log, seed, folder) for seed in seeds]
+        best = max(range(len(seeds)), key=lambda i: scores[i])
+        (runs[best].logs if any(scores[best][1:]) or len(seeds) == 1 else lonely).append(log)
+    known = {run.id for run in runs}
+    for run in _runs_by_folder(lonely, folder):
+        run.id = _fresh(run.id, known)
+        runs.append(run)
+    return runs
+
+
+def _runs_by_folder(logs: list[FoundLog], folder: Path) -> list[FoundRun]:
+    known: set[str] = set()
+    groups = itertools.groupby(sorted(logs, key=lambda log: log.path.parent), key=lambda log: log.path.parent)
+    return [
+        FoundRun(_fresh(parent.name if parent != folder else "run", known), list(group)) for parent, group in groups
+    ]
+
+
+def _run_ids(seeds: list[FoundLog], folder: Path) -> list[str]:
+    parents = [seed.path.parent for seed in seeds]
+    known: set[str] = set()
+    return [
+        _fresh(parent.name if parents.count(parent) == 1 and parent != folder else seed.stem, known)
+        for seed, parent in zip(seeds, parents, strict=True)
+    ]
+
+
+def _fit(log: FoundLog, seed: FoundLog, folder: Path) -> tuple[int, int, int, int]:
+    """How well a log fits a trajectory: time apart (−1), unknown (0) or overlapping; folders and words in common.
+
+    A log whose time is apart fits nothing: the rest counts 0 then.
+    """
+    overlap = overlaps(log.report, seed.report)
+    if overlap is False:
+        return -1, 0, 0, 0
+    home, there = _home(log, folder), _home(seed, folder)
+    shared = Path(os.path.commonpath([home, there]))
+    words = set(_words(log.stem)) & set(_words(seed.stem))
+    depth = len(shared.relative_to(folder).parts) + (home in {folder, there})
+    return int(bool(overlap)), int(bool(overlap)), depth, len(words)
+
+
+def _home(log: FoundLog, folder: Path) -> Path:
+    """Folder that the log lies in; the folder looked through where it is the log itself."""
+    return folder if log.path == folder else log.path.parent
+
+
+def overlaps(one: LogReport, other: LogReport) -> bool | None:
+    """Whether two logs overlap in time; None where their times cannot be compared."""
+    spans = _common_scale(one, other)
+    if spans is None:
+        return None
+    kind, a, b = spans
+    meets = a[0] <= b[1] and b[0] <= a[1]
+    return meets if kind != "free" or meets else None
+
+
+def shared_time(one: LogReport, other: LogReport) -> float:
+    """Share of two logs' time, from the first to the last epoch of both, that both have; 0 where it is unknown."""
+    spans = _common_scale(one, other)
+    if spans is None:
+        return 0.0
+    _, a, b = spans
+    both, either = min(a[1], b[1]) - max(a[0], b[0]), max(a[1], b[1]) - min(a[0], b[0])
+    return max(both, 0) / either if either else 1.0
+
+
+def _common_scale(one: LogReport, other: LogReport) -> tuple[str, list[int], list[int]] | None:
+    """The scale of two logs' time and their spans on it; None where they have none in common.
+
+    Seconds of the week are compared with GPS time by its own seconds of the week.
+    """
+    spans = [_comparable(one), _comparable(other)]
+    if any(span is None for span in spans):
+        return None
+    (kind_a, *a), (kind_b, *b) = (span for span in spans if span is not None)
+    if {kind_a, kind_b} == {"gps", "week"}:
+        week_ns = WEEK_S * NS_PER_S
+        a = [t % week_ns for t in a]
+        b = [t % week_ns for t in b]
+        if a[1] < a[0] or b[1] < b[0]:
+            return None  # a week ends inside
+    elif kind_a != kind_b:
+        return None
+    return kind_a, a, b
+
+
+def _comparable(report: LogReport) -> tuple[str, int, int] | None:
+    time = report.time
+    if time is None:
+        return None
+    if time.assumed is None:
+        return "gps", time.first_gps_ns, time.last_gps_ns
+    if time.is_past_the_hour:
+        return None
+    first, last = (int(ns) for ns in raw_stamps_ns(time.assumed, _stamps(time.first_gps_ns, time.last_gps_ns)))
+    return ("week" if time.assumed.system is TimeSystem.GPS_WEEK else "free"), first, last
+
+
+def _stamps(first: int, last: int) -> Int64:
+    return np.array([first, last], dtype=np.int64)
+
+
+# --- names ----------------------------------------------------------------------------------------
+
+
+def _name_sensors(run: FoundRun) -> None:
+    """Name the sensors of a run by its files, without what is only a number or names the drive."""
+    of_drive = {word for log in run.logs if log.is_trajectory for word in _words(log.stem)} | set(_words(run.id))
+    named: dict[str, list[FoundLog]] = {}
+    for log in run.logs:
+        if log.sensor_kind is None:
+            continue
+        words = [w for w in _words(log.stem) if not w.isdigit() and w not in of_drive]
+        named.setdefault(_sound_name("_".join(words)) or str(log.sensor_kind), []).append(log)
+    for name, logs in named.items():
+        for number, group in enumerate(_one_sensor_each(logs), 1):
+            for log in group:
+                log.sensor = name if number == 1 else f"{name}_{number}"
+
+
+def _one_sensor_each(logs: list[FoundLog]) -> list[list[FoundLog]]:
+    """Logs of one name, cut where they overlap or are of other formats: one sensor does not write two at a time."""
+    groups: list[list[FoundLog]] = []
+    for log in logs:
+        for group in groups:
+            if all(log.format is one.format and not overlaps(log.report, one.report) for one in group):
+                group.append(log)
+                break
+        else:
+            groups.append([log])
+    return groups
+
+
+def _words(stem: str) -> list[str]:
+    return [word for word in re.split(r"[^A-Za-z0-9]+", stem) if word]
+
+
+def _sound_name(text: str) -> str:
+    return _NOT_IN_A_NAME.sub("-", text).strip("-._")[:_NAME_LENGTH]
+
+
+def _fresh(text: str, known: set[str]) -> str:
+    """A name made of `text` that is not known yet; it is known then."""
+    name = _sound_name(text) or "run"
+    numbers = itertools.count(2)
+    fresh = name
+    while fresh in known:
+        fresh = f"{name[: _NAME_LENGTH - 5]}-{next(numbers)}"
+    known.add(fresh)
+    return fresh

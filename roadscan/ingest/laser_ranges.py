@@ -1,0 +1,192 @@
+"""Whether each laser of a spinning lidar measures the ranges that the lasers above and below it do."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.compute.robust import scatter_about
+from roadscan.core.witness import Finding, Witness
+from roadscan.ingest.format import LogHeader, Rows
+from roadscan.ingest.log_check import LogCheck
+from roadscan.store.writer import LogWriter
+
+Float64 = npt.NDArray[np.float64]
+
+LASER_RANGE: Final = Witness(
+    "laser_range",
+    input="lidar",
+    fault="One laser of a head measures ranges that are off: a damaged receiver, a wrong table of corrections.",
+    asks="the two lasers next to it in elevation: where all three see a plane, 1/range is linear in the direction",
+    does="up to four lasers that are off by more than 60 mm, and ten times its σ, to all sides alike, are left out and "
+    "named with the offset; where these do not explain all that does not fit, they are named and used",
+    told=("rejects", "findings"),
+)
+
+_TABLE: Final = "returns"
+_OFF_M: Final = 0.06
+"""Makers promise ±20 mm; of a recording of an HDL-32E, the largest median against the neighbours is 24 mm."""
+_SIGMAS: Final = 10.0
+_ALIKE: Final = 0.5
+"""Share of its offset within which the medians of all quarters of the turn lie, and the scatter (1 σ) about it."""
+_LEAST: Final = 100
+"""Firings of a quarter of the turn that count."""
+_MOST_LASERS: Final = 4
+_EVERY: Final = 8
+_MOST_CHUNKS: Final = 40
+"""One chunk in so many is looked at, at most so many: some ten million returns of a long capture."""
+_MOST_RES_M: Final = 1.0
+_NEAREST_M: Final = 1.0
+_EVEN: Final = 0.7
+"""Least ratio of the ranges of the two neighbours: beyond, they do not see one surface."""
+_AZIMUTH_RAD: Final = np.radians(2.0)
+
+
+@dataclass
+class LaserRanges(LogCheck):
+    """Compares the ranges of neighbouring lasers, in some chunks of one log."""
+
+    in_sensor_frame: bool
+    _chunks: int = 0
+    _found: dict[int, list[tuple[Float64, npt.NDArray[np.int64], float, float]]] = field(default_factory=dict)
+    """By laser and chunk: residuals (m) and quarters (n,), and what 1 m of each neighbour's range adds to them."""
+    _beside: dict[int, tuple[int, int]] = field(default_factory=dict)
+
+    def take(self, rows: Rows, refused: Sequence[npt.NDArray[np.int64]]) -> None:
+        """Look at a chunk, or not."""
+        if rows.table != _TABLE:
+            return
+        batch = rows.batch
+        self._chunks += 1
+        if not self.in_sensor_frame or self._chunks % _EVERY != 1 or self._chunks > _EVERY * _MOST_CHUNKS:
+            return
+        if "laser" not in batch.schema.names or batch.column("laser").null_count:
+            return
+        laser = batch.column("laser").to_numpy(zero_copy_only=False).astype(np.int64)
+        xyz = np.stack([np.asarray(batch.column(f"{a}_sensor_m"), dtype=np.float64) for a in "xyz"], axis=-1)
+        firing = np.cumsum(np.diff(laser, prepend=-1) <= 0)
+        if laser.size < _LEAST or laser.max() > 255 or laser.size < 4 * (firing[-1] + 1):
+            return
+        shape = int(firing[-1]) + 1, int(laser.max()) + 1
+        ranges, elevations, azimuths = (np.full(shape, np.nan) for _ in range(3))
+        own = np.linalg.norm(xyz, axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ranges[firing, laser] = np.where(own > 0, own, np.nan)
+            elevations[firing, laser] = np.arcsin(xyz[:, 2] / own)
+            azimuths[firing, laser] = np.arctan2(xyz[:, 1], xyz[:, 0])
+        known = np.flatnonzero(np.isfinite(ranges).sum(axis=0) >= _LEAST)
+        level = np.array([np.nanmedian(elevations[:, k]) for k in known.tolist()])
+        known, level = known[np.argsort(level)], np.sort(level)
+        last = known.size - 1
+        for mid in range(known.size if last >= 2 else 0):  # the lowest and the highest have two on one side
+            one, other = (1, 2) if mid == 0 else (last - 2, last - 1) if mid == last else (mid - 1, mid + 1)
+            three = [mid, one, other]
+            self._compare(ranges, azimuths, known[three].tolist(), level[three])
+
+    def _compare(self, ranges: Float64, azimuths: Float64, lasers: Sequence[int], level: Float64) -> None:
+        """Residuals of the first of three lasers against the two others, by firing; `level` (3,) elevations (rad)."""
+        mid, one, other = (ranges[:, k] for k in lasers)
+        span = float(np.sin(level[2] - level[1]))
+        if span <= 0:
+            return
+        share = float(np.sin(level[2] - level[0])) / span, float(np.sin(level[0] - level[1])) / span
+        with np.errstate(invalid="ignore", divide="ignore"):
+            should = 1.0 / (share[0] / one + share[1] / other)
+            off = mid - should
+            good = (np.abs(off) < _MOST_RES_M) & (np.minimum(one, other) > _EVEN * np.maximum(one, other))
+            good &= one > _NEAREST_M
+            for k in lasers[1:]:
+                good &= np.abs(np.sin(azimuths[:, k] - azimuths[:, lasers[0]])) < _AZIMUTH_RAD
+        if not good.any() or self._beside.setdefault(lasers[0], (lasers[1], lasers[2])) != (lasers[1], lasers[2]):
+            return
+        quarter = np.floor((azimuths[good, lasers[0]] + np.pi) / (np.pi / 2)).astype(np.int64)
+        pulls = [-float(np.median(w * (should[good] / r[good]) ** 2)) for w, r in zip(share, (one, other), strict=True)]
+        self._found.setdefault(lasers[0], []).append((off[good], quarter, *pulls))
+
+    def finish(self, writer: LogWriter, header: LogHeader) -> None:
+        """Leave the returns of lasers whose ranges are off out of the finished table."""
+        wrong, is_clear = self._wrong()
+        is_out = is_clear and len(wrong) <= _MOST_LASERS
+        for laser, (off_m, sigma_m, firings) in sorted(wrong.items()):
+            count = writer.leave_out(_TABLE, functools.partial(_is_of, laser)) if is_out else 0
+            if count:
+                writer.reject("", -1, -1, count, f"the ranges of laser {laser} are {1e3 * off_m:+,.0f} mm off")
+            writer.findings.append(_finding(laser, off_m, sigma_m, firings, count))
+
+    def _wrong(self) -> tuple[dict[int, tuple[float, float, int]], bool]:
+        """Offset and σ (m) of each laser that is off, and the firings that say so; and whether they explain all that
+        does not fit.
+
+        A wrong laser pulls the residuals of those beside it, so the one that explains most of them is taken, and its
+        pull off, until none is left.
+        """
+        lasers = sorted(k for k, parts in self._found.items() if sum(p[0].size for p in parts) >= _LEAST)
+        number = {laser: k for k, laser in enumerate(lasers)}
+        pulls = np.eye(len(lasers))
+        residuals, quarters = [], []
+        for laser in lasers:
+            parts = self._found[laser]
+            residuals.append(np.concatenate([p[0] for p in parts]))
+            quarters.append(np.concatenate([p[1] for p in parts]))
+            for side, other in enumerate(self._beside[laser]):
+                if other in number:
+                    pulls[number[laser], number[other]] = float(np.mean([p[2 + side] for p in parts]))
+        off_m = np.array([float(np.median(one)) for one in residuals])
+        wrong: dict[int, tuple[float, float, int]] = {}
+        for _ in lasers:
+            tried = [(*_explained(off_m, pulls[:, k]), k) for k in range(len(lasers)) if lasers[k] not in wrong]
+            _, by_m, k = min(tried, default=(0.0, 0.0, 0))
+            if abs(by_m) <= _OFF_M:
+                break
+            others = off_m[k] - by_m  # what other wrong lasers add to its residuals
+            sigma_m = _sigma_of(residuals[k] - others, quarters[k], by_m)
+            if sigma_m is None:
+                break
+            wrong[lasers[k]] = by_m, sigma_m, residuals[k].size
+            off_m = off_m - pulls[:, k] * by_m
+        return wrong, bool((np.abs(off_m) <= _OFF_M).all())
+
+
+def _is_of(laser: int, rows: pa.Table) -> npt.NDArray[np.bool_]:
+    """Rows (n,) of a laser."""
+    return np.asarray(rows.column("laser").to_numpy() == laser)
+
+
+def _explained(off_m: Float64, pull: Float64) -> tuple[float, float]:
+    """Sum of the residuals (m) that are left where one laser is off, and the offset (m) that leaves the least."""
+    own = np.flatnonzero(np.abs(pull) > 0)
+    ratios, weights = off_m[own] / pull[own], np.abs(pull[own])
+    order = np.argsort(ratios)
+    middle = np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)
+    by_m = float(ratios[order[min(int(middle), own.size - 1)]])
+    return float(np.abs(off_m - pull * by_m).sum()), by_m
+
+
+def _sigma_of(off_m: Float64, quarters: npt.NDArray[np.int64], middle_m: float) -> float | None:
+    """σ of an offset (m); None where the quarters of the turn do not agree on it, or it may be the scene's."""
+    medians = [
+        float(np.median(off_m[quarters == q])) for q in np.unique(quarters) if (quarters == q).sum() >= _LEAST
+    ]  # fmt: skip
+    scatter = scatter_about(off_m, middle_m)
+    if len(medians) < 2 or scatter > _ALIKE * abs(middle_m):
+        return None
+    if any(abs(one - middle_m) > _ALIKE * abs(middle_m) for one in medians):
+        return None
+    sigma_m = max(float(np.std(medians, ddof=1)) / np.sqrt(len(medians)), scatter / np.sqrt(off_m.size))
+    return sigma_m if abs(middle_m) > _SIGMAS * sigma_m else None
+
+
+def _finding(laser: int, off_m: float, sigma_m: float, firings: int, left_out: int) -> Finding:
+    done = f"its {left_out:,} returns were left out" if left_out else "it, or one beside it; all returns are used"
+    return LASER_RANGE.finds(
+        "",
+        f"the ranges of laser {laser} are {1e3 * off_m:+,.0f} mm (σ {1e3 * sigma_m:.1f} mm) off those that the lasers "
+        f"beside it measure of the same surfaces ({firings:,} firings): {done}; see to the head and its corrections",
+        left_out,
+    )

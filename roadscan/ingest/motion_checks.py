@@ -1,0 +1,237 @@
+"""What the poses of a log say of themselves as findings: heading, pitch, constant values, speeds, spacing and σ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.core.counted import counted
+from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
+from roadscan.core.witness import Finding, Witness
+from roadscan.ingest.format import LogHeader
+from roadscan.ingest.log_check import LogCheck
+from roadscan.ingest.pose_checks import POSES, PoseRecords, pose_track
+from roadscan.navigation.pose_motion import PoseMotion, Same
+from roadscan.store.writer import LogWriter
+
+Int64 = npt.NDArray[np.int64]
+
+POSE_COURSE: Final = Witness(
+    "pose_course",
+    input="trajectory",
+    fault="Heading or pitch is turned, of the wrong sign, zero, or exchanged with roll; axes or north are wrong.",
+    asks="the course over ground where the vehicle drives straight, and the slope of its path: a vehicle drives along "
+    "its body's forward axis",
+    does="the difference is named with its size; all poses are used, since a unit may be mounted turned",
+    told=("findings",),
+)
+POSE_CONSTANT: Final = Witness(
+    "pose_constant",
+    input="trajectory",
+    fault="Height or an angle is one and the same while the vehicle drives: a column was not exported, or stood still.",
+    asks="the values themselves: those of an instrument change from pose to pose",
+    does="the value is named with its span; all poses are used",
+    told=("findings",),
+)
+POSE_SPEED: Final = Witness(
+    "pose_speed",
+    input="trajectory",
+    fault="Stamps run too fast or too slow, or positions are scaled.",
+    asks="the velocities that the log states, times the time between its stamps",
+    does="the ratio is named; all poses are used, since nothing shows which of them is right",
+    told=("findings",),
+)
+POSE_SPACING: Final = Witness(
+    "pose_spacing",
+    input="trajectory",
+    fault="Poses are too far apart for the path between them.",
+    asks="the stated velocities at both ends, or else poses that are left out and found again from the others",
+    does="the error in the middle between two poses is named where it exceeds the stated σ; all poses are used",
+    told=("findings",),
+)
+POSE_SIGMA: Final = Witness(
+    "pose_sigma",
+    input="trajectory",
+    fault="The σ of the poses is 0, or covers a part of the drive only.",
+    asks="the stated σ of all poses of the log",
+    does="the poses are used; their number, and the longest span without a σ, are named",
+    told=("findings",),
+)
+
+_BLOCK: Final = 50_000
+"""Poses that are looked at together."""
+_LEAST_BETWEEN_M: Final = 0.005
+"""A smaller error between poses is below what a trajectory is known to."""
+_POINTING: Final = 0.8
+"""Below this ratio, velocities are less off in size than in direction: by 37° and more."""
+_LEAST_BARE_S: Final = 2.0
+"""Files of σ, of one a second, may begin and end up to a second beside the poses."""
+_SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_down_m")
+_NONE: Final = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True)
+class MotionCheck(LogCheck):
+    """Asks whether the poses of a log contradict themselves."""
+
+    records: PoseRecords
+
+    def finish(self, writer: LogWriter, header: LogHeader) -> None:
+        """Say what they contradict; all poses stay."""
+        world = str(header.attributes.get("world_frame"))
+        motion, sigma = PoseMotion(world), _Stated()
+        for rows in writer.tables(POSES):
+            for start in range(0, rows.num_rows, _BLOCK):
+                block = rows.slice(start, _BLOCK)
+                motion.take(pose_track(block, world, _NONE, self.records.velocities))
+                sigma.take(block)
+        writer.findings += _course(motion)
+        writer.findings += _constant(motion.same())
+        writer.findings += [*_speed(motion), *_spacing(motion), *sigma.findings()]
+
+
+def _course(motion: PoseMotion) -> Iterator[Finding]:
+    """Heading against course, pitch against slope."""
+    if (heading := motion.heading()) is not None:
+        why = "the heading, its north or the axes of the log are wrong, or the unit is mounted turned"
+        if heading.is_mounted is not None:
+            why = "the body's forward axis rises with the road, so that the heading or its north is wrong"
+        if heading.is_mounted:
+            why = (
+                "another axis rises with the road, so that the unit is mounted turned, or the axes of the log are wrong"
+            )
+        mounted = (
+            "" if heading.is_mounted is False else ", which is right where all mountings are stated along its axes"
+        )
+        yield POSE_COURSE.finds(
+            "",
+            f"the heading is {np.degrees(heading.off_rad):+.1f}° off the course over ground (median of "
+            f"{heading.way_m:,.0f} m of straight driving, scatter {np.degrees(heading.scatter_rad):.1f}°), and a "
+            f"vehicle drives along its body's forward axis: {why}{mounted}; all poses are used, and a reading 5 m away "
+            f"lies up to {10 * abs(np.sin(heading.off_rad / 2)):.2f} m off",
+        )
+    if (pitch := motion.pitch()) is not None:
+        why = "its sign is wrong" if pitch.followed < -0.5 else "one of pitch and height is wrong"
+        if pitch.roll_followed:
+            why = f"roll does ({pitch.roll_followed:+.2f} times): the two are exchanged"
+        yield POSE_COURSE.finds(
+            "",
+            f"the pitch does not follow the slope of the path: it changes by {pitch.followed:+.2f} (σ "
+            f"{pitch.sigma:.2f}) times the slope, which varies by {np.degrees(pitch.slope_rad):.2f}° over "
+            f"{pitch.way_m:,.0f} m, and that of a vehicle by 1; {why}; all poses are used",
+        )
+
+
+def _constant(same: Sequence[Same]) -> Iterator[Finding]:
+    """Values that do not change, those of one span together."""
+    spans: dict[tuple[int, int, int], list[Same]] = {}
+    for one in same:
+        spans.setdefault((one.first_gps_ns, one.last_gps_ns, one.poses), []).append(one)
+    for each in spans.values():
+        one = each[0]
+        values = [f"the {x.value}" for x in each]
+        names = " and ".join([", ".join(values[:-1]), values[-1]] if len(values) > 1 else values)
+        verb = "is" if len(each) == 1 else "are"
+        where = (
+            f"in all {one.poses:,} poses"
+            if one.everywhere
+            else f"in {counted(one.poses, 'pose')} that repeat, the most from {iso_from_gps_ns(one.first_gps_ns)} to "
+            f"{iso_from_gps_ns(one.last_gps_ns)}"
+        )
+        yield POSE_CONSTANT.finds(
+            "",
+            f"{names} {verb} one and the same {where}, while the vehicle drives {one.way_m:,.0f} m: no instrument "
+            "gives that, a column was not exported or stood still; all poses are used",
+        )
+
+
+def _speed(motion: PoseMotion) -> Iterator[Finding]:
+    if (scale := motion.scale()) is None:
+        return
+    if not np.isfinite(scale.ratio):
+        text = f"the stated velocities are 0, and the positions go {scale.way_m:,.0f} m; all poses are used"
+    elif scale.ratio < _POINTING:
+        text = (
+            f"the stated velocities point elsewhere than the positions go: along them these go {scale.ratio:.2f} times "
+            f"as far ({scale.way_m:,.0f} m): axes or signs of the velocities are wrong; all poses are used"
+        )
+    else:
+        text = (
+            f"the positions go {scale.ratio:.4f} times as far as the stated velocities say ({scale.way_m:,.0f} m): the "
+            "stamps run too fast or too slow, or positions or velocities are scaled; which is wrong nothing shows, and "
+            "all poses are used"
+        )
+    yield POSE_SPEED.finds("", text)
+
+
+def _spacing(motion: PoseMotion) -> Iterator[Finding]:
+    found = motion.between()
+    if found is None or float(np.hypot(*found.error_m)) < max(found.sigma_m, _LEAST_BETWEEN_M):
+        return
+    stated = f"stated σ {1e3 * found.sigma_m:.1f} mm" if found.sigma_m else "no σ is stated"
+    yield POSE_SPACING.finds(
+        "",
+        f"the poses are {found.step_s:.3g} s apart, and the path in the middle between two of them is uncertain by "
+        f"about {1e3 * found.error_m[0]:.0f} mm horizontally and {1e3 * found.error_m[1]:.0f} mm in height (1 σ; "
+        f"{stated}), which no σ of the products contains; export more poses a second",
+    )
+
+
+@dataclass
+class _Stated:
+    """Which poses of a log state a σ."""
+
+    poses: int = 0
+    bare: int = 0
+    zero: int = 0
+    longest: tuple[int, int] = (0, 0)
+    """Epochs of the longest span without one."""
+    open_from: int | None = field(default=None)
+    """Epoch since which none was stated."""
+
+    def take(self, rows: pa.Table) -> None:
+        """Look at a block of poses."""
+        epochs = rows.column("epoch_gps_ns").to_numpy()
+        values = np.stack([rows.column(name).to_numpy(zero_copy_only=False) for name in _SIGMAS], axis=-1)
+        bare: npt.NDArray[np.bool_] = np.asarray(np.isnan(values.astype(np.float64)).any(axis=1))
+        self.poses += epochs.size
+        self.bare += int(bare.sum())
+        self.zero += int((values == 0).all(axis=1).sum())
+        for at in np.flatnonzero(np.diff(bare.astype(np.int8), prepend=int(self.open_from is not None))).tolist():
+            if bare[at]:
+                self.open_from = int(epochs[at])
+            elif self.open_from is not None:
+                self._close(int(epochs[at]))
+        if self.open_from is not None and epochs.size:
+            self._keep(self.open_from, int(epochs[-1]))
+
+    def findings(self) -> Iterator[Finding]:
+        """Zeros, and spans without a σ in a log that states some."""
+        if self.zero:
+            yield POSE_SIGMA.finds(
+                "",
+                f"the stated σ of the position is 0 in {self.zero:,} of {counted(self.poses, 'pose')}, which no "
+                "instrument reaches: the σ of what is made of them is too small; all poses are used",
+            )
+        span_s = (self.longest[1] - self.longest[0]) / NS_PER_S
+        if 0 < self.bare < self.poses and span_s > _LEAST_BARE_S:
+            first, last = (iso_from_gps_ns(one) for one in self.longest)
+            yield POSE_SIGMA.finds(
+                "",
+                f"{self.bare:,} of {counted(self.poses, 'pose')} have no stated σ, for {span_s:,.1f} s from {first} to "
+                f"{last} at the longest, and the others have one: there, defaults are used; all poses are used",
+            )
+
+    def _close(self, epoch: int) -> None:
+        if self.open_from is not None:
+            self._keep(self.open_from, epoch)
+        self.open_from = None
+
+    def _keep(self, first: int, last: int) -> None:
+        if last - first > self.longest[1] - self.longest[0]:
+            self.longest = first, last

@@ -1,0 +1,1 @@
+"""What readers of formats share: records, stamps, columns, tables in text, poses, GNSS solutions."""

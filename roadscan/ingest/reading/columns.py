@@ -1,0 +1,328 @@
+"""Named columns with units: which column of a file is which quantity, and in what unit.
+
+A column is found by a name that carries its unit (``latitude_deg``, ``height_m``); any other name
+has to be mapped, with its unit, in the log's options. Nothing is guessed.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal, TypeAlias
+
+from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
+from roadscan.core.gpstime import UNIT_NS, Clock
+from roadscan.core.strict import Strict
+
+Dimension: TypeAlias = Literal[
+    "angle", "length", "time", "rate", "acceleration", "speed", "temperature", "count", "text"
+]
+
+_BRACKETS: Final = re.compile(r"[(\[<{].*")
+"""What many programs put a unit into: `Latitude (deg)`."""
+
+STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
+"""Size of the unit g (CGPM 1901)."""
+
+UNITS: Final[dict[Dimension, dict[str, float]]] = {
+    "angle": {"rad": 1.0, "deg": math.pi / 180, "arcmin": math.pi / 10_800, "arcsec": math.pi / 648_000},
+    "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "ft_us": 1200 / 3937},
+    "time": {unit: scale / 1e9 for unit, scale in UNIT_NS.items()} | {"utc": 1.0},
+    "rate": {
+        "rad_per_s": 1.0,
+        "rad_s": 1.0,
+        "deg_per_s": math.pi / 180,
+        "deg_s": math.pi / 180,
+        "dps": math.pi / 180,
+        "deg_per_h": math.pi / 648_000,
+        "deg_h": math.pi / 648_000,
+    },
+    "acceleration": {
+        "m_per_s2": 1.0,
+        "m_s2": 1.0,
+        "g": STANDARD_GRAVITY_M_PER_S2,
+        "mg": STANDARD_GRAVITY_M_PER_S2 / 1e3,
+    },
+    "speed": {
+        "m_per_s": 1.0,
+        "m_s": 1.0,
+        "km_per_h": 1 / 3.6,
+        "km_h": 1 / 3.6,
+        "kmh": 1 / 3.6,
+        "mph": 1609.344 / 3600,
+    },
+    "temperature": {"deg_c": 1.0},
+    "count": {"": 1.0},
+    "text": {"": 1.0},
+}
+"""Units by dimension and their size in radians, metres, seconds or what they make of these; `utc` is ISO 8601
+text."""
+
+
+class ColumnOption(Strict):
+    """One column as the survey file states it."""
+
+    name: str
+    """Name of the column in the file."""
+    unit: str | None = None
+    """Its unit: deg, rad, arcmin, arcsec; m, mm, cm, km, ft, ft_us (US survey foot); rad_per_s, deg_per_s,
+    deg_per_h; m_per_s2, g, mg; m_per_s, km_per_h, mph; deg_c. Needed unless the name ends in it."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity that a column can hold."""
+
+    name: str
+    dimension: Dimension
+    also: tuple[str, ...] = ()
+    """Other names it is known by."""
+    optional: bool = False
+
+    @property
+    def usual_unit(self) -> str:
+        """The first of its units, "" where it has none."""
+        return next(iter(UNITS[self.dimension]))
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How near the columns of a text come to those of a format."""
+
+    found: int
+    """Columns whose names carry their units."""
+    unitless: dict[str, tuple[Quantity, str]]
+    """Columns by name that lack nothing but the unit, with a usual one."""
+    absent: tuple[Quantity, ...]
+    """Quantities without a column."""
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """Order of nearness, the greater the nearer."""
+        return self.found + len(self.unitless), -len(self.absent)
+
+    @property
+    def is_near(self) -> bool:
+        """True if at least two columns, and half of all, are there."""
+        there = self.found + len(self.unitless)
+        return there >= max(2, len(self.absent))
+
+
+def likeness(quantities: Iterable[Quantity], names: Sequence[str]) -> Likeness:
+    """How near columns of these `names` come to the `quantities`; time may be without unit, the clock has it."""
+    plain = {_BRACKETS.sub("", name.lower()).strip(" _"): name for name in names}
+    bracketed = {name: bracket[0].strip("()[]<>{} ") for name in names if (bracket := _BRACKETS.search(name.lower()))}
+    found, unitless, absent = 0, {}, []
+    for quantity in quantities:
+        named = next((plain[stem] for stem in (quantity.name, *quantity.also) if stem in plain), None)
+        if any(name.lower() in _spellings(quantity) for name in plain.values()):
+            found += 1
+        elif named is None:
+            absent.append(quantity)
+        elif quantity.dimension == "time":
+            found += 1
+        else:
+            units = UNITS[quantity.dimension]
+            unit = bracketed.get(named, "")
+            unitless[named] = (quantity, unit if unit in units else quantity.usual_unit)
+    return Likeness(found, unitless, tuple(absent))
+
+
+@dataclass(frozen=True)
+class Found:
+    """The column of a quantity."""
+
+    column: str
+    scale: float
+    """Size of the column's unit, see :data:`UNITS`."""
+    unit: str
+    """Unit as named, "" where the name of a time column says none."""
+
+
+def find_columns(
+    quantities: Iterable[Quantity],
+    names: tuple[str, ...],
+    stated: Mapping[str, ColumnOption],
+    file: Path,
+    plain_units: Mapping[str, float] | None = None,
+) -> dict[str, Found]:
+    """Find the column of each quantity.
+
+    Parameters
+    ----------
+    names : names of the file's columns.
+    stated : columns as the log's options state them, by quantity.
+    plain_units : size of the unit (see :data:`UNITS`) in which columns that bear just the quantity's
+        name are taken, for quantities whose unit the stated CRS, or an option, fixes.
+
+    Raises
+    ------
+    ConfigError
+        if an option names an unknown quantity, column or unit.
+    FormatError
+        if a column is missing, comes twice, or has no known unit.
+    """
+    known = {q.name: q for q in quantities}
+    check_keys(stated, known, file)
+    found: dict[str, Found] = {}
+    for quantity in known.values():
+        option = stated.get(quantity.name)
+        one = (
+            _by_name(quantity, names, file, plain_units or {})
+            if option is None
+            else _by_option(quantity, option, names, file)
+        )
+        if one is not None:
+            found[quantity.name] = one
+        elif not quantity.optional:
+            raise _missing(quantity, names, file)
+    return found
+
+
+def fits(quantities: Iterable[Quantity], names: Iterable[str], plain: Iterable[str] = ()) -> bool:
+    """True if every needed quantity has a column whose name carries its unit (or stands in `plain`)."""
+    lower = [n.lower() for n in names]
+    return all(
+        q.optional or any(n in _spellings(q) for n in lower) or (q.name in plain and _plain(q, lower))
+        for q in quantities
+    )
+
+
+def need_stamp_unit(column: Found, clock: Clock, file: Path) -> None:
+    """Refuse a time column whose name carries another unit than the stated clock's."""
+    if column.unit in UNIT_NS and column.unit != clock.unit:
+        raise TimeSystemError(
+            f"time column '{column.column}' is in {column.unit} by its name, the clock says {clock.unit}",
+            expected="one unit",
+            change=f'set clock.unit = "{column.unit}", or map the column under another name',
+            file=file,
+            missing=Missing("clock", {"system": str(clock.system), "unit": column.unit}),
+        )
+
+
+def unit_in_name(name: str, dimension: Dimension) -> str:
+    """Unit that ends a column's name (``timestamp_ns`` → ``ns``), "" for none."""
+    ends = [unit for unit in UNITS[dimension] if unit and name.lower().endswith("_" + unit)]
+    return max(ends, key=len, default="")
+
+
+def _spellings(quantity: Quantity) -> dict[str, str]:
+    """Lower-case column names that carry the quantity's unit, and that unit."""
+    stems = (quantity.name, *quantity.also)
+    return {f"{stem}_{unit}" if unit else stem: unit for stem in stems for unit in UNITS[quantity.dimension]}
+
+
+def _plain(quantity: Quantity, lower: list[str]) -> list[str]:
+    return [stem for stem in (quantity.name, *quantity.also) if stem in lower]
+
+
+def _by_name(quantity: Quantity, names: tuple[str, ...], file: Path, plain_units: Mapping[str, float]) -> Found | None:
+    spellings = _spellings(quantity)
+    fitting = [n for n in names if n.lower() in spellings]
+    if len(fitting) > 1:
+        raise _twice(quantity, fitting, file)
+    if fitting:
+        unit = spellings[fitting[0].lower()]
+        return Found(fitting[0], UNITS[quantity.dimension][unit], unit)
+    plain = [n for n in names if n.lower() in (quantity.name, *quantity.also)]
+    if plain[1:] and quantity.name in plain_units:
+        raise _twice(quantity, plain, file)
+    if plain and quantity.name in plain_units:
+        return Found(plain[0], plain_units[quantity.name], "as stated")
+    return None
+
+
+def _twice(quantity: Quantity, columns: list[str], file: Path) -> FormatError:
+    return FormatError(
+        f"columns '{columns[0]}' and '{columns[1]}' both hold the {quantity.name}",
+        change=f'state which: columns = {{ {quantity.name} = {{ name = "{columns[0]}" }} }}',
+        file=file,
+    )
+
+
+def _by_option(quantity: Quantity, option: ColumnOption, names: tuple[str, ...], file: Path) -> Found:
+    if option.name not in names:
+        raise ConfigError(
+            f"options.columns.{quantity.name} names the column '{option.name}', which the file does not have"
+            + nearest(option.name, names),
+            expected="one of: " + ", ".join(names),
+            file=file,
+        )
+    units = UNITS[quantity.dimension]
+    unit = option.unit if option.unit is not None else unit_in_name(option.name, quantity.dimension)
+    if quantity.dimension == "time" and not unit:
+        return Found(option.name, 1.0, "")  # the clock states it
+    if unit not in units:
+        raise ConfigError(
+            f"the unit of column '{option.name}' ({quantity.name}) is "
+            + (f"'{unit}'{nearest(unit, units)}" if unit else "not stated"),
+            expected="one of: " + ", ".join(u for u in units if u),
+            change=f'columns = {{ {quantity.name} = {{ name = "{option.name}", unit = "…" }} }}',
+            file=file,
+        )
+    return Found(option.name, units[unit], unit)
+
+
+def _missing(quantity: Quantity, names: tuple[str, ...], file: Path) -> FormatError:
+    plain = [n for n in names if n.lower() in (quantity.name, *quantity.also)]
+    arrived = f"column '{plain[0]}' says no unit" if plain else f"no column holds the {quantity.name}"
+    example = plain[0] if plain else names[0] if names else "…"
+    unit = next(u for u in (*UNITS[quantity.dimension], "…"))
+    return FormatError(
+        arrived,
+        expected="a column called " + " or ".join(f"'{s}'" for s in list(_spellings(quantity))[:4]),
+        change=f'or state it: columns = {{ {quantity.name} = {{ name = "{example}", unit = "{unit}" }} }}',
+        file=file,
+        missing=Missing(f"options.columns.{quantity.name}"),
+    )
+
+
+def check_keys(stated: Iterable[str], known: Iterable[str], file: Path) -> None:
+    """Refuse an option that maps a column to an unknown quantity."""
+    allowed = list(known)
+    for key in stated:
+        if key not in allowed:
+            raise ConfigError(
+                f"options.columns names the unknown quantity '{key}'{nearest(key, allowed)}",
+                expected="one of: " + ", ".join(allowed),
+                file=file,
+            )
+
+
+def named_column(what: str, stated: str | None, known: Iterable[str], names: tuple[str, ...], file: Path) -> str:
+    """Name of the column that holds `what`: the stated one, or the one called as in `known`.
+
+    Raises
+    ------
+    ConfigError
+        if the stated column does not exist.
+    FormatError
+        if none, or more than one, of `known` exists.
+    """
+    if stated is not None:
+        if stated not in names:
+            raise ConfigError(
+                f"options name the column '{stated}' ({what}), which the file does not have{nearest(stated, names)}",
+                expected="one of: " + ", ".join(names),
+                file=file,
+            )
+        return stated
+    spellings = list(known)
+    fitting = [name for name in names if name in spellings]
+    if len(fitting) == 1:
+        return fitting[0]
+    raise FormatError(
+        f"columns {', '.join(fitting)} all hold {what}" if fitting else f"no column holds {what}",
+        expected="one column called " + " or ".join(spellings),
+        change="state the column in options",
+        file=file,
+    )
+
+
+def stamp_column(stated: str | None, names: tuple[str, ...], known: tuple[str, ...], file: Path) -> Found:
+    """Column of numeric time stamps, see :func:`named_column`, with the unit that its name ends in."""
+    column = named_column("the time stamps", stated, known, names, file)
+    return Found(column, 1.0, unit_in_name(column, "time"))

@@ -1,0 +1,130 @@
+"""Logs that hold the same bytes under two names: a copy, or one drive that would count as two."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from roadscan.core.survey import LogConfig, Survey
+from roadscan.core.witness import Finding, Witness
+from roadscan.store.logs import LogRecord
+
+SAME_CONTENT: Final = Witness(
+    "same_content",
+    input="any log",
+    fault="The same log is listed under two names: a copy, or one drive listed as two.",
+    asks="the content of the logs of the survey file, byte by byte; of clouds also their number of points, their times "
+    "and their middle",
+    does="a copy in the same run and with the same settings counts once; readings that count twice otherwise are used, "
+    "and named",
+    told=("findings",),
+)
+
+_READINGS: Final = ("scans", "returns", "cloud", "images")
+"""Tables of which no two runs share a log. One trajectory may cover several runs."""
+_FRAME: Final = ("crs", "height", "geoid", "vertical_crs")
+"""What the coordinates of two clouds have to be, for their middles to be compared."""
+_SAME_MIDDLE_M: Final = 0.005
+"""Two clouds of as many points of the same times are one where their means differ by less: the coarsest usual scale is
+0.01 m, and two scanners of one vehicle are farther apart."""
+_COMPARED_BYTES: Final = 1 << 20
+"""Bytes of either end that are compared, where sizes are the same."""
+
+
+def same_content_findings(survey: Survey, records: Sequence[LogRecord]) -> list[Finding]:
+    """Copies among the survey file's logs, and readings that count twice."""
+    listed = {(run.id, str(log.path)): log for run in survey.config.runs for log in run.logs}
+    return [*_copies(survey, listed, records), *_twice(listed, records), *_same_points(records)]
+
+
+def _copies(
+    survey: Survey, listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord]
+) -> Iterator[Finding]:
+    """Logs without a record of their own, whose bytes and settings are those of another."""
+    known = {(r.run, r.path) for r in records}
+    for (run, path), config in listed.items():
+        file = survey.resolve(config.path)
+        if (run, path) in known or not file.is_file():
+            continue
+        for record in records:
+            other = listed.get((record.run, record.path))
+            same = other is not None and record.run == run and _settings(other) == _settings(config)
+            if same and _is_copy(file, survey.resolve(Path(record.path))):
+                yield SAME_CONTENT.finds(
+                    path, f"it holds the same bytes as {record.path} of the same run {run}, and counts once"
+                )
+                break
+
+
+def _twice(listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord]) -> Iterator[Finding]:
+    """Readings of the same bytes in two runs, or of two sensors by the same settings."""
+    groups: dict[str, list[LogRecord]] = defaultdict(list)
+    for record in records:
+        if any(table in record.tables for table in _READINGS):
+            groups[record.content].append(record)
+    for group in groups.values():
+        for first, later in itertools.pairwise(sorted(group, key=lambda r: (r.run, r.path, r.sensor))):
+            one, other = listed.get((first.run, first.path)), listed.get((later.run, later.path))
+            if one is None or other is None or one.options != other.options:
+                continue
+            yield SAME_CONTENT.finds(
+                later.path,
+                f"its bytes are those of {first.path} ({first.run}/{first.sensor}): its readings count a second time "
+                f"as {later.run}/{later.sensor}; they are used",
+            )
+
+
+def same_points(records: Sequence[LogRecord]) -> Iterator[tuple[LogRecord, LogRecord]]:
+    """Clouds of other bytes with the same points, the second of each pair the later in the order of paths: a cloud
+    that was written anew at another scale, in another order, or as LAZ.
+    """
+    groups: dict[object, list[LogRecord]] = defaultdict(list)
+    for record in records:
+        files = record.tables.get("cloud", ())
+        if files and "middle_m" in record.attributes:
+            groups[sum(file.rows for file in files), tuple(file.group_spans for file in files)].append(record)
+    for group in groups.values():
+        for first, later in itertools.pairwise(sorted(group, key=lambda r: (r.run, r.path, r.sensor))):
+            same = all(first.attributes.get(name) == later.attributes.get(name) for name in _FRAME)
+            off_m = math.dist(first.attributes["middle_m"], later.attributes["middle_m"])
+            if first.content != later.content and same and off_m < _SAME_MIDDLE_M:
+                yield first, later
+
+
+def _same_points(records: Sequence[LogRecord]) -> Iterator[Finding]:
+    """What is said of such clouds."""
+    for first, later in same_points(records):
+        text = f"its {later.rows:,} points have the times and the middle of those of {first.path}"
+        if first.run == later.run:
+            yield SAME_CONTENT.finds(later.path, f"{text} of the same run {first.run}, and count once", later.rows)
+        else:
+            yield SAME_CONTENT.finds(
+                later.path,
+                f"{text} ({first.run}/{first.sensor}): they count a second time as {later.run}/{later.sensor}; they "
+                "are used",
+            )
+
+
+def _settings(config: LogConfig) -> dict[str, object]:
+    return config.model_dump(exclude={"path"})
+
+
+def _is_copy(file: Path, other: Path) -> bool:
+    """Whether two files are of one size and have the same ends."""
+    try:
+        size = file.stat().st_size
+        if size != other.stat().st_size:
+            return False
+        return all(_part(file, at) == _part(other, at) for at in (0, max(0, size - _COMPARED_BYTES)))
+    except OSError:
+        return False
+
+
+def _part(file: Path, start: int) -> bytes:
+    with file.open("rb") as stream:
+        stream.seek(start)
+        return stream.read(_COMPARED_BYTES)

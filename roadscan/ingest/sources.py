@@ -1,0 +1,217 @@
+"""Fingerprints of raw logs: what a log is known by, whatever its path."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Final
+
+from roadscan.core.errors import FormatError, StoreError
+from roadscan.ingest.format import LogFormat, format_named
+from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
+from roadscan.store.sealed import seal, unseal
+from roadscan.store.store import Store, digest_holds, file_digest
+
+_SOURCES: Final = "manifest/sources.json"
+_COPY: Final = "manifest/sources_copy.json"
+
+_NEAR: Final = 2
+"""So many folders above the survey file's a log is still near."""
+
+Known = list[Any]
+"""Size (bytes), time of the last change (ns) and digest of a file."""
+
+
+class Sources:
+    """Fingerprints of raw logs; a file of unchanged size and time is not read again, a log moved away is remembered.
+
+    Logs are known by their paths from the survey file's folder, where they lie below it or near it: survey, store and
+    logs may move together.
+    """
+
+    def __init__(self, store: Store, folder: Path, threads: ThreadPoolExecutor) -> None:
+        self._store = store
+        self._folder = folder
+        self._threads = threads
+        known, self._is_whole = _remembered(store)
+        self._kept, self._forgotten = known or {}, known is None
+        self._before = _renamed(self._kept, folder)
+        self._now: dict[str, Any] = {}
+
+    def format(self, path: Path, stated: str | None) -> LogFormat:
+        """Format of a log: as stated, as remembered, or found from its bytes."""
+        if self._forgotten and not is_there(path):
+            raise FormatError(
+                "the log does not exist",
+                change="check its path in the survey file; if it was moved away, put it back for one run: "
+                "the store's list of logs was damaged",
+                file=path,
+            )
+        cannot = cannot_be_opened(path)
+        if cannot is not None:
+            if is_there(path) or self._name(path) not in self._before:
+                raise cannot
+            stated = stated or str(self._before[self._name(path)]["format"])
+        return format_named(stated) if stated else claimed_format(path)
+
+    def begin(self, path: Path, format_: LogFormat, companions: list[Path]) -> dict[str, Future[Known]]:
+        """Start to fingerprint a log's files and companions, by their names: hashing runs in threads."""
+        before = self._before.get(self._name(path), {"files": {}})["files"]
+        if path.exists():
+            named = _named(path, format_, companions)
+            missing = next((file for file in named.values() if not file.exists()), None)
+            if missing is not None:
+                raise FormatError("a file that the log's options name does not exist", file=missing)
+            return {n: self._threads.submit(_fingerprint, file, before.get(n)) for n, file in named.items()}
+        if before:
+            return {name: _done(known) for name, known in before.items()}
+        raise FormatError("the log does not exist", change="check its path in the survey file", file=path)
+
+    def end(self, path: Path, format_: LogFormat, begun: dict[str, Future[Known]]) -> tuple[str, int, str]:
+        """Fingerprint over names and contents of a log's files and companions, their bytes in all, and their stamp as
+        of :func:`stamp_of`.
+        """
+        files = {name: future.result() for name, future in begun.items()}
+        self._now[self._name(path)] = {"format": format_.name, "files": files}
+        combined = hashlib.blake2b(digest_size=16)
+        for name, (_, _, digest) in files.items():
+            combined.update(f"{name}\0{digest}\n".encode())
+        stamp = _stamp({name: (size, changed_ns) for name, (size, changed_ns, _) in files.items()})
+        return combined.hexdigest(), sum(size for size, _, _ in files.values()), stamp
+
+    def save(self) -> None:
+        """Keep what was learnt; logs that are no longer listed stay known.
+
+        Who may only read the store can ask it all the same, and learns it each time.
+        """
+        known = {**self._before, **self._now}
+        if known and (known != self._kept or not self._is_whole):
+            with contextlib.suppress(StoreError):
+                self._store.write_bytes(_COPY, seal(known), lasting=False)
+                self._store.write_bytes(_SOURCES, seal(known))
+
+    def _name(self, path: Path) -> str:
+        return listed_name(path, self._folder)
+
+
+@contextlib.contextmanager
+def open_sources(store: Store, folder: Path) -> Iterator[Sources]:
+    """Fingerprints of a store's logs, hashed on all cores; what was learnt is kept at the end."""
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        sources = Sources(store, folder, threads)
+        try:
+            yield sources
+        except BaseException:
+            threads.shutdown(cancel_futures=True)
+            raise
+        sources.save()
+
+
+def listed_name(path: Path, folder: Path) -> str:
+    """What the list calls a log: its path from the survey file's folder where it is near, else its absolute path."""
+    try:
+        name = Path(os.path.relpath(path, folder))
+    except ValueError:  # on another drive
+        return str(path)
+    return str(path) if name.parts[: _NEAR + 1] == ("..",) * (_NEAR + 1) else name.as_posix()
+
+
+def _renamed(known: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """What is known of logs by the names that they have now: older lists hold absolute paths alone."""
+    named = {listed_name(Path(path), folder): of for path, of in known.items() if Path(path).is_absolute()}
+    return named | {path: of for path, of in known.items() if not Path(path).is_absolute()}
+
+
+def remembered_formats(store: Store, folder: Path) -> dict[str, str]:
+    """Names of the formats of logs that the store knows, by :func:`listed_name`: such a log may have moved away."""
+    known, _ = _remembered(store)
+    return {path: str(of["format"]) for path, of in _renamed(known or {}, folder).items()}
+
+
+def stamp_of(path: Path, format_: LogFormat, companions: list[Path]) -> str:
+    """Hash of the sizes and times of a log's files and companions: another one says that it changes, being uploaded.
+
+    Raises
+    ------
+    OSError
+        A file is gone.
+    """
+    stats = {name: file.stat() for name, file in _named(path, format_, companions).items()}
+    return _stamp({name: (stat.st_size, stat.st_mtime_ns) for name, stat in stats.items()})
+
+
+def _stamp(files: dict[str, tuple[int, int]]) -> str:
+    return hashlib.blake2b(json.dumps(files, sort_keys=True).encode(), digest_size=8).hexdigest()
+
+
+def _named(path: Path, format_: LogFormat, companions: list[Path]) -> dict[str, Path]:
+    """Files of a log and its companions by the names that they have in its fingerprint."""
+    named = {_name(file, path): file for file in format_.files(path)}
+    return named | {f"beside:{file.name}": file for file in companions if file not in named.values()}
+
+
+def is_unchanged(store: Store, folder: Path, path: Path, format_: LogFormat, companions: list[Path]) -> bool:
+    """True if a log's files still hold the bytes that they were fingerprinted with; reads all of them.
+
+    Raises
+    ------
+    OSError
+        A file cannot be read.
+    """
+    known, _ = _remembered(store)
+    files = _renamed(known or {}, folder).get(listed_name(path, folder), {"files": {}})["files"]
+    named = _named(path, format_, companions)
+    return named.keys() == files.keys() and all(digest_holds(file, files[name][2]) for name, file in named.items())
+
+
+def damaged_sources(store: Store) -> list[str]:
+    """In words, whether what is known of logs is damaged; the next run mends it."""
+    known, is_whole = _remembered(store)
+    if is_whole:
+        return []
+    cost = "its copy is used" if known is not None else "logs that were moved away have to be put back for one run"
+    return [f"{_SOURCES}: the list of logs is damaged; {cost}, and the next run writes it anew"]
+
+
+def _remembered(store: Store) -> tuple[dict[str, Any] | None, bool]:
+    """What is known of logs by path, and whether that is as it was kept. It may be that of the copy, or None: then
+    their files are read again.
+    """
+    if not store.exists(_SOURCES):
+        return {}, True
+    for path in (_SOURCES, _COPY):
+        try:
+            known = unseal(store.read_bytes(path))
+            logs = {log: {"format": of["format"], "files": dict(of["files"])} for log, of in known.items()}
+        except (StoreError, ValueError, KeyError, TypeError, AttributeError):
+            continue
+        return logs, path == _SOURCES
+    return None, False
+
+
+def _name(file: Path, log: Path) -> str:
+    return file.relative_to(log).as_posix() if file != log and log in file.parents else ""
+
+
+def _fingerprint(file: Path, known: Known | None) -> Known:
+    try:
+        stat = file.stat()
+        if known is not None and known[:2] == [stat.st_size, stat.st_mtime_ns]:
+            return known
+        old = known is not None and known[0] == stat.st_size and ":" not in known[2]
+        if known is not None and old and digest_holds(file, known[2]):
+            return [stat.st_size, stat.st_mtime_ns, known[2]]  # an older algorithm's: the log's key follows from it
+        return [stat.st_size, stat.st_mtime_ns, file_digest(file)]
+    except OSError as error:
+        raise FormatError(f"the log cannot be read: {error.strerror}", file=file) from error
+
+
+def _done(known: Known) -> Future[Known]:
+    future: Future[Known] = Future()
+    future.set_result(known)
+    return future

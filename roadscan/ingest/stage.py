@@ -1,0 +1,78 @@
+"""Stage `ingest`: raw logs into tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding
+from roadscan.ingest.ingest import DATA_TABLES, ingest, survey_records
+from roadscan.ingest.one_stamp import one_stamp_findings, one_stamp_logs
+from roadscan.ingest.overlap import (
+    Fault,
+    NothingPlacedError,
+    apart_logs,
+    can_be_placed,
+    empty_logs,
+    reject_findings,
+)
+from roadscan.ingest.same_content import same_content_findings
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, StageState
+from roadscan.store.logs import LogRecord, has_log
+from roadscan.store.manifest import Manifest
+from roadscan.store.salvage import read_lost
+from roadscan.surface.tasks.surface_colours import check_cameras
+from roadscan.tiles.mosaics.products import wanted_products
+from roadscan.tiles.tasks.tile_work import BYTES_PER_READING, WORKER_BASE_BYTES
+
+
+class Ingest(Stage):
+    """A table row a record; a damaged record costs itself alone."""
+
+    name = "ingest"
+    title = "raw logs into tables"
+
+    def run(self, session: Session) -> None:
+        """Read the logs that the store does not hold."""
+        wanted_products(session.survey)  # a wrong name or option is told before a log is read
+        check_cameras(session.survey)
+        try:
+            ingest(session.survey, session.store, session.reporter.line, session.compute, session.logs)
+        finally:
+            session.renew("records")
+        records = survey_records(session.survey, session.store, session.logs)
+        faults = [*_empty(session, records), *apart_logs(session.survey, records, {}, estimated=False)]
+        faults += one_stamp_logs(records)
+        has_readings = any(r.tables.get(table) for r in records for table in DATA_TABLES)
+        if faults and has_readings and not can_be_placed(records, faults, DATA_TABLES):
+            raise NothingPlacedError.of(faults)
+        session.failed(self.name, [fault.told for fault in faults])
+
+    def state(self, session: Session) -> StageState:
+        """Logs that wait to be read."""
+        planned, unplanned = session.logs
+        waiting = [log for log in planned if not has_log(session.store, log.key)]
+        if not waiting and not unplanned:
+            records = survey_records(session.survey, session.store, session.logs)
+            return StageState(len(planned), faults=[fault.told for fault in _empty(session, records)])
+        most = session.survey.config.tiles.max_block_readings
+        doing = {
+            "logs": len(waiting),
+            "raw_bytes": sum(log.bytes for log in waiting),
+            "worker_memory_bytes_at_most": WORKER_BASE_BYTES + BYTES_PER_READING * most,
+        }
+        return StageState(len(planned) - len(waiting), len(waiting) + len(unplanned), next_run=doing, hides_rest=True)
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """What readers and checks of rows doubt, and logs of which much was rejected or stands under one stamp."""
+        share = survey.config.checks.lost_share
+        own = [one for record in records for one in record.findings]
+        own += same_content_findings(survey, records)
+        return [*own, *reject_findings(records, share), *one_stamp_findings(records, share)]
+
+
+def _empty(session: Session, records: Sequence[LogRecord]) -> list[Fault]:
+    """Logs without a row, but for those whose rows were lost later: `verify` lists them until their logs are back."""
+    lost = {one.log for one in read_lost(session.store)}
+    return empty_logs([record for record in records if record.key not in lost])

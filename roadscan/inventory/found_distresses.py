@@ -1,0 +1,249 @@
+"""What a run found of the distresses of the pavement, as rows of their kinds in the inventory.
+
+Tables of distresses know no heights: those come from overviews of the tiles, as does what else the inventory asks for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import cached_property, lru_cache
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+from scipy.spatial import cKDTree
+
+from roadscan.assets.object_table import object_names
+from roadscan.assets.tasks.along_roads import along_roads
+from roadscan.condition.tasks.lines import survey_roads
+from roadscan.core.ids import TileId
+from roadscan.inventory.state import reference_points
+from roadscan.inventory.visibility import Visibility
+from roadscan.run.session import Session
+from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
+from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
+from roadscan.tiles.mosaics.products import StoredTiles, product_context
+from roadscan.tiles.product import ProductContext, TileSummary
+from roadscan.tiles.products.geo_table import in_crs_unit, read_geo_table
+from roadscan.tiles.pyramid import Level, overview_factors
+from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
+from roadscan.tiles.tasks.tiles import summary_of
+
+_PIXEL_M: Final = 0.04
+"""Edge of the pixels that heights are taken from, about."""
+_HELD_TILES: Final = 256
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+class FoundKind(NamedTuple):
+    """What a run found of a kind of distress."""
+
+    kind: str
+    rows: pa.Table
+    """Columns as `asset_schema(kind).arrow()`."""
+    records: Sequence[OutputRecord]
+    """Files that it was read from."""
+
+
+def found_distresses(session: Session) -> Iterator[FoundKind]:
+    """Rows of each kind of distress that the survey was searched for."""
+    searched = {kind: records for kind in asset_kind_names() if (records := _records(session, asset_schema(kind)))}
+    if not searched:
+        return
+    ground = Ground(session)
+    roads, _ = survey_roads(session.plan, session.manifest)
+    for kind, records in searched.items():
+        rows, shapes_m = _read(session, records, ground.context)
+        yield FoundKind(kind, _Rows(asset_schema(kind), rows, ground.raised(shapes_m)).table(ground, roads), records)
+
+
+def _records(session: Session, schema: AssetSchema) -> list[OutputRecord]:
+    """Records of the table that a kind is found in, by path; those without a file tell that nothing was found."""
+    return sorted(session.manifest.of(schema.found_in).values(), key=lambda r: r.path) if schema.found_in else []
+
+
+def _read(
+    session: Session, records: Sequence[OutputRecord], context: ProductContext
+) -> tuple[pa.Table, npt.NDArray[Any]]:
+    parts = [read_geo_table(read_recorded(session.store, r), context) for r in records if r.path.endswith(".parquet")]
+    if not parts:
+        return pa.table({}), np.empty(0, object)
+    rows = pa.concat_tables([rows.replace_schema_metadata(None) for rows, _ in parts], promote_options="permissive")
+    return rows, np.concatenate([shapes for _, shapes in parts])
+
+
+class Ground:
+    """The ground that a survey measured, tile by tile."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.context = product_context(session.plan)
+        cells = {r.unit: r for r in session.manifest.of(TILE).values() if r.path}
+        overviews = [r for r in session.manifest.of(OVERVIEWS).values() if r.path and r.unit in cells]
+        tiles = StoredTiles(
+            session.store, list(cells.values()), [r for r in overviews if r.key == cells[r.unit].key], self.context
+        )
+        factors = overview_factors(self.context.grid.cells_per_edge) or (1,)
+        self._factor = min(factors, key=lambda one: abs(math.log(one * self.context.grid.cell_m / _PIXEL_M)))
+        self._records = cells
+        self._level = lru_cache(_HELD_TILES)(lambda tile: tiles.overview(tile, self._factor))
+
+    @cached_property
+    def first_gps_ns(self) -> int:
+        """GPS time at which the survey's first pass began."""
+        return min((one.start_gps_ns for one in self._session.plan.passes), default=0)
+
+    def summaries(self, places_m: Floats) -> list[TileSummary | None]:
+        """Figures of the tile of each place (n, 2); None where there are no readings."""
+        found: list[TileSummary | None] = [None] * len(places_m)
+        for tile, own, _ in self._by_tile(places_m):
+            record = self._records.get(str(tile))
+            one = None if record is None else summary_of(record)
+            for at in own.tolist():
+                found[at] = one
+        return found
+
+    def heights_m(self, places_m: Floats) -> Floats:
+        """(n,) heights at places (n, 2) on the map: that of the pixel there, else of the nearest one of the tile.
+
+        Where a tile has no readings, the nearest of the other places that has a height gives it.
+        """
+        out = np.full(len(places_m), np.nan)
+        for tile, own, pixel in self._by_tile(places_m):
+            level = self._level(tile)
+            if level is not None and len(level):
+                place, is_there = _in_level(level, pixel)
+                if not is_there.all():
+                    tree = cKDTree(np.column_stack([level.column, level.row]))
+                    place[~is_there] = tree.query(pixel[~is_there])[1]
+                out[own] = level.height_m[place]
+        known = np.isfinite(out)
+        if known.any() and not known.all():
+            out[~known] = out[known][cKDTree(places_m[known]).query(places_m[~known])[1]]
+        return np.asarray(np.nan_to_num(out), dtype=np.float64)
+
+    def is_surveyed(self, places_m: Floats) -> npt.NDArray[np.bool_]:
+        """(n,) whether there are readings at places (n, 2)."""
+        out = np.zeros(len(places_m), dtype=bool)
+        for tile, own, pixel in self._by_tile(places_m):
+            level = self._level(tile)
+            if level is not None and len(level):
+                out[own] = _in_level(level, pixel)[1]
+        return out
+
+    def raised(self, shapes_m: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Shapes (n,) at the height of the ground, all in the map (m)."""
+        places = shapely.get_coordinates(shapes_m)
+        if not len(places):
+            return shapes_m
+        raised = np.column_stack([places, self.heights_m(places)])
+        return np.asarray(shapely.set_coordinates(shapely.force_3d(shapes_m), raised))
+
+    def _by_tile(self, places_m: Floats) -> Iterator[tuple[TileId, Ints, Ints]]:
+        """Each tile with the numbers of its places, and their pixels (n, 2), column and row."""
+        grid = self.context.grid
+        quanta = np.floor(places_m * QUANTA_PER_M).astype(np.int64)
+        tiles, number = np.unique(quanta // grid.size_quanta, axis=0, return_inverse=True)
+        order = np.argsort(number.reshape(-1), kind="stable")
+        ends = np.searchsorted(number.reshape(-1)[order], np.arange(len(tiles) + 1))
+        for at, (column, row) in enumerate(tiles.tolist()):
+            own = order[ends[at] : ends[at + 1]]
+            inside = quanta[own] - np.array([column, row]) * grid.size_quanta
+            yield TileId(column, row), own, inside // (grid.cell_quanta * self._factor)
+
+
+def _in_level(level: Level, pixel: Ints) -> tuple[Ints, npt.NDArray[np.bool_]]:
+    """Places of pixels (n, 2) in a level, and whether they hold readings."""
+    keys = level.row.astype(np.int64) << 32 | level.column
+    wanted = pixel[:, 1] << 32 | pixel[:, 0]
+    place = np.minimum(np.searchsorted(keys, wanted), keys.size - 1)
+    return place, keys[place] == wanted
+
+
+class SeenByCells:
+    """What a survey tells of places in sight: of distresses whether the ground there was measured, else as it was.
+
+    Parameters
+    ----------
+    assets : what is told of other kinds.
+    """
+
+    def __init__(self, session: Session, assets: Visibility) -> None:
+        self._session = session
+        self._assets = assets
+
+    @cached_property
+    def _ground(self) -> Ground:
+        return Ground(self._session)
+
+    def expected_passes(self, kind: str, places_m: Floats) -> Ints:
+        """(n,) passes that should have seen assets of a kind; of distresses 1 where there are readings."""
+        if not asset_schema(kind).found_in:
+            return self._assets.expected_passes(kind, places_m)
+        return self._ground.is_surveyed(places_m[:, :2]).astype(np.int64)
+
+
+class _Rows:
+    """Rows of a table of distresses on their way to the columns of their kind."""
+
+    def __init__(self, schema: AssetSchema, rows: pa.Table, shapes_m: npt.NDArray[Any]) -> None:
+        self.schema = schema
+        self.rows = rows
+        self.shapes_m = _of_type(shapes_m, schema.geometry)
+
+    def table(self, ground: Ground, roads: Any) -> pa.Table:
+        """Columns as `asset_schema(kind).arrow()`."""
+        places = reference_points(self.shapes_m) if len(self.shapes_m) else np.empty((0, 3))
+        along = along_roads(places[:, :2], roads)
+        tiles = ground.summaries(places[:, :2])
+        least_m, first = ground.context.grid.cell_m / math.sqrt(12.0), ground.first_gps_ns
+        known = [t or TileSummary.without_readings(TileId(0, 0)) for t in tiles]
+        columns: dict[str, Any] = {
+            "object": object_names(self.schema.kind, places[:, :2]),
+            "easting_m": places[:, 0],
+            "northing_m": places[:, 1],
+            "height_m": places[:, 2],
+            "sigma_horizontal_m": [math.hypot(t.sigma_horizontal_m or 0.0, least_m) for t in known],
+            "sigma_height_m": [math.hypot(t.sigma_down_m or 0.0, least_m) for t in known],
+            "passes": [len(t.passes) for t in known],
+            "first_epoch_gps_ns": [t.first_epoch_gps_ns or first for t in known],
+            "last_epoch_gps_ns": [t.last_epoch_gps_ns or first for t in known],
+            "road": along.road,
+            "station_m": [None if math.isnan(s) else s for s in along.station_m.tolist()],
+            "offset_m": [None if math.isnan(o) else o for o in along.offset_m.tolist()],
+            "lane": along.lane,
+            "geometry": shapely.to_wkb(in_crs_unit(self.shapes_m, ground.context), flavor="iso"),
+        }
+        columns |= {one.name: self._own(one) for one in self.schema.own}
+        nothing = [None] * len(self.shapes_m)
+        arrow = self.schema.arrow()
+        arrays = [pa.array(columns.get(f.name, nothing), f.type, from_pandas=True) for f in arrow]
+        return pa.Table.from_arrays(arrays, schema=arrow)
+
+    def _own(self, column: AssetColumn) -> Any:
+        """Values of a column of the kind: that of the table, or the class of another one."""
+        name = column.class_of or column.name
+        if name not in self.rows.column_names:
+            return [None] * len(self.shapes_m)
+        if not column.class_of:
+            return self.rows[name].to_pandas()
+        values = self.rows[name].to_numpy()
+        classes = np.array(column.values, object)[np.searchsorted(column.up_to, values)]
+        return np.where(np.isnan(values), None, classes)
+
+
+def _of_type(shapes: npt.NDArray[Any], geometry: str) -> npt.NDArray[Any]:
+    """Shapes of the type that a schema names: single ones as one part of several where it says so."""
+    single = geometry.removeprefix("Multi").removesuffix("Z")
+    if single == geometry.removesuffix("Z"):
+        return shapes
+    make = {"LineString": shapely.MultiLineString, "Polygon": shapely.MultiPolygon}[single]
+    out = np.empty(len(shapes), object)
+    out[:] = [make([one]) if one.geom_type == single else one for one in shapes]
+    return out

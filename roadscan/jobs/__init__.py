@@ -1,1 +1,0 @@
-"""One file a step: load → compute → store. Jobs hold no formula."""

@@ -1,1 +1,0 @@
-"""The loops: Numba on NumPy arrays, nothing else."""

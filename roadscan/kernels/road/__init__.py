@@ -1,1 +1,0 @@
-"""Which readings hit the road, and places along it."""

@@ -1,0 +1,1 @@
+"""Loops of navigation: poses at any epoch."""

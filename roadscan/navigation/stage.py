@@ -1,0 +1,54 @@
+"""Stage `navigate`: trajectories from GNSS, IMU and odometer; clocks from shared motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.calibrate.tasks.calibrate import renew_reports
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding
+from roadscan.navigation.tasks.clock_tables import set_damaged_clocks_aside
+from roadscan.navigation.tasks.clocks import estimate_clocks
+from roadscan.navigation.tasks.navigate import navigate
+from roadscan.navigation.tasks.navigation_status import navigation_status, trajectory_findings
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, StageState
+from roadscan.store.logs import LogRecord, read_log_records
+from roadscan.store.manifest import Manifest
+
+
+class Navigate(Stage):
+    """Computed trajectories are logs of their own; clocks are a small table."""
+
+    name = "navigate"
+    title = "trajectories from GNSS, IMU and odometer, clocks from shared motion"
+    after = ("ingest",)
+    uses_workers = False
+
+    def run(self, session: Session) -> None:
+        """Compute what is missing or out of date."""
+        survey, store, say = session.survey, session.store, session.reporter.line
+        for done in set_damaged_clocks_aside(store):
+            session.note(done)
+        try:
+            if any(evidence.against != "trajectory" for evidence in survey.config.clocks):
+                estimate_clocks(survey, store, before_navigation=True, logs=session.logs)
+            navigate(survey, store, say, session.logs)
+            estimate_clocks(survey, store, say, logs=session.logs)
+            renew_reports(store, say)
+        finally:
+            session.renew("records")
+            session.renew("manifest")  # pictures were recorded beside it
+
+    def state(self, session: Session) -> StageState:
+        """Computed trajectories, estimated clocks, calibrated mountings."""
+        held = {r.key: r for r in read_log_records(session.store, damaged=[])}
+        own = [held[log.key] for log in session.logs[0] if log.key in held]
+        found = navigation_status(session.survey, session.store, own, held)
+        waiting = sum(one["state"] != "computed" for one in found.trajectories)
+        lines = list(found.lines())
+        return StageState(len(found.trajectories) - waiting, waiting, lines=lines)
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """What computed trajectories, held against their own measurements, are doubted for."""
+        return trajectory_findings(records)

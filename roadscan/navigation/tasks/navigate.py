@@ -1,0 +1,144 @@
+"""Navigate: the trajectories that a survey's own logs give, beside the logs they came from.
+
+A computed trajectory is held like a log of its own (sensor ``navigation``): its key names the logs, the rig, the
+settings and the code that it was made from, and it is replaced when one of them changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from roadscan.core.errors import ConfigError, DamagedError, RoadscanError, RunError
+from roadscan.core.survey import Survey
+from roadscan.ingest.ingest import survey_records
+from roadscan.ingest.planned_logs import Logs, plan_logs
+from roadscan.navigation.tasks.computed_trajectory import PlannedTrajectory
+from roadscan.navigation.tasks.navigation_pictures import draw_trajectories
+from roadscan.navigation.tasks.solve_trajectory import plan_solutions
+from roadscan.navigation.tasks.spline_trajectory import plan_splines
+from roadscan.store.logs import NAVIGATION, LogRecord, has_log, read_log_records, retire_log, write_log_record
+from roadscan.store.store import Store
+from roadscan.store.writer import LogWriter
+
+
+def plan_trajectories(survey: Survey, store: Store, records: Sequence[LogRecord]) -> list[PlannedTrajectory]:
+    """Trajectories that the survey file and its logs ask for, at most one a run.
+
+    Raises
+    ------
+    ConfigError
+        where it is not clear which sensors navigate.
+    """
+    solutions = plan_solutions(survey, store, records)
+    solved = {s.run for s in solutions}
+    rest = [run.id for run in survey.config.runs if run.id not in solved]
+    return [*solutions, *plan_splines(survey, store, records, rest)]
+
+
+def navigate(
+    survey: Survey, store: Store, report: Callable[[str], None] = lambda _: None, logs: Logs | None = None
+) -> list[LogRecord]:
+    """Compute the trajectories that are missing or out of date.
+
+    Raises
+    ------
+    RunError
+        after all runs were tried, if one could not be computed; the others are kept.
+    """
+    done: list[LogRecord] = []
+    failures: list[str] = []
+    wanted = plan_trajectories(survey, store, survey_records(survey, store, logs))
+    for planned in wanted:
+        fresh = not has_log(store, planned.key)
+        if fresh:
+            try:
+                keep_trajectory(store, planned, report)
+            except RoadscanError as error:
+                failures.append(f"run '{planned.run}': {error}")
+                report(f"failed: {failures[-1]}")
+                continue
+        record = read_log_records(store, [planned.key])[0]
+        done.append(record)
+        report(f"{'computed' if fresh else 'known'}: {record.run}/{NAVIGATION} {record.rows:,} poses{_figures(record)}")
+        if not fresh:
+            for doubt in record.attributes.get("doubts", ()):
+                report(f"doubtful: run '{record.run}': {doubt}")
+    draw_trajectories(survey, store, done, [planned.run for planned in wanted], report)
+    if failures:
+        number = "1 trajectory" if len(failures) == 1 else f"{len(failures)} trajectories"
+        raise RunError(
+            f"{number} could not be computed: " + " | ".join(failures),
+            change="correct the survey or rig file or the logs; the next run computes only what is missing",
+        )
+    return done
+
+
+def records_with_trajectories(survey: Survey, store: Store, logs: Logs | None = None) -> list[LogRecord]:
+    """Records of the survey file's logs and of the trajectories computed from them.
+
+    Raises
+    ------
+    RunError
+        where a log is not ingested, or a trajectory not computed from the logs as they are.
+    """
+    records = survey_records(survey, store, logs)
+    planned = plan_trajectories(survey, store, records)
+    missing = [p.run for p in planned if not has_log(store, p.key)]
+    if missing:
+        raise RunError(
+            f"the trajectory of run '{missing[0]}' is not computed, or of older logs or settings",
+            change="run `roadscan navigate` (or `roadscan run`) first",
+        )
+    return [*records, *read_log_records(store, [p.key for p in planned])]
+
+
+def known_keys(survey: Survey, store: Store, logs: Logs | None = None) -> list[str]:
+    """Keys of the survey file's logs that the store holds, and of the trajectories computed from them."""
+    planned, _ = plan_logs(survey, store) if logs is None else logs
+    keys = [log.key for log in planned if has_log(store, log.key)]
+    try:
+        solutions = plan_trajectories(survey, store, read_log_records(store, keys, damaged=[]))
+    except (ConfigError, DamagedError):  # the run, and `verify`, say so
+        return keys
+    return keys + [p.key for p in solutions if has_log(store, p.key)]
+
+
+def keep_trajectory(store: Store, planned: PlannedTrajectory, report: Callable[[str], None]) -> None:
+    """Compute a trajectory and make it part of the store, in place of an older one of its run."""
+    computed = planned.compute(report)
+    with store.scratch() as folder:
+        writer = LogWriter(folder, None)
+        for table, batch in computed.rows:
+            writer.add(table, batch)
+        writer.finish()
+        for old in read_log_records(store):
+            if (old.run, old.sensor) == (planned.run, NAVIGATION) and old.key != planned.key:
+                retire_log(store, old)
+        tables = writer.publish(store, planned.run, NAVIGATION, planned.key)
+    write_log_record(
+        store,
+        LogRecord(
+            key=planned.key,
+            run=planned.run,
+            sensor=NAVIGATION,
+            format=planned.format,
+            path="",
+            content=planned.key,
+            source_bytes=0,
+            tables=tables,
+            attributes=computed.attributes,
+            rows=writer.rows["trajectory"],
+            rejected=0,
+            reject_reasons={},
+        ),
+    )
+
+
+def _figures(record: LogRecord) -> str:
+    a = record.attributes
+    if "poses_changed" in a:
+        return f", {a['poses_changed']:,} of them smoothed in {len(a['changes'])} places"
+    text = f", σ up to {a['largest_sigma_horizontal_m']:.3f} m horizontal, {a['largest_sigma_down_m']:.3f} m down"
+    if "outliers" in a:
+        text += f", {a['outliers']:,} of {a['updates']:,} updates are outliers"
+    return text

@@ -1,0 +1,65 @@
+"""What a section of the report is, and which there are: modules of `jobs/report/sections/`, and entry points."""
+
+from __future__ import annotations
+
+import functools
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Final
+
+from roadscan.core.plugins import found_kinds
+from roadscan.navigation.tasks.navigate import known_keys
+from roadscan.report.blocks import Block
+from roadscan.run.session import Session
+from roadscan.run.summary import SurveySummary, survey_summary
+from roadscan.store.logs import LogRecord, read_log_records
+
+ENTRY_POINT_GROUP: Final = "roadscan.report_sections"
+
+
+@dataclass(frozen=True)
+class Material:
+    """What sections are made of; what several of them ask for is found once."""
+
+    session: Session
+
+    @cached_property
+    def summary(self) -> SurveySummary:
+        """Figures of the whole survey."""
+        return survey_summary(self.session.survey, self.session.store)
+
+    @cached_property
+    def records(self) -> dict[str, LogRecord]:
+        """All sound records of logs by key."""
+        return {record.key: record for record in read_log_records(self.session.store, damaged=[])}
+
+    @cached_property
+    def logs(self) -> list[LogRecord]:
+        """Records of the survey file's logs and of the trajectories computed from them."""
+        listed = set(known_keys(self.session.survey, self.session.store, self.session.logs))
+        return [record for key, record in self.records.items() if key in listed]
+
+
+class Section(ABC):
+    """A section of the report. It reads small tables, records and pictures of the store, never readings."""
+
+    name: ClassVar[str]
+    """Its anchor in the page."""
+    title: ClassVar[str]
+    """Its heading."""
+    position: ClassVar[int]
+    """Sections stand in ascending order of this number: recorded 100, navigation 200, adjustment 300, surfaces 400,
+    condition 500, assets 600, products 900."""
+
+    @abstractmethod
+    def blocks(self, material: Material) -> Iterator[Block]:
+        """What the section shows; nothing where the survey has nothing of its kind: it is left out then."""
+
+
+@functools.cache
+def sections() -> tuple[Section, ...]:
+    """All sections, in the order of the page."""
+    known = found_kinds("roadscan.report.sections", Section, ENTRY_POINT_GROUP)
+    return tuple(sorted((kind() for kind in known.values()), key=lambda s: (s.position, s.name)))

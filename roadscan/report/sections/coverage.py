@@ -1,0 +1,106 @@
+"""Section of the report: a map of what was driven and which tiles hold readings, and the passes."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from itertools import cycle
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.ids import TileId
+from roadscan.report.blocks import Block, Drawing, Line, Table
+from roadscan.report.map_page import COLOURS, WIDTH, MapPage
+from roadscan.report.section import Material, Section
+from roadscan.report.sections.recorded import seconds_of
+from roadscan.store.manifest import OutputRecord
+from roadscan.tiles.plan.drives import Drives
+from roadscan.tiles.plan.plan import NothingToPlaceError
+from roadscan.tiles.tasks.tile_plan import TILE
+
+_ONE_PASS: Final = "#cfd6dd"
+_OVERLAPPED: Final = "#9fb4c7"
+_MOST_SQUARES: Final = 4000
+_MOST_POINTS: Final = 1500
+
+Float64 = npt.NDArray[np.float64]
+
+
+class Coverage(Section):
+    """Where the runs went and what they saw."""
+
+    name = "coverage"
+    title = "Passes and coverage"
+    position = 110
+
+    def blocks(self, material: Material) -> Iterator[Block]:
+        """A map of runs over tiles; a row a pass."""
+        session = material.session
+        try:
+            plan = session.plan
+        except NothingToPlaceError:
+            return
+        drives = Drives.of(plan)
+        paths = {one.run: path for one in drives.trajectories if len(path := drives.path_m(session.store, one)) > 1}
+        tiles = [r for r in session.manifest.of(TILE).values() if r.path]
+        if paths or tiles:
+            yield _drawing(paths, tiles, session.survey.config.tiles.size_m)
+        yield Table(
+            ("pass", "run", "lane", "direction", "from", "seconds"),
+            [
+                (
+                    str(p.pass_id), p.run, p.lane or "–", p.direction or "–", seconds_of(p.start_gps_ns),
+                    f"{(p.end_gps_ns - p.start_gps_ns) / NS_PER_S:,.1f}",
+                )
+                for p in plan.passes
+            ],
+        )  # fmt: skip
+
+
+def _drawing(paths: dict[str, Float64], tiles: Sequence[OutputRecord], size_m: float) -> Drawing:
+    corners = _corners(tiles, size_m)
+    page = MapPage.around(np.concatenate([*paths.values(), corners, corners + size_m]))
+    colours = dict(zip(sorted(paths), cycle(COLOURS), strict=False))
+    lines = [Line(_points(page.on_page(paths[run])), colours[run]) for run in sorted(paths)]
+    squares, edge_m = _squares(tiles, size_m)
+    placed = page.on_page(np.array([[s[0], s[1] + edge_m] for s in squares]).reshape(-1, 2))
+    legend = [(colours[run], f"run {run}") for run in sorted(paths)]
+    legend += [(_ONE_PASS, "tiles with readings"), (_OVERLAPPED, "most of it seen by two passes or more")]
+    return Drawing(
+        WIDTH, page.height, lines,
+        squares=[(x, y, edge_m * page.scale, s[2]) for (x, y), s in zip(placed.tolist(), squares, strict=True)],
+        scale_bar=page.scale_bar, legend=legend,
+        caption="Runs over the tiles that hold readings, in the coordinates of the map.",
+    )  # fmt: skip
+
+
+def _corners(tiles: Sequence[OutputRecord], size_m: float) -> Float64:
+    ids = [TileId.parse(r.unit) for r in tiles]
+    return np.array([(t.column * size_m, t.row * size_m) for t in ids]).reshape(-1, 2)
+
+
+def _squares(tiles: Sequence[OutputRecord], size_m: float) -> tuple[list[tuple[float, float, str]], float]:
+    """West and south edge and colour of squares, and their edge (m): tiles, or squares of them where they are many."""
+    ids, together = [TileId.parse(record.unit) for record in tiles], 1
+    while len({(tile.column // together, tile.row // together) for tile in ids}) > _MOST_SQUARES:
+        together *= 2
+    cells: dict[tuple[int, int], list[dict[str, Any]]] = defaultdict(list)
+    for tile, record in zip(ids, tiles, strict=True):
+        cells[tile.column // together, tile.row // together].append(record.figures())
+    edge_m = size_m * together
+    return [(c * edge_m, r * edge_m, _colour(held)) for (c, r), held in sorted(cells.items())], edge_m
+
+
+def _colour(held: Sequence[dict[str, Any]]) -> str:
+    overlapped = sum(figures.get("overlapped_cells") or 0 for figures in held)
+    return _OVERLAPPED if overlapped > 0.5 * sum(figures["cells"] for figures in held) else _ONE_PASS
+
+
+def _points(places: Float64) -> str:
+    step = max(1, math.ceil(len(places) / _MOST_POINTS))
+    kept = np.concatenate([places[::step], places[-1:]])
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in kept.tolist())

@@ -1,0 +1,36 @@
+"""Section of the report: computed trajectories, estimated clocks and calibrated mountings, with their pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from roadscan.navigation.tasks.navigation_status import NavigationStatus, navigation_status, trajectory_findings
+from roadscan.report.blocks import Block, Paragraph, Picture
+from roadscan.report.section import Material, Section
+
+
+class Navigation(Section):
+    """What was computed of poses, clocks and mountings."""
+
+    name = "navigation"
+    title = "Trajectories, clocks and mountings"
+    position = 200
+
+    def blocks(self, material: Material) -> Iterator[Block]:
+        """A line for each of them, doubts, and the recorded pictures."""
+        store = material.session.store
+        found = navigation_status(material.session.survey, store, material.logs, material.records)
+        for one in trajectory_findings(material.logs):
+            yield Paragraph(one.line, is_warning=True)
+        for line in found.lines():
+            yield Paragraph(line)
+        for path, caption in _pictures(found).items():
+            if store.exists(path):
+                yield Picture(store.read_bytes(path), caption)
+
+
+def _pictures(found: NavigationStatus) -> dict[str, str]:
+    """Captions by path: one picture may show several estimates."""
+    shown = {one["picture"]: f"Trajectory of run '{one['run']}'" for one in found.trajectories if one["picture"]}
+    shown |= {one["picture"]: f"Clock of {one['run']}/{one['sensor']}" for one in found.clocks if one["picture"]}
+    return shown | {one["picture"]: "Calibration of the mountings" for one in found.mountings if one["picture"]}

@@ -1,0 +1,38 @@
+"""Keys: short hashes of everything that an output depends on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.crs import Geoid
+
+
+def key_of(*parts: Any) -> str:
+    """Sixteen hexadecimal digits over JSON-like values (order matters, dictionaries are sorted)."""
+    text = json.dumps(parts, sort_keys=True, default=str, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def keys_of(common: str, content: npt.NDArray[np.void], ends: npt.NDArray[np.int64]) -> list[str]:
+    """A key for each part of an array of records, (parts,) `ends` of the parts; `common` shapes all of them.
+
+    Faster than :func:`key_of` for the tiles of a network.
+    """
+    begun = hashlib.blake2b(common.encode(), digest_size=8)
+    stream, size, start, found = memoryview(content.tobytes()), content.dtype.itemsize, 0, []
+    for end in (size * ends).tolist():
+        one = begun.copy()
+        one.update(stream[start:end])
+        found.append(one.hexdigest())
+        start = end
+    return found
+
+
+def grid_key(geoid: Geoid | None) -> list[str] | None:
+    """Name and content of a geoid grid: a replaced grid is another grid."""
+    return None if geoid is None else [geoid.grid, geoid.content]

@@ -1,0 +1,180 @@
+"""Tasks on a Dask cluster: what runs them, and how a scheduler that runs elsewhere is reached."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import queue
+import time
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+import dask
+from distributed import Client, KilledWorker
+from distributed.protocol import pickle
+
+from roadscan.core.errors import RoadscanError
+from roadscan.run.engine.compute import Done
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+QUIET_CLIENT = {
+    "distributed.admin.low-level-log-length": 50,
+    "distributed.admin.large-graph-warning-threshold": "1GB",
+}
+"""Settings of Dask: its log of messages holds whole tasks, by default the last 1,000 of each worker; and nobody who
+runs a survey can change how large a task is."""
+
+_HELD_A_THREAD = 2
+"""Tasks of each worker thread that the scheduler holds at least, while there are any …"""
+
+_MORE_HELD = 28
+"""… and more in all while many wait, so that messages carry several of tasks that end quickly."""
+
+_TOGETHER_S = 0.02
+"""How long results wait for half of the others at most, so that one message asks for them all."""
+
+
+class OnDask:
+    """Runs tasks on a Dask cluster; a bounded number is handed out at a time."""
+
+    def __init__(self, client: Client, workers: int | None = None) -> None:
+        """`workers` is how many there are when all are alive, where that is known."""
+        self._client, self._workers = client, workers
+
+    @property
+    def workers(self) -> int:
+        """Threads of all workers, also of those that are started anew."""
+        return self._alive() if self._workers is None else self._workers
+
+    def _alive(self) -> int:
+        return int(max(1, sum(self._client.nthreads().values())))
+
+    def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
+        """Run all tasks, most of them at the same time; a task is tried once more if its worker dies.
+
+        Those that waited at the same worker die with it. So all of them are tried again when the others have ended, on
+        half of the threads and no more than are alive, where none waits behind another: what dies there is at fault
+        itself.
+        """
+        threads = self.workers
+        died: list[T] = []
+        for done in self._ended(function, tasks, lambda left: _HELD_A_THREAD * threads + min(_MORE_HELD, left // 4)):
+            if isinstance(done.error, KilledWorker):
+                died.append(done.task)
+            else:
+                yield done
+        for done in self._ended(function, died, lambda _: max(1, min(threads // 2, self._alive()))):
+            yield Done(done.task, None, _death()) if isinstance(done.error, KilledWorker) else done
+
+    def send(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Any]:
+        """Hand some tasks to the scheduler; returns their futures.
+
+        Tasks travel as bytes: the scheduler hands them on without importing or holding what they name.
+        """
+        keys = [f"{function.__name__}-{uuid.uuid4().hex}" for _ in tasks]
+        sent = [pickle.dumps((function, task)) for task in tasks]
+        return list(self._client.map(_called, sent, key=keys, pure=False, retries=0))
+
+    def _ended(
+        self, function: Callable[[T], R], tasks: Sequence[T], held: Callable[[int], int]
+    ) -> Iterator[Done[T, R]]:
+        """Tasks as they end; `held` says how many the scheduler holds while so many are left to hand out."""
+        running: dict[str, T] = {}
+        ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+        def hand_out(first: int) -> int:
+            left = len(tasks) - first
+            chosen = tasks[first : first + max(held(left) - len(running), 0)] if left else []
+            if chosen:
+                futures = self.send(function, chosen)
+                running.update((future.key, task) for future, task in zip(futures, chosen, strict=True))
+                for future in futures:
+                    future.add_done_callback(ended.put)
+            return first + len(chosen)
+
+        handed_out = hand_out(0)
+        while running:
+            futures = _taken(ended, len(running) // 2)
+            own = [running.pop(future.key) for future in futures]
+            handed_out = hand_out(handed_out)
+            results = self._client.gather({future.key: future for future in futures}, errors="skip")
+            for future, task in zip(futures, own, strict=True):
+                error = future.exception() if future.status != "finished" else None
+                future.release()
+                yield Done(task, None if error is not None else pickle.loads(results.pop(future.key)), error)
+
+
+def _death() -> RoadscanError:
+    return RoadscanError(
+        "each worker that began this task died of it",
+        expected="a worker that lives",
+        change="most often memory is short: give fewer workers (--workers), or smaller tiles ([tiles] size_m)",
+    )
+
+
+def _taken(ended: queue.SimpleQueue[Any], wanted: int) -> list[Any]:
+    """The next futures to end: as many as are wanted, or those of a moment."""
+    taken = [ended.get()]
+    until = time.perf_counter() + _TOGETHER_S
+    with contextlib.suppress(queue.Empty):
+        while len(taken) < wanted and (left_s := until - time.perf_counter()) > 0:
+            taken.append(ended.get(timeout=left_s))
+        while True:
+            taken.append(ended.get_nowait())
+    return taken
+
+
+def _called(sent: bytes) -> bytes:
+    """Result of a function and its task, as :class:`OnDask` sends them (runs on a worker).
+
+    It is made to bytes while the task runs: a result that cannot be is the task's error then, and one whose worker dies
+    of it counts as a death.
+    """
+    function, task = pickle.loads(sent)
+    result: bytes = pickle.dumps(function(task))
+    _freeze()
+    return result
+
+
+@functools.cache
+def _freeze() -> None:
+    """Tell Python's collector, once a process, that what was loaded for a first task stays.
+
+    Else it looks through all of that again and again while records are made.
+    """
+    gc.collect()
+    gc.freeze()
+
+
+@contextlib.contextmanager
+def connected(scheduler: str) -> Iterator[OnDask]:
+    """The cluster of a scheduler (an address such as ``tls://host:8786``); where it has no worker, tasks wait for one.
+
+    Certificates for TLS come from Dask's configuration (``distributed.comm.tls``).
+
+    Raises
+    ------
+    RoadscanError
+        No scheduler answers, or it does not accept the certificate, or none is stated.
+    """
+    with dask.config.set(QUIET_CLIENT):
+        try:
+            client = Client(scheduler, timeout="30s")
+        except TypeError as error:  # so Dask says that it has no certificate
+            raise RoadscanError(
+                f"the scheduler {scheduler} is reached by TLS, and no certificate is stated",
+                expected="distributed.comm.tls in Dask's configuration: ca-file, client.cert and client.key",
+                change="state them, as docs/deployment.md shows",
+            ) from error
+        except (OSError, ValueError) as error:
+            raise RoadscanError(
+                f"no Dask scheduler answers at {scheduler}",
+                expected="tls://host:port or tcp://host:port, as the scheduler was started",
+                change=str(error),
+            ) from error
+        with client:
+            yield OnDask(client)

@@ -1,0 +1,660 @@
+"""Preflight: all mistakes of a survey that show before any log is read through, told at once, one line a cause.
+
+A check is a function of :class:`Asked` that yields errors. To add one, write it and list it in ``CHECKS`` with the
+first stage that would fail of what it finds. Checks are independent: one that needs the map says nothing where the map
+itself is at fault, since another one tells that. Of a log its header is read, and of logs of positions the first block.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import functools
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+
+from roadscan.core.crs import (
+    LOCAL_WORLD,
+    MapFrame,
+    crs_from_text,
+    geodetic_from_world,
+    one_vertical_datum,
+    world_frame_of,
+)
+from roadscan.core.errors import ConfigError, CrsError, FormatError, RoadscanError, StoreError
+from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.core.rig import SensorKind
+from roadscan.core.survey import ControlConfig, LogConfig, Survey
+from roadscan.core.witness import Witness
+from roadscan.ingest.first_look import LookedAt, key_of_look, look_at, named, never_meeting
+from roadscan.ingest.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
+from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
+from roadscan.ingest.one_stamp import one_stamp_logs
+from roadscan.ingest.overlap import Fault, NothingPlacedError, no_row
+from roadscan.ingest.place_checks import without_fix
+from roadscan.ingest.planned_logs import CONTROL_RUN, log_source
+from roadscan.ingest.sources import listed_name, remembered_formats
+from roadscan.navigation.tasks.clocks import check_clocks
+from roadscan.run.stage import stages
+from roadscan.store.logs import read_log_records
+from roadscan.store.store import Store
+from roadscan.surface.tasks.surface_colours import check_cameras
+from roadscan.surface.tasks.surface_plan import checked_surface
+from roadscan.tiles.georeferencing.place import CloudFrame
+from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.mosaics.products import check_product, wanted_tile_products
+from roadscan.tiles.plan.centre_line import CentreLines, load_buffer
+from roadscan.tiles.plan.road import looks_across
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.tasks.selection import Selection
+
+FARTHEST_DEG: Final = 10.0
+"""Positions farther than this outside the area of the map's CRS are refused (degrees): a metre of such a map is no
+metre of the road. Between 1° and that a run goes on, and says so."""
+_NEAR_DEG: Final = 1.0
+
+WORST_SCALE: Final = 0.05
+"""Maps on which lengths are wrong by more are refused, as Web Mercator far from the equator: widths of lanes and areas
+of potholes would be wrong by as much. Maps that surveyors use keep within 0.002."""
+
+KINDS: Final[dict[str, tuple[SensorKind, ...]]] = {
+    "scans": ("profiler", "lidar"),
+    "returns": ("lidar",),
+    "cloud": ("lidar", "profiler", "camera"),
+    "gnss": ("gnss",),
+    "imu": ("imu",),
+    "encoder": ("encoder",),
+    "images": ("camera",),
+    "trajectory": ("gnss", "imu"),
+    "trajectory_accuracy": ("gnss", "imu"),
+}
+"""Kinds of sensors whose logs fill a table; what is not listed may come from any."""
+
+_PLACED: Final = ("scans", "returns")
+_POSITIONS: Final = ("trajectory", "gnss")
+
+
+Place: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
+"""Longitude, latitude (°) and ellipsoidal height (m)."""
+
+
+@dataclass(frozen=True)
+class CheckedLog:
+    """A log of the survey file, as far as it can be opened."""
+
+    run: str
+    config: LogConfig | ControlConfig
+    path: Path
+    format: LogFormat | None = None
+    source: LogSource | None = None
+    header: LogHeader | None = None
+    """None where the log cannot be opened, or was ingested and moved away."""
+    error: RoadscanError | None = None
+
+    @property
+    def yields(self) -> tuple[str, ...]:
+        """Tables that it fills, none where its format is not known."""
+        return () if self.format is None else self.format.yields
+
+
+class Asked:
+    """A survey and its store, and what several checks ask of them."""
+
+    def __init__(self, survey: Survey, store: Store) -> None:
+        self.survey = survey
+        self.store = store
+
+    @cached_property
+    def frame(self) -> MapFrame | None:
+        """The map, None where its settings are at fault."""
+        try:
+            return self.survey.frame()
+        except RoadscanError:
+            return None
+
+    @cached_property
+    def logs(self) -> list[CheckedLog]:
+        """Logs of the survey file with their headers."""
+        moved = remembered_formats(self.store, self.survey.folder)
+        listed: list[tuple[str, LogConfig | ControlConfig]] = [
+            (run.id, log) for run in self.survey.config.runs for log in run.logs
+        ]
+        listed += [(CONTROL_RUN, control) for control in self.survey.config.control]
+        return [_checked(self.survey, run, config, moved) for run, config in listed]
+
+    @cached_property
+    def beginnings(self) -> list[_Beginning]:
+        """Where the positions of logs begin."""
+        return [_beginning(log) for log in self.logs]
+
+    @cached_property
+    def places(self) -> list[tuple[CheckedLog, Place, float]]:
+        """Logs of positions, where these begin, and how far outside the area of the map's CRS that is (degrees)."""
+        frame = self.frame
+        return [
+            (one.log, one.place, frame.beyond_area_deg(one.place))
+            for one in self.beginnings
+            if frame is not None and one.place is not None
+        ]
+
+    @cached_property
+    def times(self) -> list[LookedAt]:
+        """When the logs of runs that are not ingested were recorded, as far as a first look tells."""
+        held = {(record.run, record.path) for record in read_log_records(self.store, damaged=[])}
+        due = {log.run for log in self.logs if (log.run, str(log.config.path)) not in held}
+        found: list[LookedAt] = []
+        for log in self.logs:
+            if log.run not in due or log.format is None or log.source is None or log.header is None:
+                continue
+            sensor = getattr(log.config, "sensor", None) or log.format.yields[0]
+            seen = look_at(log.run, sensor, log.format, log.source, log.header)
+            if seen is not None:
+                found.append(named(seen, str(log.config.path)))
+        return found
+
+    @cached_property
+    def time_faults(self) -> list[Fault]:
+        """Logs that cannot meet the poses of their run, and those whose clock stood still."""
+        return [*never_meeting(self.survey, self.times), *one_stamp_logs([t.record for t in self.times if t.ends])]
+
+    def yields(self, run: str) -> set[str]:
+        """Tables that the logs of a run fill."""
+        return {table for log in self.logs if log.run == run for table in log.yields}
+
+
+Check: TypeAlias = Callable[[Asked], Iterator[RoadscanError]]
+
+
+def check_map(asked: Asked) -> Iterator[RoadscanError]:
+    """A CRS that is known, projected and not compound, and a geoid where heights need one."""
+    yield from _faults(asked.survey.frame)
+
+
+def check_geoids(asked: Asked) -> Iterator[RoadscanError]:
+    """Every geoid grid is there, whoever names it."""
+    config = asked.survey.config
+    named = [config.map.geoid if config.map.height == "orthometric" else None]
+    named += [log.config.geoid if log.config.height != "ellipsoidal" else None for log in asked.logs]
+    for geoid in (asked.survey.geoid(grid) for grid in dict.fromkeys(named)):
+        if geoid is not None:
+            yield from _faults(geoid.check)
+    yield from _uncovered(asked)
+
+
+def _uncovered(asked: Asked) -> Iterator[RoadscanError]:
+    """The error of the map's geoid where its grid does not cover the place where a log begins."""
+    geoid = None if asked.frame is None else asked.frame.geoid
+    if geoid is None or geoid.file is None:
+        return
+    for log, (longitude, latitude, *_), _ in asked.places:
+        faults = list(_faults(functools.partial(geoid.undulation_m, longitude, latitude)))
+        if faults:
+            yield faults[0].at(log.path)
+            return
+
+
+def check_logs(asked: Asked) -> Iterator[RoadscanError]:
+    """Every log is there, can be opened, and is told all that its reader asks for: clock, CRS, sensor, settings."""
+    for log in asked.logs:
+        if log.error is not None:
+            yield log.error
+
+
+def check_positions(asked: Asked) -> Iterator[RoadscanError]:
+    """Every log of positions has one."""
+    for one in asked.beginnings:
+        if one.error is not None:
+            yield one.error
+
+
+def check_kinds(asked: Asked) -> Iterator[RoadscanError]:
+    """A sensor's kind fits what its logs hold."""
+    for log in asked.logs:
+        sensor = None if log.source is None or log.error is not None else log.source.sensor  # a reader may have told it
+        allowed = {kind for table in log.yields for kind in KINDS.get(table, (sensor.kind if sensor else "lidar",))}
+        if sensor is not None and sensor.kind not in allowed and isinstance(log.config, LogConfig):
+            yield ConfigError(
+                f"the sensor '{log.config.sensor}' is of kind {sensor.kind}, and the log yields "
+                f"{' and '.join(log.yields)}",
+                expected="a sensor of kind " + " or ".join(sorted(allowed)),
+                change="name another sensor, or correct its kind in the rig file",
+                file=log.path,
+            )
+
+
+def check_lever_arms(asked: Asked) -> Iterator[RoadscanError]:
+    """Sensors sit on the vehicle."""
+    most_m = asked.survey.config.checks.lever_arm_max_m
+    for name, sensor in asked.survey.rig.sensors.items():
+        if max(map(abs, sensor.lever_arm_body_m)) > most_m:
+            stated = ", ".join(f"{component:g}" for component in sensor.lever_arm_body_m)
+            yield ConfigError(
+                f"the lever arm of sensor '{name}' is [{stated}] m",
+                expected=f"components of at most {most_m:g} m (checks.lever_arm_max_m)",
+                change="state lever_arm_body_m in metres; of a vehicle that is as long, raise checks.lever_arm_max_m",
+            )
+
+
+def check_times(asked: Asked) -> Iterator[RoadscanError]:
+    """A log of readings is left that meets the poses of its run, and whose clock did not stand still."""
+    found = asked.time_faults
+    faulty = {key for fault in found for key in fault.keys}
+    readings = [log for log in asked.logs if {*_PLACED, "cloud"} & set(log.yields)]
+    if readings and all(key_of_look(log.run, log.path) in faulty for log in readings):
+        yield NothingPlacedError.of(found)
+
+
+def _cloud_of(survey: Survey, attributes: Mapping[str, Any]) -> CloudFrame:
+    geoid, vertical = survey.geoid(attributes.get("geoid")), attributes.get("vertical_crs")
+    return CloudFrame(attributes["crs"], attributes["height"], geoid, vertical)
+
+
+def check_datums(asked: Asked) -> Iterator[RoadscanError]:
+    """Positions of every log can be brought into the map."""
+    astray = [log for log, _, beyond_deg in asked.places if beyond_deg > FARTHEST_DEG]  # that is told, and is enough
+    for log in asked.logs:
+        if asked.frame is None or log.header is None or log in astray:
+            continue
+        if isinstance(log.config, LogConfig) and not asked.yields(log.run) & {*_PLACED, "cloud"}:
+            continue  # nothing of its run goes to the map
+        if "cloud" in log.yields:
+            cloud = _cloud_of(asked.survey, log.header.attributes)
+            faults = (
+                [] if cloud.is_in(asked.frame) else list(_faults(functools.partial(cloud.check, asked.frame), log.path))
+            )
+            yield from faults
+            if faults or cloud.is_in(asked.frame) or cloud.is_by_proj(asked.frame):
+                continue
+        stated = log.header.attributes.get("world_frame") or log.header.attributes.get("crs")
+        crs = stated or (log.config.crs if isinstance(log.config, ControlConfig) else None)
+        if crs is not None and not (crs == LOCAL_WORLD and asked.frame.is_local):
+            world = LOCAL_WORLD if crs == LOCAL_WORLD else world_frame_of(str(crs))
+            yield from _faults(lambda frame=asked.frame, world=world: frame.check_world(world), log.path)  # type: ignore[misc]
+
+
+VERTICAL_DATUM: Final = Witness(
+    name="vertical_datum",
+    input="cloud",
+    fault="Heights of a cloud count from another vertical datum than those of the map, or of another cloud.",
+    asks="the vertical CRS that the file names, against map.vertical_crs, or that of the other clouds",
+    does="heights are transformed where PROJ knows the operation within map.max_datum_error_m and has its grid, or by "
+    "the geoids of log and map; otherwise the run ends before it computes",
+    told=("error",),
+)
+
+
+def check_vertical_datums(asked: Asked) -> Iterator[RoadscanError]:
+    """Clouds count their heights from one datum where the map states none."""
+    if asked.frame is None or asked.frame.is_local or asked.frame.vertical_crs is not None:
+        return
+    first: tuple[str, CheckedLog] | None = None
+    for log in asked.logs:
+        vertical = None if log.header is None else log.header.attributes.get("vertical_crs")
+        if vertical is None or log.header is None or log.header.attributes.get("geoid") is not None:
+            continue
+        first = first or (vertical, log)
+        if not one_vertical_datum(vertical, first[0]):
+            yield CrsError(
+                f"its heights are of {crs_from_text(vertical).name} ({vertical}), those of {first[1].config.path} of "
+                f"{crs_from_text(first[0]).name} ({first[0]})",
+                expected="clouds of one vertical datum, or a map that says into which they are brought",
+                change=f'state map.vertical_crs = "{first[0]}"; or name the geoid of each log and map.geoid',
+                file=log.path,
+            )
+
+
+def check_area(asked: Asked) -> Iterator[RoadscanError]:
+    """Positions lie where the map's CRS is made for."""
+    for log, place, beyond_deg in asked.places:
+        if beyond_deg > FARTHEST_DEG:
+            yield CrsError(
+                f"the positions begin near {_place_words(place)}, far outside the area of {_map_words(asked)}",
+                expected="the CRS of the region that was driven",
+                change="correct map.crs, or the crs of the log",
+                file=log.path,
+            )
+
+
+def check_scale(asked: Asked) -> Iterator[RoadscanError]:
+    """A metre of the map is a metre of the road."""
+    for log, place, beyond_deg in asked.places:
+        scale = 1.0 if asked.frame is None or beyond_deg > FARTHEST_DEG else asked.frame.length_scale(place)
+        if abs(scale - 1.0) > WORST_SCALE:
+            yield CrsError(
+                f"the positions begin near {_place_words(place)}, where 1 m on the ground is {scale:.2f} m in "
+                f"{_map_words(asked)}",
+                expected="a map that keeps lengths",
+                change="state the projected CRS of the region as map.crs, such as its UTM zone",
+                file=log.path,
+            )
+
+
+def check_poses(asked: Asked) -> Iterator[RoadscanError]:
+    """Each run with readings has poses, or what they are computed from."""
+    solve = asked.survey.config.navigation.solve
+    for run in asked.survey.config.runs:
+        yields = asked.yields(run.id)
+        unknown = any(log.format is None for log in asked.logs if log.run == run.id)
+        poses = "trajectory" in yields or (solve != "never" and {"gnss", "imu"} <= yields)
+        if not unknown and not poses and yields & set(_PLACED):
+            yield ConfigError(
+                f"run '{run.id}' has readings ({', '.join(sorted(yields & set(_PLACED)))}) and no trajectory",
+                expected="one trajectory log, or several in one datum; or logs of GNSS and IMU with navigation.solve",
+                change=f"add its trajectory to the logs of run '{run.id}'",
+            )
+
+
+def check_segmentation(asked: Asked) -> Iterator[RoadscanError]:
+    """The segmentation applies to some sensor: to one with profiles across the road."""
+    settings, found = asked.survey.config.segmentation, _tables_of_sensors(asked)
+    if settings is None or any(log.format is None for log in asked.logs):
+        return
+    for name in settings.sensors or ():
+        if "scans" not in found.get(name, {"scans"}):
+            yield ConfigError(
+                f"segmentation.sensors names '{name}', whose readings are {' and '.join(sorted(found[name]))}",
+                expected="a sensor with profiles, rows of the table scans",
+                change="take it out of the list",
+            )
+    if settings.sensors is None and found and not _segmented(asked):
+        known = ", ".join(f"{name} ({' and '.join(sorted(tables))})" for name, tables in sorted(found.items()))
+        yield ConfigError(
+            f"[segmentation] would do nothing: no sensor has profiles that lie across the road; there is {known}",
+            expected="scans of a sensor that looks down, its x along the driving direction",
+            change="name sensors of scans in segmentation.sensors, or take the section out",
+        )
+
+
+def check_products(asked: Asked) -> Iterator[RoadscanError]:
+    """Products are known, and so are their settings; they fit the cells."""
+    survey, stated = asked.survey, asked.survey.config.products
+    faults = [
+        fault
+        for name in dict.fromkeys([*(stated.make or ()), *stated.options])
+        for fault in _faults(lambda name=name: check_product(survey, name))  # type: ignore[misc]
+    ]
+    yield from faults
+    if faults or asked.frame is None:
+        return
+    tiles = survey.config.tiles
+    nowhen = dt.date(1980, 1, 6)
+    context = ProductContext(survey.config.id, "", asked.frame, TileGrid(tiles.size_m, tiles.cell_m), (), nowhen)
+    yield from _faults(lambda: wanted_tile_products(survey, context))
+    yield from _faults(lambda: check_cameras(survey))
+
+
+def check_surface(asked: Asked) -> Iterator[RoadscanError]:
+    """Settings of the surface fit the tiles, and its polygons lie on the map."""
+    surface = asked.survey.config.surface
+    if surface is not None and asked.frame is not None:
+        yield from _faults(lambda: checked_surface(asked.survey, surface))
+
+
+def check_centre_lines(asked: Asked) -> Iterator[RoadscanError]:
+    """The layer of centre lines can be read and lies on the map."""
+    frame = asked.frame
+    if frame is not None:
+        for fault in _faults(lambda: CentreLines.of(asked.survey)):
+            yield fault
+            return
+        lines = CentreLines.of(asked.survey)
+        if lines is not None:
+            yield from _faults(lambda: load_buffer(lines, frame))
+
+
+def check_motion_clocks(asked: Asked) -> Iterator[RoadscanError]:
+    """``[[clocks]]`` names sensors and runs that there are."""
+    yield from _faults(lambda: check_clocks(asked.survey))
+
+
+def check_passes(asked: Asked) -> Iterator[RoadscanError]:
+    """Passes are stated with a time zone, and end after they start."""
+    for one in asked.survey.config.passes:
+        faults = [f for at in (one.start, one.end) if at for f in _faults(lambda at=at: gps_ns_from_utc(at), None)]  # type: ignore[misc]
+        yield from faults
+        if not faults and one.start and one.end and one.end <= one.start:
+            yield ConfigError(f"pass {one.id} ends before it starts", change="swap its start and end")
+
+
+def check_store(asked: Asked) -> Iterator[RoadscanError]:
+    """The store can be written, and holds nothing but a survey's."""
+    if not asked.store.is_folder:
+        yield from _faults(lambda: asked.store.exists("manifest"))
+        return
+    root = Path(asked.store.root)
+    above = next(folder for folder in (root, *root.parents) if folder.exists())
+    if not above.is_dir():
+        yield StoreError("the store cannot be written: a file stands in its way", change=_STORE, file=above)
+    elif not os.access(above, os.W_OK | os.X_OK) or _is_read_only(above):
+        yield StoreError("the store cannot be written: no right to write there", change=_STORE, file=above)
+    elif above == root and _is_foreign(root):
+        yield StoreError(
+            "the folder is no store of roadscan: it holds other files",
+            change="name another folder as store, or another id of the survey",
+            file=root,
+        )
+
+
+def _is_foreign(root: Path) -> bool:
+    """Whether a folder holds files, and none of what a store has."""
+    names = {entry.name for entry in root.iterdir()}
+    return bool(names) and not names & {"manifest", "tables", "tiles", "products", ".staging"}
+
+
+_STORE: Final = "name a folder of yours as store in the survey file, or see to its rights"
+
+CHECKS: Final[tuple[tuple[str, Check], ...]] = (
+    ("ingest", check_store),
+    ("ingest", check_map),
+    ("ingest", check_geoids),
+    ("ingest", check_logs),
+    ("ingest", check_positions),
+    ("ingest", check_kinds),
+    ("ingest", check_lever_arms),
+    ("ingest", check_datums),
+    ("ingest", check_vertical_datums),
+    ("ingest", check_area),
+    ("ingest", check_scale),
+    ("ingest", check_products),
+    ("ingest", check_passes),
+    ("ingest", check_times),
+    ("navigate", check_motion_clocks),
+    ("footprints", check_poses),
+    ("footprints", check_segmentation),
+    ("footprints", check_centre_lines),
+    ("surfaces", check_surface),
+)
+"""Checks with the first stage that fails of what they find."""
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """What would fail, and what should be known."""
+
+    causes: tuple[RoadscanError, ...]
+    notes: tuple[str, ...]
+    failing: tuple[str, ...] = ()
+    """Logs that would fail while others go on, and why."""
+
+    def begin(self, report: Callable[[str], None]) -> None:
+        """Let a run begin: report the notes; raise the only cause, or one error that lists them all, a line each."""
+        for note in self.notes:
+            report(f"note: {note}")
+        if len(self.causes) == 1:
+            raise self.causes[0]
+        if self.causes:
+            lines = "".join(f"\n  - {cause}" for cause in self.causes)
+            raise ConfigError(f"{len(self.causes)} things would fail, so nothing was read:{lines}")
+
+
+def preflight(survey: Survey, store: Store, last_stage: str = "", selection: Selection | None = None) -> Preflight:
+    """Check all that can be checked before the logs are read, as far as stages up to `last_stage` (all, where none is
+    named) need it, for some tiles or for all.
+    """
+    if selection is not None and not store.exists("manifest/outputs"):
+        raise ConfigError("tiles are chosen, and none is computed yet", change="run `roadscan run` first")
+    asked = Asked(survey, store)
+    names = [stage.name for stage in stages()]
+    due = set(names[: names.index(last_stage) + 1] if last_stage else names)
+    found = [cause for stage, check in CHECKS if stage in due for cause in check(asked)]
+    found += [cause for stage in stages() if stage.name in due for cause in stage.check(survey)]
+    failing = () if found else tuple(": ".join(fault.told) for fault in asked.time_faults)
+    return Preflight(tuple(_grouped(found)), tuple(_notes(asked)), failing)
+
+
+_NAMED: Final = 3
+"""So many logs with the same fault are named."""
+
+
+def _grouped(found: Sequence[RoadscanError]) -> Iterator[RoadscanError]:
+    """One error for each cause: what several logs have in common is said once, with the first of them."""
+    by_cause: dict[tuple[str, str, str], list[RoadscanError]] = {}
+    for one in found:
+        by_cause.setdefault((one.arrived, one.expected, one.change), []).append(one)
+    for (arrived, expected, change), same in by_cause.items():
+        files = list(dict.fromkeys(one.file for one in same))
+        if len(files) == 1:
+            yield same[0]
+            continue
+        named = [file for file in files if file is not None]
+        others = len(named) - _NAMED
+        place = ", ".join(named[:_NAMED]) + (f" and {others} more" if others > 0 else "") if None not in files else None
+        yield type(same[0])(arrived, expected=expected, change=change, file=place)
+
+
+def _notes(asked: Asked) -> Iterator[str]:
+    found, settings = _tables_of_sensors(asked), asked.survey.config.segmentation
+    if settings is not None and (segmented := _segmented(asked)) and (rest := sorted(found.keys() - segmented)):
+        yield (
+            f"[segmentation] applies to {', '.join(sorted(segmented))}; all readings of {', '.join(rest)} count, "
+            "whether they hit the road or not"
+        )
+    for log, place, beyond_deg in asked.places:
+        if _NEAR_DEG < beyond_deg <= FARTHEST_DEG:
+            yield (
+                f"{log.path}: its positions begin near {_place_words(place)}, {beyond_deg:.1f}° outside the area of "
+                f"{_map_words(asked)}: distances on the map differ from those on the ground"
+            )
+
+
+def _tables_of_sensors(asked: Asked) -> dict[str, set[str]]:
+    """Tables of readings by the sensors of the survey's logs."""
+    found: dict[str, set[str]] = {}
+    for log in asked.logs:
+        placed = set(log.yields) & set(_PLACED)
+        if placed and isinstance(log.config, LogConfig) and log.config.sensor is not None:
+            found.setdefault(log.config.sensor, set()).update(placed)
+    return found
+
+
+def _segmented(asked: Asked) -> set[str]:
+    """Sensors of the survey's logs whose profiles are segmented."""
+    settings = asked.survey.config.segmentation
+    if settings is None:
+        return set()
+    scanners = {name for name, tables in _tables_of_sensors(asked).items() if "scans" in tables}
+    if settings.sensors is not None:
+        return scanners & set(settings.sensors)
+    return {name for name in scanners if looks_across(asked.survey.sensor(name).mounting())}
+
+
+@dataclass(frozen=True)
+class _Beginning:
+    """Where the first block of positions of a log lies."""
+
+    log: CheckedLog
+    place: Place | None = None
+    """None for a local frame, and where the log does not say."""
+    error: RoadscanError | None = None
+    """Why it has not one position."""
+
+
+def _beginning(log: CheckedLog) -> _Beginning:
+    """Read a log of positions as far as its first rows: it has none only where it ends before them."""
+    if log.format is None or log.source is None or log.header is None or not set(_POSITIONS) & set(log.yields):
+        return _Beginning(log)
+    items = log.format.read(log.source, log.header)
+    reasons: Counter[str] = Counter()
+    try:
+        for item in items:
+            if isinstance(item, Reject):
+                reasons[item.reason] += item.records
+            elif isinstance(item, Rows) and item.batch.num_rows:
+                return _Beginning(log, _place_of(item, str(log.header.attributes.get("world_frame", LOCAL_WORLD))))
+    except OSError:  # it was opened just now; who reads it through tells of it
+        return _Beginning(log)
+    except RoadscanError as error:
+        error.file = error.file or str(log.path)
+        return _Beginning(log, error=error)
+    finally:
+        getattr(items, "close", lambda: None)()
+    return _Beginning(log, error=no_row(reasons, log.path))
+
+
+def _place_of(rows: Rows, world: str) -> Place | None:
+    if world == LOCAL_WORLD or rows.table not in _POSITIONS:
+        return None
+    xyz = np.column_stack([rows.batch.column(f"{axis}_world_m").to_numpy(zero_copy_only=False) for axis in "xyz"])
+    known = xyz[np.isfinite(xyz).all(axis=1)]
+    known = known[~without_fix(known)] if not without_fix(known).all() else known
+    if not len(known):
+        return None
+    middle = np.median(known, axis=0)  # one wrong pose, be it the first, is not where the drive begins
+    nearest = known[np.argmin(np.linalg.norm(known - middle, axis=1))]
+    place: Place = geodetic_from_world(world, nearest[None])[0]
+    return place
+
+
+def _place_words(place: Place) -> str:
+    return f"longitude {place[0]:.1f}°, latitude {place[1]:.1f}°"
+
+
+def _map_words(asked: Asked) -> str:
+    area = crs_from_text(asked.survey.config.map.crs or "").area_of_use
+    return f"map.crs '{asked.survey.config.map.crs}'" + (f" ({area.name.split('. ')[0].rstrip('.')})" if area else "")
+
+
+def _checked(survey: Survey, run: str, config: LogConfig | ControlConfig, moved: dict[str, str]) -> CheckedLog:
+    """Open a log as far as its header."""
+    path = survey.resolve(config.path)
+    if not is_there(path) and (known := moved.get(listed_name(path, survey.folder))) is not None:
+        return CheckedLog(run, config, path, format_named(config.format or known))
+    format_: LogFormat | None = None
+    source: LogSource | None = None
+    try:
+        if cannot := cannot_be_opened(path):
+            raise cannot
+        format_ = format_named(config.format) if config.format else claimed_format(path)
+        options = format_.options.parse(config.options, file=path)
+        source = log_source(survey, config, path, format_, options)
+        for file in format_.companions(path, options):
+            if not is_there(file):
+                raise FormatError("a file that the log's options name does not exist", file=file)
+        return CheckedLog(run, config, path, format_, source, format_.header(source))
+    except OSError as error:
+        fault = FormatError(f"it cannot be opened: {error.strerror or error}", file=path)
+        return CheckedLog(run, config, path, format_, source, error=fault)
+    except RoadscanError as error:
+        error.file = error.file or str(path)
+        return CheckedLog(run, config, path, format_, source, error=error)
+
+
+def _is_read_only(folder: Path) -> bool:
+    """Whether the file system takes no files, which the rights of a folder do not say to its administrator."""
+    return bool(os.statvfs(folder).f_flag & os.ST_RDONLY)
+
+
+def _faults(check: Callable[[], object], file: Path | None = None) -> Iterator[RoadscanError]:
+    """What a function raises on purpose; with the file that is meant, where it does not name one."""
+    try:
+        check()
+    except RoadscanError as error:
+        if error.file is None and file is not None:
+            error.file = str(file)
+        yield error

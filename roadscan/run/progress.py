@@ -1,0 +1,85 @@
+"""Progress: bars on a terminal, plain lines in a log."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from roadscan.run.session import Reporter
+
+
+class Shown(Reporter):
+    """What both kinds share: they know how far a stage is."""
+
+    def __init__(self) -> None:
+        self._done: dict[str, tuple[int, int]] = {}
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """Keep how far a stage is."""
+        self._done[stage] = (done, total)
+
+    def where(self, stage: str) -> str:
+        """How far a stage is, in words."""
+        if stage not in self._done:
+            return f"in the stage {stage}" if stage else "before the first stage"
+        done, total = self._done[stage]
+        return f"in the stage {stage}, {done:,} of {total:,} done"
+
+
+class LineReporter(Shown):
+    """Plain lines on standard error; at most one every few seconds a stage."""
+
+    def __init__(self, every_s: float = 5.0) -> None:
+        super().__init__()
+        self._every_s = every_s
+        self._last: dict[str, float] = {}
+
+    def line(self, text: str) -> None:
+        """Print a line."""
+        sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """Print how far a stage is."""
+        super().progress(stage, done, total)
+        now = time.monotonic()
+        if total and (done == total or now - self._last.get(stage, 0.0) >= self._every_s):
+            self._last[stage] = now
+            self.line(f"{stage}: {done} of {total}")
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+class TerminalReporter(Shown):
+    """Bars on standard error."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._bars = Progress(
+            TextColumn("{task.description:>10}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )
+        self._ids: dict[str, TaskID] = {}
+        self._bars.start()
+
+    def line(self, text: str) -> None:
+        """Print a line above the bars."""
+        self._bars.console.print(text, highlight=False, markup=False)
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """Move a stage's bar."""
+        super().progress(stage, done, total)
+        if stage not in self._ids:
+            self._ids[stage] = self._bars.add_task(stage, total=total)
+        self._bars.update(self._ids[stage], completed=done, total=total)
+
+    def close(self) -> None:
+        """Leave the bars as they stand."""
+        self._bars.stop()

@@ -1,0 +1,122 @@
+"""Stages run one after another on a session; what fails is kept and told at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from roadscan.core.counted import counted
+from roadscan.core.errors import RoadscanError, RunError
+from roadscan.navigation.tasks.navigate import known_keys
+from roadscan.run.engine.compute import damaged_file, rare_collections
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, findings_of, stages
+from roadscan.store.logs import read_log_records
+from roadscan.store.manifest import begin_changes, end_changes, write_failures
+from roadscan.store.mend import mend_records
+from roadscan.store.verified import note_written, recorded_files
+from roadscan.tiles.plan.plan import NothingToPlaceError
+from roadscan.tiles.tasks.selection import SelectionError
+
+_CLOCK_TICK_NS: Final = 50_000_000
+"""A file's time may lie that much before the clock's."""
+
+
+def run_stages(session: Session, chosen: Sequence[Stage] | None = None) -> None:
+    """Run stages in their order (all, where none are chosen), then close the run.
+
+    Raises
+    ------
+    RunError
+        at the end, if any unit failed; all others are finished and kept.
+    """
+    wanted = stages() if chosen is None else chosen
+    with session.store.lock():
+        for stage in wanted:
+            started = time.perf_counter()
+            run_stage(session, stage)
+            session.reporter.line(f"{stage.name}: {time.perf_counter() - started:.1f} s")
+        close_run(session, wanted)
+
+
+def run_stage(session: Session, stage: Stage) -> None:
+    """Run one stage; where units of an earlier one failed, its own end joins their list instead of hiding it."""
+    session.stage = stage.name
+    if session.goes_on is None:
+        mend_records(session.store, session.note)
+        session.goes_on = begin_changes(session.store)
+        session.began_ns = time.time_ns() - _CLOCK_TICK_NS
+    try:
+        with rare_collections():
+            stage.run(session)
+        _tell_findings(session, stage)
+    except SelectionError:
+        raise
+    except NothingToPlaceError as nothing:
+        if not session.places_nothing:
+            session.note(str(nothing))
+        session.places_nothing = True
+    except RoadscanError as error:
+        if damaged := damaged_file(error):
+            session.manifest.doubt_files({damaged})  # the next run makes it again
+        if not session.failures:
+            with contextlib.suppress(RoadscanError):  # a store that cannot be written is the error itself
+                write_failures(session.store, [{"stage": stage.name, "unit": "as a whole", "reason": str(error)}])
+            raise
+        session.failed(stage.name, [("as a whole", error)])
+
+
+def _tell_findings(session: Session, stage: Stage) -> None:
+    if type(stage).findings is Stage.findings:  # it asks nobody: no record need be read
+        return
+    listed = set(known_keys(session.survey, session.store, session.logs))
+    records = [r for r in read_log_records(session.store, damaged=[]) if r.key in listed]
+    for one in findings_of(session.survey, records, session.manifest, [stage]):
+        session.note(one.line)
+
+
+def _removed_words(paths: Sequence[str]) -> str:
+    folders = dict.fromkeys(path.rpartition("/")[0] for path in paths)
+    return f"removed {counted(len(paths), 'file')} that a stopped run left without a record, in {', '.join(folders)}"
+
+
+def close_run(session: Session, done: Sequence[Stage]) -> None:
+    """Keep the list of failures for `roadscan status`, and raise if there are any.
+
+    A whole run without failures has a record for every file that is due: what a run before it left without one is
+    removed.
+    """
+    whole = {stage.name for stage in done}.issuperset(stage.name for stage in stages())
+    write_failures(session.store, [{"stage": s, "unit": u, "reason": r} for s, u, r in session.failures])
+    if whole:
+        _report(session)
+        session.manifest.compact()
+        if session.selection is None and not session.failures:
+            folders = [folder for stage in stages() for folder in stage.folders()]
+            removed = end_changes(session.store, session.manifest, folders if session.goes_on else ())
+            if removed:
+                session.note(_removed_words(removed))
+    if session.store.is_folder:
+        logs = read_log_records(session.store, damaged=[])
+        note_written(session.store, session.began_ns, recorded_files(session.store, logs, session.manifest))
+    if session.failures:
+        listed = "; ".join(f"{s} {u}: {r}" for s, u, r in session.failures[:10])
+        more = f"; and {len(session.failures) - 10} more (`roadscan status`)" if len(session.failures) > 10 else ""
+        raise RunError(
+            f"{counted(len(session.failures), 'unit')} failed: {listed}{more}",
+            change="everything else is finished; the next run does only these",
+        )
+
+
+def _report(session: Session) -> None:
+    """Write the report; what keeps it from being made costs nothing else."""
+    from roadscan.report.page import keep_report
+
+    try:
+        path = keep_report(session)
+    except RoadscanError as error:
+        session.note(f"the report could not be written: {error}")
+    else:
+        session.reporter.line(f"report: {session.store.path(path)}")

@@ -1,0 +1,123 @@
+"""What a stage is, and which there are: the modules of `jobs/stages/`, and entry points of other packages."""
+
+from __future__ import annotations
+
+import functools
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Final
+
+from roadscan.core.errors import ConfigError, RoadscanError, nearest
+from roadscan.core.plugins import found_kinds
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding
+from roadscan.run.session import Session
+from roadscan.store.logs import LogRecord
+from roadscan.store.manifest import Manifest
+
+ENTRY_POINT_GROUP: Final = "roadscan.stages"
+
+
+@dataclass
+class StageState:
+    """What there is of a stage's outputs, and what the next run would do."""
+
+    current: int = 0
+    """Units that are finished and up to date."""
+    stale: int = 0
+    """Units that are missing or out of date."""
+    empty: int = 0
+    """Units that were looked at and hold nothing: a run's progress counts these, too."""
+    next_run: dict[str, int] = field(default_factory=dict)
+    """What the next run would do, by words of its own: tasks, bytes read."""
+    notes: list[str] = field(default_factory=list)
+    """What the user should know."""
+    lines: list[str] = field(default_factory=list)
+    """A line for each of the things it made, where these are few."""
+    faults: list[tuple[str, str]] = field(default_factory=list)
+    """Units that the next run cannot do, with the reason, as far as that is known before it."""
+    hides_rest: bool = False
+    """True where nothing can be said of later stages before this one has run."""
+
+
+class Stage(ABC):
+    """One stage of a run. It does what is missing or stale, and nothing else."""
+
+    name: ClassVar[str]
+    """Its name, and the command that runs it alone, unless `command` says another."""
+    title: ClassVar[str]
+    """What it makes, in a line."""
+    after: ClassVar[tuple[str, ...]] = ()
+    """Stages that have to be done before."""
+    command: ClassVar[str] = ""
+    """Name on the command line where it is not `name`."""
+    uses_workers: ClassVar[bool] = True
+    """False for a stage that computes in the run's own process."""
+
+    @abstractmethod
+    def run(self, session: Session) -> None:
+        """Bring the stage's outputs up to date; failures of single units join ``session.failures``."""
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """All that is wrong with the survey file as far as it concerns this stage; called before a run reads a log."""
+        return []
+
+    def state(self, session: Session) -> StageState:
+        """What there is and what is to do; reads no readings.
+
+        Raises
+        ------
+        RoadscanError
+            where that cannot be said: `status` shows the reason.
+        """
+        return StageState()
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """What the witnesses of its inputs said: told during a run, in the summary, by `status` and in the report.
+
+        It comes from the records of the survey's logs and computed trajectories, and from the manifest, in no time.
+        """
+        return ()
+
+    def folders(self) -> Sequence[str]:
+        """Folders of the store that hold nothing but files that the manifest names: other files in them are removed."""
+        return ()
+
+    @property
+    def word(self) -> str:
+        """Its name on the command line."""
+        return self.command or self.name
+
+
+def findings_of(
+    survey: Survey, records: Sequence[LogRecord], manifest: Manifest, chosen: Sequence[Stage] | None = None
+) -> list[Finding]:
+    """What the witnesses of stages (of all, where none are chosen) said, each finding once."""
+    said = (one for s in (stages() if chosen is None else chosen) for one in s.findings(survey, records, manifest))
+    return list(dict.fromkeys(said))
+
+
+@functools.cache
+def stages() -> tuple[Stage, ...]:
+    """All stages, each after those that it needs; neighbours by name."""
+    known = found_kinds("roadscan.jobs.stages", Stage, ENTRY_POINT_GROUP)
+    waiting = {name: kind() for name, kind in known.items()}
+    ordered: list[Stage] = []
+    while waiting:
+        done = {stage.name for stage in ordered}
+        ready = [stage for _, stage in sorted(waiting.items()) if done.issuperset(stage.after)]
+        if not ready:
+            needs = "; ".join(f"'{s.name}' after {', '.join(s.after)}" for s in waiting.values())
+            raise ConfigError(f"these stages can never run: {needs}", expected="stages that exist, in no circle")
+        ordered.append(ready[0])
+        del waiting[ready[0].name]
+    return tuple(ordered)
+
+
+def stage_named(name: str) -> Stage:
+    """Stage by name, or an error that names the nearest known one."""
+    known = {stage.name: stage for stage in stages()}
+    if name not in known:
+        raise ConfigError(f"unknown stage '{name}'{nearest(name, known)}", expected="one of: " + ", ".join(known))
+    return known[name]

@@ -1,0 +1,229 @@
+"""What the store holds, what is stale, what failed; and whether every file is whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.core.errors import RoadscanError, StoreError
+from roadscan.core.witness import Finding
+from roadscan.ingest.overlap import NothingPlacedError
+from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog
+from roadscan.ingest.sources import damaged_sources
+from roadscan.navigation.tasks.navigate import known_keys
+from roadscan.run.preflight import preflight
+from roadscan.run.session import Session
+from roadscan.run.stage import StageState, findings_of, stages
+from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
+from roadscan.store.manifest import Manifest, OutputRecord, read_failures
+from roadscan.store.mend import fault_of
+from roadscan.store.salvage import Lost, read_lost
+from roadscan.store.sql_files import Stamp, stamp_of
+from roadscan.store.store import Store
+from roadscan.store.verified import held_faults, note_verified
+from roadscan.tiles.footprints.footprints import PRODUCT
+from roadscan.tiles.plan.plan import NothingToPlaceError
+from roadscan.tiles.product import products
+from roadscan.tiles.tasks.tile_fates import told
+from roadscan.tiles.tasks.tile_plan import TILE
+
+
+@dataclass
+class Status:
+    """State of a survey."""
+
+    logs: list[dict[str, Any]] = field(default_factory=list)
+    """Logs of the survey file: run, sensor, path, format, rows, rejected, state."""
+    unused_logs: list[str] = field(default_factory=list)
+    """Logs in the store that the survey file no longer lists."""
+    readings: dict[str, int] = field(default_factory=dict)
+    """Readings by fate."""
+    stages: dict[str, StageState] = field(default_factory=dict)
+    """What there is and what is to do, by stage; without those of which nothing can be said yet."""
+    outputs: dict[str, int] = field(default_factory=dict)
+    """Finished files by product."""
+    failures: list[dict[str, str]] = field(default_factory=list)
+    """What failed in the last run."""
+    checked: list[str] = field(default_factory=list)
+    """What the checks before a run note of the survey."""
+    damaged: list[str] = field(default_factory=list)
+    """Records of the store that are damaged; the next run mends them."""
+    lost: list[Lost] = field(default_factory=list)
+    """Ingested rows that the store holds no more, and that could not be read again."""
+    findings: list[Finding] = field(default_factory=list)
+    """What the witnesses of the inputs said."""
+    note: str = ""
+    """Why nothing can be said of tiles."""
+    would_fail: list[str] = field(default_factory=list)
+    """Why the next run would fail, as far as that is known before it."""
+    places_nothing: str = ""
+    """Why there are no tiles, and shall be none: no log of the survey holds readings."""
+
+    @property
+    def is_complete(self) -> bool:
+        """True if nothing is missing, stale or failed, and no rows are lost but those that the user gave up."""
+        lost = any(not one.accepted for one in self.lost)
+        due = any(state.stale or state.hides_rest for state in self.stages.values())
+        return not (due or self.failures or self.damaged or self.note or self.would_fail or lost)
+
+    @property
+    def notes(self) -> list[str]:
+        """What the user should know, beside what is to do."""
+        found = [one.line for one in self.findings]
+        return [*self.checked, *found, *(note for state in self.stages.values() for note in state.notes)]
+
+    @property
+    def next_run(self) -> dict[str, int]:
+        """What the next run would do: tasks, tiles, raw bytes, bytes of memory a worker."""
+        return {word: count for state in self.stages.values() for word, count in state.next_run.items()}
+
+    def of(self, stage: str) -> StageState:
+        """State of a stage; an empty one where nothing can be said of it yet."""
+        return self.stages.get(stage, StageState())
+
+
+def survey_status(session: Session) -> Status:
+    """Look at everything the manifest says; reads no readings."""
+    store, damaged = session.store, session.hear_of_damage()
+    found = preflight(session.survey, store)
+    causes = [*map(str, found.causes), *found.failing]
+    status = Status(failures=read_failures(store), would_fail=causes.copy(), checked=list(found.notes))
+    planned, unplanned = session.logs
+    unsaid = [u for u in unplanned if not causes]  # else it is said there, once for a cause
+    status.failures += [{"stage": "ingest", "unit": u.path, "reason": str(u.error)} for u in unsaid]
+    manifest = session.manifest
+    records = {r.key: r for r in read_log_records(store, damaged=damaged)}
+    status.damaged = list(map(str, damaged))
+    status.lost = read_lost(store)
+    status.logs = [_log_state(store, log, records.get(log.key)) for log in planned]
+    status.logs += [_unplanned_state(one) for one in unplanned]
+    keys = {*(log.key for log in planned), *known_keys(session.survey, store, session.logs)}
+    status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
+    status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
+    status.readings = told([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])
+    status.findings = findings_of(session.survey, [r for r in records.values() if r.key in keys], manifest)
+    for stage in stages():
+        try:
+            status.stages[stage.name] = state = stage.state(session)
+        except NothingPlacedError as error:
+            status.would_fail.append(str(error))
+            break
+        except NothingToPlaceError as nothing:
+            status.places_nothing = str(nothing)
+            break
+        except RoadscanError as error:
+            status.note = str(error)  # a survey may hold tables only: poses without readings, readings without poses
+            break
+        status.would_fail += [f"{unit}: {reason}" for unit, reason in state.faults]
+        status.failures = [one for one in status.failures if (one["unit"], one["reason"]) not in state.faults]
+        if state.hides_rest:
+            break
+    return status
+
+
+def _log_state(store: Store, log: PlannedLog, record: LogRecord | None) -> dict[str, Any]:
+    return {
+        "run": log.run,
+        "sensor": log.sensor,
+        "path": str(log.config.path),
+        "format": log.format.name,
+        "rows": record.rows if record else 0,
+        "rejected": record.rejected if record else 0,
+        "state": "ingested" if record else "damaged" if has_log(store, log.key) else "waiting",
+        "bytes": log.bytes,
+    }
+
+
+def _unplanned_state(log: UnplannedLog) -> dict[str, Any]:
+    """Of a log that cannot be planned: a file of it is missing, or its settings are wrong."""
+    unknown = dict.fromkeys(("rows", "rejected", "bytes"), 0)
+    return {"run": log.run, "sensor": "", "path": log.path, "format": "", "state": "cannot be read", **unknown}
+
+
+@dataclass
+class Damage:
+    """What is wrong with the files of a store."""
+
+    faults: list[str] = field(default_factory=list)
+    """Of records, small tables and outputs, in words."""
+    ingested: dict[str, str] = field(default_factory=dict)
+    """Of files of ingested rows, by their paths relative to the survey's root."""
+
+
+def verify_store(store: Store, report: Callable[[int, int], None] = lambda _a, _b: None) -> list[str]:
+    """Read every file the store should hold and compare it with what was recorded; returns the faults.
+
+    A product that is not whole counts as stale from then on: the next run makes it again.
+    """
+    with store.lock():
+        found = find_damage(store, report)
+    return found.faults + [
+        f"{fault}; `roadscan verify --repair` reads its log again" for fault in found.ingested.values()
+    ]
+
+
+def find_damage(store: Store, report: Callable[[int, int], None] = lambda _a, _b: None) -> Damage:
+    """The same, by whoever has the store's lock; what is whole is noted, so that SQL need not read it."""
+    damaged: list[StoreError] = []
+    manifest = Manifest(store, damaged)
+    logs = read_log_records(store, damaged=damaged)
+    found = Damage(
+        [*map(str, damaged), *damaged_sources(store), *_copy_faults(store, [r.key for r in logs]), *held_faults(store)]
+    )
+    data = [f for r in logs for own in r.tables.values() for f in own]
+    outputs = [r for r in manifest.all() if r.path]
+    odd: list[OutputRecord] = []
+    whole: dict[str, Stamp] = {}
+    total = len(data) + len(outputs)
+    with store.scratch() as folder:
+        for number, file in enumerate(data, 1):
+            stamp = stamp_of(store, file.path)  # before it is read
+            fault = fault_of(store, folder, file.path, file.bytes, file.digest)
+            if fault:
+                found.ingested[file.path] = fault
+            elif stamp is not None:
+                whole[file.path] = stamp
+            report(number, total)
+        for number, record in enumerate(outputs, len(data) + 1):
+            stamp = stamp_of(store, record.path)
+            fault = _check_output(store, folder, record)
+            if fault:
+                found.faults.append(f"{fault}; the next run makes it again")
+                odd.append(record)
+            elif stamp is not None and record.path.endswith(".parquet"):
+                whole[record.path] = stamp
+            report(number, total)
+    manifest.doubt(odd)
+    note_verified(store, whole, anew=True)
+    return found
+
+
+def _copy_faults(store: Store, keys: Sequence[str]) -> list[str]:
+    """Copies of sound log records that differ from them; they are set aside, so that the next run writes them anew."""
+    faults: list[str] = []
+    for key in keys:
+        copy = copy_path(key)
+        if store.exists(copy) and store.read_bytes(copy) != store.read_bytes(record_path(key)):
+            aside = store.set_aside(copy)
+            faults.append(f"{copy}: differs from the log's record and was set aside ({aside}); the next run copies it")
+    return faults
+
+
+def _check_output(store: Store, folder: Path, record: OutputRecord) -> str | None:
+    fault = fault_of(store, folder, record.path, record.bytes, record.digest)
+    if fault is not None:
+        return fault
+    local = store.local_copy(record.path, folder)
+    try:
+        if record.product in products():
+            products()[record.product].check(local)
+        elif record.path.endswith(".parquet"):
+            pq.ParquetFile(local).read(use_threads=False)
+    except (RoadscanError, OSError, pa.ArrowInvalid) as error:
+        return f"{record.path}: {error}"
+    return None

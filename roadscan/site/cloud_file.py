@@ -1,0 +1,161 @@
+"""A kilometre sheet of points as one COPC file: points are kept by square on the disk, and written cell by cell.
+
+Memory holds the points of one block of tiles, of the cells of one column of the octree, and of the nodes above the
+cells, which are one point a voxel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.errors import StoreError
+from roadscan.core.gpstime import utc_from_gps_ns
+from roadscan.core.ids import TileId
+from roadscan.store.codecs.copc import CopcWriter, Key
+from roadscan.tiles.georeferencing.cloud import TilePoints
+from roadscan.tiles.georeferencing.octree import CELL_M, Cube, NodeCutter
+from roadscan.tiles.products.cloud_records import SCALE_M, Lattice, layout_of, picked, records_of, without_colours
+
+_SQUARE_M: Final = 16.0
+"""Larger tiles are kept in squares of about this edge."""
+_BATCH_POINTS: Final = 1_000_000
+"""Nodes with so many points are compressed side by side."""
+
+Records = npt.NDArray[np.void]
+
+
+@dataclass(frozen=True)
+class _Square:
+    """Points of a square of the map, where they lie in the scratch file."""
+
+    tile: TileId
+    part: int
+    at: int
+    """First record."""
+    count: int
+    low: tuple[int, int]
+    high: tuple[int, int]
+    """Least and greatest stored x and y."""
+
+
+class PointSpool:
+    """Points of a sheet on the disk, square by square."""
+
+    def __init__(self, path: Path, lattice: Lattice) -> None:
+        self._lattice, self._path = lattice, path
+        self._kind = layout_of(lattice.map, coloured=True).records
+        self._squares: list[_Square] = []
+        self.low = np.full(3, np.iinfo(np.int32).max, np.int64)
+        """Least stored coordinates."""
+        self.high = np.full(3, np.iinfo(np.int32).min, np.int64)
+        """Greatest stored coordinates."""
+        self.count = 0
+        self.coloured = False
+        """True where any point has a colour."""
+        self.first_epoch_gps_ns = np.iinfo(np.int64).max
+
+    def fill(self, tiles: Iterable[TilePoints]) -> None:
+        """Take the points of tiles, each tile once and in any order."""
+        with self._path.open("wb") as stream:
+            for points in tiles:
+                self._take(points, stream)
+        self._squares.sort(key=lambda s: (s.tile.row, s.tile.column, s.part))
+
+    def _take(self, points: TilePoints, stream: BinaryIO) -> None:
+        records = records_of(points, self._lattice)
+        self.coloured = self.coloured or "red" in points.extra
+        self.first_epoch_gps_ns = min(self.first_epoch_gps_ns, int(points.epoch_gps_ns.min()))
+        for axis, name in enumerate("XYZ"):
+            self.low[axis] = min(self.low[axis], records[name].min())
+            self.high[axis] = max(self.high[axis], records[name].max())
+        for part, own in self._parts(points, records):
+            x, y = own["X"], own["Y"]
+            low, high = (int(x.min()), int(y.min())), (int(x.max()), int(y.max()))
+            self._squares.append(_Square(points.tile, part, self.count, own.size, low, high))
+            stream.write(np.ascontiguousarray(own).view(np.uint8).data)
+            self.count += own.size
+
+    def _parts(self, points: TilePoints, records: Records) -> Iterator[tuple[int, Records]]:
+        """Squares of a tile's points, in the order of the points."""
+        grid = self._lattice.grid
+        across = max(1, round(grid.size_m / _SQUARE_M))
+        if across == 1:
+            yield 0, records
+            return
+        edge = -(-grid.size_quanta // across)
+        number = (points.y_quanta // edge).astype(np.int64) * across + points.x_quanta // edge
+        order = np.argsort(number, kind="stable")
+        starts = np.flatnonzero(np.diff(number[order], prepend=-1))
+        for first, end in zip(starts.tolist(), [*starts[1:].tolist(), number.size], strict=True):
+            yield int(number[order[first]]), picked(records, order[first:end])
+
+    def columns(self, cube: Cube) -> Iterator[Records]:
+        """Points of each column of the octree's cells, column by column from the west, each from the south."""
+        places: dict[tuple[int, int], list[_Square]] = {}
+        for square in self._squares:
+            spans = []
+            for axis in (0, 1):
+                ends = cube.cells(axis, np.array([square.low[axis], square.high[axis]], np.int32)).tolist()
+                spans.append(range(ends[0], ends[1] + 1))
+            for column in spans[0]:
+                for row in spans[1]:
+                    places.setdefault((column, row), []).append(square)
+        with self._path.open("rb") as stream:
+            for place in sorted(places):
+                held = [self._inside(stream, square, place, cube) for square in places[place]]
+                joined = np.concatenate(held)
+                if joined.size:
+                    yield joined
+
+    def _inside(self, stream: BinaryIO, square: _Square, place: tuple[int, int], cube: Cube) -> Records:
+        stream.seek(square.at * self._kind.itemsize)
+        records = np.fromfile(stream, self._kind, square.count)
+        if records.size != square.count:
+            raise StoreError("points are missing from the scratch file", file=self._path)
+        inside = np.ones(records.size, np.bool_)
+        for axis, name in enumerate("XY"):
+            first, end = (cube.first_step(axis, place[axis] + k) for k in (0, 1))
+            if square.low[axis] < first:
+                inside &= records[name] >= first
+            if square.high[axis] >= end and place[axis] + 1 < 1 << cube.top:
+                inside &= records[name] < end
+        return records if inside.all() else picked(records, np.flatnonzero(inside))
+
+
+def write_cloud(path: Path, spool: PointSpool, lattice: Lattice, facts: dict[str, Any]) -> None:
+    """Write all points of a spool as COPC 1.0."""
+    layout = layout_of(lattice.map, coloured=spool.coloured)
+    low, high = (tuple(map(int, one.tolist())) for one in (spool.low, spool.high))
+    cube = Cube.around((low[0], low[1], low[2]), (high[0], high[1], high[2]), CELL_M / SCALE_M)
+    date = utc_from_gps_ns(spool.first_epoch_gps_ns).date()
+    writer = CopcWriter(path, layout, lattice.offsets, date)
+    cutter = NodeCutter(cube)
+    above: dict[Key, list[Records]] = {}
+    with writer.begin(cube.corner, cube.edge, {**facts, "points": spool.count}):
+        waiting: list[tuple[Key, Records]] = []
+        for column in spool.columns(cube):
+            records = column if spool.coloured else without_colours(column, layout.records)
+            for node in cutter.nodes(records["X"], records["Y"], records["Z"]):
+                own = picked(records, node.points)
+                if node.key.level < cube.top:
+                    above.setdefault(node.key, []).append(own)
+                else:
+                    waiting.append((node.key, own))
+            waiting = _written(writer, waiting)
+        _written(writer, [*waiting, *((key, np.concatenate(above[key])) for key in sorted(above))], at_least=1)
+
+
+def _written(
+    writer: CopcWriter, waiting: Sequence[tuple[Key, Records]], at_least: int = _BATCH_POINTS
+) -> list[tuple[Key, Records]]:
+    """What still waits after nodes of enough points were written."""
+    if sum(records.size for _, records in waiting) < at_least:
+        return list(waiting)
+    writer.add(waiting)
+    return []

@@ -1,0 +1,74 @@
+"""Edits: which layers people may edit, and where their edits go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from roadscan.core.errors import DamagedError
+from roadscan.inventory.homes.page_edits import LAYER
+from roadscan.site.document import Document, json_document
+from roadscan.site.layers.assets import GEOMETRY_OF, site_column
+from roadscan.site.material import Material
+from roadscan.site.part import SitePart
+from roadscan.site.parts.vectors import site_layers
+from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.inventory_schema import asset_columns, editable_columns
+
+POST: Final = "edits"
+"""Where a server takes edits."""
+FORMS: Final = "edits/forms.json"
+"""The columns that people fill in, by layer."""
+
+
+class Edits(SitePart):
+    """The layers of the inventory, where edits are wished for and the survey has one."""
+
+    name = "edits"
+    position = 150
+
+    def members(self, material: Material) -> Mapping[str, Any]:
+        """The layers, the commit that they show, and where edits are sent; null where nothing is to be edited."""
+        return {"edits": _about(material)}
+
+    def documents(self, material: Material) -> Iterator[Document]:
+        """The forms of all kinds; what is edited lies in the layers."""
+        if _about(material) is not None:
+            yield json_document(FORMS, forms())
+
+
+def kinds() -> list[dict[str, str]]:
+    """All kinds of assets by title: the layer that each has, and how it is drawn."""
+    known = [asset_schema(kind) for kind in asset_kind_names()]
+    told = [
+        {"layer": f"{LAYER}{one.table}", "title": one.title, "geometry": GEOMETRY_OF[one.geometry]} for one in known
+    ]
+    return sorted(told, key=lambda one: one["title"])
+
+
+def forms() -> dict[str, Any]:
+    """The columns of each kind that people fill in when they draw one of it, its own first."""
+    columns = {}
+    for kind in asset_kind_names():
+        schema, edited = asset_schema(kind), editable_columns(kind)
+        order = [*schema.own, *(c for c in asset_columns(kind) if c not in schema.own)]
+        columns[f"{LAYER}{schema.table}"] = [
+            site_column(c, (), is_edited=True).stated() for c in order if c.name in edited
+        ]
+    return {"columns": columns}
+
+
+def _about(material: Material) -> dict[str, Any] | None:
+    if not material.wishes.edits:
+        return None
+    try:
+        shown = material.inventory
+    except DamagedError:
+        return None
+    if shown is None:
+        return None
+    name, state = shown
+    layers = [layer.name for layer in site_layers(material)[0] if layer.name.startswith(LAYER)]
+    post = POST if material.wishes.edits == "post" else None
+    about = {"layers": layers, "kinds": kinds(), "forms": FORMS, "post": post}
+    return about | {"inventory": name, "commit": state.commit}

@@ -1,0 +1,147 @@
+"""Pictures of cameras with their poses, and cut-outs of assets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from roadscan.core.errors import DamagedError
+from roadscan.navigation.tasks.taken_pictures import taken_pictures
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.site.document import Ask, Document, json_document
+from roadscan.site.material import Material, sheet_name
+from roadscan.site.part import SitePart
+from roadscan.site.parts.vectors import site_layers
+from roadscan.site.site_pictures import (
+    SHOWN_AS_THEY_ARE,
+    cut_out_records,
+    cut_out_url,
+    picture_url,
+    placed_pictures,
+)
+from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.surface.tasks.pictures import Pictures as PlacedPictures
+from roadscan.surface.views import HEIGHT, WIDTH
+from roadscan.tiles.georeferencing.picture_axes import camera_from_map
+
+_LENS: Final = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+_CODE: Final = "roadscan.site.parts.pictures"
+
+
+class Pictures(SitePart):
+    """Pictures that have a pose, by kilometre sheet of the camera."""
+
+    name = "pictures"
+    position = 600
+
+    def members(self, material: Material) -> Mapping[str, Any]:
+        """Where the index lies."""
+        held = placed_pictures(material)
+        return {"pictures": {"url": "pictures/index.json", "pictures": len(held)} if held is not None else None}
+
+    def documents(self, material: Material) -> Iterator[Document]:
+        """The index, poses by sheet, and the pictures."""
+        held = placed_pictures(material)
+        if held is None:
+            return
+        sheets: dict[str, list[int]] = {}
+        for number, (east, north) in enumerate(held.place_m.tolist()):
+            sheets.setdefault(sheet_name(east, north), []).append(number)
+        parts = [
+            {"url": f"pictures/{name}.json", "bounds_m": _bounds(held, numbers), "pictures": len(numbers)}
+            for name, numbers in sorted(sheets.items())
+        ]
+        epochs = _epochs(material, held)
+        yield json_document("pictures/index.json", {"cameras": _cameras(held), "parts": parts})
+        for name, numbers in sorted(sheets.items()):
+            yield json_document(f"pictures/{name}.json", _poses(held, numbers, epochs))
+        for number in range(len(held)):
+            yield Document(picture_url(held, number), _key(held, number), _copied(held, number))
+        shown = {one.get("url") for layer in site_layers(material)[0] for row in layer.evidence for one in row}
+        for record in cut_out_records(material).values():
+            if cut_out_url(record) in shown:
+                yield Document(cut_out_url(record), record.digest, _stored(material, record))
+
+
+def _stored(material: Material, record: OutputRecord) -> Any:
+    def write(path: Path, _ask: Ask) -> None:
+        path.write_bytes(read_recorded(material.store, record))
+
+    return write
+
+
+def _bounds(held: PlacedPictures, numbers: list[int]) -> list[float]:
+    own = held.place_m[numbers]
+    return [round(float(v), 3) for v in (*own.min(axis=0), *own.max(axis=0))]
+
+
+def _cameras(held: PlacedPictures) -> list[dict[str, Any]]:
+    found = []
+    for number, log in enumerate(held.logs):
+        own = np.flatnonzero(held.log == number)
+        if not own.size:
+            continue
+        lens = held.views.lenses[int(held.views.lens[own[0]])]
+        values = dict(zip(_LENS, lens.parameters.tolist(), strict=False))
+        found.append(
+            {
+                "camera": number, "run": log.run, "title": log.sensor,
+                "model": "equirectangular" if lens.is_around else "perspective",
+                "width_px": round(float(lens.parameters[WIDTH])), "height_px": round(float(lens.parameters[HEIGHT])),
+                "focal_px": [values["fx"], values["fy"]], "principal_px": [values["cx"], values["cy"]],
+                "distortion": [values[n] for n in _LENS[4:]],
+            }
+        )  # fmt: skip
+    return found
+
+
+def _poses(held: PlacedPictures, numbers: list[int], epochs: list[str]) -> dict[str, Any]:
+    views = held.views.picked(np.array(numbers, np.int64))
+    place, turn = np.empty((len(numbers), 3)), np.empty((len(numbers), 3, 3))
+    for world, name in enumerate(held.worlds):
+        own = views.world == world
+        if own.any():
+            place[own], turn[own] = camera_from_map(
+                held.map, name, views.eye_world_m[own], views.opencv_from_world[own]
+            )
+    return {
+        "pictures": len(numbers), "id": numbers, "camera": [int(held.log[k]) for k in numbers],
+        "url": [picture_url(held, k) for k in numbers], "name": [held.name(k) for k in numbers],
+        "epoch_gps_ns": [epochs[k] for k in numbers],
+        "easting_m": np.round(place[:, 0], 5), "northing_m": np.round(place[:, 1], 5),
+        "height_m": np.round(place[:, 2], 5), "camera_from_map": turn.reshape(-1, 9), "sigma_m": [None] * len(numbers),
+    }  # fmt: skip
+
+
+def _epochs(material: Material, held: PlacedPictures) -> list[str]:
+    """GPS time of each picture (ns), as its camera's clock was found."""
+    known: dict[tuple[str, str], int] = {}
+    for log in held.logs:
+        for taken in taken_pictures(material.store, material.plan.records, log.sensor):
+            known |= {(taken.record.key, f): e for f, e in zip(taken.files, taken.epochs_gps_ns.tolist(), strict=True)}
+    return [str(known[held.logs[log].key, file]) for log, file in zip(held.log.tolist(), held.files, strict=True)]
+
+
+def _key(held: PlacedPictures, number: int) -> str:
+    return key_of(code_digest(_CODE), held.logs[int(held.log[number])].key, held.files[number])
+
+
+def _copied(held: PlacedPictures, number: int) -> Any:
+    def write(path: Path, _ask: Ask) -> None:
+        source = held.path(number)
+        try:
+            if source.suffix.lower() in SHOWN_AS_THEY_ARE:
+                path.write_bytes(source.read_bytes())
+                return
+            from PIL import Image
+
+            with Image.open(source) as image:
+                image.convert("RGB").save(path, format="JPEG", quality=90)
+        except (OSError, SyntaxError, ValueError) as error:
+            raise DamagedError(f"the picture {held.name(number)} cannot be read: {error}", file=source) from error
+
+    return write

@@ -1,0 +1,163 @@
+"""Vectors: a file a layer, or a kilometre sheet of a layer."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from roadscan.core.errors import RoadscanError
+from roadscan.site.document import Document, json_document
+from roadscan.site.layer import SiteLayer, layer_kinds
+from roadscan.site.material import Material, box_of, sheet_name
+from roadscan.site.part import SitePart
+
+_MOST_VERTICES: Final = 10_000
+"""A layer with more is cut into kilometre sheets."""
+_FROM_FAR: Final = ("survey", "control", "condition")
+"""Groups whose layers are worth a look from far away; single cracks and poles are not seen there."""
+_MOST_FROM_FAR: Final = 30_000
+"""A layer in sheets with more features has no file for who looks from far away."""
+_SEEN_PX: Final = 4000
+"""Pixels across which a whole survey may be seen."""
+_OVERVIEW: Final = "overview"
+_DECIMALS: Final = 5
+"""Coordinates are told to 10 µm."""
+
+
+class Vectors(SitePart):
+    """All layers; one whose table is damaged is left out, and said to be."""
+
+    name = "layers"
+    position = 100
+
+    def members(self, material: Material) -> Mapping[str, Any]:
+        """What the layers are and where their files lie."""
+        found, left_out = site_layers(material)
+        return {"layers": [about(layer) for layer in found], "left_out": list(left_out)}
+
+    def documents(self, material: Material) -> Iterator[Document]:
+        """A file a layer, or a sheet of it; for a layer in sheets one more, for who looks from far away."""
+        for layer in site_layers(material)[0]:
+            for path, content in files_of(layer):
+                yield json_document(path, content())
+
+
+def files_of(layer: SiteLayer) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """Paths of a layer's files, each with a function that gives its content."""
+    parts = parts_of(layer)
+    for name, numbers in parts:
+        yield _url(layer, name), functools.partial(_features, layer, numbers)
+    if _has_overview(layer, parts):
+        yield _url(layer, _OVERVIEW), functools.partial(_overview, layer)
+
+
+@functools.lru_cache(maxsize=2)
+def site_layers(material: Material) -> tuple[tuple[SiteLayer, ...], tuple[str, ...]]:
+    """Layers in the order in which they are drawn, and why others are not there."""
+    found: list[SiteLayer] = []
+    left_out: list[str] = []
+    for kind in layer_kinds():
+        try:
+            found += [_near(layer, material) for layer in kind.layers(material)]
+        except RoadscanError as error:
+            left_out.append(f"{kind.name}: {error}")
+    shown = (layer for layer in found if len(layer.rows))
+    return tuple(sorted(shown, key=lambda one: (one.order, one.name))), tuple(left_out)
+
+
+def _near(layer: SiteLayer, material: Material) -> SiteLayer:
+    """A layer without the features that lie outside what is wished for."""
+    if material.wishes.near is None:
+        return layer
+    kept = np.flatnonzero(shapely.intersects(layer.shapes_m, shapely.box(*material.wishes.near))).tolist()
+    held = {**layer.__dict__, "shapes_m": layer.shapes_m[kept], "rows": [layer.rows[k] for k in kept]}
+    if layer.evidence:
+        held["evidence"] = [layer.evidence[k] for k in kept]
+    return SiteLayer(**held)
+
+
+def parts_of(layer: SiteLayer) -> list[tuple[str, list[int]]]:
+    """Names of a layer's files, and numbers of their features: all in one, or by the sheet of their middle."""
+    if shapely.get_num_coordinates(layer.shapes_m).sum() <= _MOST_VERTICES:
+        return [("whole", list(range(len(layer.rows))))]
+    found: dict[str, list[int]] = {}
+    for number, (west, south, east, north) in enumerate(shapely.bounds(layer.shapes_m).tolist()):
+        found.setdefault(sheet_name((west + east) / 2, (south + north) / 2), []).append(number)
+    return sorted(found.items())
+
+
+def about(layer: SiteLayer) -> dict[str, Any]:
+    """A layer as the page reads it in the entry."""
+    held = parts_of(layer)
+    parts = [
+        {"url": _url(layer, name), "bounds_m": box_of(layer.shapes_m[numbers]), "features": len(numbers)}
+        for name, numbers in held
+    ]
+    return {
+        "name": layer.name, "title": layer.title, "group": layer.group, "geometry": layer.geometry,
+        "order": layer.order, "visible": layer.visible, "features": len(layer.rows), "parts": parts,
+        "key": layer.key or None, "label": layer.label or None, "columns": [c.stated() for c in layer.columns],
+        "style": layer.styles[0].stated(), "choices": [style.stated() for style in layer.styles],
+        "arrows": layer.arrows, "overview": _url(layer, _OVERVIEW) if _has_overview(layer, held) else None,
+    }  # fmt: skip
+
+
+def _has_overview(layer: SiteLayer, parts: Sequence[Any]) -> bool:
+    return layer.group in _FROM_FAR and len(parts) > 1 and len(layer.rows) <= _MOST_FROM_FAR
+
+
+def _overview(layer: SiteLayer) -> dict[str, Any]:
+    """All features of a layer, as coarse as they are seen with the whole survey, with the values that colour them."""
+    west, south, east, north = shapely.total_bounds(layer.shapes_m).tolist()
+    coarse = shapely.simplify(shapely.force_2d(layer.shapes_m), max(east - west, north - south) / _SEEN_PX)
+    coarse = shapely.transform(coarse, lambda places: np.round(places, 1))
+    names = [style.by for style in layer.styles if style.by]
+    features = [
+        {"type": "Feature", "id": number, "geometry": geometry_of(shape), "properties": {n: row.get(n) for n in names}}
+        for number, (shape, row) in enumerate(zip(coarse, layer.rows, strict=True))
+    ]
+    return {"type": "FeatureCollection", "coordinates": "map_m", "layer": layer.name, "features": features}
+
+
+def _url(layer: SiteLayer, part: str) -> str:
+    return f"layers/{layer.name}/{part}.json"
+
+
+def _features(layer: SiteLayer, numbers: Sequence[int]) -> dict[str, Any]:
+    names = [c.name for c in layer.columns]
+    features = []
+    for number in numbers:
+        row = layer.rows[number]
+        told = {name: _told(name, row.get(name)) for name in names}
+        feature = {"type": "Feature", "id": number, "geometry": geometry_of(layer.shapes_m[number]), "properties": told}
+        if layer.evidence and layer.evidence[number]:
+            feature["evidence"] = list(layer.evidence[number])
+        features.append(feature)
+    return {"type": "FeatureCollection", "coordinates": "map_m", "layer": layer.name, "features": features}
+
+
+def _told(name: str, value: Any) -> Any:
+    """A value as the page gets it: epochs as text, whatever their size."""
+    return str(value) if name.endswith("_gps_ns") and value is not None else value
+
+
+def geometry_of(shape: Any) -> dict[str, Any]:
+    """A shape as GeoJSON writes it, in metres of the map."""
+    kind = shape.geom_type
+    if kind.startswith("Multi"):
+        return {"type": kind, "coordinates": [geometry_of(one)["coordinates"] for one in shape.geoms]}
+    if kind == "Polygon":
+        return {"type": kind, "coordinates": [_places(ring) for ring in (shape.exterior, *shape.interiors)]}
+    places = _places(shape)
+    return {"type": kind, "coordinates": places[0] if kind == "Point" else places}
+
+
+def _places(shape: Any) -> list[list[float]]:
+    held: npt.NDArray[np.float64] = shapely.get_coordinates(shape, include_z=bool(shape.has_z))
+    places: list[list[float]] = np.round(held, _DECIMALS).tolist()
+    return places

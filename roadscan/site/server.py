@@ -1,0 +1,255 @@
+"""A server for one machine: it gives the documents of a site to the browser beside it, and does nothing else.
+
+It listens on a loopback address. It answers GET and HEAD, whole or by one range (RFC 9110, 14), for paths that the site
+names; no path reaches the file system. A request that names another host is refused, so that no page of another origin
+reads the survey by a name that resolves to this machine. Where it is asked to, it takes edits: by POST from its own
+page, with a token that stands in no document.
+"""
+
+from __future__ import annotations
+
+import hmac
+import re
+import secrets
+import sys
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, BinaryIO, Final, Protocol
+from urllib.parse import unquote, urlsplit
+
+from roadscan import __version__
+from roadscan.core.errors import RoadscanError
+from roadscan.site.document import json_bytes
+from roadscan.site.live import Served
+from roadscan.site.parts.edits import POST
+from roadscan.site.site import REPORT_PAGE
+from roadscan.site.web_part import HOW_TO_BUILD, PAGE
+
+LOOPBACK: Final = "127.0.0.1"
+
+POLICY: Final = (
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; style-src 'self'; "
+    "img-src 'self' data: blob:; connect-src 'self' data: blob:; font-src 'self'; manifest-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""What the page may do: run and load what this server gives, and nothing of another origin."""
+_REPORT_POLICY: Final = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
+"""The report has no script; its style and its pictures stand in the page."""
+
+_TYPES: Final = {
+    ".css": "text/css; charset=utf-8", ".fgb": "application/vnd.flatgeobuf",
+    ".glb": "model/gltf-binary", ".html": "text/html; charset=utf-8",
+    ".ico": "image/x-icon", ".jpg": "image/jpeg", ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json; charset=utf-8", ".laz": "application/octet-stream",
+    ".mjs": "text/javascript; charset=utf-8",
+    ".parquet": "application/octet-stream", ".png": "image/png", ".svg": "image/svg+xml", ".tif": "image/tiff",
+    ".txt": "text/plain; charset=utf-8", ".vpc": "application/json; charset=utf-8", ".vrt": "application/xml",
+    ".wasm": "application/wasm", ".webmanifest": "application/manifest+json", ".webp": "image/webp",
+    ".woff2": "font/woff2",
+}  # fmt: skip
+_PATH: Final = re.compile(r"/([A-Za-z0-9_-][A-Za-z0-9_.-]*(?:/[A-Za-z0-9_-][A-Za-z0-9_.-]*)*)?")
+_RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+_LONGEST_HEAD: Final = 8192
+TOKEN_HEADER: Final = "X-Roadscan-Edit"
+"""Carries the token; a page of another origin can send no such header without asking this server first."""
+_MOST_EDITS_BYTES: Final = 16_000_000
+
+
+class Documents(Protocol):
+    """Where documents come from."""
+
+    def document(self, path: str) -> Served | None:
+        """A document by its path; None where there is none."""
+
+
+class SiteServer(ThreadingHTTPServer):
+    """Serves a site on a loopback port; use it as a context, `serve_forever` answers until `shutdown`.
+
+    With `take`, a function that takes in a document of edits and answers, it takes edits.
+    """
+
+    daemon_threads = True
+    allow_reuse_address = False
+
+    def __init__(self, documents: Documents, port: int = 0, take: Callable[[bytes], Any] | None = None) -> None:
+        """Listen; port 0 takes one that is free."""
+        self.documents, self.take = documents, take
+        self.token = secrets.token_urlsafe(24) if take is not None else ""
+        super().__init__((LOOPBACK, port), _Handler)
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Pass over a browser that went away before its answer was there; tell of all else."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+    @property
+    def address(self) -> str:
+        """Address of the page; it carries the token of edits behind `#`, which browsers send to no server."""
+        return f"http://{LOOPBACK}:{self.server_port}/" + (f"#edit={self.token}" if self.token else "")
+
+    @property
+    def hosts(self) -> frozenset[str]:
+        """Names by which a browser may ask."""
+        return frozenset(f"{name}:{self.server_port}" for name in (LOOPBACK, "localhost"))
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: SiteServer
+    protocol_version = "HTTP/1.1"
+    server_version = f"roadscan/{__version__}"
+    sys_version = ""
+    timeout = 60
+
+    def do_GET(self) -> None:
+        """Answer with a document or a part of it."""
+        self._answer(with_body=True)
+
+    def do_HEAD(self) -> None:
+        """Answer with the head alone."""
+        self._answer(with_body=False)
+
+    def do_POST(self) -> None:
+        """Take in edits."""
+        self.close_connection = True  # a body may follow that nobody reads
+        if self.server.take is None or urlsplit(self.path).path != f"/{POST}":
+            self._refuse_method()
+            return
+        refused = self._refused()
+        if refused is not None:
+            self._text(*refused)
+            return
+        try:
+            answer = self.server.take(self.rfile.read(int(self.headers["Content-Length"])))
+        except RoadscanError as error:
+            self._text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+            return
+        content = json_bytes(answer)
+        self._head(HTTPStatus.OK, "answer.json", {"Content-Length": str(len(content))})
+        self.wfile.write(content)
+
+    def _refused(self) -> tuple[HTTPStatus, str] | None:
+        """Why edits are not taken; None where they come from this server's own page."""
+        host, origin = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
+        if host not in [[one] for one in self.server.hosts] or origin != [f"http://{host[0]}"]:
+            return HTTPStatus.FORBIDDEN, "edits are taken from this server's own page alone"
+        token = self.headers.get(TOKEN_HEADER, "").encode("utf-8", "replace")
+        if not hmac.compare_digest(token, self.server.token.encode()):
+            return HTTPStatus.FORBIDDEN, "open the page by the address that roadscan printed: it allows edits"
+        if self.headers.get_content_type() != "application/geo+json":
+            return HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "edits come as application/geo+json"
+        length = self.headers.get("Content-Length", "")
+        if not length.isascii() or not length.isdigit():
+            return HTTPStatus.LENGTH_REQUIRED, "edits come with their length"
+        if int(length) > _MOST_EDITS_BYTES:
+            return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"edits hold {_MOST_EDITS_BYTES} bytes at most"
+        return None
+
+    def __getattr__(self, name: str) -> object:
+        if name.startswith("do_"):
+            return self._refuse_method
+        raise AttributeError(name)
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002  as the base class has it
+        """Say nothing of each request."""
+
+    def _refuse_method(self) -> None:
+        self.close_connection = True  # a body may follow that nobody reads
+        told = "this server is read-only" if self.server.take is None else "only edits are taken, at their address"
+        self._text(HTTPStatus.METHOD_NOT_ALLOWED, told, {"Allow": "GET, HEAD"})
+
+    def _answer(self, *, with_body: bool) -> None:
+        if self.headers.get_all("Host", []) not in [[host] for host in self.server.hosts]:
+            self._text(HTTPStatus.MISDIRECTED_REQUEST, "ask for the address that roadscan printed", with_body=with_body)
+            return
+        path = unquote(urlsplit(self.path).path, errors="replace") if len(self.path) < _LONGEST_HEAD else ""
+        found = _PATH.fullmatch(path)
+        if found is None:
+            self._text(HTTPStatus.NOT_FOUND, "there is no such document", with_body=with_body)
+            return
+        name = found[1] or PAGE
+        try:
+            served = self.server.documents.document(name)
+        except RoadscanError as error:
+            self._text(HTTPStatus.INTERNAL_SERVER_ERROR, str(error), with_body=with_body)
+            return
+        if served is None:
+            missing = f"the page was not built: {HOW_TO_BUILD}" if name == PAGE else "there is no such document"
+            self._text(HTTPStatus.NOT_FOUND, missing, with_body=with_body)
+            return
+        self._send(name, served, with_body=with_body)
+
+    def _send(self, name: str, served: Served, *, with_body: bool) -> None:
+        tag = f'"{served.key}"'
+        if tag in [one.strip() for one in self.headers.get("If-None-Match", "").split(",")]:
+            self._head(HTTPStatus.NOT_MODIFIED, name, {"ETag": tag})
+            return
+        with served.file.open("rb") as stream:
+            size = stream.seek(0, 2)
+            asked = self.headers.get("Range") if self.headers.get("If-Range", tag) == tag else None
+            span = None if asked is None else range_of(asked, size)
+            if span is not None and not span:
+                self._text(
+                    HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, "the document is shorter",
+                    {"Content-Range": f"bytes */{size}"}, with_body=with_body,
+                )  # fmt: skip
+                return
+            told = {"ETag": tag, "Accept-Ranges": "bytes", "Content-Length": str(size if span is None else len(span))}
+            if span is not None:
+                told["Content-Range"] = f"bytes {span.start}-{span.stop - 1}/{size}"
+            self._head(HTTPStatus.OK if span is None else HTTPStatus.PARTIAL_CONTENT, name, told)
+            if with_body:
+                self._copy(stream, range(size) if span is None else span)
+
+    def _copy(self, stream: BinaryIO, span: range) -> None:
+        stream.seek(span.start)
+        left = len(span)
+        while left:
+            piece = stream.read(min(left, 1 << 20))
+            if not piece:
+                self.close_connection = True  # the file was cut meanwhile: what was promised cannot be kept
+                return
+            self.wfile.write(piece)
+            left -= len(piece)
+
+    def _text(
+        self, status: HTTPStatus, text: str, further: dict[str, str] | None = None, *, with_body: bool = True
+    ) -> None:
+        content = f"{text}\n".encode()
+        self._head(status, "message.txt", {"Content-Length": str(len(content)), **(further or {})})
+        if with_body:
+            self.wfile.write(content)
+
+    def _head(self, status: HTTPStatus, name: str, further: dict[str, str]) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", _TYPES.get(Path(name).suffix, "application/octet-stream"))
+        self.send_header("Content-Security-Policy", _REPORT_POLICY if name == REPORT_PAGE else POLICY)
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("X-Frame-Options", "DENY")
+        self.send_header("Referrer-Policy", "no-referrer")
+        self.send_header("Cross-Origin-Opener-Policy", "same-origin")
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        self.send_header("Cache-Control", "no-cache")
+        for header, value in further.items():
+            self.send_header(header, value)
+        self.end_headers()
+
+
+def range_of(asked: str, size: int) -> range | None:
+    """Bytes of a document that a header ``Range`` asks for; empty where it has none of them.
+
+    None where the whole document is to be sent: for another unit, several ranges, or what is no range.
+    """
+    found = _RANGE.fullmatch(asked.strip())
+    if found is None or not (found[1] or found[2]):
+        return None
+    if not found[1]:
+        return range(max(0, size - int(found[2])), size)
+    first, last = int(found[1]), int(found[2]) if found[2] else size - 1
+    if found[2] and last < first:
+        return None
+    return range(first, min(last + 1, size)) if first < size else range(0)

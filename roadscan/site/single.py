@@ -1,0 +1,129 @@
+"""A site as one file that opens by a double click: a page of a file may ask for no others, so all is inside."""
+
+from __future__ import annotations
+
+import base64
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+from roadscan.core.errors import ConfigError
+from roadscan.site.material import Material
+from roadscan.site.site import KEYS, REPORT_PAGE, publish
+from roadscan.site.web_part import DATA_MARK, single_page
+
+LARGEST_MB: Final = 200.0
+"""Larger pages take browsers long to open."""
+
+_TEXT: Final = (".json",)
+_NOT_INSIDE: Final = (".parquet", ".vpc", ".tif", ".vrt", ".fgb", ".html")
+"""What is for other programs, or a page of its own."""
+_WEB: Final = ("app/",)
+_BASE64: Final = 4 / 3
+
+
+@dataclass(frozen=True)
+class SinglePage:
+    """What was written."""
+
+    path: Path
+    bytes: int
+    left_out: tuple[str, ...]
+    """What did not fit, or could not be made."""
+
+
+def write_single(
+    material: Material,
+    path: Path,
+    largest_mb: float = LARGEST_MB,
+    report: Callable[[int, int], None] = lambda _a, _b: None,
+) -> SinglePage:
+    """Write the site of a survey, or of the part that is wished for, as one file.
+
+    Where it would be larger than `largest_mb`, it goes without the pictures of cameras, then without the finest rasters
+    one after another, then without the points.
+
+    Raises
+    ------
+    ConfigError
+        where the web part was not built, or the file would be larger all the same.
+    """
+    page = single_page()
+    left_out: list[str] = []
+    with TemporaryDirectory(prefix=".single-", dir=path.absolute().parent) as scratch:
+        folder = Path(scratch) / "site"
+        for wished, without in _ever_less(material):
+            if without:
+                left_out.append(without)
+            held = publish(wished, folder, report)
+            size = round(sum(_size(file) for file in _inside(folder)) + len(page))
+            if size <= largest_mb * 1e6:
+                break
+        else:
+            raise ConfigError(
+                f"one file would hold {size / 1e6:,.0f} MB even without rasters' details and points",
+                expected=f"{largest_mb:g} MB or less", change="name a road or a smaller --box",
+            )  # fmt: skip
+        _write(path, page, folder)
+    failed = [f"{document}: {why}" for document, why in held.failures]
+    return SinglePage(path, path.stat().st_size, (*left_out, *failed))
+
+
+def _ever_less(material: Material) -> Iterator[tuple[Material, str]]:
+    """The material with ever fewer wishes, and what each goes without."""
+    wishes = material.wishes
+    yield material, ""
+    if wishes.pictures:
+        wishes = replace(wishes, pictures=False)
+        yield replace(material, wishes=wishes), "pictures of cameras"
+    pixel_m = max(material.context.grid.cell_m, wishes.finest_pixel_m)
+    for _ in range(3):
+        pixel_m *= 4
+        wishes = replace(wishes, finest_pixel_m=pixel_m)
+        yield replace(material, wishes=wishes), f"rasters with pixels finer than {pixel_m:g} m"
+    if wishes.clouds:
+        yield replace(material, wishes=replace(wishes, clouds=False)), "points"
+
+
+def _inside(folder: Path) -> list[Path]:
+    """Files of a site that belong into the page, in an order of their own."""
+    found = []
+    for file in sorted(folder.rglob("*")):
+        name = file.relative_to(folder).as_posix()
+        if file.is_file() and file.suffix not in _NOT_INSIDE and not name.startswith(_WEB) and name != KEYS:
+            found.append(file)
+    return found
+
+
+def _size(file: Path) -> float:
+    """Bytes that a file takes in the page."""
+    return file.stat().st_size * (1.0 if file.suffix in _TEXT else _BASE64) + 100
+
+
+def _write(path: Path, page: str, folder: Path) -> None:
+    """Write the page with all files inside, and let it appear as a whole."""
+    before, after = page.split(DATA_MARK)
+    scratch = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
+    try:
+        with scratch.open("wb") as stream:
+            stream.write(before.encode())
+            for file in _inside(folder):
+                name = file.relative_to(folder).as_posix()
+                is_text = file.suffix in _TEXT
+                kind = "application/json" if is_text else "application/octet-stream"
+                stream.write(f'<script type="{kind}" data-path="{name}">'.encode("ascii"))
+                content = file.read_bytes()
+                stream.write(_without_report(content) if is_text else base64.b64encode(content))
+                stream.write(b"</script>\n")
+            stream.write(after.encode())
+        scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def _without_report(content: bytes) -> bytes:
+    """A document without the way to the report, which is a page of its own."""
+    return content.replace(f'"report":"{REPORT_PAGE}"'.encode(), b'"report":null')

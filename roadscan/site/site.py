@@ -1,0 +1,247 @@
+"""The site as a whole: its entry, all its documents, and publishing them as a folder."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from roadscan.core.crs import MapFrame, crs_from_text
+from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.site.degrees import degrees_on_map
+from roadscan.site.document import Ask, Document, json_document
+from roadscan.site.material import SHEET_M, Box, Material
+from roadscan.site.part import site_parts
+from roadscan.site.parts.catalog import to_longitude_latitude
+from roadscan.site.report_copy import REPORT, linked_report
+from roadscan.site.web_part import web_documents
+from roadscan.store.codecs import SOFTWARE
+from roadscan.store.manifest import read_recorded
+
+LAYOUT: Final = 1
+ENTRY: Final = "survey.json"
+REPORT_PAGE: Final = "report.html"
+_LINKED: Final = "roadscan.site.report_copy:linked_report"
+KEYS: Final = "keys.json"
+"""Which documents the folder holds, with the key of each."""
+
+
+@functools.lru_cache(maxsize=2)
+def entry(material: Material) -> Document:
+    """`survey.json`, from which a page finds everything."""
+    context = material.context
+    extent_m = material.extent_m
+    told: dict[str, Any] = {
+        "layout": LAYOUT, "software": SOFTWARE, "id": context.survey_id, "title": context.title or context.survey_id,
+        "crs": _crs(context.map), "origin_m": _origin(material), "extent_m": extent_m,
+        "height_extent_m": _heights(material), "lon_lat": _longitude_latitude(context.map, extent_m),
+        "degrees": degrees_on_map(context.map, extent_m),
+        "tile_m": context.grid.size_m, "cell_m": context.grid.cell_m, "sheet_m": SHEET_M,
+        "report": REPORT_PAGE if _report(material) is not None else None,
+    }  # fmt: skip
+    for part in site_parts():
+        told |= part.members(material)
+    if extent_m is None:
+        told["extent_m"] = box = _box_of(told["layers"])
+        told["lon_lat"] = _longitude_latitude(context.map, box)
+        told["degrees"] = degrees_on_map(context.map, box)
+    return json_document(ENTRY, told)
+
+
+def site_documents(material: Material) -> Iterator[Document]:
+    """All documents of the site, in the order in which a page asks for them."""
+    yield from first_documents(material)
+    for part in site_parts():
+        yield from part.documents(material)
+
+
+def first_documents(material: Material) -> Iterator[Document]:
+    """The web part, the entry and the report."""
+    yield from web_documents()
+    yield entry(material)
+    record = _report(material)
+    if record is not None:
+
+        def write(path: Path, _ask: Ask) -> None:
+            path.write_bytes(linked_report(read_recorded(material.store, record), ""))
+
+        yield Document(REPORT_PAGE, key_of(record.digest, code_digest(_LINKED)), write)
+
+
+@dataclass(frozen=True)
+class Published:
+    """What was published."""
+
+    folder: Path
+    files: int
+    made: int
+    """Files that were made anew; the others stood there."""
+    bytes: int
+    failures: tuple[tuple[str, str], ...]
+    """Documents that could not be made, and why."""
+
+
+def publish(material: Material, out: Path, report: Callable[[int, int], None] = lambda _a, _b: None) -> Published:
+    """Publish the site as a folder, which appears as a whole: beside it under another name, then renamed.
+
+    What a folder that was published before holds unchanged is taken over.
+
+    Raises
+    ------
+    ConfigError
+        where `out` holds something else than a site.
+    """
+    known = known_files(out)
+    scratch = out.parent / f".{out.name}-{uuid.uuid4().hex}"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    scratch.mkdir()
+    try:
+        writer = _Writer(scratch, known)
+        documents = list(site_documents(material))
+        for done, document in enumerate(documents):
+            writer.add(document)
+            if done % 50 == 0:
+                report(done, len(documents))
+        report(len(documents), len(documents))
+        (scratch / KEYS).write_text(json.dumps({"layout": LAYOUT, "keys": writer.keys}, sort_keys=True))
+        _exchange(scratch, out)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return Published(out, len(writer.keys), writer.made, writer.bytes, tuple(writer.failures))
+
+
+def known_files(out: Path) -> dict[str, Path]:
+    """Files of a folder that was published before, by key; nothing where it is not there or empty."""
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return {}
+    try:
+        told = json.loads((out / KEYS).read_text())
+        return {key: out / path for path, key in told["keys"].items() if (out / path).is_file()}
+    except (OSError, ValueError, KeyError, AttributeError) as error:
+        raise ConfigError(
+            f"{out} is there already and holds no site", expected="a new or empty folder, or a site to be renewed",
+            change="choose another --out",
+        ) from error  # fmt: skip
+
+
+class _Writer:
+    """Writes documents into a folder, once each."""
+
+    def __init__(self, folder: Path, known: dict[str, Path]) -> None:
+        self._folder, self._known = folder, known
+        self.keys: dict[str, str] = {}
+        self.made = self.bytes = 0
+        self.failures: list[tuple[str, str]] = []
+
+    def add(self, document: Document) -> None:
+        """Take a document over or write it; one that fails is left out and told."""
+        path = self._folder / document.path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            known = self._known.get(document.key)
+            if known is not None:
+                _linked(known, path)
+            else:
+                document.write(path, self._ask)
+                self.made += 1
+        except RoadscanError as error:
+            path.unlink(missing_ok=True)
+            self.failures.append((document.path, str(error)))
+            return
+        self.keys[document.path] = document.key
+        self.bytes += path.stat().st_size
+
+    def _ask(self, path: str) -> Path:
+        """A document that was written before: finer pictures come before coarser ones."""
+        return self._folder / path
+
+
+def _linked(known: Path, path: Path) -> None:
+    """The same file under another name; a copy where the system has no links."""
+    try:
+        os.link(known, path)
+    except OSError:
+        shutil.copyfile(known, path)
+
+
+def _exchange(scratch: Path, out: Path) -> None:
+    """Let a folder take the place of another in two renames; the old one goes last."""
+    old = out.parent / f".{out.name}-{uuid.uuid4().hex}"
+    if out.exists():
+        out.rename(old)
+    try:
+        scratch.rename(out)
+    except OSError:
+        with contextlib.suppress(OSError):
+            old.rename(out)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _report(material: Material) -> Any:
+    record = material.session.manifest.get(REPORT, REPORT)
+    return record if record is not None and material.store.exists(record.path) else None
+
+
+def _crs(frame: MapFrame) -> dict[str, Any]:
+    crs = None if frame.crs is None else crs_from_text(frame.crs)
+    authority = None if crs is None else crs.to_authority()
+    return {
+        "name": (frame.local_name or "local") if crs is None else crs.name,
+        "authority": None if authority is None else ":".join(authority), "is_local": frame.is_local,
+        "wkt2": frame.wkt(), "proj4": None if crs is None else _proj4(crs),
+        "horizontal_unit": {
+            "name": "metre" if crs is None else crs.axis_info[0].unit_name, "m": frame.horizontal_unit_m,
+        },
+        "vertical_unit": {"name": frame.vertical_unit, "m": frame.vertical_unit_m}, "height": frame.height,
+        "geoid": None if frame.geoid is None else frame.geoid.grid,
+    }  # fmt: skip
+
+
+def _proj4(crs: Any) -> str:
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it tells that such a text loses what the WKT beside it keeps
+        return str(crs.to_proj4())
+
+
+def _origin(material: Material) -> list[float]:
+    """A whole place near the survey, to be taken off before coordinates become floats of 32 bits."""
+    extent_m, heights = material.extent_m, _heights(material)
+    if extent_m is None:
+        return [0.0, 0.0, 0.0]
+    low = (extent_m[0], extent_m[1], 0.0 if heights is None else heights[0])
+    return [float(v // 10 * 10) for v in low]
+
+
+def _box_of(layers: Sequence[Mapping[str, Any]]) -> Box | None:
+    """Box of all layers, for a survey without tiles; None without any."""
+    boxes = [part["bounds_m"] for layer in layers for part in layer["parts"]]
+    if not boxes:
+        return None
+    west, south, east, north = zip(*boxes, strict=True)
+    return min(west), min(south), max(east), max(north)
+
+
+def _heights(material: Material) -> list[float] | None:
+    held = material.summaries.values()
+    return [min(s.height_min_m for s in held), max(s.height_max_m for s in held)] if held else None
+
+
+def _longitude_latitude(frame: MapFrame, extent_m: Box | None) -> list[float] | None:
+    if frame.crs is None or extent_m is None:
+        return None
+    import numpy as np
+
+    middle = np.array([[(extent_m[0] + extent_m[2]) / 2, (extent_m[1] + extent_m[3]) / 2]])
+    return [round(v, 8) for v in to_longitude_latitude(frame)(middle)[0].tolist()]

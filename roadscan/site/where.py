@@ -1,0 +1,105 @@
+"""Pictures that see a place of the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from roadscan.core.errors import ConfigError
+from roadscan.core.ids import TileId
+from roadscan.run.session import Session
+from roadscan.surface.tasks.pictures import plan_pictures
+from roadscan.surface.views import PictureRule, sights
+from roadscan.tiles.grid import Bounds
+from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.tasks.tile_plan import TILE
+
+REACH_M: Final = 60.0
+"""Pictures from farther away are not named unless they are asked for (m)."""
+_NEAR_M: Final = 1.0
+"""The height of a place is that of the cells so near to it (m)."""
+_BORDER_PX: Final = 1
+_ANY_ANGLE_DEG: Final = -90.0
+
+
+@dataclass(frozen=True)
+class PictureOfPlace:
+    """A picture that sees a place, if nothing stands between."""
+
+    run: str
+    camera: str
+    file: Path
+    u_px: float
+    """From the centre of the upper left pixel to the right."""
+    v_px: float
+    """Downwards."""
+    distance_m: float
+    resolution_m: float
+    """What a pixel spans at the place (m)."""
+
+
+def pictures_of_place(
+    session: Session, easting_m: float, northing_m: float, height_m: float | None = None, reach_m: float = REACH_M
+) -> list[PictureOfPlace]:
+    """Pictures that see a place of the map, that with the finest resolution first.
+
+    Parameters
+    ----------
+    easting_m, northing_m, height_m : place on the map (m); without a height that of the surveyed ground there.
+    reach_m : farthest distance from a camera.
+
+    Raises
+    ------
+    ConfigError
+        where no cell tells the height of the place; where no camera has an interior orientation.
+    RunError
+        where the survey has no pictures, or none has a pose.
+    """
+    if height_m is None:
+        height_m = ground_height_m(session, easting_m, northing_m)
+    rule = PictureRule((), reach_m, _ANY_ANGLE_DEG, _BORDER_PX)
+    pictures = plan_pictures(session.plan, rule).near(Bounds(easting_m, northing_m, easting_m, northing_m))
+    frame, place = session.plan.ground.map, np.array([[easting_m, northing_m, height_m]])
+    worlds = [frame.world_from_map(world, place)[None] for world in pictures.worlds]
+    no_front = [np.full((1, 3), np.nan)] * len(worlds)
+    near = ((number, np.zeros(1, np.int64)) for number in range(len(pictures)))
+    seen = sights(worlds, no_front, pictures.views, rule, near)
+    found = []
+    for view, (u, v), distance, resolution in zip(
+        seen.view.tolist(), seen.pixel.tolist(), seen.distance_m.tolist(), seen.resolution_m.tolist(), strict=True
+    ):
+        log = pictures.logs[pictures.log[view]]
+        found.append(PictureOfPlace(log.run, log.sensor, pictures.path(view), u, v, distance, resolution))
+    return found
+
+
+def ground_height_m(session: Session, easting_m: float, northing_m: float) -> float:
+    """Median height of the cells within a metre of a place (m).
+
+    Raises
+    ------
+    ConfigError
+        where there is none.
+    """
+    grid = session.plan.ground.grid
+    box = Bounds(easting_m - _NEAR_M, northing_m - _NEAR_M, easting_m + _NEAR_M, northing_m + _NEAR_M)
+    heights = [np.empty(0, np.float32)]
+    for record in session.manifest.of(TILE).values():
+        if not record.path or not grid.bounds(TileId.parse(record.unit)).meets(box):
+            continue
+        cells = read_cells(session.store, record, grid.cells_per_edge)
+        corner = grid.bounds(cells.tile)
+        east = corner.easting_min_m + (cells.column + 0.5) * grid.cell_m - easting_m
+        north = corner.northing_min_m + (cells.row + 0.5) * grid.cell_m - northing_m
+        heights.append(cells.height_robust_m[np.hypot(east, north) <= _NEAR_M])
+    known = np.concatenate(heights)
+    known = known[np.isfinite(known)]
+    if not known.size:
+        raise ConfigError(
+            f"no cell lies within {_NEAR_M:g} m of {easting_m:.3f} {northing_m:.3f}",
+            expected="a place on the surveyed ground", change="state its height as well",
+        )  # fmt: skip
+    return float(np.median(known))

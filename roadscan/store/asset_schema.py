@@ -1,0 +1,156 @@
+"""Schemas of the tables of assets and distresses, read from ``schemas/assets/``: a file a kind, and common columns."""
+
+from __future__ import annotations
+
+import functools
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias
+
+import pyarrow as pa
+
+from roadscan.core.errors import SchemaError, nearest
+from roadscan.store.schema import schema_folders
+
+GeometryType: TypeAlias = Literal["PointZ", "LineStringZ", "PolygonZ", "MultiLineStringZ", "MultiPolygonZ"]
+
+_TYPES: Final = {
+    "bool": pa.bool_(),
+    "date": pa.date32(),
+    "float64": pa.float64(),
+    "int32": pa.int32(),
+    "int64": pa.int64(),
+    "string": pa.string(),
+}
+_COMMON: Final = "common"
+ASSET_FOLDER: Final = "products/assets"
+"""Folder of the tables, relative to the survey's root: a file a table."""
+_INVENTORY: Final = "inventory"
+
+
+@dataclass(frozen=True)
+class AssetColumn:
+    """One column of a table of assets."""
+
+    name: str
+    type: str
+    unit: str
+    title: str
+    """What people call it: the label in forms and reports."""
+    meaning: str
+    frame: str = ""
+    nullable: bool = False
+    min: float | None = None
+    max: float | None = None
+    values: tuple[str, ...] = ()
+    is_evidence: bool = False
+    """It tells of what was seen, not of the asset: people do not change it, and its changes are none of the asset."""
+    sigma_share: float = 0.0
+    """1 σ of a measured value as a share of it, where that is more than what follows from σ of the place."""
+    class_of: str = ""
+    """Column whose value decides which of `values` is found: the first one whose limit in `up_to` is not exceeded."""
+    up_to: tuple[float, ...] = ()
+    """Limits of all values but the last, ascending."""
+
+    def field(self) -> pa.Field:
+        """The column as Arrow has it, with unit, frame and meaning as metadata."""
+        metadata = {"unit": self.unit, "frame": self.frame, "meaning": self.meaning}
+        return pa.field(self.name, _TYPES[self.type], nullable=self.nullable, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class AssetSchema:
+    """The table of a kind of assets."""
+
+    kind: str
+    table: str
+    """Name of the table and of the layer."""
+    title: str
+    geometry: GeometryType
+    meaning: str
+    parents: tuple[str, ...]
+    """Kinds that it may stand on or hang from."""
+    found_in: str
+    """Table of the store that holds what was found of a kind of distress; empty of what the stage `assets` finds."""
+    known_within_m: float | None
+    """Distance up to which outlines are one where four σ are less; None: that of the inventory's settings."""
+    own: tuple[AssetColumn, ...]
+    common: tuple[AssetColumn, ...]
+
+    @property
+    def geometry_words(self) -> str:
+        """Type of its geometries as GeoParquet and GDAL call it, such as ``Point Z``."""
+        return f"{self.geometry.removesuffix('Z')} Z"
+
+    @property
+    def columns(self) -> tuple[AssetColumn, ...]:
+        """Common columns, then those of the kind; the geometry, WKB with heights, stands after them as `geometry`."""
+        return (*self.common, *self.own)
+
+    def arrow(self) -> pa.Schema:
+        """Arrow schema of the found assets of the kind."""
+        geometry = pa.field("geometry", pa.binary(), nullable=False, metadata={"meaning": f"WKB, {self.geometry}"})
+        return pa.schema([c.field() for c in self.columns] + [geometry])
+
+
+def asset_kind_names() -> list[str]:
+    """Names of all kinds: those that the stage `assets` finds, then distresses of the pavement."""
+    return sorted(set(_files()) - {_COMMON, _INVENTORY}, key=lambda name: ("found_in" in _read(name), name))
+
+
+@functools.cache
+def _files() -> dict[str, Path]:
+    """Schema files by name of their kind: roadscan's own, and those of packages that add kinds."""
+    folders = [folder / "assets" for folder in reversed(schema_folders())]
+    return {file.stem: file for folder in folders for file in sorted(folder.glob("*.toml"))}
+
+
+@functools.cache
+def asset_tables() -> dict[str, str]:
+    """Kind by the name of its table, in the order of these, of what the stage `assets` finds."""
+    schemas = [asset_schema(kind) for kind in asset_kind_names()]
+    return dict(sorted((one.table, one.kind) for one in schemas if not one.found_in))
+
+
+@functools.cache
+def asset_schema(kind: str) -> AssetSchema:
+    """Schema of a kind of assets.
+
+    Raises
+    ------
+    SchemaError
+        for an unknown kind.
+    """
+    names = asset_kind_names()
+    if kind not in names:
+        raise SchemaError(f"there is no kind of assets '{kind}'{nearest(kind, names)}", expected=", ".join(names))
+    raw = _read(kind)
+    return AssetSchema(
+        kind, raw["table"], raw["title"], raw["geometry"], raw["meaning"], tuple(raw["parents"]),
+        found_in=raw.get("found_in", ""), known_within_m=raw.get("known_within_m"),
+        own=_columns(raw), common=_columns(_read(_COMMON)),
+    )  # fmt: skip
+
+
+@functools.cache
+def inventory_columns() -> tuple[AssetColumn, ...]:
+    """Columns that the inventory adds to the table of each kind."""
+    return _columns(_read(_INVENTORY))
+
+
+def _read(name: str) -> dict[str, Any]:
+    return _parsed(_files()[name])
+
+
+@functools.cache
+def _parsed(file: Path) -> dict[str, Any]:
+    with file.open("rb") as stream:
+        return tomllib.load(stream)
+
+
+def _columns(raw: dict[str, Any]) -> tuple[AssetColumn, ...]:
+    lists = ("values", "up_to")
+    return tuple(
+        AssetColumn(**c | {name: tuple(c[name]) for name in lists if name in c}) for c in raw.get("columns", ())
+    )

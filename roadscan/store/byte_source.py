@@ -1,0 +1,79 @@
+"""Bytes of a file of the store, some of them on their way before they are needed.
+
+A folder's files are announced to the system, which reads them into its cache while kernels compute. Spans of an
+object are fetched by threads, several at a time, because each request waits for the network.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import os
+import weakref
+from typing import Any
+
+from roadscan.store.read_ahead import ReadAhead
+from roadscan.store.store import Store
+
+
+class LocalBytes:
+    """A file of a folder."""
+
+    def __init__(self, path: str) -> None:
+        self.stream: Any = io.FileIO(path)
+        weakref.finalize(self, self.stream.close)
+
+    def expect(self, start: int, end: int) -> None:
+        """Let bytes `start` to `end` come into the system's cache."""
+        if hasattr(os, "posix_fadvise"):
+            os.posix_fadvise(self.stream.fileno(), start, end - start, os.POSIX_FADV_WILLNEED)
+
+    def read_into(self, start: int, room: memoryview) -> bool:
+        """Fill `room` with the bytes from `start` on; False where the file is too short."""
+        return _filled(self.stream, start, room)
+
+
+class RemoteBytes:
+    """An object of any fsspec file system. What is expected and not read yet stays in memory."""
+
+    def __init__(self, store: Store, path: str) -> None:
+        self.stream: Any = store.fs.open(path, "rb")
+        weakref.finalize(self, self.stream.close)
+        self._fetch = functools.partial(store.fs.cat_file, path)
+        self._ahead: ReadAhead[bytes] = ReadAhead()
+        self._expected: list[tuple[int, int]] = []
+        self._start, self._held = 0, b""
+
+    def expect(self, start: int, end: int) -> None:
+        """Begin to fetch bytes `start` to `end`, in one request."""
+        if (start, end) not in self._expected:
+            self._expected.append((start, end))
+            self._ahead.begin((start, end), functools.partial(self._fetch, start=start, end=end))
+
+    def read_into(self, start: int, room: memoryview) -> bool:
+        """Fill `room` with the bytes from `start` on; False where the object is too short."""
+        end = start + len(room)
+        for span in self._expected:
+            if span[0] <= start and end <= span[1]:
+                self._expected.remove(span)
+                self._start, self._held = span[0], self._ahead.take(span)
+                break
+        if not self._start <= start <= end <= self._start + len(self._held):
+            return _filled(self.stream, start, room)
+        room[:] = memoryview(self._held)[start - self._start : end - self._start]
+        return True
+
+
+def opened(store: Store, path: str) -> LocalBytes | RemoteBytes:
+    """A file of a store, by its full path."""
+    return LocalBytes(path) if store.is_folder else RemoteBytes(store, path)
+
+
+def _filled(stream: Any, start: int, room: memoryview) -> bool:
+    stream.seek(start)
+    while room:
+        count = stream.readinto(room)
+        if not count:
+            return False
+        room = room[count:]
+    return True

@@ -1,0 +1,180 @@
+"""ERD, the text form: longitudinal profiles as programs for pavement engineers exchange them.
+
+Sources: the first part of *The ERD File Specification* (University of Michigan Transportation Research Institute: a
+header of text lines, of which the first, the second and an END line are required, then the data), and headers of
+published files of the Long-Term Pavement Performance programme, such as ::
+
+    ERDFILEV2.00
+          3,   6295,     -1,      1,      5,       0.0250,     -1,
+    UNITSNAMmm      mm      mm
+    XUNITS  m
+    END
+
+The second line counts channels and samples; its fifth number is 5 where the data are text, its sixth is the step. Words
+of the header take eight letters, and so do names and units of channels. Binary data are refused.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.errors import FormatError
+
+Floats = npt.NDArray[np.float64]
+
+MAGIC = "ERDFILEV2.00"
+_TEXT = 5
+_WIDTH = 8
+_MOST_HEADER_LINES = 1000
+_MOST_NUMBERS = 500_000_000
+
+
+@dataclass(frozen=True)
+class ErdFile:
+    """What an ERD file holds, in its own units."""
+
+    step: float
+    """Distance between samples."""
+    start: float
+    """Station of the first sample (XSTART; 0 where it is not stated)."""
+    x_unit: str
+    """Unit of stations as it stands there (XUNITS); empty where it is not stated."""
+    names: tuple[str, ...]
+    """Channels (SHORTNAM); numbers from 1 where they are not stated."""
+    units: tuple[str, ...]
+    """Units of channels (UNITSNAM); empty where they are not stated."""
+    values: Floats
+    """(channels, samples)."""
+    title: str
+    """TITLE of the file."""
+
+
+def is_erd(beginning: bytes) -> bool:
+    """True if a file that begins so says that it is one."""
+    return beginning.lstrip().upper().startswith(b"ERDFILE")
+
+
+def parse_erd(text: str) -> ErdFile:
+    """The channels of a file.
+
+    Raises
+    ------
+    FormatError
+        where it is no ERD file of text, or does not hold the numbers that its header counts.
+    """
+    lines = text.splitlines()
+    if len(lines) < 3 or not lines[0].strip().upper().startswith(MAGIC):
+        raise FormatError(f"the first line is {lines[0][:40]!r}" if lines else "an empty file", expected=MAGIC)
+    channels, samples, step = _counts(lines[1])
+    end = next((k for k, line in enumerate(lines[:_MOST_HEADER_LINES]) if line.strip().upper() == "END"), None)
+    if end is None:
+        raise FormatError("a header without END", expected="a line END before the data")
+    words = _words(lines[2:end])
+    values = _numbers(lines[end + 1 :], end + 2, channels, samples)
+    names = _fields(words.get("SHORTNAM", ""), channels)
+    return ErdFile(
+        step,
+        _number(words.get("XSTART", "0"), "XSTART"),
+        words.get("XUNITS", "").strip(),
+        tuple(name or str(k + 1) for k, name in enumerate(names)),
+        _fields(words.get("UNITSNAM", ""), channels),
+        values,
+        words.get("TITLE", "").strip(),
+    )
+
+
+def erd_text(step_m: float, start_m: float, names: Sequence[str], heights_m: Floats, title: str = "") -> str:
+    """An ERD file of profiles.
+
+    Parameters
+    ----------
+    step_m, start_m : distance between samples, and station of the first one (m).
+    names : of the channels; only eight letters of each are kept.
+    heights_m : (channels, samples), all finite (m); written as millimetres, to 0.1 µm.
+    """
+    channels, samples = heights_m.shape
+    head = [
+        MAGIC,
+        "".join(f"{number:>8}," for number in (channels, samples, -1, 1, _TEXT)) + f" {step_m:.9g},      -1,",
+        f"{'TITLE':<8}{' '.join(title.split())[:80]}",
+        f"{'SHORTNAM':<8}{''.join(f'{name[:_WIDTH]:<8}' for name in names)}",
+        f"{'UNITSNAM':<8}{'mm      ' * channels}",
+        f"{'XLABEL':<8}Station",
+        f"{'XUNITS':<8}m",
+        f"{'XSTART':<8}{start_m:.9g}",
+        "END",
+    ]
+    rows = [" ".join(f"{value:.4f}" for value in row) for row in (1e3 * heights_m.T).tolist()]
+    return "\n".join([*(line.rstrip() for line in head), *rows, ""])
+
+
+def _counts(line: str) -> tuple[int, int, float]:
+    """Channels, samples and step of the second line."""
+    fields = [field for field in re.split(r"[,\s]+", line.strip()) if field]
+    if len(fields) < 6:
+        raise FormatError(f"{len(fields)} numbers in the second line", expected="six or seven", record=2)
+    channels, samples, kind = (round(_number(fields[k], "a number of the second line")) for k in (0, 1, 4))
+    step = _number(fields[5], "the step")
+    if kind != _TEXT:
+        raise FormatError(f"data of kind {kind}", expected=f"text, kind {_TEXT}", change="export it as text", record=2)
+    if not 0 < channels <= 1000 or not step > 0.0 or samples * channels > _MOST_NUMBERS:
+        raise FormatError(
+            f"{channels} channels of {samples} samples, a step of {step:g}",
+            expected="1 to 1,000 channels, 500 million numbers at the most, and a step above 0",
+            record=2,
+        )
+    return channels, samples, step
+
+
+def _words(lines: Sequence[str]) -> Mapping[str, str]:
+    """Header words and what stands behind their eight letters."""
+    found: dict[str, str] = {}
+    for line in lines:
+        found.setdefault(line[:_WIDTH].strip().upper(), line[_WIDTH:])
+    return found
+
+
+def _fields(line: str, channels: int) -> tuple[str, ...]:
+    """Fields of eight letters."""
+    return tuple(line[_WIDTH * k : _WIDTH * (k + 1)].strip() for k in range(channels))
+
+
+def _numbers(lines: Sequence[str], first_record: int, channels: int, samples: int) -> Floats:
+    """Numbers of the data as (channels, samples)."""
+    read: list[float] = []
+    for record, line in enumerate(lines, first_record):
+        try:
+            read += map(float, line.replace(",", " ").split())
+        except ValueError:
+            raise FormatError(f"{line.strip()[:40]!r} among the data", expected="numbers", record=record) from None
+    if samples > 0 and len(read) < samples * channels:
+        raise FormatError(
+            f"{len(read):,} numbers",
+            expected=f"{channels} × {samples:,}",
+            change="the file was cut short; copy it anew",
+        )
+    whole = samples if samples > 0 else len(read) // channels
+    if len(read) > whole * channels:
+        counted = f"{channels} × {samples:,}" if samples > 0 else f"a multiple of the {channels} channels"
+        raise FormatError(
+            f"{len(read):,} numbers",
+            expected=counted,
+            change="let the second line count the channels and samples that are there",
+            record=2,
+        )
+    return np.ascontiguousarray(np.array(read, np.float64).reshape(whole, channels).T)
+
+
+def _number(text: str, what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise FormatError(f"{text.strip()[:40]!r} as {what}", expected="a number")
+    return value

@@ -1,0 +1,262 @@
+"""Writes Parquet files of tables with fixed-size lists of numbers.
+
+General writers look at each value's place in its list; here lists have one size, and only the values are looked at.
+Any reader of Parquet reads the file: lists are DELTA_BINARY_PACKED, the rest is PLAIN, nothing is compressed further
+(differences of a surface's ranges do not compress). Each page has its CRC-32, and so has the footer: see `sealed`.
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.store.codecs.choice import LIBRARY
+from roadscan.store.codecs.kernels import delta_packing, wide_packing
+from roadscan.store.codecs.kernels.delta_packing import room_words
+from roadscan.store.codecs.parquet import pages
+from roadscan.store.codecs.parquet.thrift import Value, binary, boolean, i8, i16, i32, i64, listed, struct
+from roadscan.store.codecs.zlib_stream import crc32
+
+MAGIC: Final = b"PAR1"
+_MOST_VALUES: Final = 1 << 28
+"""Of a page, whose size is stated in 32 bits."""
+_VERSION: Final = 2
+_WRITER: Final = "roadscan"
+_INT32, _INT64, _FLOAT, _DOUBLE = 1, 2, 4, 5
+_REQUIRED, _OPTIONAL, _REPEATED = 0, 1, 2
+_CONVERTED_LIST: Final = 3
+_LOGICAL_LIST, _LOGICAL_INTEGER = 3, 10
+_UNCOMPRESSED: Final = 0
+_LZ4_RAW: Final = 7
+_SEAL: Final = b"roadscan.footer_crc32"
+_SEAL_DIGITS: Final = 8
+_ENCODE: Final = wide_packing.encode if wide_packing.THERE else delta_packing.encode
+_SEALED: Final = re.compile(_SEAL + rb"\x18\x08(.{8})", re.DOTALL)
+
+
+class Kind(NamedTuple):
+    """How Parquet holds a type of numbers."""
+
+    physical: int
+    stored: str
+    """NumPy type of a PLAIN value."""
+    bits: int = 0
+    """Of an integer."""
+    signed: bool = True
+    converted: int = 0
+
+    def fields(self) -> dict[int, Value]:
+        """What a schema element says of it beside its physical type."""
+        if not self.bits:
+            return {}
+        integer = struct({1: i8(self.bits), 2: boolean(self.signed)})
+        return {6: i32(self.converted), 10: struct({_LOGICAL_INTEGER: integer})}
+
+
+KINDS: Final = {
+    pa.uint8(): Kind(_INT32, "<u4", 8, False, 11),
+    pa.uint16(): Kind(_INT32, "<u4", 16, False, 12),
+    pa.uint32(): Kind(_INT32, "<u4", 32, False, 13),
+    pa.int32(): Kind(_INT32, "<i4", 32, True, 17),
+    pa.int64(): Kind(_INT64, "<i8", 64, True, 18),
+    pa.float32(): Kind(_FLOAT, "<f4"),
+    pa.float64(): Kind(_DOUBLE, "<f8"),
+}
+_LIST_TYPES: Final = (pa.uint8(), pa.uint16())
+
+
+def is_list_table(schema: pa.Schema) -> bool:
+    """True if the table has fixed-size lists and nothing that this writer does not know."""
+    lists = [f.type for f in schema if pa.types.is_fixed_size_list(f.type)]
+    flat = [f.type for f in schema if not pa.types.is_fixed_size_list(f.type)]
+    known = all(t.value_type in _LIST_TYPES and not t.value_field.nullable and t.list_size for t in lists)
+    return bool(lists) and known and all(t in KINDS and pa.types.is_integer(t) for t in flat)
+
+
+def write_list_table(path: Path, rows: pa.Table, group_rows: int) -> None:
+    """Write rows in row groups of `group_rows`; same rows, same bytes. The table is one of `is_list_table`."""
+    if LIBRARY:
+        _write_by_arrow(path, rows, group_rows)
+        return
+    longest = max(f.type.list_size for f in rows.schema if pa.types.is_fixed_size_list(f.type))
+    step = max(min(group_rows, _MOST_VALUES // longest), 1)
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        groups = [writer.group(rows.slice(first, step), k) for k, first in enumerate(range(0, rows.num_rows, step))]
+        writer.finish(rows.schema, rows.num_rows, groups)
+
+
+def sealed(footer: bytes) -> bool | None:
+    """True if a footer is as this writer left it, False if it is damaged, None if another program wrote it.
+
+    The last of the footer's own entries is the CRC-32 of the footer with the CRC's digits set to 0.
+    """
+    found = list(_SEALED.finditer(footer))
+    if not found:
+        return None
+    digits = found[-1].span(1)
+    return b"%08x" % crc32(_with_digits(footer, digits[0], b"0" * _SEAL_DIGITS)) == footer[slice(*digits)]
+
+
+def _with_digits(footer: bytes, at: int, digits: bytes) -> bytes:
+    return footer[:at] + digits + footer[at + _SEAL_DIGITS :]
+
+
+class Writer:
+    """Writes pages one behind the other, and the footer that says where they are."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._at = self._group = stream.write(MAGIC)
+        self._words = np.empty(0, np.uint64)
+        self._codec = pa.Codec("lz4_raw")
+
+    def group(self, rows: pa.Table, number: int) -> Value:
+        """Write a row group; returns its part of the footer."""
+        columns = [
+            self._lists(field, _whole(rows.column(k)))
+            if pa.types.is_fixed_size_list(field.type)
+            else self._flat(field, _whole(rows.column(k)))
+            for k, field in enumerate(rows.schema)
+        ]
+        return self.row_group(columns, rows.num_rows, number)
+
+    def row_group(self, columns: list[Value], rows: int, number: int) -> Value:
+        """What the footer says of the row group whose columns were written last."""
+        start, size = self._group, self._at - self._group
+        self._group = self._at
+        about = {1: listed(columns), 2: i64(size), 3: i64(rows), 5: i64(start), 6: i64(size)}
+        return struct(about | ({7: i16(number)} if number < 1 << 15 else {}))
+
+    def finish(self, schema: pa.Schema, rows: int, groups: list[Value]) -> None:
+        """Write the footer."""
+        arrow = base64.b64encode(schema.serialize().to_pybytes())
+        own = (schema.metadata or {}).items()
+        entries = [*own, (b"ARROW:schema", arrow), (_SEAL, b"0" * _SEAL_DIGITS)]
+        fields = {
+            1: i32(_VERSION),
+            2: listed(list(_elements(schema))),
+            3: i64(rows),
+            4: listed(groups),
+            5: listed([struct({1: binary(k), 2: binary(v)}) for k, v in entries]),
+            6: binary(_WRITER),
+            7: listed([struct({1: struct({})})] * len(schema)),  # order of values: that of their type
+        }
+        footer = struct(fields).content
+        at = footer.rindex(_SEAL) + len(_SEAL) + 2
+        footer = _with_digits(footer, at, b"%08x" % crc32(footer))
+        self._stream.write(footer + len(footer).to_bytes(4, "little") + MAGIC)
+
+    def _flat(self, field: pa.Field, column: pa.Array) -> Value:
+        kind = KINDS[field.type]
+        values = (column.drop_null() if column.null_count else column).to_numpy().astype(kind.stored)
+        levels = pages.flat_levels(_valid(field, column))
+        at, size = self.page(levels, values.view(np.uint8), len(column), pages.PLAIN)
+        statistics = {3: i64(column.null_count)}
+        if values.size:
+            low, high = values.min().tobytes(), values.max().tobytes()
+            statistics |= {5: binary(high), 6: binary(low)}
+        return chunk(kind, (field.name,), pages.PLAIN, len(column), Page(at, size), {12: struct(statistics)})
+
+    def _lists(self, field: pa.Field, column: pa.Array) -> Value:
+        values = column.flatten().to_numpy()
+        levels = pages.list_levels(len(column), field.type.list_size, _valid(field, column))
+        if self._words.size < room_words(values.size):
+            self._words = np.empty(room_words(values.size), np.uint64)
+        packed = self._words.view(np.uint8)[: _ENCODE(values, self._words)]
+        count = values.size + column.null_count
+        at, size = self.page(levels, packed, count, pages.DELTA_BINARY_PACKED)
+        path = (field.name, "list", "element")
+        return chunk(KINDS[field.type.value_type], path, pages.DELTA_BINARY_PACKED, count, Page(at, size), {})
+
+    def compressed(
+        self, field: pa.Field, encoding: int, content: npt.NDArray[np.uint8], count: int, more: dict[int, Value]
+    ) -> Value:
+        """Write a column of numbers that are always there as a page under LZ4; returns its part of the footer."""
+        packed = np.frombuffer(self._codec.compress(content), np.uint8)
+        at, size = self.page(b"", packed, count, encoding, content.size)
+        raw = size - packed.size + content.size
+        return chunk(KINDS[field.type], (field.name,), encoding, count, Page(at, size, raw), more)
+
+    def page(self, levels: bytes, values: Any, count: int, encoding: int, raw: int | None = None) -> tuple[int, int]:
+        """Write a page, of `raw` bytes before it was compressed; returns where it starts, and its whole size."""
+        start = self._at
+        crc = crc32(values, crc32(levels))
+        self._at += self._stream.write(pages.page_header(len(levels) + values.size, crc, count, encoding, raw) + levels)
+        self._at += self._stream.write(values)
+        return start, self._at - start
+
+
+def _valid(field: pa.Field, column: pa.Array) -> pages.Bools | None:
+    """Which values are there; None for a column that has no nulls ever."""
+    if not field.nullable:
+        return None
+    return np.asarray(column.is_valid()) if column.null_count else np.ones(len(column), np.bool_)
+
+
+def _whole(column: pa.ChunkedArray) -> pa.Array:
+    """The column in one piece, without a copy where it is that already."""
+    return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
+
+
+class Page(NamedTuple):
+    """Where the one page of a column chunk lies in the file."""
+
+    at: int
+    """Its first byte."""
+    size: int
+    """Bytes that it has there."""
+    raw: int | None = None
+    """Bytes that it had before it was compressed; None where it was not."""
+
+
+def chunk(kind: Kind, path: tuple[str, ...], encoding: int, count: int, page: Page, more: dict[int, Value]) -> Value:
+    """What the footer says of a column chunk of one page."""
+    start, length = i64(page.at), i64(page.size)
+    before, codec = (length, _UNCOMPRESSED) if page.raw is None else (i64(page.raw), _LZ4_RAW)
+    metadata = _about(kind, path, encoding, codec) | {5: i64(count), 6: before, 7: length, 9: start}
+    return struct({2: start, 3: struct(metadata | more)})
+
+
+@functools.lru_cache(maxsize=64)
+def _about(kind: Kind, path: tuple[str, ...], encoding: int, codec: int) -> dict[int, Value]:
+    """What all chunks of a column say."""
+    return {
+        1: i32(kind.physical),
+        2: listed([i32(pages.RLE), i32(encoding)]),
+        3: listed([binary(name) for name in path]),
+        4: i32(codec),
+    }
+
+
+def _elements(schema: pa.Schema) -> Iterator[Value]:
+    """The schema as Parquet lists it, depth first."""
+    yield struct({3: i32(_REQUIRED), 4: binary("schema"), 5: i32(len(schema))})
+    for field in schema:
+        own = {3: i32(_OPTIONAL if field.nullable else _REQUIRED), 4: binary(field.name)}
+        if not pa.types.is_fixed_size_list(field.type):
+            kind = KINDS[field.type]
+            yield struct({1: i32(kind.physical)} | own | kind.fields())
+            continue
+        kind = KINDS[field.type.value_type]
+        logical = struct({_LOGICAL_LIST: struct({})})
+        yield struct(own | {5: i32(1), 6: i32(_CONVERTED_LIST), 10: logical})
+        yield struct({3: i32(_REPEATED), 4: binary("list"), 5: i32(1)})
+        yield struct({1: i32(kind.physical), 3: i32(_REQUIRED), 4: binary("element")} | kind.fields())
+
+
+def _write_by_arrow(path: Path, rows: pa.Table, group_rows: int) -> None:
+    encodings = {
+        f"{f.name}.list.element": "DELTA_BINARY_PACKED" for f in rows.schema if pa.types.is_fixed_size_list(f.type)
+    }
+    settings = {"compression": "none", "use_dictionary": False, "write_page_checksum": True}
+    pq.write_table(rows, path, row_group_size=group_rows, column_encoding=encodings, **settings)

@@ -1,0 +1,159 @@
+"""Reads the pages of Parquet files as `list_table.Writer` writes them; anything else in such a file is damage."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any, Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.store.codecs.kernels.delta_packing import SLACK_BYTES
+from roadscan.store.codecs.parquet import pages
+from roadscan.store.codecs.parquet.list_table import MAGIC, sealed
+from roadscan.store.codecs.zlib_stream import crc32
+
+TAIL_BYTES: Final = 8
+"""Length of the footer, and the mark that ends a Parquet file."""
+_WORD: Final = 8
+_LISTED: Final = ".list.element"
+
+
+class DamageError(Exception):
+    """What is wrong with a file."""
+
+
+class ByteSource(Protocol):
+    """Where a file's bytes come from."""
+
+    stream: Any
+
+    def expect(self, start: int, end: int) -> None:
+        """Let bytes `start` to `end` be on their way."""
+
+    def read_into(self, start: int, room: memoryview) -> bool:
+        """Fill `room` with the bytes from `start` on; False where the file is too short."""
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """A column of a row group."""
+
+    start: int
+    """Byte of the file."""
+    size: int
+    values: int
+    nullable: bool
+    encoding: str
+
+
+def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
+    """The footer of a Parquet file, and whether `list_table` wrote it; DamageError where it is damaged."""
+    size = stream.seek(0, os.SEEK_END)
+    tail = _read(stream, max(size - TAIL_BYTES, 0), size)
+    length = int.from_bytes(tail[:4], "little")
+    if tail[4:] != MAGIC or length > size - TAIL_BYTES:
+        raise DamageError("it does not end as a Parquet file")
+    tail = _read(stream, size - TAIL_BYTES - length, size)
+    ours = sealed(tail[:-TAIL_BYTES])
+    if ours is False:
+        raise DamageError("its footer does not have its checksum")
+    return pq.read_metadata(pa.BufferReader(tail)), ours is True
+
+
+def _read(stream: Any, start: int, end: int) -> bytes:
+    stream.seek(start)
+    return bytes(stream.read(end - start))
+
+
+class PageFile:
+    """Pages of row groups, one row group at a time; holds its buffer, so one a thread.
+
+    Bytes are read at once for all columns wanted; each page is held against its CRC-32 before it is looked at.
+    """
+
+    def __init__(self, source: ByteSource, metadata: pq.FileMetaData) -> None:
+        self._source = source
+        self._size = source.stream.seek(0, os.SEEK_END)
+        self._metadata = metadata
+        self.words = np.empty(0, np.uint64)
+        """The buffer."""
+        self._columns = _columns(metadata)
+        self._known: dict[tuple[int, str], _Chunk] = {}
+        self._chunks: dict[str, _Chunk] = {}
+        self._origin = 0
+
+    def load(self, group: int, names: Sequence[str]) -> None:
+        """Bring columns of a row group into the buffer."""
+        self._chunks = {name: self._located(group, name) for name in names}
+        self._origin, end = _span(self._chunks.values())
+        words = -(-(end - self._origin + SLACK_BYTES) // _WORD)
+        if self.words.size < words:
+            self.words = np.empty(words, np.uint64)
+        room = self.words.view(np.uint8).data[: end - self._origin]
+        if not self._source.read_into(self._origin, room):
+            raise DamageError("it is cut short")
+
+    def expect(self, groups: Sequence[int], names: Sequence[str]) -> None:
+        """Let the bytes of row groups be on their way that will be loaded soon; groups in a row in one piece."""
+        for _, run in groupby(enumerate(groups), lambda pair: pair[1] - pair[0]):
+            self._source.expect(*_span([self._located(group, name) for _, group in run for name in names]))
+
+    def encoding(self, name: str) -> str:
+        """Encoding of a loaded column's values, as Parquet calls it."""
+        return self._chunks[name].encoding
+
+    def content(self, name: str) -> npt.NDArray[np.uint8]:
+        """Bytes of a loaded column, as they are stored."""
+        chunk, data = self._chunks[name], self.words.view(np.uint8)
+        return data[chunk.start - self._origin : chunk.start - self._origin + chunk.size]
+
+    def page(self, name: str, encoding: int) -> tuple[npt.NDArray[np.uint8], int, int, int]:
+        """The buffer, where in it a loaded column's page begins and ends, and its bytes once it is unpacked.
+
+        The page has its checksum.
+        """
+        chunk, data = self._chunks[name], self.words.view(np.uint8)
+        start = chunk.start - self._origin
+        end = start + chunk.size
+        header = pages.read_page_header(data[start:end], chunk.values, encoding)
+        if header is None:
+            raise DamageError(f"column '{name}': a page's header is damaged")
+        start += header.length
+        if crc32(data[start:end]) != header.crc:
+            raise DamageError(f"column '{name}': a page does not have its checksum")
+        return data, start, end, header.raw
+
+    def _located(self, group: int, name: str) -> _Chunk:
+        known = self._known.get((group, name))
+        if known is not None:
+            return known
+        number, nullable = self._columns[name]
+        column = self._metadata.row_group(group).column(number)
+        size, encoding = column.total_compressed_size, column.encodings[-1]
+        chunk = _Chunk(column.data_page_offset, size, column.num_values, nullable, encoding)
+        if not 0 <= chunk.start <= chunk.start + chunk.size <= self._size:
+            raise DamageError("its footer speaks of pages outside of it")
+        self._known[group, name] = chunk
+        return chunk
+
+
+def _span(chunks: Iterable[_Chunk]) -> tuple[int, int]:
+    """First byte of some chunks, and the one behind the last."""
+    ends = [(c.start, c.start + c.size) for c in chunks]
+    return min(start for start, _ in ends), max(end for _, end in ends)
+
+
+def _columns(metadata: pq.FileMetaData) -> dict[str, tuple[int, bool]]:
+    """Number of each column by its name, and whether it may hold nulls."""
+    found = {}
+    for k in range(metadata.num_columns):
+        column = metadata.schema.column(k)
+        listed = column.path.endswith(_LISTED)
+        found[column.path.removesuffix(_LISTED)] = k, column.max_definition_level > listed
+    return found

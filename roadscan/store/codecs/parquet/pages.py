@@ -1,0 +1,115 @@
+"""Data pages (version 1) of whole numbers and of fixed-size lists of them.
+
+A page is a header, then repetition levels (0 begins a list, 1 goes on with it), then definition levels (how much of
+the value's path is there), then the values. Lists of a fixed size have levels that can be stated without looking at the
+values, so a page's levels are compared with those that it has to have, instead of being decoded.
+
+(Apache Parquet format, *parquet.thrift*, and *Encodings.md*, "RLE / bit-packing hybrid".)
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from itertools import groupby
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.store.codecs.parquet import thrift
+
+PLAIN, RLE, DELTA_BINARY_PACKED, BYTE_STREAM_SPLIT = 0, 3, 5, 9
+_NUMBER: Final = b"\x15"
+"""The next field, a number of 32 bits."""
+_DATA_PAGE: Final = _NUMBER + b"\x00"
+"""The first field of a page's header: its type."""
+_LENGTH_BYTES: Final = 4
+_SIZES_AND_CRC: Final = re.compile(
+    rb"\x15\x00" + 3 * rb"\x15((?:[\x80-\xFF]{0,3}[\x80-\xFF](?=[^\x00]))?[\x00-\x7F])", re.DOTALL
+)
+"""A page's type, its bytes before and after it was compressed, its CRC, each behind the byte that names the field."""
+_LONGEST_HEADER: Final = 64
+_LIMIT: Final = 1 << 31
+"""Of a number of 32 bits."""
+
+Bools = np.ndarray[Any, np.dtype[np.bool_]]
+
+
+def flat_levels(valid: npt.NDArray[np.bool_] | None) -> bytes:
+    """Levels of (n,) values; None for a column without nulls, which has none."""
+    if valid is None:
+        return b""
+    if valid.all():
+        return _section(_run(valid.size, 1) if valid.size else b"")
+    return _section(b"".join(_run(len(list(same)), int(there)) for there, same in groupby(valid.tolist())))
+
+
+def list_levels(rows: int, size: int, valid: npt.NDArray[np.bool_] | None) -> bytes:
+    """Levels of lists of `size` (1 or more) values, which are never null; `valid` is None for lists that never are."""
+    own = _run(1, 0) + (_run(size - 1, 1) if size > 1 else b"")
+    if valid is None or valid.all():
+        repetition = own * rows if size > 1 else _run(rows, 0)
+        return _section(repetition) + _section(_run(rows * size, 1 if valid is None else 2))
+    repetition = b"".join(own if there else _run(1, 0) for there in valid.tolist())
+    runs = ((there, len(list(same))) for there, same in groupby(valid.tolist()))
+    return _section(repetition) + _section(b"".join(_run(n * size, 2) if there else _run(n, 0) for there, n in runs))
+
+
+def page_header(size: int, crc: int, values: int, encoding: int, raw: int | None = None) -> bytes:
+    """Header of a page of `size` bytes, `raw` ones before they were compressed, and of `values` levels.
+
+    The CRC-32 is over levels and values as they are stored.
+    """
+    signed = crc - (1 << 32) if crc >> 31 else crc
+    sizes = _NUMBER + thrift.zigzag(size if raw is None else raw) + _NUMBER + thrift.zigzag(size)
+    return _DATA_PAGE + sizes + _NUMBER + thrift.zigzag(signed) + _about(values, encoding)
+
+
+@functools.lru_cache(maxsize=64)
+def _about(values: int, encoding: int) -> bytes:
+    """What ends the header of a page: its fifth field, a struct, and the mark that no field follows."""
+    own = thrift.struct({k: thrift.i32(v) for k, v in {1: values, 2: encoding, 3: RLE, 4: RLE}.items()})
+    return thrift.struct({1: own}).content
+
+
+class PageHeader(NamedTuple):
+    """What the header of a column chunk's one page says."""
+
+    length: int
+    """Bytes of the header itself."""
+    crc: int
+    raw: int
+    """Bytes of the page before it was compressed."""
+
+
+def read_page_header(chunk: npt.NDArray[np.uint8], values: int, encoding: int) -> PageHeader | None:
+    """Header of the one page of a column chunk; None if it is not as `page_header` writes it."""
+    head = chunk[:_LONGEST_HEADER].tobytes()
+    found = _SIZES_AND_CRC.match(head)
+    if found is None:
+        return None
+    raw, size, crc = (_number(varint) for varint in found.groups())
+    rest = _about(values, encoding)
+    length = found.end() + len(rest)
+    known = 0 <= raw < _LIMIT and 0 <= size < _LIMIT and -_LIMIT <= crc < _LIMIT
+    if not known or length + size != chunk.size or head[found.end() : length] != rest:
+        return None
+    return PageHeader(length, crc % (1 << 32), raw)
+
+
+def _number(varint: bytes) -> int:
+    """A signed number of its varint."""
+    value = 0
+    for byte in reversed(varint):
+        value = value << 7 | byte & 127
+    return (value >> 1) ^ -(value & 1)
+
+
+def _section(runs: bytes) -> bytes:
+    return len(runs).to_bytes(_LENGTH_BYTES, "little") + runs
+
+
+def _run(count: int, level: int) -> bytes:
+    """A level `count` times, of a column whose levels fit in a byte."""
+    return thrift.varint(count << 1) + bytes([level])

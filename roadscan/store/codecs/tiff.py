@@ -1,0 +1,152 @@
+"""A cloud-optimised TIFF from blocks that are compressed already (TIFF 6.0; BigTIFF where 4 GB do not do).
+
+First come all directories, then the blocks: those of the smallest overview first, those of the image last. Each has
+its size before it and its last four bytes again behind it, as GDAL's own cloud-optimised files do. A block that holds
+nothing is left out (offset and size 0), as GDAL reads sparse files.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from blake3 import blake3
+
+from roadscan.core.errors import StoreError
+
+DIGEST_ITEM: Final = "ROADSCAN_FILE_BLAKE3"
+"""Metadata item with the BLAKE3 digest (128 bits, hexadecimal) of the whole file, this digest's characters as 0."""
+
+_NO_DIGEST: Final = b"0" * 32
+_DIGEST: Final = re.compile(rb'<Item name="' + DIGEST_ITEM.encode() + rb'">([0-9a-f]{32})</Item>')
+_STRUCTURE: Final = b"""LAYOUT=IFDS_BEFORE_DATA
+BLOCK_ORDER=ROW_MAJOR
+BLOCK_LEADER=SIZE_AS_UINT4
+BLOCK_TRAILER=LAST_4_BYTES_REPEATED
+KNOWN_INCOMPATIBLE_EDITION=NO
+ """
+_GHOST: Final = b"GDAL_STRUCTURAL_METADATA_SIZE=%06d bytes\n" % len(_STRUCTURE) + _STRUCTURE
+"""What GDAL knows a cloud-optimised file by (GDAL, COG driver: header ghost area)."""
+_KINDS: Final = {"s": 2, "H": 3, "I": 4, "d": 12, "Q": 16}
+_LEADER: Final = 4
+_CLASSIC_END: Final = 2**32 - 2**20
+
+
+@dataclass(frozen=True)
+class Tag:
+    """One entry of a directory: values of a `struct` kind, text as bytes of the kind ``s``."""
+
+    number: int
+    kind: str
+    values: Sequence[Any]
+
+    def packed(self) -> bytes:
+        """Values as the file holds them; text ends with a zero byte."""
+        if self.kind == "s":
+            return b"".join(self.values) + b"\0"
+        return struct.pack(f"<{len(self.values)}{self.kind}", *self.values)
+
+    @property
+    def count(self) -> int:
+        """Values of the entry."""
+        return len(self.packed()) if self.kind == "s" else len(self.values)
+
+
+@dataclass(frozen=True)
+class Page:
+    """An image or one of its overviews: its tags but for the places of the blocks, and the blocks."""
+
+    tags: tuple[Tag, ...]
+    blocks: Sequence[Any]
+    """Buffers, None where nothing lies; by band, then row by row."""
+
+
+def tiff_parts(pages: Sequence[Page]) -> list[Any]:
+    """Buffers of the file: directories, then blocks. The image comes first in `pages`, then overviews, falling."""
+    sizes = [[0 if b is None else len(b) for b in page.blocks] for page in pages]
+    entries = sum(len(s) for s in sizes)
+    big = sum(map(sum, sizes)) + 40 * entries > _CLASSIC_END
+    word = "Q" if big else "I"
+    starts, at = [], (16 if big else 8) + len(_GHOST)
+    for page, size in zip(pages, sizes, strict=True):
+        at += at % 2
+        starts.append(at)
+        at += len(_directory(_tags(page, size, size, word), 0, 0, big))
+    places: list[list[int]] = [[] for _ in pages]
+    for number in reversed(range(len(pages))):
+        for length in sizes[number]:
+            places[number].append(at + _LEADER if length else 0)
+            at += length + 2 * _LEADER if length else 0
+    head = struct.pack("<2sHHHQ", b"II", 43, 8, 0, starts[0]) if big else struct.pack("<2sHI", b"II", 42, starts[0])
+    head += _GHOST
+    for page, size, place, start, following in zip(pages, sizes, places, starts, [*starts[1:], 0], strict=True):
+        head += b"\0" * (start - len(head))
+        head += _directory(_tags(page, place, size, word), start, following, big)
+    blocks = [
+        part
+        for page in reversed(pages)
+        for block in page.blocks
+        if block is not None
+        for part in (struct.pack("<I", len(block)), block, bytes(memoryview(block)[-_LEADER:]))
+    ]
+    return [head.replace(_NO_DIGEST, _digest([head, *blocks]), 1), *blocks]
+
+
+def digest_item() -> str:
+    """The metadata item that `tiff_parts` fills in; it belongs into the metadata of the first page, once."""
+    return f'<Item name="{DIGEST_ITEM}">{_NO_DIGEST.decode()}</Item>'
+
+
+def check_cog(path: Path) -> None:
+    """Raise :class:`StoreError` unless the file is to the bit what `tiff_parts` gave."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise StoreError(f"the GeoTIFF cannot be read: {error}", change="make it again", file=path) from error
+    stated = _DIGEST.search(content)
+    if stated is None or _GHOST not in content[:256]:
+        raise StoreError(
+            "the GeoTIFF states no digest of itself",
+            expected="one: the file was made by an older version, or is damaged",
+            change="make it again",
+            file=path,
+        )
+    found = _digest([content[: stated.start(1)], _NO_DIGEST, memoryview(content)[stated.end(1) :]])
+    if found != stated[1]:
+        raise StoreError(
+            f"the file's digest is {found.decode()}",
+            expected=stated[1].decode(),
+            change="the file is damaged: make it again",
+            file=path,
+        )
+
+
+def _tags(page: Page, places: Sequence[int], sizes: Sequence[int], word: str) -> list[Tag]:
+    return sorted([*page.tags, Tag(324, word, places), Tag(325, word, sizes)], key=lambda tag: tag.number)
+
+
+def _directory(tags: Sequence[Tag], start: int, following: int, big: bool) -> bytes:
+    """Directory that lies at `start`, with the values that do not fit into its entries behind it."""
+    word, room = ("Q", 8) if big else ("I", 4)
+    end = start + (8 if big else 2) + len(tags) * (4 + 2 * room) + room
+    entries, values = struct.pack("<Q" if big else "<H", len(tags)), b""
+    for tag in tags:
+        packed = tag.packed()
+        entries += struct.pack(f"<HH{word}", tag.number, _KINDS[tag.kind], tag.count)
+        if len(packed) <= room:
+            entries += packed.ljust(room, b"\0")
+        else:
+            entries += struct.pack(f"<{word}", end + len(values))
+            values += packed + b"\0" * (len(packed) % 2)
+    return entries + struct.pack(f"<{word}", following) + values
+
+
+def _digest(parts: Iterable[Any]) -> bytes:
+    digest = blake3()
+    for part in parts:
+        digest.update(part)
+    return digest.hexdigest(length=16).encode()

@@ -1,0 +1,26 @@
+"""Columns that are computed when rows come in, so that no log has to bring them.
+
+They stand beside the raw readings for their statistics: a reader learns what a row group holds without decoding it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+
+from roadscan.compute.kernels.profile_bounds import range_bounds
+from roadscan.store.schema import TableSchema
+
+
+def with_derived(schema: TableSchema, rows: pa.RecordBatch) -> pa.RecordBatch:
+    """Rows of a table with its derived columns, whatever those held."""
+    if schema.name != "scans":
+        return rows
+    lists = rows.column("range")
+    ranges = lists.flatten().to_numpy().reshape(rows.num_rows, lists.type.list_size)
+    low, high = np.empty(rows.num_rows, np.uint16), np.empty(rows.num_rows, np.uint16)
+    range_bounds(ranges, low, high)
+    for name, values in (("range_low", low), ("range_high", high)):
+        at = rows.schema.get_field_index(name)
+        rows = rows.set_column(at, rows.schema.field(at), pa.array(values))
+    return rows

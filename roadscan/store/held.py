@@ -1,0 +1,100 @@
+"""Small tables that are held whole, a file each: what was estimated of clocks, mountings and trajectories.
+
+No record of the manifest names them, and no run makes all of them. So each says by itself what mends it. A list of
+their digests (``manifest/held.json``) tells damage that the checksums of their pages do not cover; a table that someone
+put there, and roadscan did not write, is not in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.core.errors import DamagedError, StoreError
+from roadscan.store.schema import table_schema
+from roadscan.store.sealed import seal, unseal
+from roadscan.store.store import Store, bytes_digest
+
+_DIGESTS: Final = "manifest/held.json"
+
+WAY_OUT: Final = {
+    "clocks": "`roadscan clocks` (or `roadscan run`) estimates the clocks anew",
+    "clock_residuals": "`roadscan clocks` (or `roadscan run`) estimates the clocks anew",
+    "mountings": "`roadscan calibrate` makes it anew of the survey file's evidence; if it is removed, the rig file's "
+    "mountings hold",
+    "mounting_corrections": "put it back, or adjust again; if it is removed, mountings hold as they were stated",
+    "corrections": "put it back, or compute it again; if it is removed, trajectories hold as they were recorded",
+}
+"""What mends each of the tables where it is damaged."""
+
+
+def held_path(name: str) -> str:
+    """File of such a table, relative to the survey's root."""
+    return f"tables/{name}/part-00000.parquet"
+
+
+def read_held(store: Store, name: str) -> pa.Table | None:
+    """The table, None where there is none.
+
+    Raises
+    ------
+    DamagedError
+        Says what mends it.
+    StoreError
+        It cannot be read.
+    """
+    path = held_path(name)
+    if not store.exists(path):
+        return None
+    change = WAY_OUT[name]
+    table = store.read_table(path, change=change)
+    missing = [c.name for c in table_schema(name).columns if not c.nullable and c.name not in table.column_names]
+    if missing:
+        raise DamagedError(
+            f"the table `{name}` has no column `{missing[0]}`: another file stands in its place",
+            change=change,
+            file=store.path(path),
+        )
+    return table
+
+
+def write_held(store: Store, name: str, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Replace the table; columns that a row does not name are null."""
+    schema = table_schema(name)
+    full = [{c.name: row.get(c.name) for c in schema.columns} for row in rows]
+    table = pa.Table.from_pylist(full, schema.arrow()).sort_by([(c, "ascending") for c in schema.sort])
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, row_group_size=schema.row_group_rows, compression="zstd", write_page_checksum=True)
+    content = sink.getvalue().to_pybytes()
+    known = _known(store)
+    both = {"bytes": len(content), "digest": bytes_digest(content)}
+    store.write_bytes(_DIGESTS, seal({**known, name: {**both, "before": known.get(name, {}).get("digest")}}))
+    store.write_bytes(held_path(name), content)
+
+
+def held_records(store: Store) -> dict[str, tuple[int, str]]:
+    """Bytes and digest of the small tables that roadscan wrote, by their paths.
+
+    One whose writing was cut short is the one before it.
+    """
+    found: dict[str, tuple[int, str]] = {}
+    for name, of in _known(store).items():
+        path = held_path(name)
+        if store.exists(path) and bytes_digest(content := store.read_bytes(path)) == of.get("before"):
+            found[path] = (len(content), str(of["before"]))
+        else:
+            found[path] = (int(of["bytes"]), str(of["digest"]))
+    return found
+
+
+def _known(store: Store) -> dict[str, Any]:
+    """Digests that were kept; none where their list is damaged, which costs nothing but this check."""
+    if not store.exists(_DIGESTS):
+        return {}
+    try:
+        return {name: of for name, of in unseal(store.read_bytes(_DIGESTS)).items() if name in WAY_OUT and dict(of)}
+    except (StoreError, ValueError, TypeError):
+        return {}

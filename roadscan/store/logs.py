@@ -1,0 +1,180 @@
+"""Log records: which raw logs the store holds, and where their rows lie."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+from roadscan.core.errors import DamagedError, StoreError
+from roadscan.core.witness import Finding
+from roadscan.store.sealed import seal, unseal
+from roadscan.store.store import Store
+
+_FOLDER: Final = "manifest/logs"
+_COPIES: Final = "manifest/log_copies"
+
+NAVIGATION: Final = "navigation"
+"""Sensor of the records of computed trajectories."""
+
+
+@dataclass(frozen=True)
+class DataFile:
+    """One Parquet file of ingested rows."""
+
+    path: str
+    """Relative to the survey's root."""
+    rows: int
+    bytes: int
+    digest: str
+    """BLAKE3-128 of its bytes with the prefix ``blake3:``; without a prefix, BLAKE2b-128 (older versions)."""
+    group_rows: tuple[int, ...]
+    """Rows of each row group."""
+    group_spans: tuple[tuple[int, int], ...]
+    """First and last epoch (GPS ns) of each row group; empty for tables without epochs."""
+
+    @cached_property
+    def span(self) -> tuple[int, int] | None:
+        """First and last epoch (GPS ns)."""
+        if not self.group_spans:
+            return None
+        return min(s[0] for s in self.group_spans), max(s[1] for s in self.group_spans)
+
+
+@dataclass(frozen=True)
+class LogRecord:
+    """What is known of one ingested log; written last, so a log is in the store whole or not at all."""
+
+    key: str
+    """Fingerprint of the log's bytes and of everything that shaped its rows."""
+    run: str
+    sensor: str
+    """Sensor of the rig; 'trajectory' or 'control' for logs without one."""
+    format: str
+    path: str
+    """Path in the survey file."""
+    content: str
+    """Fingerprint of the log's bytes alone."""
+    source_bytes: int
+    tables: dict[str, tuple[DataFile, ...]]
+    attributes: dict[str, Any]
+    rows: int
+    rejected: int
+    """Records listed in the table ``rejects``."""
+    reject_reasons: dict[str, int]
+    findings: tuple[Finding, ...] = ()
+    """What its reader, and the checks of its rows, doubt."""
+
+    def span(self, table: str) -> tuple[int, int] | None:
+        """First and last epoch (GPS ns) of the log's rows in a table."""
+        spans = [f.span for f in self.tables.get(table, ()) if f.span is not None]
+        return (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else None
+
+    def folder(self, table: str) -> str:
+        """Folder of the log's rows in a table, relative to the survey's root."""
+        return log_folder(table, self.run, self.sensor, self.key)
+
+
+def log_folder(table: str, run: str, sensor: str, key: str) -> str:
+    """Folder of one log's rows in a table."""
+    return f"tables/{table}/run={run}/sensor={sensor}/log={key}"
+
+
+def log_of(path: str) -> str:
+    """Key of the log whose rows lie in a file below its folder."""
+    return path.partition("/log=")[2].partition("/")[0]
+
+
+def record_path(key: str) -> str:
+    """File of a log's record, relative to the survey's root."""
+    return f"{_FOLDER}/{key}.json"
+
+
+def copy_path(key: str) -> str:
+    """File of its copy: raw logs may be archived, and nothing else says how their rows are to be understood."""
+    return f"{_COPIES}/{key}.json"
+
+
+def write_log_record(store: Store, record: LogRecord) -> None:
+    """Make a log part of the store."""
+    content = seal(dataclasses.asdict(record))
+    store.write_bytes(copy_path(record.key), content, lasting=False)
+    store.write_bytes(record_path(record.key), content)
+
+
+def read_log_records(
+    store: Store, keys: Iterable[str] | None = None, damaged: list[StoreError] | None = None
+) -> list[LogRecord]:
+    """Records of all logs in the store, or of those named, sorted by run, sensor, start and key.
+
+    One that is damaged is an error, or joins `damaged` and is left out.
+    """
+    records: list[LogRecord] = []
+    for key in log_keys(store) if keys is None else keys:
+        path = record_path(key)
+        try:
+            records.append(parse_log_record(store.read_bytes(path), key, store.path(path)))
+        except StoreError as error:
+            if damaged is None:
+                raise
+            damaged.append(error)
+    return sorted(records, key=lambda r: (r.run, r.sensor, _start(r), r.key))
+
+
+def log_keys(store: Store) -> list[str]:
+    """Keys of all logs in the store, also of those whose record is damaged."""
+    return [path.rsplit("/", 1)[1].removesuffix(".json") for path in store.files(_FOLDER, ".json")]
+
+
+def _start(record: LogRecord) -> int:
+    """First epoch (GPS ns) of a log, 0 for one without rows or epochs."""
+    return min(((record.span(table) or (0, 0))[0] for table in record.tables), default=0)
+
+
+def has_log(store: Store, key: str) -> bool:
+    """True if the log of this key is in the store, be its record damaged or not."""
+    return store.exists(record_path(key))
+
+
+def retire_log(store: Store, record: LogRecord) -> None:
+    """Take a log out of the tables without losing it: its record and rows move below ``superseded/``.
+
+    Used when the same bytes were read again under other settings (a corrected clock, say).
+    """
+    path = record_path(record.key)
+    store.write_bytes(f"superseded/{path}", store.read_bytes(path))
+    store.remove(path)  # before its rows go: no log is half there
+    store.remove(copy_path(record.key))
+    for table in record.tables:
+        if store.is_folder and store.exists(record.folder(table)):
+            aside = f"superseded/{record.folder(table)}"
+            store.remove(aside)
+            target = store.path(aside)
+            store.fs.makedirs(target.rsplit("/", 1)[0], exist_ok=True)
+            store.fs.mv(store.path(record.folder(table)), target, recursive=True)
+
+
+def data_file(raw: Mapping[str, Any]) -> DataFile:
+    """What a record holds of a data file, from JSON."""
+    spans = tuple((s[0], s[1]) for s in raw["group_spans"])
+    return DataFile(**{**raw, "group_rows": tuple(raw["group_rows"]), "group_spans": spans})
+
+
+def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
+    """The record of the log `key`, from the content of the file `path`."""
+    try:
+        raw = unseal(content)
+        raw["tables"] = {name: tuple(map(data_file, files)) for name, files in raw["tables"].items()}
+        raw["findings"] = tuple(map(Finding.of, raw.get("findings", ())))
+        record = LogRecord(**raw)
+        if record.key != key:
+            raise ValueError(f"it is the record of the log {record.key}")
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        raise DamagedError(
+            f"the log record is damaged ({error})",
+            change="the next run puts its copy in its place, or reads the log again",
+            file=path,
+        ) from error
+    return record

@@ -1,0 +1,347 @@
+"""The manifest of outputs: which file has which key. What is there and verified is not made again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from roadscan.core.errors import DamagedError, StoreError
+from roadscan.store.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, sound_rows, table_of, unpacked
+from roadscan.store.store import MADE_AGAIN, Store, bytes_hold
+
+__all__ = ["Manifest", "OutputRecord", "begin_changes", "end_changes", "read_failures", "write_failures"]
+
+_FOLDER: Final = "manifest/outputs"
+_FAILURES: Final = "manifest/failures.json"
+_CHANGING: Final = "manifest/changing"
+_OLDER: Final = b"older files, too"
+_DAMAGED: Final = "damaged"
+"""Key of outputs whose files are not as recorded."""
+_MOST_PARTS: Final = 256
+"""More parts than that are merged: a long run would begin with thousands of files to read."""
+_LOOKS: Final = 10
+"""How often parts are listed at most, where a run at work merges them while they are read."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A file of records, written once. Parts hold what changed, in the order of their numbers."""
+
+    path: str
+    rows: int
+    records: Packed | None = None
+    """What it holds, where that was written a moment ago and is soon merged."""
+
+
+class Manifest:
+    """All output records; one writer at a time (the run that holds the store's lock).
+
+    What changes is written as a part of its own. Parts are merged with those before them that are no more than twice
+    as large, so a record is written again as often as the survey doubles, not each time that some tasks end.
+
+    Records stay in tables; only those of products that are asked for one by one become Python's.
+    """
+
+    def __init__(self, store: Store, damaged: list[StoreError] | None = None) -> None:
+        """Read the parts. One that is damaged is an error, or joins `damaged`: what is sound of it counts then."""
+        self._store = store
+        read = read_parts(store)
+        faults = [one.fault for one in read if one.fault is not None]
+        if faults and damaged is None:
+            raise faults[0]
+        if damaged is not None:
+            damaged += faults
+        self._parts = [_Part(one.path, one.table.num_rows) for one in read if one.fault is None]
+        self._next = read[-1].number + 1 if read else 0
+        self._table, self._moved = latest(pa.concat_tables([RECORDS.empty_table(), *(one.table for one in read)]))
+        self._behind: list[_Part] = []  # parts that the table does not know yet
+        self._rows: dict[str, dict[str, Row]] = {}  # by product and unit, of products that were asked for
+
+    def get(self, product: str, unit: str) -> OutputRecord | None:
+        """Record of an output, None where it was never finished."""
+        row = self._of(product).get(unit)
+        return None if row is None else OutputRecord._make(row)
+
+    def of(self, product: str) -> dict[str, OutputRecord]:
+        """Records of one product by unit."""
+        return {unit: OutputRecord._make(row) for unit, row in self._of(product).items()}
+
+    def all(self) -> list[OutputRecord]:
+        """All records, by product and unit."""
+        return list(map(OutputRecord._make, rows_of(self.table())))
+
+    def beside(self, products: Collection[str], units: Collection[str]) -> list[OutputRecord]:
+        """Records of some products, of all units but these."""
+        table = self.table()
+        own = pc.is_in(table.column("product"), pa.array(sorted(products), pa.string()))
+        due = pc.is_in(table.column("unit"), pa.array(list(units), pa.string()))
+        return list(map(OutputRecord._make, rows_of(table.filter(pc.and_not(own, due)))))
+
+    def without_file(self, product: str) -> set[str]:
+        """Units of a product that are finished and have no file."""
+        table = self.table()
+        found = pc.and_(pc.equal(table.column("product"), product), pc.equal(table.column("path"), ""))
+        return set(table.column("unit").filter(found).to_pylist())
+
+    def files(self) -> dict[str, int]:
+        """How many files there are, by product."""
+        table = self.table()
+        found = table.column("product").filter(pc.not_equal(table.column("path"), ""))
+        return {one["values"]: one["counts"] for one in found.value_counts().to_pylist()}
+
+    def is_current(self, product: str, unit: str, key: str) -> bool:
+        """True if the output has this key and its file is there in its recorded size."""
+        record = self.get(product, unit)
+        if record is None or record.key != key:
+            return False
+        return not record.path or self._store.size(record.path) == record.bytes
+
+    def add(self, records: Iterable[OutputRecord]) -> None:
+        """Record finished outputs; durable when this returns. Files under older names are removed by :meth:`settle`."""
+        added = list(records)
+        if not added:
+            return
+        known = [self._of(r.product).get(r.unit) for r in added]
+        for r in added:
+            self._rows[r.product][r.unit] = (*r,)
+        self._append(Packed.of(table_of(added)))
+        pairs = zip(known, added, strict=True)
+        self._moved += [old[3] for old, new in pairs if old is not None and old[3] not in ("", new.path)]
+
+    def add_packed(self, records: Packed) -> None:
+        """The same, of many as a worker packed them."""
+        if records.rows:
+            self._rows.clear()
+            self._append(records)
+
+    def settle(self) -> None:
+        """Remove files under older names that no output has any more, also those that a run that was killed left."""
+        table = self.table()
+        if self._moved:
+            moved = pa.array(sorted(set(self._moved)), pa.string())
+            for path in moved.filter(pc.invert(pc.is_in(moved, table.column("path")))).to_pylist():
+                self._store.remove(path)
+            self._moved.clear()
+
+    def remove(self, records: Iterable[OutputRecord]) -> None:
+        """Forget outputs and remove their files."""
+        gone = list(records)
+        if not gone:
+            return
+        self._forget([(r.product, r.unit) for r in gone])
+        for r in gone:
+            if r.path:
+                self._store.remove(r.path)
+
+    def forget(self, product: str, units: Iterable[str]) -> None:
+        """Drop the records of outputs that could not be made again: their files stay, but count as stale."""
+        known = [(product, u) for u in units if u in self._of(product)]
+        if known:
+            begin_changes(self._store, older=True)
+            self._forget(known)
+
+    def doubt(self, records: Iterable[OutputRecord]) -> None:
+        """Count outputs as stale whose files are damaged; their records stay, so that whoever reads them is told."""
+        self.add(record._replace(key=_DAMAGED) for record in records)
+
+    def doubt_files(self, paths: Collection[str]) -> None:
+        """The same of files by their full paths, as errors name them; those of no output are passed over."""
+        if paths:
+            table = self.table()
+            own = pa.array(sorted(path.removeprefix(f"{self._store.root}/") for path in paths), pa.string())
+            self.doubt(map(OutputRecord._make, rows_of(table.filter(pc.is_in(table.column("path"), own)))))
+
+    def compact(self) -> None:
+        """Bring all parts into one, without what is no more."""
+        self.settle()
+        old, self._parts = self._parts, []
+        self._write(Packed.of(self._table, "lz4"))
+        for part in old:
+            self._store.remove(part.path)
+
+    def _of(self, product: str) -> dict[str, Row]:
+        """Rows of a product by unit."""
+        rows = self._rows.get(product)
+        if rows is None:
+            table = self.table()
+            own = rows_of(table.filter(pc.equal(table.column("product"), product)))
+            rows = self._rows[product] = {row[1]: row for row in own}
+        return rows
+
+    def table(self) -> pa.Table:
+        """Every record, by product and unit."""
+        if self._behind:
+            news, self._behind = list(map(self._read, self._behind)), []
+            self._table, moved = latest(pa.concat_tables([self._table, *news]))
+            self._moved += moved
+        return self._table
+
+    def _forget(self, outputs: list[tuple[str, str]]) -> None:
+        for product, unit in outputs:
+            self._rows.get(product, {}).pop(unit, None)
+        self._append(Packed.of(table_of([(product, unit, "", "", 0, "", "") for product, unit in outputs])))
+
+    def _append(self, records: Packed) -> None:
+        self._behind.append(self._write(records, keep=True))
+        if len(self._parts) > _MOST_PARTS:
+            self._merge()
+
+    def _merge(self) -> None:
+        """Bring the last parts into one, which says the same as these in their order, but not which files moved."""
+        self.settle()
+        rows = self._parts[-1].rows
+        first = len(self._parts) - 1
+        while first and (first > _MOST_PARTS // 2 or self._parts[first - 1].rows <= 2 * rows):
+            first -= 1
+            rows += self._parts[first].rows
+        old = self._parts[first:]
+        table, _ = latest(pa.concat_tables(list(map(self._read, old))), forgotten=True)
+        del self._parts[first:]
+        self._write(Packed.of(table, "lz4"))
+        for part in old:  # where these stay, the new part says once more what they say
+            self._store.remove(part.path)
+
+    def _read(self, part: _Part) -> pa.Table:
+        return unpacked(self._store.read_bytes(part.path)) if part.records is None else part.records.table()
+
+    def _write(self, records: Packed, keep: bool = False) -> _Part:
+        path = part_path(self._next)
+        self._store.write_bytes(path, records.content)
+        self._next += 1
+        self._parts.append(_Part(path, records.rows, records if keep else None))
+        return self._parts[-1]
+
+
+@dataclass(frozen=True)
+class ReadPart:
+    """A part as it was found."""
+
+    path: str
+    table: pa.Table
+    """Its records; of a damaged one those that are sound."""
+    fault: StoreError | None
+
+    @property
+    def number(self) -> int:
+        """Its place among the parts."""
+        return int(self.path.rsplit("-", 1)[1].removesuffix(".parquet"))
+
+
+def part_path(number: int) -> str:
+    """File of a part, relative to the survey's root."""
+    return f"{_FOLDER}/part-{number:08d}.parquet"
+
+
+def read_parts(store: Store) -> list[ReadPart]:
+    """Parts and their records, in order; listed again where a run at work has merged some of them meanwhile.
+
+    Raises
+    ------
+    StoreError
+        Parts vanish again and again while they are read.
+    """
+    looks = 0
+    while True:
+        looks += 1
+        paths = store.files(_FOLDER, ".parquet")
+        try:
+            return [_read_part(store, path) for path in paths]
+        except StoreError:
+            if looks == _LOOKS:
+                raise
+
+
+def _read_part(store: Store, path: str) -> ReadPart:
+    try:
+        content = store.read_bytes(path)
+    except StoreError as error:
+        if not store.exists(path):
+            raise
+        return ReadPart(path, RECORDS.empty_table(), error)
+    table, reason = sound_rows(content)
+    fault = DamagedError(
+        f"this part of the manifest is damaged: {reason}",
+        expected="a Parquet file of records of outputs",
+        change="the next run sets it aside and makes again what it alone told of",
+        file=store.path(path),
+    )
+    return ReadPart(path, table, fault if reason else None)
+
+
+def read_recorded(store: Store, record: OutputRecord) -> bytes:
+    """Content of an output's file, as it was recorded.
+
+    Raises
+    ------
+    DamagedError
+        It is missing, or another.
+    """
+    try:
+        content = store.read_bytes(record.path)
+    except StoreError as error:
+        if store.exists(record.path):
+            raise
+        raise DamagedError(error.arrived, change=MADE_AGAIN, file=error.file) from error
+    if record.digest and not bytes_hold(content, record.digest):
+        raise DamagedError("the file is not as it was recorded", change=MADE_AGAIN, file=store.path(record.path))
+    return content
+
+
+def begin_changes(store: Store, *, older: bool = False) -> bool:
+    """Note that files may lie in the store from now on that no record names; True where that was noted before.
+
+    A run that is killed leaves files that it had not recorded yet. With other settings the next one would make others,
+    and those would stay. `older` says that files which lie there already lost their record, too.
+    """
+    before = store.exists(_CHANGING)
+    if not before or (older and not store.read_bytes(_CHANGING)):
+        store.write_bytes(_CHANGING, _OLDER if older else b"")
+    return before
+
+
+def end_changes(store: Store, manifest: Manifest, folders: Iterable[str]) -> list[str]:
+    """Remove the files below some folders that no record names, once all that is due has one; returns their paths.
+
+    What lay there before the run that was killed began is nothing of its making, and stays.
+    """
+    listed = set(manifest.table().column("path").to_pylist())
+    began = 0 if store.exists(_CHANGING) and store.read_bytes(_CHANGING) else _changed_ns(store, _CHANGING)
+    removed = [
+        path
+        for folder in folders
+        for path in store.files(folder)
+        if path not in listed and _changed_ns(store, path) >= began
+    ]
+    for path in removed:
+        store.remove(path)
+    store.remove(_CHANGING)
+    return removed
+
+
+def _changed_ns(store: Store, path: str) -> int:
+    """When a file was written (Unix ns), 0 where the store is no folder."""
+    return Path(store.path(path)).stat().st_mtime_ns if store.is_folder and store.exists(path) else 0
+
+
+def write_failures(store: Store, failures: list[dict[str, str]]) -> None:
+    """Keep what failed in the last run, for `roadscan status`."""
+    store.write_bytes(_FAILURES, json.dumps(failures, indent=1).encode(), lasting=False)
+
+
+def read_failures(store: Store) -> list[dict[str, str]]:
+    """What failed in the last run: unit, error."""
+    if not store.exists(_FAILURES):
+        return []
+    try:
+        return [
+            {name: str(told[name]) for name in ("stage", "unit", "reason")}
+            for told in json.loads(store.read_bytes(_FAILURES))
+        ]
+    except (StoreError, ValueError, KeyError, TypeError) as error:
+        return [{"stage": "the list of failures", "unit": _FAILURES, "reason": f"it is damaged ({error}); run again"}]

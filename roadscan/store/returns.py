@@ -1,0 +1,100 @@
+"""Returns of a lidar out of the store, into arrays that are used again.
+
+Files of roadscan's own pages are decoded by `codecs/parquet`; those of other writers, and of older stores, by Arrow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.store.codecs.parquet.number_file import NumberFile
+from roadscan.store.codecs.parquet.page_file import DamageError
+from roadscan.store.group_reader import GroupReader
+from roadscan.store.store import Store
+
+_EPOCH, _POSE_EPOCH = "epoch_gps_ns", "pose_epoch_gps_ns"
+_KINDS: Final[dict[str, np.dtype[Any]]] = {
+    _EPOCH: np.dtype(np.int64), _POSE_EPOCH: np.dtype(np.int64),
+    "x_sensor_m": np.dtype(np.float32), "y_sensor_m": np.dtype(np.float32), "z_sensor_m": np.dtype(np.float32),
+    "intensity": np.dtype(np.uint16),
+}  # fmt: skip
+_COLUMNS: Final = list(_KINDS)
+
+Array = npt.NDArray[Any]
+Int64 = npt.NDArray[np.int64]
+Float32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Returns:
+    """Returns as stored, (n,) each."""
+
+    epoch_gps_ns: Int64
+    """GPS time at which each was measured."""
+    pose_epoch_gps_ns: Int64
+    """GPS time of the pose that places it; the very same array where the two are equal."""
+    x_sensor_m: Float32
+    y_sensor_m: Float32
+    z_sensor_m: Float32
+    intensity: npt.NDArray[np.uint16]
+
+
+class ReturnsReader(GroupReader[Returns, NumberFile]):
+    """Row groups of a file of returns; errors as of :class:`GroupReader`."""
+
+    what = "returns"
+    columns = _COLUMNS
+
+    def __init__(self, store: Store, file: str) -> None:
+        self._arrays = {name: np.empty(0, kind) for name, kind in _KINDS.items()}
+        super().__init__(store, file)
+
+    def _suits(self, schema: pa.Schema) -> bool:
+        missing = set(_COLUMNS).difference(schema.names)
+        if missing:
+            raise DamageError(f"it has no column '{min(missing)}'")
+        return _as_stored(schema)
+
+    def _pages(self) -> NumberFile:
+        return NumberFile(self._source, self._metadata)
+
+    def _decoded(self, packed: NumberFile, groups: Sequence[int]) -> Returns:
+        rows = [self._metadata.row_group(k).num_rows for k in groups]
+        total = sum(rows)
+        if self._arrays[_EPOCH].size < total:
+            self._arrays = {name: np.empty(total, kind) for name, kind in _KINDS.items()}
+        columns = {name: values[:total] for name, values in self._arrays.items()}
+        first, one_epoch = 0, True
+        for group, n in zip(groups, rows, strict=True):
+            packed.load(group, _COLUMNS)
+            own = {name: values[first : first + n] for name, values in columns.items()}
+            same = packed.same(_EPOCH, _POSE_EPOCH)
+            for name, values in own.items():
+                if not (same and name == _POSE_EPOCH):
+                    packed.numbers(name, values)
+            if one_epoch and not same:
+                columns[_POSE_EPOCH][:first] = columns[_EPOCH][:first]
+            one_epoch &= same
+            if same and not one_epoch:
+                own[_POSE_EPOCH][:] = own[_EPOCH]
+            first += n
+        if one_epoch:
+            columns[_POSE_EPOCH] = columns[_EPOCH]
+        return Returns(*(columns[name] for name in _COLUMNS))
+
+    def _from_table(self, rows: pa.Table) -> Returns:
+        if any(rows.column(name).null_count for name in _COLUMNS):
+            raise DamageError("a return is not whole")
+        return Returns(*(np.array(rows.column(name).to_numpy(), kind) for name, kind in _KINDS.items()))
+
+
+def _as_stored(schema: pa.Schema) -> bool:
+    """True if the columns have the types that are stored today."""
+    kinds = (schema.field(name) for name in _COLUMNS)
+    return all(f.type == pa.from_numpy_dtype(_KINDS[f.name]) and not f.nullable for f in kinds)

@@ -1,0 +1,34 @@
+"""Small JSON files that hold their own checksum, as last member: any JSON reader opens them, no damage is missed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any, Final
+
+from roadscan.store.store import bytes_digest
+
+_SEAL: Final = b',\n "checksum": "%b"'
+_END: Final = b"\n}"
+
+
+def seal(values: Mapping[str, Any]) -> bytes:
+    """An object that is not empty, with its checksum."""
+    return _sealed(json.dumps(values, indent=1, sort_keys=True).encode())
+
+
+def unseal(content: bytes) -> dict[str, Any]:
+    """The object without its checksum, if it has one, as files of older versions have not; ValueError for damage."""
+    mark, _, _ = _SEAL.partition(b"%b")
+    start = content.rfind(mark)
+    text = content if start < 0 else content[:start] + _END
+    if start >= 0 and content != _sealed(text):
+        raise ValueError("its checksum differs")
+    values = json.loads(text)
+    if not isinstance(values, dict):
+        raise ValueError("it holds no object")
+    return values
+
+
+def _sealed(text: bytes) -> bytes:
+    return text.removesuffix(_END) + _SEAL % bytes_digest(text).encode() + _END

@@ -1,0 +1,269 @@
+"""DuckDB over a store: every table as a view, and spans of time that touch only their partitions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import duckdb
+import pyarrow as pa
+
+from roadscan.core.errors import RoadscanError, StoreError
+from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, leap_second_steps
+from roadscan.store.asset_schema import ASSET_FOLDER, asset_tables
+from roadscan.store.logs import DataFile, read_log_records
+from roadscan.store.manifest import Manifest
+from roadscan.store.schema import schema_names, table_schema
+from roadscan.store.sql_files import PROTOCOL, StoreFiles, url
+from roadscan.store.store import Store
+from roadscan.store.verified import faults_of_opened, recorded_files
+
+_PER_TILE = ("cells", "overviews")
+_MISTAKES = (duckdb.CatalogException, duckdb.BinderException, duckdb.ParserException)
+"""Errors of the statement."""
+_ALWAYS = ("rejects",)
+"""Tables that answer even before they have a row: no rejects is news too."""
+_MISSING = re.compile(r"Table (?:Function )?with name \"?(?P<name>\w+)\"? does not exist")
+"""What DuckDB says of a table, or of a macro of a table, that is not there."""
+_CONFINED = (
+    "SET temp_directory = ''",
+    f"SET allowed_directories = ['{PROTOCOL}://']",
+    "SET enable_external_access = false",
+    "SET disabled_filesystems = 'LocalFileSystem'",
+    "SET allow_persistent_secrets = false",
+    "SET lock_configuration = true",
+)
+"""What leaves a statement nothing but the store's files and memory, in the order that DuckDB takes them. The last one
+keeps a statement from taking one of them back.
+"""
+_NO_EXTENSIONS = (
+    "SET autoinstall_known_extensions = false",
+    "SET allow_community_extensions = false",
+    "SET python_enable_replacements = false",
+    "SET enable_external_file_cache = false",
+)
+"""Nothing is fetched from the network, confined or not; each file is opened when it is asked for."""
+_WAY_OUT_OF_STORE = "`--unconfined` (in Python `unconfined=True`) lets a statement reach other files"
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A connection, and what its views are made of."""
+
+    connection: duckdb.DuckDBPyConnection
+    files: StoreFiles
+    """The files that it opens."""
+    recorded: pa.Table
+    """What is recorded of them."""
+    shut: dict[str, StoreError]
+    """Tables whose files cannot be opened, and why."""
+
+
+def connect(
+    store: Store,
+    logs: Iterable[str] | None = None,
+    damaged: list[StoreError] | None = None,
+    *,
+    unconfined: bool = False,
+) -> duckdb.DuckDBPyConnection:
+    """A DuckDB connection with one view a table and, for tables in time, one macro a table.
+
+    ``returns`` is the whole table; ``returns_between(first_gps_ns, last_gps_ns)`` opens only the files of
+    the partitions that hold the span. Hive columns run, sensor, log and gps_bin_s come with each row.
+    ``tiles``, ``cells``, ``overviews``, ``cracks``, ``potholes``, ``regions``, ``footprints``, ``outputs`` are there
+    once a run has made them, as are the tables of assets (``poles`` …),
+    ``clocks``, ``mountings`` and ``corrections`` once they were estimated. `logs` are the keys of the logs to
+    show, all in the store where left out. What is damaged is an error, or joins `damaged` and is not shown.
+    The macro ``utc(epoch_gps_ns)`` gives the UTC instant of a GPS epoch.
+
+    Statements reach the store's files, as ``store://survey=<id>/…``, and memory. They write no file and read no other,
+    unless the connection is `unconfined`. Extensions are never fetched.
+    """
+    return _opened(store, logs, damaged, unconfined).connection
+
+
+def _opened(store: Store, logs: Iterable[str] | None, damaged: list[StoreError] | None, unconfined: bool) -> Opened:
+    connection = duckdb.connect()
+    try:
+        opened = _with_views(connection, store, logs, damaged)
+        for setting in (*_NO_EXTENSIONS, *(() if unconfined else _CONFINED)):
+            connection.execute(setting)
+    except BaseException:
+        connection.close()
+        raise
+    opened.files.opened.clear()  # a view looks at the first file of its table
+    return opened
+
+
+def _with_views(
+    connection: duckdb.DuckDBPyConnection, store: Store, logs: Iterable[str] | None, damaged: list[StoreError] | None
+) -> Opened:
+    own_files = StoreFiles(store)
+    connection.register_filesystem(own_files)
+    _add_utc(connection)
+    files: dict[str, list[DataFile]] = {}
+    shut: dict[str, StoreError] = {}
+    wanted = None if logs is None else set(logs)
+    records = read_log_records(store, damaged=damaged)
+    for record in records:
+        if wanted is not None and record.key not in wanted:
+            continue  # replaced by a newer version of the log, or no longer listed
+        for table, own in record.tables.items():
+            files.setdefault(table, []).extend(own)
+    for table, held in files.items():
+        partition_s = table_schema(table).partition_s
+        fault = _view(connection, own_files, table, [url(store, f.path) for f in held], damaged, hive=True)
+        if fault is not None:
+            shut[table] = fault
+        elif partition_s is not None:
+            connection.execute(
+                f"CREATE MACRO {table}_between(first_gps_ns, last_gps_ns) AS TABLE SELECT * FROM {table} "
+                f"WHERE gps_bin_s BETWEEN first_gps_ns // 1000000000 // {partition_s} * {partition_s} "
+                "AND last_gps_ns // 1000000000 "
+                "AND epoch_gps_ns BETWEEN first_gps_ns AND last_gps_ns"
+            )
+    for table in _ALWAYS:
+        if table not in files:
+            connection.register(table, table_schema(table).arrow().empty_table())
+    manifest = Manifest(store, damaged)
+    made = manifest.table()  # not its files: a later record replaces an earlier one
+    if made.num_rows:
+        connection.register("outputs", made)
+    places = {name: location for name in schema_names() if (location := table_schema(name).location) is not None}
+    made_of = {name: store.files(folder, ".parquet") for name, folder in places.items()}
+    assets = store.files(ASSET_FOLDER, ".parquet")
+    made_of |= {name: [path] for name in asset_tables() if (path := f"{ASSET_FOLDER}/{name}.parquet") in assets}
+    for name, found in made_of.items():
+        urls = [url(store, f) for f in found]
+        if found and (fault := _view(connection, own_files, name, urls, damaged, filename=name in _PER_TILE)):
+            shut[name] = fault
+    return Opened(connection, own_files, recorded_files(store, records, manifest), shut)
+
+
+def query(
+    store: Store,
+    statement: str,
+    logs: Iterable[str] | None = None,
+    damaged: list[StoreError] | None = None,
+    *,
+    unconfined: bool = False,
+) -> pa.Table:
+    """Run one SQL statement over the store's views (:func:`connect`).
+
+    The files that it opens are held against their records where they changed since they were last verified. One that is
+    damaged is an error, or joins `damaged` (as :class:`AnswerError`), and the answer is given.
+    """
+    opened = _opened(store, logs, damaged, unconfined)
+    with opened.connection as connection:
+        _refuse_to_fetch(connection, statement)
+        try:
+            relation = connection.sql(statement)
+            answer = pa.table({}) if relation is None else relation.to_arrow_table()
+        except duckdb.Error as error:
+            if damaged is not None:
+                damaged += faults_of_opened(store, opened.files.opened, opened.recorded)
+                fault = opened.shut.get((missing_table(error) or "").removesuffix("_between"))
+                if fault is not None:  # the table was made, and cannot be shown
+                    damaged.remove(fault)
+                    raise fault from None
+            raise _in_words(error, opened.files) from error
+    faults = faults_of_opened(store, opened.files.opened, opened.recorded)
+    if faults and damaged is None:
+        raise faults[0]
+    if damaged is not None:
+        damaged += faults
+    return answer
+
+
+def _in_words(error: duckdb.Error, files: StoreFiles) -> RoadscanError:
+    """What a statement did wrong, or was not let do."""
+    if files.refused:
+        return RoadscanError(f"the query was refused: {files.refused[-1]}", change=_WAY_OUT_OF_STORE)
+    text = _reason(error) if str(error).startswith("Traceback") else str(error)
+    if isinstance(error, duckdb.PermissionException) or "has been locked" in text:
+        return RoadscanError(
+            f"the query was refused: {text.splitlines()[0]}",
+            expected=f"the views, and files of the store as {PROTOCOL}://survey=…",
+            change=_WAY_OUT_OF_STORE,
+        )
+    change = "if a file is damaged, `roadscan verify` finds it and says what to do"
+    if isinstance(error, _MISTAKES):
+        change = "`roadscan sql 'SHOW TABLES'` lists what there is"
+    if isinstance(error, duckdb.OutOfMemoryException):
+        change = "ask for less at once; with `--unconfined`, what does not fit into memory goes to the folder .tmp"
+    return RoadscanError(f"the query failed: {text}", change=change)
+
+
+def _refuse_to_fetch(connection: duckdb.DuckDBPyConnection, statement: str) -> None:
+    """RoadscanError where a statement would install an extension: code from the network."""
+    try:
+        parts = connection.extract_statements(statement)
+        words = [part.query.split(None, 1)[0].lower() for part in parts if part.type == duckdb.StatementType.LOAD]
+        fetches = any(word != "load" for word in words)
+    except duckdb.Error:
+        return  # DuckDB says what is wrong with it
+    except ValueError:  # a kind that its Python does not know yet: UPDATE EXTENSIONS
+        fetches = True
+    if fetches:
+        raise RoadscanError(
+            "the query was refused: it fetches an extension",
+            expected="a question to what is here",
+            change="install the extension with DuckDB itself, then LOAD it with `--unconfined`",
+        )
+
+
+def missing_table(error: BaseException | None) -> str | None:
+    """Name of the table or macro that a failed query named and that is not there; None where it failed otherwise."""
+    if not isinstance(error, duckdb.CatalogException):
+        return None
+    found = _MISSING.search(str(error))
+    return None if found is None else found["name"]
+
+
+def _add_utc(connection: duckdb.DuckDBPyConnection) -> None:
+    """Add ``utc(epoch_gps_ns)``: the UTC instant of a GPS epoch, with its zone, cut to microseconds."""
+    steps = sorted(leap_second_steps(), reverse=True)
+    leaps = " ".join(f"WHEN epoch_gps_ns >= {first}000000000 THEN {count}" for first, count in steps)
+    micros = f"epoch_gps_ns::BIGINT // 1000 + ({GPS_EPOCH_UNIX_S} - CASE {leaps} ELSE 0 END)::BIGINT * 1000000"
+    connection.execute("SET TimeZone = 'UTC'")
+    connection.execute(f"CREATE MACRO utc(epoch_gps_ns) AS make_timestamptz({micros})")
+
+
+def _view(
+    connection: duckdb.DuckDBPyConnection,
+    files: StoreFiles,
+    name: str,
+    urls: list[str],
+    damaged: list[StoreError] | None,
+    *,
+    hive: bool = False,
+    filename: bool = False,
+) -> StoreError | None:
+    """Show some of the files as a table; where that cannot be, why, and `damaged` is told."""
+    files.opened.clear()
+    listed = ", ".join("'" + u.replace("'", "''") + "'" for u in sorted(urls))
+    options = "hive_partitioning = true, hive_types_autocast = true" if hive else "hive_partitioning = false"
+    if filename:
+        options += ", filename = true"
+    try:
+        connection.execute(f"CREATE VIEW {name} AS SELECT * FROM read_parquet([{listed}], {options})")
+    except duckdb.Error as error:
+        fault = StoreError(
+            f"table '{name}' cannot be opened: {_reason(error)}",
+            change="`roadscan verify` finds damaged files and says what to do",
+            file=next(reversed(files.opened), None),
+        )
+        if damaged is None:
+            raise fault from error
+        damaged.append(fault)
+        return fault
+    return None
+
+
+def _reason(error: duckdb.Error) -> str:
+    """What an error says, in one line: of a fault in a file's reader, DuckDB tells the way through the code first."""
+    lines = str(error).splitlines()
+    if lines[0].startswith("Traceback"):
+        return next((line for line in lines[1:] if line and not line.startswith(" ")), lines[0])
+    return lines[0]

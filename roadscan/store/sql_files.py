@@ -1,0 +1,224 @@
+"""The file system of SQL: one survey's files of a store, to be read and never written.
+
+DuckDB can confine statements to folders, but not to reading: what may be read may be written (``COPY … TO``, which
+may stand inside a ``WITH``, ``ATTACH``, ``EXPORT DATABASE``). So statements reach files through this file system alone,
+which has no way to write, and DuckDB's own is switched off.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import io
+import os
+import stat
+import threading
+from typing import Any, Final, NamedTuple
+
+from fsspec import AbstractFileSystem
+
+from roadscan.store.store import Store
+
+PROTOCOL: Final = "store"
+
+
+class Stamp(NamedTuple):
+    """What tells, without reading it, that a file was not written since."""
+
+    bytes: int
+    changed: str
+    """Time of the last change (ns) in a folder; what an object store has for it, empty where it has nothing."""
+
+
+def stamp_of(store: Store, path: str) -> Stamp | None:
+    """Size and time of a file of the store (`path` relative to the survey's root), None where it is missing."""
+    try:
+        if store.is_folder:
+            return _stamp_of_stat(os.stat(store.path(path)))  # noqa: PTH116 — thousands of them
+        return _remote_stamp(store.fs.info(store.path(path)))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+
+
+def url(store: Store, path: str) -> str:
+    """Name that statements have for a file of the store."""
+    return f"{PROTOCOL}://survey={store.survey_id}/{path}"
+
+
+class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
+    """One survey's files as ``store://survey=<id>/…``; it notes which of them are opened.
+
+    Anything else is refused: other modes than reading, ``..``, and links that lead out of the survey's folder.
+    """
+
+    protocol = PROTOCOL
+    cachable = False
+    root_marker = ""
+
+    def __init__(self, store: Store) -> None:
+        super().__init__()
+        self._store = store
+        self._top = f"survey={store.survey_id}"
+        self._root = os.path.realpath(store.root) if store.is_folder else None
+        self._inside: set[str] = set()
+        """Folders that were followed and found inside."""
+        self._alone = threading.Lock()  # DuckDB opens files from several threads
+        self.opened: dict[str, Stamp] = {}
+        """Files that were opened, relative to the survey's root, as they were then."""
+        self.refused: list[str] = []
+        """What was asked for and not given, in words."""
+
+    def open(self, path: str, mode: str = "rb", **_: Any) -> Any:
+        """A file's bytes; PermissionError for any other mode and for files outside."""
+        if mode != "rb":
+            self._refuse(f"{path} cannot be written: SQL only reads the store")
+        place = self._place(path)
+        stream: _LocalFile
+        if self._root is not None:
+            stream = _LocalFile(place)
+            stamp = stream.stamp()
+        else:
+            stamp = _remote_stamp(self._store.fs.info(place))
+            stream = _RemoteFile(self._store.fs.open(place, "rb"), stamp.bytes)
+        with self._alone:
+            self.opened.setdefault(self._relative(path), stamp)
+        return stream
+
+    def info(self, path: str, **_: Any) -> dict[str, Any]:
+        """Name, size and kind of a file or folder; FileNotFoundError where there is none."""
+        place = self._place(path)
+        if self._root is not None:
+            local = os.stat(place)  # noqa: PTH116 — thousands of them
+            kind = "directory" if stat.S_ISDIR(local.st_mode) else "file"
+            return {"name": self._strip_protocol(path), "size": local.st_size, "type": kind}
+        found = self._store.fs.info(place)
+        return {"name": self._strip_protocol(path), "size": found["size"], "type": found["type"]}
+
+    def modified(self, path: str) -> Any:
+        """Time of the last change."""
+        place = self._place(path)
+        if self._root is not None:
+            return dt.datetime.fromtimestamp(os.stat(place).st_mtime, dt.UTC)  # noqa: PTH116 — thousands of them
+        return self._store.fs.modified(place)
+
+    def ls(self, path: str, detail: bool = True, **_: Any) -> list[Any]:
+        """Entries of a folder, without links that lead outside."""
+        found = []
+        for entry in self._store.fs.ls(self._place(path), detail=True):
+            name = f"{self._strip_protocol(path).rstrip('/')}/{str(entry['name']).rstrip('/').rsplit('/', 1)[1]}"
+            found.append({"name": name, "size": entry["size"], "type": entry["type"]})
+        return found if detail else [one["name"] for one in found]
+
+    def glob(self, path: str, maxdepth: int | None = None, **more: Any) -> list[Any]:
+        """Files that fit a pattern; a name without one is itself."""
+        if not any(sign in path for sign in "*?["):
+            self._relative(path)
+            return [path.removeprefix(f"{PROTOCOL}://")]
+        return list(super().glob(path, maxdepth=maxdepth, **more))
+
+    def _relative(self, path: str) -> str:
+        """Path below the survey's root."""
+        top, _, relative = path.removeprefix(f"{PROTOCOL}://").partition("/")
+        if top != self._top or ".." in relative.split("/"):
+            self._refuse(f"{path} is no file of the store: its files are {PROTOCOL}://{self._top}/…")
+        return relative
+
+    def _place(self, path: str) -> str:
+        """Where the store's own file system has it; PermissionError outside of the survey's folder."""
+        place = self._store.path(self._relative(path))
+        if self._root is not None:
+            folder = place.rsplit("/", 1)[0]
+            known = folder in self._inside or place == self._store.root or self._leads_inside(folder)
+            if not known or (os.path.islink(place) and not self._leads_inside(place)):  # noqa: PTH114 — thousands
+                self._refuse(f"{path} is a link that leads out of the store")
+            self._inside.add(folder)
+        return place
+
+    def _leads_inside(self, place: str) -> bool:
+        real = os.path.realpath(place)
+        return real == self._root or real.startswith(f"{self._root}/")
+
+    def _refuse(self, words: str) -> None:
+        self.refused.append(words)
+        raise PermissionError(words)
+
+
+class _LocalFile(io.RawIOBase):
+    """A file with a position for each thread: DuckDB's threads share one, and seek and read in two calls."""
+
+    def __init__(self, place: str) -> None:
+        self._file = os.open(place, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        self._at = threading.local()
+
+    def stamp(self) -> Stamp:
+        """Size and time of the file that is open."""
+        return _stamp_of_stat(os.fstat(self._file))
+
+    def readable(self) -> bool:
+        """Yes."""
+        return True
+
+    def seekable(self) -> bool:
+        """Yes."""
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Move this thread's position."""
+        start = {os.SEEK_SET: 0, os.SEEK_CUR: self.tell(), os.SEEK_END: self._bytes()}[whence]
+        self._at.position = start + offset
+        return start + offset
+
+    def tell(self) -> int:
+        """Position of this thread."""
+        return int(getattr(self._at, "position", 0))
+
+    def read(self, size: int | None = -1) -> bytes:
+        """Bytes from this thread's position."""
+        position = self.tell()
+        wanted = self._bytes() - position if size is None or size < 0 else size
+        content = self._take(position, max(wanted, 0))
+        self._at.position = position + len(content)
+        return content
+
+    def close(self) -> None:
+        """Give the file back; DuckDB drops it without that."""
+        if not self.closed:
+            super().close()
+            self._release()
+
+    def _bytes(self) -> int:
+        return os.fstat(self._file).st_size
+
+    def _take(self, position: int, size: int) -> bytes:
+        return os.pread(self._file, size, position)
+
+    def _release(self) -> None:
+        os.close(self._file)
+
+
+class _RemoteFile(_LocalFile):
+    """The same of an object store, whose library knows one position a file."""
+
+    def __init__(self, stream: Any, size: int) -> None:
+        self._stream, self._size = stream, size
+        self._at = threading.local()
+        self._alone = threading.Lock()
+
+    def _bytes(self) -> int:
+        return self._size
+
+    def _take(self, position: int, size: int) -> bytes:
+        with self._alone:
+            self._stream.seek(position)
+            return bytes(self._stream.read(size))
+
+    def _release(self) -> None:
+        self._stream.close()
+
+
+def _stamp_of_stat(found: os.stat_result) -> Stamp:
+    return Stamp(found.st_size, str(found.st_mtime_ns))
+
+
+def _remote_stamp(found: dict[str, Any]) -> Stamp:
+    known = (found.get(name) for name in ("ETag", "etag", "md5Hash", "LastModified", "mtime", "updated", "created"))
+    return Stamp(int(found["size"]), str(next((one for one in known if one), "")))

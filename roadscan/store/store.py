@@ -1,0 +1,494 @@
+"""The store: one survey's tables, tiles, products and manifest below one root.
+
+    <store>/survey=<id>/tables/<table>/run=<run>/sensor=<sensor>/log=<key>/gps_bin_s=<start>/part-<k>.parquet
+    <store>/survey=<id>/tiles/<product>/<column>_<row><suffix>
+    <store>/survey=<id>/products/<product>/<file>
+    <store>/survey=<id>/manifest/…
+
+A store is a folder or an object-store URL (fsspec). A file is written under a temporary name, then
+published by rename (folder) or by one upload (object store); readers never see half of it.
+
+In a folder, what other files are judged by (records, small tables) and what cannot be made again (ingested rows) is on
+the disk before its name is seen: a power loss leaves it whole or absent. Files of products are not waited for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import os
+import shutil
+import socket
+import tempfile
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import fsspec
+import pyarrow as pa
+import pyarrow.parquet as pq
+from blake3 import blake3
+
+from roadscan.core.errors import DamagedError, FullDiskError, RoadscanError, StoreError
+
+try:
+    import fcntl
+except ImportError:  # no such locks on this system
+    fcntl = None  # type: ignore[assignment]
+
+_STAGING: Final = ".staging"
+_CHUNK: Final = 1 << 18  # stays in a core's cache between reading and hashing
+_ALGORITHM: Final = "blake3:"
+
+_NO_ROOM_BYTES: Final = 8 << 20
+"""A writer that fails with less free room than that, and does not say why, failed for that: GDAL and others write
+blocks of some megabytes.
+"""
+_MAKE_ROOM: Final = (
+    "see to more room, and run again: what is finished stays, and the next run goes on where this one stopped"
+)
+
+MADE_AGAIN: Final = "run `roadscan verify`, which finds all such files; the next run then makes them again"
+"""What mends a damaged product."""
+
+_T = TypeVar("_T")
+
+
+def file_digest(path: Path) -> str:
+    """BLAKE3-128 of a file's bytes: ``blake3:`` and 32 hexadecimal digits."""
+    return f"{_ALGORITHM}{_hashed(path, blake3()).digest(length=16).hex()}"
+
+
+def bytes_digest(content: bytes) -> str:
+    """As :func:`file_digest`, of the bytes that a file will have."""
+    return f"{_ALGORITHM}{blake3(content).digest(length=16).hex()}"
+
+
+def digest_holds(path: Path, digest: str) -> bool:
+    """True if a file still has the content of `digest`.
+
+    A digest without a prefix is BLAKE2b-128, as stores of older versions hold them: such files stay sound.
+    """
+    if ":" in digest:
+        return file_digest(path) == digest
+    return bool(_hashed(path, hashlib.blake2b(digest_size=16)).hexdigest() == digest)
+
+
+def bytes_hold(content: bytes, digest: str) -> bool:
+    """As :func:`digest_holds`, of a file's content."""
+    if ":" in digest:
+        return bytes_digest(content) == digest
+    return hashlib.blake2b(content, digest_size=16).hexdigest() == digest
+
+
+def _hashed(path: Path, state: Any) -> Any:
+    # Read, not mapped: a sector that the disk cannot read is an OSError then, and no signal that ends the process.
+    buffer = bytearray(_CHUNK)
+    view = memoryview(buffer)
+    with path.open("rb", buffering=0) as stream:
+        while count := stream.readinto(buffer):
+            state.update(view[:count])
+    return state
+
+
+class Store:
+    """One survey's place; cheap to make, safe to send to a worker."""
+
+    def __init__(self, url: str, survey_id: str) -> None:
+        self.url = url
+        self.survey_id = survey_id
+        self.fs, base = _opened(url)
+        self.root = f"{base.rstrip('/')}/survey={survey_id}"
+        self.is_folder = "file" in self.fs.protocol or "local" in self.fs.protocol
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Workers open the file system themselves."""
+        return (Store, (self.url, self.survey_id))
+
+    def path(self, relative: str) -> str:
+        """Full path, for the file system `fs`, of one below the root."""
+        return f"{self.root}/{relative}"
+
+    def exists(self, relative: str) -> bool:
+        """True if the file or folder is there; StoreError where the store does not answer."""
+        try:
+            return bool(self.fs.exists(self.path(relative)))
+        except Exception as error:  # each library of an object store has its own
+            raise StoreError(
+                f"the store {self.url} cannot be reached: {error}",
+                change="see to its address, the network and your keys",
+            ) from error
+
+    def size(self, relative: str) -> int | None:
+        """Bytes of a file, None where it is missing."""
+        try:
+            return int(self.fs.size(self.path(relative)))
+        except FileNotFoundError:
+            return None
+
+    def files(self, relative: str, suffix: str = "") -> list[str]:
+        """Files below a folder, relative to the root, sorted."""
+        if not self.exists(relative):
+            return []
+        found = self.fs.find(self.path(relative))
+        start = len(self.fs._strip_protocol(self.root)) + 1
+        return sorted(f[start:] for f in found if f.endswith(suffix))
+
+    def read_bytes(self, relative: str) -> bytes:
+        """Content of a small file."""
+        try:
+            return bytes(self.fs.cat_file(self.path(relative)))
+        except FileNotFoundError as error:
+            raise StoreError("the file is missing from the store", file=self.path(relative)) from error
+        except IsADirectoryError as error:
+            raise StoreError("a folder stands where a file belongs", change="remove it", file=error.filename) from error
+        except OSError as error:
+            raise StoreError(
+                f"the file cannot be read: {error.strerror or error}",
+                change="see to its rights and to the disk",
+                file=self.path(relative),
+            ) from error
+
+    def read_table(self, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN) -> pa.Table:
+        """Content of a small Parquet file; `change` says what mends it. Pages that have a checksum are held against it.
+
+        Read by this thread alone: a thread of Arrow's that still let go of the bytes when the interpreter ends would
+        end the process with SIGABRT (`pq.read_table` hands them to such threads).
+        """
+        return self.parse_table(self.read_bytes(relative), relative, columns, change)
+
+    def parse_table(
+        self, content: bytes, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN
+    ) -> pa.Table:
+        """The same, of content that was read from there."""
+        try:
+            file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
+            return file.read(None if columns is None else list(columns), use_threads=False)
+        except (pa.ArrowException, OSError) as error:
+            raise DamagedError(f"the file is damaged: {error}", change=change, file=self.path(relative)) from error
+
+    def write_bytes(self, relative: str, content: bytes, *, lasting: bool = True) -> None:
+        """Write a small file at once; StoreError where the store cannot be written.
+
+        One that is `lasting` is on the disk when this returns, with its name.
+        """
+        with _in_words(self.path(relative)):
+            self._write_bytes(relative, content, lasting)
+
+    def _write_bytes(self, relative: str, content: bytes, lasting: bool) -> None:
+        if not self.is_folder:
+            with self.scratch() as folder:
+                temporary = folder / "content"
+                temporary.write_bytes(content)
+                self.publish(temporary, relative)
+            return
+        temporary = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
+        try:
+            with _made(temporary.parent, lambda: temporary.open("wb"), lasting=True) as stream:
+                stream.write(content)
+                if lasting:
+                    stream.flush()
+                    os.fsync(stream.fileno())
+            self.publish(temporary, relative, lasting=lasting)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+    @contextlib.contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """A temporary local folder, on the store's own disk where it is a folder."""
+        if self.is_folder:
+            folder = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
+            with _in_words(str(folder)):
+                _made(folder.parent, folder.mkdir, lasting=True)
+        else:
+            folder = Path(tempfile.mkdtemp(prefix="roadscan-"))
+        try:
+            with told_if_full(folder):
+                yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def publish(self, local: Path, relative: str, *, lasting: bool = False) -> None:
+        """Move a finished local file into the store under its final name; on the disk itself if it is `lasting`."""
+        target = self.path(relative)
+        if self.is_folder:
+            try:
+                _made(Path(target).parent, lambda: local.replace(target), lasting)
+            except IsADirectoryError:
+                self.set_aside(relative)
+                local.replace(target)
+            if lasting:
+                _sync_folder(Path(target).parent)
+        else:
+            self.fs.put_file(str(local), target)
+            local.unlink()
+
+    def publish_folder(self, local: Path, relative: str) -> None:
+        """Move a finished local folder into the store, in place of one of that name, once all of it is on the disk."""
+        if self.is_folder:
+            for path in (local, *local.rglob("*")):
+                sync = _sync_folder if path.is_dir() else _sync_file
+                sync(path)
+            target = Path(self.path(relative))
+            _make_folder(target.parent, lasting=True)
+            if target.exists():
+                self.remove(relative)
+            local.rename(target)
+            _sync_folder(target.parent)
+            return
+        self.remove(relative)
+        for file in sorted(p for p in local.rglob("*") if p.is_file()):
+            self.fs.put_file(str(file), f"{self.path(relative)}/{file.relative_to(local).as_posix()}")
+
+    def remove(self, relative: str) -> None:
+        """Remove a file or folder if it is there; a folder vanishes at once."""
+        if not self.is_folder:
+            if self.exists(relative):
+                self.fs.rm(self.path(relative), recursive=True)
+            return
+        path = Path(self.path(relative))
+        if not path.is_dir():
+            path.unlink(missing_ok=True)
+            return
+        doomed = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
+        _made(doomed.parent, lambda: path.rename(doomed))
+        shutil.rmtree(doomed, ignore_errors=True)
+
+    def set_aside(self, relative: str, *, keep: bool = False) -> str:
+        """Move a damaged file below ``damaged/``, for whoever wants to look at it; returns its name there.
+
+        With `keep` it stays under its old name too, until another takes its place at once.
+        """
+        aside, number = f"damaged/{relative}", 1
+        while self.exists(aside):
+            number += 1
+            aside = f"damaged/{relative}.{number}"
+        with _in_words(self.path(aside)):
+            if self.is_folder:
+                Path(self.path(aside)).parent.mkdir(parents=True, exist_ok=True)
+                _move_aside(Path(self.path(relative)), Path(self.path(aside)), keep)
+            elif keep:
+                self.fs.copy(self.path(relative), self.path(aside))
+            else:
+                self.fs.mv(self.path(relative), self.path(aside))
+        return aside
+
+    def local_copy(self, relative: str, folder: Path) -> Path:
+        """Path of a local file with the content of a stored one (itself, where the store is a folder)."""
+        if self.is_folder:
+            return Path(self.path(relative))
+        target = folder / Path(relative).name
+        self.fs.get_file(self.path(relative), str(target))
+        return target
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep a second run out of a folder store; leftovers of dead runs are cleared."""
+        if not self.is_folder:
+            yield
+            return
+        file = Path(self.path("manifest/lock"))
+        with _in_words(str(file)):
+            _make_folder(file.parent, lasting=True)
+            self._take(file)
+        try:
+            self._clear_staging()
+            yield
+        finally:
+            file.unlink(missing_ok=True)
+
+    def _take(self, file: Path) -> None:
+        me = f"{socket.gethostname()} {os.getpid()}"
+        with _alone_in(file.parent):
+            for _ in range(2):
+                try:
+                    with file.open("x") as stream:
+                        stream.write(me)
+                    return
+                except FileExistsError:
+                    _check_dead(file)
+                    file.unlink(missing_ok=True)
+        raise StoreError("the store's lock cannot be taken", change="run again", file=file)
+
+    def _clear_staging(self) -> None:
+        parent = Path(self.path(_STAGING))
+        for left in parent.iterdir() if parent.is_dir() else ():
+            maker = left.name.split("-")[0]
+            if not (maker.isdigit() and process_lives(int(maker))):
+                shutil.rmtree(left, ignore_errors=True)
+                left.unlink(missing_ok=True) if left.is_file() else None
+
+
+def _move_aside(file: Path, aside: Path, keep: bool) -> None:
+    if keep:
+        with contextlib.suppress(OSError):  # a file system without links
+            aside.hardlink_to(file)
+            return
+    file.rename(aside)
+
+
+def _made(folder: Path, write: Callable[[], _T], lasting: bool = False) -> _T:
+    """What comes of `write`, which needs the folder: it is made where it is missing."""
+    try:
+        return write()
+    except FileNotFoundError:
+        _make_folder(folder, lasting)
+        return write()
+
+
+def _make_folder(folder: Path, lasting: bool) -> None:
+    """Make a folder and those above it that are missing; on the disk itself if they are to be `lasting`."""
+    missing = [one for one in (folder, *folder.parents) if not one.exists()] if lasting else []
+    folder.mkdir(parents=True, exist_ok=True)
+    for one in missing:
+        _sync_folder(one.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to the disk, where the system can do that."""
+    with contextlib.suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
+
+
+def _sync_file(path: Path) -> None:
+    """Bring a file's bytes to the disk; OSError where it does not take them."""
+    with path.open("rb+") as stream:
+        os.fsync(stream.fileno())
+
+
+def _opened(url: str) -> tuple[Any, str]:
+    """File system and path of a store; a folder's name may hold what chains file systems in URLs (``::``).
+
+    Lists of what an object store holds are not kept: workers write to it at the same time.
+    """
+    if "://" in url:
+        try:
+            opened: tuple[Any, str] = fsspec.core.url_to_fs(url, use_listings_cache=False)
+        except (ImportError, ValueError) as error:
+            raise StoreError(
+                f"the store {url} cannot be opened: {error}",
+                expected="a folder, or the URL of an object store",
+                change="S3 needs `pip install 'roadscan[s3]'`; other stores need their package of fsspec",
+            ) from error
+        return opened
+    folders = fsspec.filesystem("file")
+    return folders, folders._strip_protocol(url)
+
+
+@contextlib.contextmanager
+def told_if_full(folder: Path) -> Iterator[None]:
+    """Say what is full where a writer fails in a folder for want of room, whatever words its library has for that.
+
+    Raises
+    ------
+    FullDiskError
+        in place of what the writer raised.
+    """
+    try:
+        yield
+    except RoadscanError:
+        raise
+    except Exception as error:
+        if not (_names_want_of_room(error) or _has_no_room(folder)):
+            raise
+        raise full_disk(folder, error) from error
+
+
+def full_disk(folder: Path, error: Exception) -> FullDiskError:
+    """What to tell of a writer that failed in a folder for want of room."""
+    there = next((one for one in (folder, *folder.parents) if one.exists()), folder)
+    if _STAGING in folder.parts:  # say the store's name, not that of a folder that is gone in a moment
+        folder = Path(*folder.parts[: folder.parts.index(_STAGING)])
+    with contextlib.suppress(OSError):
+        room = shutil.disk_usage(there)
+        arrived = f"the disk is full: {room.free / 1e6:,.1f} MB are free of {room.total / 1e6:,.0f} MB ({error})"
+        return FullDiskError(arrived, change=_MAKE_ROOM, file=folder)
+    return FullDiskError(f"the disk is full ({error})", change=_MAKE_ROOM, file=folder)
+
+
+def _names_want_of_room(error: BaseException) -> bool:
+    """True if an error, or one that led to it, is that of a full disk or of a quota that is used up."""
+    found: BaseException | None = error
+    while found is not None:
+        if isinstance(found, OSError) and found.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        if any(os.strerror(code) in str(found) for code in (errno.ENOSPC, errno.EDQUOT)):
+            return True
+        found = found.__cause__ or found.__context__
+    return False
+
+
+def _has_no_room(folder: Path) -> bool:
+    """True if next to nothing is free where a writer failed that does not say why, as GDAL."""
+    try:
+        return shutil.disk_usage(folder).free < _NO_ROOM_BYTES
+    except OSError:
+        return False
+
+
+@contextlib.contextmanager
+def _in_words(file: str) -> Iterator[None]:
+    """A disk that is full or must not be written is no fault of the program."""
+    try:
+        yield
+    except OSError as error:
+        if _names_want_of_room(error):
+            raise full_disk(Path(file).parent, error) from error
+        raise StoreError(
+            f"the store cannot be written: {error.strerror or error}",
+            change="see to room, rights and the disk itself, and run again: what is finished stays",
+            file=file,
+        ) from error
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keep other processes of this machine out: of several that find the lock of a dead run, one takes it."""
+    with contextlib.ExitStack() as stack:
+        if fcntl is not None:
+            opened = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, opened)
+            with contextlib.suppress(OSError):  # a file system without such locks
+                fcntl.flock(opened, fcntl.LOCK_EX)
+        yield
+
+
+def _check_dead(lock: Path) -> None:
+    """StoreError where the process that a lock names may be at work; words that no run writes name none."""
+    try:
+        owner = lock.read_text().split()
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        raise StoreError(
+            f"the store's lock cannot be read: {error}", change="remove it if no run is at work", file=lock
+        ) from error
+    if (
+        len(owner) != 2
+        or not owner[1].isdigit()
+        or (owner[0] == socket.gethostname() and not process_lives(int(owner[1])))
+    ):
+        return
+    raise StoreError(
+        f"process {owner[1]} on {owner[0]} is working on this store",
+        expected="one run at a time",
+        change=f"wait for it, or remove {lock} if that process is gone",
+    )
+
+
+def process_lives(pid: int) -> bool:
+    """True if a process of this machine has that number."""
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -1,0 +1,171 @@
+"""Which files of SQL were held against their records, and how they looked then.
+
+DuckDB does not look at checksums. A file whose size and time are as they were when its digest was found right was not
+written since, and a look at those costs microseconds. What changed since, or was never held, is read once.
+
+The note is no record: where it is lost or damaged, files are read once more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from roadscan.core.errors import AnswerError, StoreError
+from roadscan.store.held import WAY_OUT, held_path, held_records, read_held
+from roadscan.store.logs import LogRecord
+from roadscan.store.manifest import Manifest
+from roadscan.store.mend import fault_of
+from roadscan.store.sql_files import Stamp, stamp_of
+from roadscan.store.store import MADE_AGAIN, Store
+
+_FILE: Final = "manifest/verified.parquet"
+_STAMPS: Final = pa.schema([("path", pa.string()), ("bytes", pa.int64()), ("changed", pa.string())])
+_RECORDED: Final = pa.schema([("path", pa.string()), ("bytes", pa.int64()), ("digest", pa.string())])
+_SUFFIX: Final = ".parquet"
+
+
+class Recorded(NamedTuple):
+    """What a record says of a file."""
+
+    bytes: int
+    digest: str
+
+
+def recorded_files(store: Store, logs: Iterable[LogRecord], manifest: Manifest) -> pa.Table:
+    """Every Parquet file that a record names (columns path, bytes, digest): ingested, made or estimated."""
+    data = [(f.path, f.bytes, f.digest) for log in logs for own in log.tables.values() for f in own]
+    data += [(path, *one) for path, one in held_records(store).items()]
+    ingested = _table(data, _RECORDED)
+    made = manifest.table().select(_RECORDED.names)
+    return pa.concat_tables([ingested, made.filter(pc.ends_with(made.column("path"), _SUFFIX))])
+
+
+def faults_of_opened(store: Store, opened: Mapping[str, Stamp], recorded: pa.Table) -> list[AnswerError]:
+    """What is wrong with files that a query opened (paths and stamps); those that are right are not read again.
+
+    A file of an object store is held by its size alone, unless its time or tag has changed since it was verified: the
+    object store checks what it keeps, and to read all of it would cost more than the query.
+    """
+    paths = sorted(opened)
+    records, notes = _looked_up(paths, recorded), _looked_up(paths, _read(store))
+    faults = {p: _fault_of_held(store, p) for p in _held_of(paths) if p not in records}
+    due: list[str] = []
+    for path in paths:
+        record, stamp = records.get(path), opened[path]
+        if record is None:
+            continue
+        if stamp.bytes != record[0]:
+            faults[path] = f"{path}: {stamp.bytes} bytes, expected {record[0]}"
+        elif tuple(stamp) != notes.get(path) and (store.is_folder or path in notes):
+            due.append(path)
+    found = _held_against(store, {path: Recorded(*records[path]) for path in due})
+    note_verified(store, {path: opened[path] for path in due if found[path] is None})
+    return [_in_answer(path, fault) for path, fault in sorted({**faults, **found}.items()) if fault is not None]
+
+
+def note_verified(store: Store, stamps: Mapping[str, Stamp], *, anew: bool = False) -> None:
+    """Keep how files looked whose digest was found right, beside what was known, or in its place if `anew`.
+
+    Who may only read the store asks it all the same, and holds such files each time.
+    """
+    if not stamps and not anew:
+        return
+    table = _table([(path, *stamps[path]) for path in sorted(stamps)], _STAMPS)
+    before = _read(store)
+    if not anew:
+        kept = before.filter(pc.invert(pc.is_in(before.column("path"), table.column("path"))))
+        table = pa.concat_tables([kept, table])
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
+    with contextlib.suppress(StoreError):
+        store.write_bytes(_FILE, sink.getvalue().to_pybytes(), lasting=False)
+
+
+def note_written(store: Store, since_ns: int, recorded: pa.Table) -> None:
+    """Note the recorded files that were written after a time (ns): their digests were taken as they were published."""
+    if not store.is_folder:
+        return
+    paths = recorded.column("path").to_pylist()
+    notes = _looked_up(paths, _read(store))
+    sizes = dict(zip(paths, recorded.column("bytes").to_pylist(), strict=True))
+    stamps = {path: stamp for path in paths if (stamp := stamp_of(store, path)) is not None}
+    note_verified(
+        store,
+        {
+            path: stamp
+            for path, stamp in stamps.items()
+            if stamp.bytes == sizes[path] and int(stamp.changed) >= since_ns and tuple(stamp) != notes.get(path)
+        },
+    )
+
+
+def held_faults(store: Store) -> list[str]:
+    """What is wrong with the small tables that are held whole."""
+    records = held_records(store)
+    found: list[str | None] = []
+    for path in map(held_path, WAY_OUT):
+        if path in records and store.exists(path):
+            found.append(_held_against(store, {path: Recorded(*records[path])})[path])
+        if not found or found[-1] is None:
+            found.append(_fault_of_held(store, path))
+    return [fault for fault in found if fault is not None]
+
+
+def _held_of(paths: Iterable[str]) -> list[str]:
+    return [path for path in paths if path in map(held_path, WAY_OUT)]
+
+
+def _fault_of_held(store: Store, path: str) -> str | None:
+    """Of a small table without a record: its pages have checksums."""
+    try:
+        read_held(store, path.split("/")[1])
+    except StoreError as error:
+        return str(error)
+    return None
+
+
+def _held_against(store: Store, files: Mapping[str, Recorded]) -> dict[str, str | None]:
+    """What is wrong with each of some files, read whole on all cores; None where it is as recorded."""
+    with tempfile.TemporaryDirectory(prefix="roadscan-") as folder, ThreadPoolExecutor(os.cpu_count()) as threads:
+        place = Path(folder)
+        faults = threads.map(lambda path: fault_of(store, place, path, *files[path]), files)
+        return {path: _with_way_out(path, fault) for path, fault in zip(files, faults, strict=True)}
+
+
+def _with_way_out(path: str, fault: str | None) -> str | None:
+    return f"{fault}; {WAY_OUT[path.split('/')[1]]}" if fault and _held_of([path]) else fault
+
+
+def _in_answer(path: str, fault: str) -> AnswerError:
+    ingested = "/log=" in path and not path.startswith("tables/footprints/")
+    change = "" if _held_of([path]) else "`roadscan verify --repair` reads its log again" if ingested else MADE_AGAIN
+    return AnswerError(f"the answer is made of a damaged file: {fault}", change=change)
+
+
+def _table(rows: Sequence[tuple[str, int, str]], schema: pa.Schema) -> pa.Table:
+    columns = list(zip(*rows, strict=True)) or [()] * len(schema)
+    return pa.Table.from_arrays([pa.array(c, f.type) for c, f in zip(columns, schema, strict=True)], schema=schema)
+
+
+def _looked_up(paths: Sequence[str], table: pa.Table) -> dict[str, tuple[int, str]]:
+    """The other two columns of the rows of a table that name a path; of several the last."""
+    known = table.filter(pc.is_in(table.column("path"), pa.array(paths, pa.string())))
+    columns = [known.column(name).to_pylist() for name in known.column_names]
+    return {path: (size, text) for path, size, text in zip(*columns, strict=True)}
+
+
+def _read(store: Store) -> pa.Table:
+    with contextlib.suppress(StoreError, pa.ArrowException, OSError, ValueError):
+        if store.exists(_FILE):
+            return store.read_table(_FILE).select(_STAMPS.names).cast(_STAMPS)
+    return _STAMPS.empty_table()

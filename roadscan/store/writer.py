@@ -1,0 +1,285 @@
+"""Rows in, sorted partitions of GPS time out, in bounded memory."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.witness import Finding
+from roadscan.store.codecs.parquet.list_table import is_list_table, write_list_table
+from roadscan.store.codecs.parquet.number_table import is_number_table, write_number_table
+from roadscan.store.derived import with_derived
+from roadscan.store.logs import DataFile, log_folder
+from roadscan.store.merge import merged
+from roadscan.store.schema import TableSchema, table_schema
+from roadscan.store.store import Store, file_digest
+
+BUDGET_BYTES: Final = 128 << 20
+"""Rows held in memory before the fullest partitions are written out."""
+
+
+@dataclass
+class _Bin:
+    batches: list[pa.RecordBatch] = field(default_factory=list)
+    bytes: int = 0
+    row_bytes: float = 1.0
+    """Bytes of a row, as the largest batch average."""
+    parts: list[tuple[Path, int, int]] = field(default_factory=list)
+    """Written parts with their first and last epoch."""
+
+
+def _once(
+    faults: Sequence[tuple[npt.NDArray[np.int64], str]]
+) -> list[tuple[npt.NDArray[np.int64], str]]:  # fmt: skip
+    """The same with each row under its first reason alone."""
+    found: list[tuple[npt.NDArray[np.int64], str]] = []
+    for rows, reason in faults:
+        rest = np.setdiff1d(rows, np.concatenate([bad for bad, _ in found])) if found else rows
+        if rest.size:
+            found.append((rest, reason))
+    return found
+
+
+class LogWriter:
+    """Writes the rows of one log; nothing is visible before :meth:`publish`."""
+
+    def __init__(self, folder: Path, list_size: int | None) -> None:
+        self._folder = folder
+        self._list_size = list_size
+        self._bins: dict[tuple[str, int], _Bin] = defaultdict(_Bin)
+        self._held = 0
+        self.rows: Counter[str] = Counter()
+        self.reject_reasons: Counter[str] = Counter()
+        self.findings: list[Finding] = []
+        """What is doubtful of the log; kept in its record."""
+
+    def add(
+        self, table: str, batch: pa.RecordBatch, refused: Sequence[tuple[npt.NDArray[np.int64], str]] = ()
+    ) -> list[tuple[npt.NDArray[np.int64], str]]:
+        """Take rows of a table; returns the rows refused, with their reasons: those `refused` already, and others."""
+        schema = table_schema(table)
+        rows = schema.conform(batch, self._list_size)
+        faults = _once([*refused, *schema.faults(rows)])
+        if faults:
+            good = np.ones(rows.num_rows, dtype=bool)
+            for bad, _ in faults:
+                good[bad] = False
+            rows = rows.filter(pa.array(good))
+        rows = with_derived(schema, rows)
+        for start, part in _by_bin(schema, rows):
+            held = self._bins[(table, start)]
+            held.batches.append(part)
+            held.bytes += part.nbytes
+            held.row_bytes = max(held.row_bytes, part.nbytes / part.num_rows)
+            self._held += part.nbytes
+        self.rows[table] += rows.num_rows
+        while self._held > BUDGET_BYTES:
+            self._flush(max(self._bins, key=lambda k: self._bins[k].bytes))
+        return faults
+
+    def reject(self, file: str, record: int, offset: int, records: int, reason: str) -> None:
+        """List a record that could not be used."""
+        row = {"file": [file], "record": [record], "offset": [offset], "records": [records], "reason": [reason]}
+        self.add("rejects", pa.RecordBatch.from_pydict(row))
+        self.reject_reasons[reason] += records
+
+    def finish(self) -> None:
+        """Write what is held and merge parts that overlap in time."""
+        for key in sorted(self._bins):
+            self._flush(key)
+        for (table, start), held in sorted(self._bins.items()):
+            if _overlap(held.parts):
+                held.parts = self._merge(table, start, held)
+
+    def tables(self, table: str, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
+        """Rows of a finished table, file by file, in order of time."""
+        for key in sorted(key for key in self._bins if key[0] == table):
+            for path, _, _ in self._bins[key].parts:
+                yield pq.read_table(path, columns=None if columns is None else list(columns), partitioning=None)
+
+    def leave_out(
+        self,
+        table: str,
+        is_out: Callable[[pa.Table], npt.NDArray[np.bool_]],
+        may_be_out: Callable[[npt.NDArray[np.int64]], bool] = lambda _: True,
+    ) -> int:
+        """Take rows out of a finished table; returns how many.
+
+        Parameters
+        ----------
+        is_out : says of the rows of a file (n,), in order of time, which are taken out.
+        may_be_out : says by the epochs of a file whether it need be looked at.
+        """
+        schema, left_out = table_schema(table), 0
+        for key in sorted(key for key in self._bins if key[0] == table):
+            parts, self._bins[key].parts = self._bins[key].parts, []
+            for path, first, last in parts:
+                epochs = pq.read_table(path, columns=["epoch_gps_ns"], partitioning=None).column(0).to_numpy()
+                rows = pq.read_table(path, partitioning=None) if may_be_out(epochs) else None
+                out = np.zeros(epochs.size, dtype=bool) if rows is None else is_out(rows)
+                if rows is not None and out.any():
+                    path.unlink()
+                    if not out.all():
+                        write_parquet(path, rows.filter(pa.array(~out)), schema)
+                if not out.all():
+                    self._bins[key].parts.append((path, first, last))
+                left_out += int(out.sum())
+        self.rows[table] -= left_out
+        return left_out
+
+    def publish(self, store: Store, run: str, sensor: str, key: str) -> dict[str, tuple[DataFile, ...]]:
+        """Move the finished tables into the store, each at once."""
+        out = self.files(run, sensor, key)
+        for table in out:
+            store.publish_folder(self._folder / table, log_folder(table, run, sensor, key))
+        return {table: tuple(files.values()) for table, files in out.items()}
+
+    def files(self, run: str, sensor: str, key: str) -> dict[str, dict[Path, DataFile]]:
+        """Finished files by table and by where they lie now, as :meth:`publish` would record them."""
+        out: dict[str, dict[Path, DataFile]] = {}
+        for table in sorted({t for t, _ in self._bins}):
+            local = self._folder / table
+            target = log_folder(table, run, sensor, key)
+            found = sorted(local.rglob("*.parquet"))
+            out[table] = {p: describe(p, f"{target}/{p.relative_to(local).as_posix()}") for p in found}
+        return out
+
+    def _flush(self, key: tuple[str, int]) -> None:
+        held = self._bins[key]
+        if not held.batches:
+            return
+        table, start = key
+        rows = pa.Table.from_batches(held.batches)
+        self._held -= held.bytes
+        held.batches, held.bytes = [], 0
+        held.parts.append(self._write(table, start, len(held.parts), rows))
+
+    def _merge(self, table: str, start: int, held: _Bin) -> list[tuple[Path, int, int]]:
+        """Parts anew, one after another in time, none larger than what is held in memory."""
+        apart = held.parts[0][0].parent / "overlapping"
+        apart.mkdir()
+        moved = [path.rename(apart / path.name) for path, _, _ in held.parts]
+        rows = max(1, int(BUDGET_BYTES / held.row_bytes))
+        parts = [
+            self._write(table, start, number, piece)
+            for number, piece in enumerate(merged(moved, table_schema(table), rows))
+        ]
+        shutil.rmtree(apart)
+        return parts
+
+    def _write(self, table: str, start: int, number: int, rows: pa.Table) -> tuple[Path, int, int]:
+        schema = table_schema(table)
+        folder = self._folder / table
+        if schema.partition_s is not None:
+            folder = folder / f"gps_bin_s={start}"
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"part-{number:05d}.parquet"
+        rows = sorted_rows(schema, rows)
+        write_parquet(path, rows, schema)
+        if schema.partition_s is None:
+            return path, number, number
+        epochs = rows.column("epoch_gps_ns")
+        return path, epochs[0].as_py(), epochs[-1].as_py()
+
+
+def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
+    """Write rows in the encodings that measured best for their kind; same rows, same bytes."""
+    if is_list_table(rows.schema):
+        write_list_table(path, rows, schema.row_group_rows)
+        return
+    if schema.compression == "lz4" and is_number_table(rows.schema):
+        write_number_table(path, rows, schema.row_group_rows)
+        return
+    _write_by_arrow(path, rows, schema)
+
+
+def parquet_bytes(rows: pa.Table, schema: TableSchema) -> bytes:
+    """Content of a small file of rows without lists of readings, as :func:`write_parquet` writes them."""
+    stream = pa.BufferOutputStream()
+    _write_by_arrow(stream, rows, schema)
+    content: bytes = stream.getvalue().to_pybytes()
+    return content
+
+
+def _write_by_arrow(to: Path | pa.NativeFile, rows: pa.Table, schema: TableSchema) -> None:
+    encodings: dict[str, str] = {}
+    strings: list[str] = []
+    for column in schema.columns:
+        leaf = f"{column.name}.list.element" if column.is_list else column.name
+        kind = column.type[5:-1] if column.is_list else column.type
+        if kind == "string":
+            strings.append(leaf)
+        elif column.encoding:
+            encodings[leaf] = column.encoding
+        elif kind.startswith("float"):
+            encodings[leaf] = "BYTE_STREAM_SPLIT"
+        elif kind != "uint8" and not column.variable:
+            encodings[leaf] = "DELTA_BINARY_PACKED"
+    pq.write_table(
+        rows,
+        to,
+        row_group_size=schema.row_group_rows,
+        compression=schema.compression,
+        compression_level=1 if schema.compression == "zstd" else None,
+        use_dictionary=strings,
+        column_encoding=encodings,
+        write_statistics=[c.name for c in schema.columns if not c.is_list],
+        write_page_checksum=True,
+    )
+
+
+def sorted_rows(schema: TableSchema, rows: pa.Table) -> pa.Table:
+    """Rows in the schema's order; equal keys keep the order they came in."""
+    keys = [rows.column(name).to_numpy() for name in schema.sort]
+    if len(keys) == 1 and (keys[0][1:] >= keys[0][:-1]).all():
+        return rows
+    if keys[0].dtype.kind != "O" and (keys[0][1:] > keys[0][:-1]).all():
+        return rows
+    order = np.lexsort(keys[::-1])
+    return rows if np.array_equal(order, np.arange(order.size)) else rows.take(pa.array(order))
+
+
+def _by_bin(schema: TableSchema, rows: pa.RecordBatch) -> list[tuple[int, pa.RecordBatch]]:
+    if rows.num_rows == 0:
+        return []
+    if schema.partition_s is None:
+        return [(0, rows)]
+    seconds = rows.column("epoch_gps_ns").to_numpy() // NS_PER_S
+    starts = seconds // schema.partition_s * schema.partition_s
+    if starts[0] == starts[-1] and (starts == starts[0]).all():
+        return [(int(starts[0]), rows)]
+    return [(int(s), rows.filter(pa.array(starts == s))) for s in np.unique(starts)]
+
+
+def _overlap(parts: list[tuple[Path, int, int]]) -> bool:
+    return any(later[1] < earlier[2] for earlier, later in itertools.pairwise(parts))
+
+
+def describe(path: Path, relative: str) -> DataFile:
+    """What a record says of a finished local file that will lie at `relative`."""
+    metadata = pq.read_metadata(path)
+    groups = [metadata.row_group(k) for k in range(metadata.num_row_groups)]
+    spans: list[tuple[int, int]] = []
+    if metadata.num_row_groups and "epoch_gps_ns" in metadata.schema.names:
+        column = metadata.schema.names.index("epoch_gps_ns")
+        statistics: list[Any] = [g.column(column).statistics for g in groups]
+        spans = [(int(s.min), int(s.max)) for s in statistics]
+    return DataFile(
+        path=relative,
+        rows=metadata.num_rows,
+        bytes=path.stat().st_size,
+        digest=file_digest(path),
+        group_rows=tuple(g.num_rows for g in groups),
+        group_spans=tuple(spans),
+    )

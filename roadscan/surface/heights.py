@@ -1,0 +1,122 @@
+"""A window of a gridded surface, as the detection of cracks and potholes takes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.errors import RoadscanError
+from roadscan.surface.lowest import LowestReadings
+
+Float64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+
+HEIGHT_STEP_M = 1e-5
+"""Heights are whole multiples of this, so that sums do not depend on their order."""
+_OUTLIER_SIGMAS = 6.0
+_SURE_READINGS = 5
+"""Of so many readings half are hardly wrong."""
+
+
+@dataclass(frozen=True)
+class HeightWindow:
+    """Heights of a rectangle of square cells, its northernmost row last.
+
+    Cells are counted from the map's origin: cell (row, column) covers northing [row, row + 1) · `cell_m`.
+    """
+
+    raw_m: Float64
+    """(rows, columns) heights before smoothing (m), NaN where there is none."""
+    height_m: Float64
+    """The same after smoothing."""
+    cell_m: float
+    sigma_m: float
+    """1 σ of the noise of one cell's raw height (m)."""
+    first_row: int = 0
+    """Row on the map of the window's first row."""
+    first_column: int = 0
+    halo: int = 0
+    """Cells along each border that belong to the neighbours: they are looked at, and nothing is reported of them."""
+    cut_off: tuple[tuple[int, int], tuple[int, int]] = ((0, 0), (0, 0))
+    """Cells that were cut off at the south and north, and at the west and east, the halo's first."""
+    lowest: LowestReadings | None = None
+    """Of the same cells; None where they are not known."""
+
+    def __post_init__(self) -> None:
+        if self.raw_m.ndim != 2 or self.raw_m.shape != self.height_m.shape:
+            raise RoadscanError(
+                f"heights of shapes {self.raw_m.shape} and {self.height_m.shape}",
+                expected="two grids of the same rows and columns",
+            )
+        whole = [n + sum(gone) for n, gone in zip(self.raw_m.shape, self.cut_off, strict=True)]
+        if 2 * self.halo >= min(whole):
+            raise RoadscanError(
+                f"a window of {whole[0]} × {whole[1]} cells with a halo of {self.halo}",
+                expected="cells that are not halo",
+            )
+
+    def inner(self) -> tuple[slice, slice]:
+        """Rows and columns of the cells that are not halo."""
+        rows, columns = (
+            slice(min(max(self.halo - low, 0), n), max(n - max(self.halo - high, 0), 0))
+            for n, (low, high) in zip(self.raw_m.shape, self.cut_off, strict=True)
+        )
+        return rows, columns
+
+    def part(self, rows: tuple[int, int], columns: tuple[int, int]) -> HeightWindow:
+        """Its cells from one row and column up to others, as far as it has them."""
+        spans, cut_off = [], []
+        for n, span, gone in zip(self.raw_m.shape, (rows, columns), self.cut_off, strict=True):
+            low = min(max(span[0], 0), n)
+            high = max(min(span[1], n), low)
+            spans.append(slice(low, high))
+            cut_off.append((gone[0] + low, gone[1] + n - high))
+        own = (spans[0], spans[1])
+        return replace(
+            self,
+            raw_m=self.raw_m[own],
+            height_m=self.height_m[own],
+            lowest=None if self.lowest is None else self.lowest.part(*own),
+            first_row=self.first_row + spans[0].start,
+            first_column=self.first_column + spans[1].start,
+            cut_off=(cut_off[0], cut_off[1]),
+        )
+
+    def is_inner(self, row: npt.NDArray[np.int64], column: npt.NDArray[np.int64]) -> Bool:
+        """Which cells (n,), counted within the window, are not halo."""
+        rows, columns = self.inner()
+        return np.asarray((row >= rows.start) & (row < rows.stop) & (column >= columns.start) & (column < columns.stop))
+
+    def cleaned_m(self) -> Float64:
+        """Raw heights without those that the smoothing left out as impulses.
+
+        The robust height of several readings that lies below is none: it is a crack's, of which little is in the cells
+        around. One above may be that of what lies on the road.
+        """
+        off = self.raw_m - self.height_m
+        with np.errstate(invalid="ignore"):
+            kept = np.abs(off) <= _OUTLIER_SIGMAS * self.sigma_m
+            if self.lowest is not None:
+                kept |= (off < 0.0) & (self.lowest.count >= _SURE_READINGS)
+        return np.where(kept, self.raw_m, np.nan)
+
+    def lowered_m(self, most_m: float) -> Float64:
+        """The same, lowered to the lowest reading of a cell where it is known, but by `most_m` at most.
+
+        A crack that takes in less than half of a cell is not in its height, but in its lowest reading. A single wrong
+        reading decides that: it must not outweigh the cells around. Nor must cells with many times the readings of
+        those around them (``surfaces/lowest.py``): the lowest of 300 readings lies lower than that of 10.
+        """
+        heights = self.cleaned_m()
+        if self.lowest is None or most_m <= 0.0:
+            return heights
+        drop = np.minimum(self.lowest.drop_m, np.float32(most_m))
+        return np.asarray(heights - np.where(np.isnan(drop) | self.lowest.crowded(), np.float32(0.0), drop))
+
+    def map_m(self, row: npt.ArrayLike, column: npt.ArrayLike) -> Float64:
+        """Easting and northing (n, 2) of places in cells within the window; .5 is a cell's middle."""
+        east = (np.asarray(column, np.float64) + self.first_column) * self.cell_m
+        north = (np.asarray(row, np.float64) + self.first_row) * self.cell_m
+        return np.stack([east, north], axis=-1)

@@ -1,0 +1,175 @@
+"""Control points of Clough–Tocher cubic triangles with cubic precision.
+
+A triangle's patch is 19 heights, by corner k (edge k lies opposite corner k and runs from i = k + 1 to j = k + 2, both
+modulo 3; c is the centroid; [·, ·, ·] is the polar form of the cubic that the point belongs to):
+
+====  ==================  ==========================================
+from  [·, ·, ·]           of
+====  ==================  ==========================================
+0     [k, k, k]           corner k
+3     [i, i, j], [i, j, j]  edge k, at 3 + 2 k and 4 + 2 k
+9     [k, k, c]           corner k
+12    [i, j, c]           edge k
+15    [k, c, c]           corner k
+18    [c, c, c]
+====  ==================  ==========================================
+
+The theory stands in ``surfaces.clough_tocher``.
+"""
+
+from __future__ import annotations
+
+from roadscan.compute.kernel_options import inlined, inner, kernel
+from roadscan.compute.kernels.patch_heights import BY_CORNER, BY_EDGE, CENTRE, CORNER, EDGE, INNER
+
+ALONG, ACROSS, SLOPE = 0, 1, 2
+THIN = 0.25
+"""A triangle is thin beside another if its corner lies nearer to their edge by this factor."""
+LEAST_SHARE = 0.05
+"""Of the slope across the middle of an edge in what a thin triangle's corner says (1.5 above the middle, 0 at an end).
+"""
+
+
+@inlined
+def third_of_slope(gradients, i, dx, dy):
+    """A third of the derivative at vertex i along (dx, dy): from a vertex to its control point (eq. 7-9)."""
+    return (gradients[i, 0] * dx + gradients[i, 1] * dy) / 3.0
+
+
+@kernel
+def cross_slopes(x, y, z, gradients, triangles, halves):
+    """What each triangle knows of the slope across its edges.
+
+    Parameters
+    ----------
+    x, y, z : (m,) float64; gradients : (m, 2); triangles : (n, 3) int64.
+    halves : (n, 3, 3) float64, out: of edge k, where the corner opposite lies along and across it (in lengths of the
+        edge, from its first end to the left of it), and the slope across its middle as this corner sees it.
+    """
+    for t in range(triangles.shape[0]):
+        for k in range(3):
+            a, i, j = triangles[t, k], triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]
+            lo, hi = min(i, j), max(i, j)  # both triangles of an edge compute in the same direction
+            ex, ey, ax, ay = x[hi] - x[lo], y[hi] - y[lo], x[a] - x[lo], y[a] - y[lo]
+            square = ex * ex + ey * ey
+            along, across = (ex * ax + ey * ay) / square, (ex * ay - ey * ax) / square
+            z3 = z[hi] - z[lo]
+            z1, z2 = third_of_slope(gradients, lo, ex, ey), z3 - third_of_slope(gradients, hi, ex, ey)
+            seen = 2.0 * (z[a] - z[lo]) + third_of_slope(gradients, a, ex - 2.0 * ax, ey - 2.0 * ay)
+            rest = 1.0 - along
+            known = rest * rest * (z1) + 2.0 * rest * along * (z1 + z2) + along * along * (z2 + z3)
+            ends = rest * third_of_slope(gradients, lo, -ey, ex) + along * third_of_slope(gradients, hi, -ey, ex)
+            halves[t, k, ALONG], halves[t, k, ACROSS] = along, across
+            halves[t, k, SLOPE] = (seen - known) / (2.0 * across) - ends
+
+
+@inlined
+def misfits(x, y, z, gradients, lo, hi, a):
+    """Where corner a lies along and across an edge, and what its height and slopes say beyond what the edge knows.
+
+    Returns
+    -------
+    along, across; then, of the cubic less its edge and its slopes across the ends of it: height over `across`, slope
+    along over `across`, slope across (lengths of the edge).
+    """
+    ex, ey, ax, ay = x[hi] - x[lo], y[hi] - y[lo], x[a] - x[lo], y[a] - y[lo]
+    square = ex * ex + ey * ey
+    s, t = (ex * ax + ey * ay) / square, (ex * ay - ey * ax) / square
+    r = 1.0 - s
+    z3 = z[hi] - z[lo]
+    z1, z2 = third_of_slope(gradients, lo, ex, ey), z3 - third_of_slope(gradients, hi, ex, ey)
+    n0, n1 = third_of_slope(gradients, lo, -ey, ex), third_of_slope(gradients, hi, -ey, ex)
+    edge = 3.0 * s * r * (r * z1 + s * z2) + s * s * s * z3
+    rise = 3.0 * (r * r * z1 + 2.0 * s * r * (z2 - z1) + s * s * (z3 - z2))
+    ends = 3.0 * (r * r * n0 + s * s * n1)
+    height = (z[a] - z[lo] - edge) / t - ends
+    along = (3.0 * third_of_slope(gradients, a, ex, ey) - rise) / t + 6.0 * (r * n0 - s * n1)
+    return s, t, height, along, 3.0 * third_of_slope(gradients, a, -ey, ex) - ends
+
+
+@inner
+def slope_beside_thin(x, y, z, gradients, lo, hi, wide, thin, seen_wide, seen_thin):
+    """Slope across the middle of an edge beside a thin triangle, from what the cubic through the wide one has to meet.
+
+    Two equations for it: the slope at the thin corner, and the rule of Foley & Opitz times the small distance of that
+    corner (`seen_wide`, `seen_thin`: the slopes of :func:`cross_slopes`). They are solved by least squares; where the
+    thin corner lies at an end of the edge it tells nothing of the middle, and the mean of the ends is taken.
+    """
+    s, t, height, along, across = misfits(x, y, z, gradients, lo, hi, wide)
+    thin_s, thin_t, _, _, thin_across = misfits(x, y, z, gradients, lo, hi, thin)
+    ratio = thin_t / t
+    bulge, thin_bulge = 6.0 * s * (1.0 - s), 6.0 * thin_s * (1.0 - thin_s)
+    share = thin_bulge + ratio * ((3.0 * ratio - 4.0) * bulge - 12.0 * (1.0 - 2.0 * s) * (thin_s - s))
+    known = 2.0 * (3.0 * height - across + along * (thin_s - s)) + 3.0 * ratio * (across - 2.0 * height)
+    near = 2.0 * thin_t
+    square = share * share + (near * (1.0 - ratio)) ** 2
+    if square < LEAST_SHARE * LEAST_SHARE:
+        ex, ey = x[hi] - x[lo], y[hi] - y[lo]
+        return 0.5 * (third_of_slope(gradients, lo, -ey, ex) + third_of_slope(gradients, hi, -ey, ex))
+    total = share * (thin_across - ratio * known) + near * (1.0 - ratio) * near * (seen_thin - ratio * seen_wide)
+    return total / square
+
+
+@kernel
+def control_points(x, y, z, gradients, triangles, opposite, halves, patches):
+    """Control points of each triangle.
+
+    Parameters
+    ----------
+    x, y, z : (m,) float64; gradients : (m, 2); triangles, opposite : (n, 3) int64.
+    halves : (n, 3, 3) float64, of :func:`cross_slopes`.
+    patches : (n, POINTS) float64, out.
+    """
+    flat = halves.reshape(-1, 3)
+    for t in range(triangles.shape[0]):
+        patch = patches[t]
+        inner, sides = 0.0, 0
+        for k in range(3):
+            i, j = triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]
+            dx, dy = x[j] - x[i], y[j] - y[i]
+            patch[CORNER + k] = z[triangles[t, k]]
+            near, far = z[i] + third_of_slope(gradients, i, dx, dy), z[j] - third_of_slope(gradients, j, dx, dy)
+            patch[EDGE + 2 * k], patch[EDGE + 2 * k + 1] = near, far
+            other = opposite[t, k]
+            if other >= 0:
+                mine, theirs = halves[t, k, ACROSS], flat[other, ACROSS]
+                a, b, lo, hi = triangles[t, k], triangles[other // 3, other % 3], min(i, j), max(i, j)
+                mine_seen, theirs_seen = halves[t, k, SLOPE], flat[other, SLOPE]
+                if abs(theirs) < THIN * abs(mine):
+                    slope = slope_beside_thin(x, y, z, gradients, lo, hi, a, b, mine_seen, theirs_seen)
+                elif abs(mine) < THIN * abs(theirs):
+                    slope = slope_beside_thin(x, y, z, gradients, lo, hi, b, a, theirs_seen, mine_seen)
+                else:
+                    slope = (mine_seen * theirs - theirs_seen * mine) / (theirs - mine)
+                along = halves[t, k, ALONG] if i < j else 1.0 - halves[t, k, ALONG]
+                patch[BY_EDGE + k] = (1.0 - along) * near + along * far + mine * slope
+                inner += patch[BY_EDGE + k]
+                sides += 1
+        if sides < 3:
+            if sides == 0:  # quadratic precision
+                for e in range(6):
+                    inner += 0.25 * patch[EDGE + e]
+                for k in range(3):
+                    inner -= patch[k] / 6.0
+            else:
+                inner /= sides
+            for k in range(3):
+                if opposite[t, k] < 0:
+                    patch[BY_EDGE + k] = inner
+        split(patch)
+
+
+@inlined
+def split(patch):
+    """From the inner point of each edge to the control points of three cubics that meet smoothly (Clough–Tocher)."""
+    centre = 0.0
+    for k in range(3):
+        near, far = patch[EDGE + 2 * k], patch[EDGE + 2 * k + 1]
+        patch[BY_EDGE + k] = (near + far + patch[BY_EDGE + k]) / 3.0
+        towards_next, towards_last = patch[EDGE + 2 * ((k + 2) % 3)], patch[EDGE + 2 * ((k + 1) % 3) + 1]
+        patch[BY_CORNER + k] = (patch[k] + towards_next + towards_last) / 3.0
+    for k in range(3):
+        inner = (patch[BY_CORNER + k] + patch[BY_EDGE + (k + 1) % 3] + patch[BY_EDGE + (k + 2) % 3]) / 3.0
+        patch[INNER + k] = inner
+        centre += inner
+    patch[CENTRE] = centre / 3.0

@@ -1,0 +1,249 @@
+"""Medians and means of seven cells in a line, and sums over small windows, each over a whole grid.
+
+Every loop runs along a row of a grid with a margin, so that it needs no look at the borders. The order of operations
+at a cell is the same whatever the grid around it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roadscan.compute.kernel_options import inlined, inner, kernel
+
+CELLS = 7
+"""Cells of a line, its middle among them."""
+
+
+@inlined
+def put_in_order(a, b):
+    """The smaller, the larger."""
+    return (a if a < b else b), (b if a < b else a)
+
+
+@inlined
+def middle_two(v0, v1, v2, v3, v4, v5, v6, absent):
+    """The middle two of up to seven heights, and how many there are; of an odd number the median twice.
+
+    Those below `absent` count. A sorting network of 16 exchanges (Knuth 1998, The Art of Computer Programming 3,
+    section 5.3.4) puts the others last. `absent` where there is none.
+    """
+    n = (1.0 if v0 < absent else 0.0) + (1.0 if v6 < absent else 0.0)
+    n += (1.0 if v1 < absent else 0.0) + (1.0 if v5 < absent else 0.0)
+    n += (1.0 if v2 < absent else 0.0) + (1.0 if v4 < absent else 0.0)
+    n += 1.0 if v3 < absent else 0.0
+    v0, v6 = put_in_order(v0, v6)
+    v2, v3 = put_in_order(v2, v3)
+    v4, v5 = put_in_order(v4, v5)
+    v0, v2 = put_in_order(v0, v2)
+    v1, v4 = put_in_order(v1, v4)
+    v3, v6 = put_in_order(v3, v6)
+    v0, v1 = put_in_order(v0, v1)
+    v2, v5 = put_in_order(v2, v5)
+    v3, v4 = put_in_order(v3, v4)
+    v1, v2 = put_in_order(v1, v2)
+    v4, v6 = put_in_order(v4, v6)
+    v2, v3 = put_in_order(v2, v3)
+    v4, v5 = put_in_order(v4, v5)
+    v1, v2 = put_in_order(v1, v2)
+    v3, v4 = put_in_order(v3, v4)
+    low = v3 if n > 6.5 else (v2 if n > 4.5 else (v1 if n > 2.5 else v0))
+    high = v3 if n > 5.5 else (v2 if n > 3.5 else (v1 if n > 1.5 else v0))
+    return low, high, n
+
+
+@inner
+def median_row(a, b, c, d, e, f, g, absent, median, count, own):
+    """Of each place of seven rows (n,) the median, how many heights it is of, and the share of `d` in it.
+
+    Of an even number the median is the mean of the middle two; `absent` where there is none.
+    """
+    for j in range(median.size):
+        low, high, n = middle_two(a[j], b[j], c[j], d[j], e[j], f[j], g[j], absent)
+        median[j] = 0.5 * (low + high)
+        count[j] = n
+        own[j] = np.float32((0.5 if d[j] == low else 0.0) + (0.5 if d[j] == high else 0.0))
+
+
+@inlined
+def or_mirrored(value, opposite, middle, absent):
+    """The value, or if it is absent the one that lies with its opposite and the middle in one straight line."""
+    return value if value < absent else (2.0 * middle - opposite if opposite < absent else absent)
+
+
+@inner
+def mirrored_median_row(a, b, c, d, e, f, g, middle, absent, median):
+    """As :func:`median_row`; where one side has two heights more than the other, the other's are mirrored.
+
+    So the median at a border has no lean to one side of a slope. What is missing here and there stays missing: in a
+    crack, a mirrored height would lie far below it.
+
+    middle : (n,) float64, a height of the place itself or `absent`; see :func:`or_mirrored`.
+    """
+    for j in range(median.size):
+        m = middle[j]
+        before = (1 if a[j] < absent else 0) + (1 if b[j] < absent else 0) + (1 if c[j] < absent else 0)
+        after = (1 if e[j] < absent else 0) + (1 if f[j] < absent else 0) + (1 if g[j] < absent else 0)
+        mirror = (abs(before - after) > 1) & (m < absent)
+        low, high, _ = middle_two(
+            or_mirrored(a[j], g[j], m, absent) if mirror else a[j],
+            or_mirrored(b[j], f[j], m, absent) if mirror else b[j],
+            or_mirrored(c[j], e[j], m, absent) if mirror else c[j],
+            d[j],
+            or_mirrored(e[j], c[j], m, absent) if mirror else e[j],
+            or_mirrored(f[j], b[j], m, absent) if mirror else f[j],
+            or_mirrored(g[j], a[j], m, absent) if mirror else g[j],
+            absent,
+        )
+        median[j] = 0.5 * (low + high)
+
+
+@inlined
+def row_of_line(values, margin, line, k, i, n):
+    """The k-th cells of the lines through the n cells of row i."""
+    first = margin + line[k, 1]
+    return values[i + margin + line[k, 0], first : first + n]
+
+
+@inlined
+def rows_of_line(values, margin, line, i, n):
+    """The seven cells of these lines, a row (n,) each."""
+    return (
+        row_of_line(values, margin, line, 0, i, n),
+        row_of_line(values, margin, line, 1, i, n),
+        row_of_line(values, margin, line, 2, i, n),
+        row_of_line(values, margin, line, 3, i, n),
+        row_of_line(values, margin, line, 4, i, n),
+        row_of_line(values, margin, line, 5, i, n),
+        row_of_line(values, margin, line, 6, i, n),
+    )
+
+
+@kernel
+def line_medians(values, margin, line, absent, median, count, own):
+    """Median of the seven cells of a line through each cell.
+
+    Parameters
+    ----------
+    values : (rows + 2 margin, columns + 2 margin) float64; cells that hold nothing are `absent`, above all others.
+    line : (7, 2) int64, rows and columns from the cell, none beyond `margin`.
+    median, count : (rows, columns) float64, out; own : the same, float32, out; see :func:`median_row`.
+    """
+    rows, n = median.shape
+    for i in range(rows):
+        median_row(
+            *rows_of_line(values, margin, line, i, n),
+            absent,
+            median[i],
+            count[i],
+            own[i],
+        )
+
+
+@kernel
+def mirrored_line_medians(values, margin, line, middle, absent, median):
+    """The same at borders and holes without a lean to one side of a slope; see :func:`mirrored_median_row`.
+
+    middle : (rows, columns) float64, a height of the cell itself; the others as of :func:`line_medians`.
+    """
+    rows, n = median.shape
+    for i in range(rows):
+        mirrored_median_row(
+            *rows_of_line(values, margin, line, i, n),
+            middle[i],
+            absent,
+            median[i],
+        )
+
+
+@inner
+def mean_row(a, b, c, d, e, f, g, absent, mean):
+    """Of each place of seven rows (n,) the mean of the middle one `d` and of the pairs about it; see `line_means`."""
+    for j in range(mean.size):
+        v = d[j] if d[j] < absent else 0.0
+        far, mid, near = max(a[j], g[j]) < absent, max(b[j], f[j]) < absent, max(c[j], e[j]) < absent
+        total = (a[j] - v) + (g[j] - v) if far else 0.0
+        total += (b[j] - v) + (f[j] - v) if mid else 0.0
+        total += (c[j] - v) + (e[j] - v) if near else 0.0
+        n = 1.0 + ((2.0 if far else 0.0) + (2.0 if mid else 0.0) + (2.0 if near else 0.0))
+        mean[j] = v + total / n if d[j] < absent else absent
+
+
+@kernel
+def line_means(values, margin, line, absent, mean):
+    """Mean of the seven cells of a line through each cell; arguments as of :func:`line_medians`.
+
+    A cell counts if its mirror image does, so that the mean of a slope is the slope's height at borders and holes as
+    well. What holds nothing has no mean.
+    """
+    rows, n = mean.shape
+    for i in range(rows):
+        mean_row(
+            *rows_of_line(values, margin, line, i, n),
+            absent,
+            mean[i],
+        )
+
+
+@inner
+def judge_row(heights, ground, median, count, own, least, sigma, limit, absent, contrast, risk):
+    """How far medians along a line lie from the ground and from the heights; all (n,), see :func:`judge_lines`."""
+    for j in range(risk.size):
+        there = heights[j] < absent
+        away = abs(median[j] - ground[j]) * np.sqrt(count[j]) if there & (count[j] >= least) else 0.0
+        contrast[j] = max(contrast[j], np.float32(away))
+        off = min(abs(heights[j] - median[j]) / sigma, limit) if there else 0.0
+        risk[j] = np.float32(off * off + 2.0 * own[j]) if there else np.float32(0.0)
+
+
+@kernel
+def judge_lines(heights, ground, median, count, own, least, sigma, limit, absent, contrast, risk):
+    """Rate the medians along the lines of one direction.
+
+    Parameters
+    ----------
+    heights, ground, median, count : (rows, columns) float64; own : the same, float32.
+    least : medians of fewer heights show no contrast; sigma : 1 σ of a height (m); limit : greatest misfit (σ).
+    contrast : (rows, columns) float32, in/out, the greatest |median − ground| · √count so far (m).
+    risk : (rows, columns) float32, out, misfit² + 2 · own in σ², 0 where nothing was measured: but for a constant, the
+        squared error that is to be expected (Stein 1981, "Estimation of the mean of a multivariate normal
+        distribution", Annals of Statistics 9, 1135–1151).
+    """
+    for i in range(risk.shape[0]):
+        judge_row(heights[i], ground[i], median[i], count[i], own[i], least, sigma, limit, absent, contrast[i], risk[i])
+
+
+@kernel
+def keep_better(risk, median, own, direction, least_risk, best, best_own, best_direction):
+    """Keep the medians whose risk is less than the least so far; (n,) each, the last four in/out."""
+    for j in range(risk.size):
+        better = risk[j] < least_risk[j]
+        least_risk[j] = risk[j] if better else least_risk[j]
+        best[j] = median[j] if better else best[j]
+        best_own[j] = own[j] if better else best_own[j]
+        best_direction[j] = direction if better else best_direction[j]
+
+
+@kernel
+def add_row(values, total):
+    """Add one row (n,) float32 to another."""
+    for j in range(total.size):
+        total[j] += values[j]
+
+
+@kernel
+def window_sums(values, half, across, total):
+    """Sums over the (2 half + 1)² cells around each cell.
+
+    Parameters
+    ----------
+    values : (rows + 2 half, columns + 2 half) float32.
+    across : (rows + 2 half, columns) float32, zeros, scratch.
+    total : (rows, columns) float32, zeros, out.
+    """
+    rows, n = total.shape
+    for i in range(across.shape[0]):
+        for k in range(2 * half + 1):
+            add_row(values[i, k : k + n], across[i])
+    for i in range(rows):
+        for k in range(2 * half + 1):
+            add_row(across[i + k], total[i])

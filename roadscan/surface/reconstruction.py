@@ -1,0 +1,309 @@
+"""The surface of a tile, from the tiles' cells or from points: what is needed around it, raw heights, smoothing.
+
+A tile is computed on a window that reaches beyond it: by the cells that products see of the neighbours
+(:data:`SHOWN_M`; before smoothing, where they ask for more, farther), by those that smoothing depends on, and, for
+points, by those that triangles depend on. The outer ones are cut off again, so all that is left has the same bits in
+every tile that sees it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.ids import TileId
+from roadscan.core.settings.surface import SurfaceConfig
+from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
+from roadscan.surface.clough_tocher import cubic_surface
+from roadscan.surface.detailed import DetailedSettings
+from roadscan.surface.holes import RIM, Holes, cells_across
+from roadscan.surface.lowest import LowestReadings
+from roadscan.surface.normals import slopes_at
+from roadscan.surface.sites import sites
+from roadscan.surface.smoothing import halo_cells, smooth_surface
+from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.surface.triangulation import triangulate
+from roadscan.surface.window import GridWindow
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.georeferencing.cloud import QUANTUM_M, TilePoints
+from roadscan.tiles.grid import Bounds, TileGrid
+
+Float64 = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+Bool = npt.NDArray[np.bool_]
+
+SHOWN_M: Final = 1.15
+"""What products see of the neighbouring tiles, at least (m)."""
+
+_BRIGHTEST: Final = 65_535.0
+_MOST_COUNTED: Final = 65_535
+_CELLS_SMOOTHED: Final = 2_000_000
+"""Cells that are smoothed at once, about: smoothing needs 100 bytes of memory a cell."""
+
+
+@dataclass(frozen=True)
+class SurfaceGrid:
+    """The cells of a survey's surface, and how far a tile has to look around itself."""
+
+    tiles: TileGrid
+    config: SurfaceConfig
+    around_m: float = 0.0
+    """What products see of the neighbours before smoothing, at least (m)."""
+
+    @property
+    def cell_m(self) -> tuple[float, float]:
+        """Edges of a cell (m): east, north."""
+        return self.config.cell_m or (self.tiles.cell_m, self.tiles.cell_m)
+
+    @property
+    def shown(self) -> int:
+        """Cells of the neighbours that products see, on each side."""
+        return math.ceil(SHOWN_M / min(self.cell_m) - 1e-9)
+
+    @property
+    def around(self) -> int:
+        """Cells of the neighbours that products see before smoothing, on each side."""
+        return max(self.shown, math.ceil(self.around_m / min(self.cell_m) - 1e-9))
+
+    @property
+    def smoothed(self) -> int:
+        """Cells beyond those that smoothing depends on."""
+        settings = self.config.smoothing_settings()
+        return 0 if settings is None else halo_cells(settings)
+
+    @property
+    def holes(self) -> tuple[int, int]:
+        """Empty cells in the widest hole that is filled: northwards, eastwards."""
+        east, north = self.cell_m
+        return cells_across(self.config.fill_m, north), cells_across(self.config.fill_m, east)
+
+    @property
+    def filled(self) -> int:
+        """Cells beyond those that are shown, that filling depends on."""
+        return max(self.holes) + RIM if max(self.holes) else 0
+
+    def window(self, tile: TileId) -> GridWindow:
+        """Cells that are computed for a tile."""
+        beyond = max(self.shown + self.filled + self.smoothed, self.around)
+        return GridWindow.over(self.tiles.bounds(tile), *self.cell_m).grown(beyond)
+
+    def reach(self, tile: TileId) -> Bounds:
+        """Box (m) of all cells or points that a tile's surface depends on."""
+        box, margin = self.window(tile).bounds(), 0.0
+        if self.config.method == "points":
+            margin = self.detailed.halo_m + max(self.cell_m)
+        return Bounds(
+            box.easting_min_m - margin,
+            box.northing_min_m - margin,
+            box.easting_max_m + margin,
+            box.northing_max_m + margin,
+        )
+
+    def rings(self) -> int:
+        """Rings of tiles around a tile that :meth:`reach` touches."""
+        tile = TileId(0, 0)
+        own, box = self.tiles.bounds(tile), self.reach(tile)
+        beyond = max(box.easting_max_m - own.easting_max_m, box.northing_max_m - own.northing_max_m)
+        return math.ceil((beyond + max(self.cell_m)) / self.tiles.size_m)
+
+    @property
+    def detailed(self) -> DetailedSettings:
+        """Settings of the detailed model."""
+        return DetailedSettings(max_gap_m=self.config.max_gap_m, slopes=self.config.slopes)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Raw arrays (rows, columns) of a window, row 0 the southernmost."""
+
+    raw_m: Float64
+    origin: npt.NDArray[np.uint8]
+    intensity: Float32
+    lowest: LowestReadings | None = None
+    """Of the same cells; None where they are not known."""
+
+
+def patch_of_cells(window: GridWindow, tiles: Iterable[TileCells]) -> Patch:
+    """What tiles' cells say of a window: robust heights, mean intensities, and lowest readings where they are stored.
+
+    Parameters
+    ----------
+    window : in the tiles' own cells.
+    tiles : those that share cells with it, in any order.
+    """
+    shape = window.rows, window.columns
+    raw, intensity = np.full(shape, np.nan), np.full(shape, np.nan, np.float32)
+    lowest = LowestReadings(np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint16))
+    for cells in tiles:
+        row = cells.row.astype(np.int64) + (cells.tile.row * cells.cells_per_edge - window.first_row)
+        column = cells.column.astype(np.int64) + (cells.tile.column * cells.cells_per_edge - window.first_column)
+        own = (row >= 0) & (row < window.rows) & (column >= 0) & (column < window.columns)
+        raw[row[own], column[own]] = cells.height_robust_m[own]
+        intensity[row[own], column[own]] = cells.intensity_mean[own]
+        lowest.drop_m[row[own], column[own]] = (cells.height_robust_m - cells.height_min_m)[own]
+        lowest.count[row[own], column[own]] = np.minimum(cells.count[own], _MOST_COUNTED)
+    stored = not np.isnan(lowest.drop_m).all()
+    origin = np.where(np.isnan(raw), EMPTY, MEASURED).astype(np.uint8)
+    return Patch(raw, origin, intensity, lowest if stored else None)
+
+
+def patch_of_points(
+    window: GridWindow, tiles: Iterable[TilePoints], grid: SurfaceGrid, wanted: Bool | None = None
+) -> Patch:
+    """The detailed model through points, at the nodes of a window.
+
+    A cell with a point in it is measured, the others that hold a height are interpolated. Intensities are a smooth
+    surface over the same triangles.
+
+    Parameters
+    ----------
+    tiles : those that :meth:`SurfaceGrid.reach` touches, in any order.
+    wanted : (rows, columns) cells whose surface is wanted; None for all. What these do not depend on may be left out.
+    """
+    if wanted is None:
+        return _detailed(window, tiles, grid)
+    shape = window.rows, window.columns
+    empty = Patch(np.full(shape, np.nan), np.zeros(shape, np.uint8), np.full(shape, np.nan, np.float32))
+    if not wanted.any():
+        return empty
+    rows, columns = (_needed(np.asarray(wanted.any(axis=axis)), grid.filled + grid.smoothed) for axis in (1, 0))
+    part = replace(
+        window,
+        first_row=window.first_row + rows.start,
+        first_column=window.first_column + columns.start,
+        rows=rows.stop - rows.start,
+        columns=columns.stop - columns.start,
+    )
+    made = _detailed(part, tiles, grid)
+    for name in ("raw_m", "origin", "intensity"):
+        getattr(empty, name)[rows, columns] = getattr(made, name)
+    return empty
+
+
+def _needed(wanted: Bool, beyond: int) -> slice:
+    """From the first to the last that is wanted, and so many more on both sides."""
+    at = np.flatnonzero(wanted)
+    return slice(max(int(at[0]) - beyond, 0), min(int(at[-1]) + 1 + beyond, wanted.size))
+
+
+def _detailed(window: GridWindow, tiles: Iterable[TilePoints], grid: SurfaceGrid) -> Patch:
+    box, margin = window.bounds(), grid.detailed.halo_m + max(grid.cell_m)
+    parts = [_near(one, grid.tiles, box, margin) for one in tiles]
+    places = np.concatenate([p for p, _ in parts]) if parts else np.empty((0, 3))
+    light = np.concatenate([i for _, i in parts]) if parts else np.empty(0)
+    ground = sites(places)
+    brightness = sites(np.column_stack([places[:, :2], light]))
+    mesh = triangulate(ground, grid.detailed.max_gap_m)
+    raw = cubic_surface(ground, mesh, slopes_at(ground, mesh, grid.detailed.slopes).slopes).heights(window)
+    grey = cubic_surface(brightness, mesh, slopes_at(brightness, mesh, "quadratic").slopes).heights(window)
+    origin = np.where(np.isnan(raw), EMPTY, np.where(_held(window, places), MEASURED, INTERPOLATED))
+    return Patch(raw, origin.astype(np.uint8), np.clip(grey, 0.0, _BRIGHTEST).astype(np.float32))
+
+
+def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | None = None) -> SurfaceTile:
+    """Smooth a window's heights, fill its holes, and cut off what was needed for that alone.
+
+    Parameters
+    ----------
+    patch : of :meth:`SurfaceGrid.window`.
+    wanted : (rows, columns) of the window, cells outside which there shall be no surface; None for all.
+    """
+    settings = grid.config.smoothing_settings()
+    around_m = _around(patch.raw_m if wanted is None else np.where(wanted, patch.raw_m, np.nan), grid)
+    patch, wanted = _for_smoothing(patch, grid), None if wanted is None else _cut(wanted, _beyond_smoothing(grid))
+    height = patch.raw_m if settings is None else smoothed_where_known(patch.raw_m, settings)
+    rim, window = grid.filled + grid.smoothed, grid.window(tile).grown(-_beyond_smoothing(grid))
+    inner = (slice(rim, window.rows - rim), slice(rim, window.columns - rim))
+    raw, origin = patch.raw_m[inner].copy(), patch.origin[inner].copy()
+    lowest = None if patch.lowest is None else patch.lowest.part(*inner)
+    if grid.filled:
+        seen = (slice(grid.smoothed, window.rows - grid.smoothed), slice(grid.smoothed, window.columns - grid.smoothed))
+        cut = (slice(grid.filled, -grid.filled),) * 2
+        height, intensity, filled = _filled(height[seen], patch.intensity[seen], grid)
+        height, intensity = height[cut], intensity[cut]
+        origin[filled[cut]] = FILLED
+    else:
+        height, intensity = height[inner].copy(), patch.intensity[inner].copy()
+    if wanted is not None:
+        left_out = ~wanted[inner]
+        raw[left_out] = height[left_out] = np.nan
+        intensity[left_out], origin[left_out] = np.nan, EMPTY
+    return SurfaceTile(
+        tile, window.grown(-rim), grid.shown, raw, height, origin, intensity, grid.config.sigma_m,
+        around_m=around_m, lowest=lowest,
+    )  # fmt: skip
+
+
+def _around(raw_m: Float64, grid: SurfaceGrid) -> Float64:
+    """Heights before smoothing of what products see, of those of a tile's window."""
+    return _cut(raw_m, max(grid.shown + grid.filled + grid.smoothed - grid.around, 0))
+
+
+def _for_smoothing(patch: Patch, grid: SurfaceGrid) -> Patch:
+    """The part of a window's patch that smoothing and filling look at."""
+    margin = _beyond_smoothing(grid)
+    rows, columns = (slice(margin, n - margin) for n in patch.raw_m.shape)
+    lowest = None if patch.lowest is None else patch.lowest.part(rows, columns)
+    return Patch(_cut(patch.raw_m, margin), _cut(patch.origin, margin), _cut(patch.intensity, margin), lowest)
+
+
+def _beyond_smoothing(grid: SurfaceGrid) -> int:
+    """Cells along each border of a tile's window that are seen as they were measured alone."""
+    return max(grid.around - grid.shown - grid.filled - grid.smoothed, 0)
+
+
+def _cut(cells: npt.NDArray[Any], margin: int) -> npt.NDArray[Any]:
+    """An array (rows, columns) without so many cells along each border."""
+    return cells[margin : cells.shape[0] - margin, margin : cells.shape[1] - margin]
+
+
+def _filled(height_m: Float64, intensity: Float32, grid: SurfaceGrid) -> tuple[Float64, Float32, Bool]:
+    """Heights and intensities of a window with holes filled, and which cells were."""
+    found = Holes.of(~np.isnan(height_m), grid.holes)
+    return found.fill(height_m), found.fill(intensity.astype(np.float64)).astype(np.float32), found.filled()
+
+
+def smoothed_where_known(raw_m: Float64, settings: SurfaceSmoothing) -> Float64:
+    """Smoothed heights (rows, columns), computed on the smallest box of known cells: a grid ends like a hole.
+
+    Strip by strip, to save memory: a strip reaches beyond its own rows by the halo of the smoothing.
+    """
+    known = ~np.isnan(raw_m)
+    if not known.any():
+        return raw_m
+    spans = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
+    rows, columns = (slice(int(s[0]), int(s[-1]) + 1) for s in spans)
+    height = np.full(raw_m.shape, np.nan)
+    halo = halo_cells(settings)
+    strip = max(_CELLS_SMOOTHED // (columns.stop - columns.start), 2 * halo)
+    for first in range(rows.start, rows.stop, strip):
+        last = min(first + strip, rows.stop)
+        low, high = max(first - halo, rows.start), min(last + halo, rows.stop)
+        height[first:last, columns] = smooth_surface(raw_m[low:high, columns], settings)[first - low : last - low]
+    return height
+
+
+def _near(points: TilePoints, tiles: TileGrid, box: Bounds, margin_m: float) -> tuple[Float64, Float64]:
+    """Places (n, 3) and intensities (n,) of a tile's points within `margin_m` of a box."""
+    corner = tiles.bounds(points.tile)
+    easting = corner.easting_min_m + points.x_quanta * QUANTUM_M
+    northing = corner.northing_min_m + points.y_quanta * QUANTUM_M
+    near = (easting >= box.easting_min_m - margin_m) & (easting <= box.easting_max_m + margin_m)
+    near &= (northing >= box.northing_min_m - margin_m) & (northing <= box.northing_max_m + margin_m)
+    places = np.column_stack([easting[near], northing[near], points.height_quanta[near] * QUANTUM_M])
+    return places, points.intensity[near].astype(np.float64)
+
+
+def _held(window: GridWindow, places_m: Float64) -> Bool:
+    """(rows, columns) cells with a place in them."""
+    column = np.floor(places_m[:, 0] / window.cell_east_m).astype(np.int64) - window.first_column
+    row = np.floor(places_m[:, 1] / window.cell_north_m).astype(np.int64) - window.first_row
+    own = (row >= 0) & (row < window.rows) & (column >= 0) & (column < window.columns)
+    held = np.zeros((window.rows, window.columns), bool)
+    held[row[own], column[own]] = True
+    return held

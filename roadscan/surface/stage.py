@@ -1,0 +1,58 @@
+"""Stage `surfaces`: cells or points into the reconstructed surface and its products."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, StageState
+from roadscan.surface.tasks.found_regions import find_due_regions
+from roadscan.surface.tasks.surface_colours import check_colours, colour_notes
+from roadscan.surface.tasks.surface_plan import SURFACE, files_without_surface
+from roadscan.surface.tasks.surface_work import plan_surface_work
+from roadscan.surface.tasks.surfaces import compute_surfaces
+from roadscan.tiles.tasks.tiles import run_tasks
+
+
+class Surfaces(Stage):
+    """The road's surface, where the survey file has a section `[surface]`."""
+
+    name = "surfaces"
+    title = "cells or points into the reconstructed surface and its files"
+    after = ("tiles",)
+
+    def run(self, session: Session) -> None:
+        """Reconstruct what is missing or stale."""
+        manifest, surface = session.manifest, session.survey.config.surface
+        if surface is not None and surface.regions == "found":
+            bar = session.bar("regions of interest")
+            session.failed(self.name, find_due_regions(session.plan, manifest, session.compute, bar))
+        work = plan_surface_work(session)
+        manifest.remove(work.gone)
+        if work.note:
+            session.note(work.note)
+        if work.planned is None or not work.chosen:
+            return
+        check_colours(session.plan, folders=True)
+        tasks = work.planned.tasks(work.chosen, session.compute.workers)
+        failures = run_tasks(
+            compute_surfaces, tasks, len(work.chosen), work.planned.singly, manifest, session.compute,
+            session.bar(self.name),
+        )  # fmt: skip
+        manifest.forget(SURFACE, [unit for unit, _ in failures])
+        manifest.remove(files_without_surface(manifest))
+        made = manifest.of(SURFACE)
+        for note in colour_notes(work.planned.pictures, [made[str(t)] for t in work.chosen if str(t) in made]):
+            session.note(note)
+        session.failed(self.name, failures)
+
+    def state(self, session: Session) -> StageState:
+        """Tiles whose surface is missing or stale, of those that hold cells by now."""
+        work = plan_surface_work(session)
+        waiting = set() if work.planned is None else work.planned.waiting & work.planned.cells.keys()
+        stale = len(work.chosen) + len(waiting)
+        return StageState(len(session.manifest.of(SURFACE)) - len(work.chosen), stale, next_run={"surfaces": stale})
+
+    def folders(self) -> Sequence[str]:
+        """Outlines of the regions; files of surfaces lie beside those of tiles."""
+        return ("tables/regions",)

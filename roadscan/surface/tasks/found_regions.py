@@ -1,0 +1,294 @@
+"""Regions of interest that the coarse model finds: looked for in pieces of each drive, kept in the table ``regions``.
+
+A piece is a span of GPS time at whole multiples of its own length, with the profiles of a few seconds before and after
+it. So a region has the same corners however the readings lie in files, and whichever worker looks for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+
+from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.ids import TileId
+from roadscan.core.settings.surface_regions import RegionSettings
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.compute import Compute
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.logs import DataFile
+from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store, file_digest
+from roadscan.surface.coarse import CoarseSettings, Stretch, coarse_model
+from roadscan.surface.regions import Region, find_regions
+from roadscan.surface.tasks.surface_regions import Regions
+from roadscan.tiles.footprints.footprints import FootprintRanges
+from roadscan.tiles.georeferencing.place import Placement, ProfilePoints
+from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.plan.road import looks_across, road_key
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
+from roadscan.tiles.tasks.readings import Ground, Placer, RawSlice, ReadingSource, geometry_of, read_rows
+
+REGIONS: Final = "regions"
+
+_READINGS: Final = 1_500_000
+"""Readings of a piece, about: its working arrays hold a hundred bytes each."""
+_LONGEST_S: Final = 64
+_MARGIN_NS: Final = 4 * NS_PER_S
+_EVERY_NS: Final = 2_500_000
+"""Of denser profiles one in each such span of time is looked at: at 50 km/h every 35 mm."""
+_CHUNK_ROWS: Final = 4_000
+_BUNDLE: Final = 20_000_000
+
+
+@dataclass(frozen=True)
+class RegionPiece:
+    """A span of a sensor's profiles in one run; it holds no data."""
+
+    store: Store
+    ground: Ground
+    context: ProductContext
+    settings: RegionSettings
+    source: ReadingSource
+    slices: tuple[RawSlice, ...]
+    """Row groups that may hold profiles of the span and its margins."""
+    start_gps_ns: int
+    end_gps_ns: int
+    readings: int
+    """About how many."""
+    key: str
+
+    @property
+    def unit(self) -> str:
+        """Its name in the manifest."""
+        return f"{self.source.run}/{self.source.sensor}/{self.start_gps_ns // NS_PER_S}"
+
+
+def searched_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
+    """Profiles whose coarse model is looked at, with their files; none where the survey does not ask for it.
+
+    Raises
+    ------
+    ConfigError
+        where there are no profiles across the road.
+    """
+    config = plan.survey.config.surface
+    if config is None or config.regions != "found":
+        return []
+    sources = [(s, files) for s, files in plan.sources if s.table == "scans" and _sees_the_road(s)]
+    if not sources and any(s.table == "scans" for s, _ in plan.sources):
+        known = sorted({s.sensor for s, _ in plan.sources})
+        raise ConfigError(
+            f'surface.regions = "found" needs profiles across the road; there is {", ".join(known)}',
+            expected="scans of a sensor that looks down, its x along the driving direction",
+            change='take regions = "everywhere" or "polygons"',
+        )
+    return sources
+
+
+def region_pieces(plan: SurveyPlan) -> list[RegionPiece]:
+    """All pieces of the drives that are searched; errors as of :func:`searched_sources`."""
+    config, sources = plan.survey.config.surface, searched_sources(plan)
+    if config is None or not sources:
+        return []
+    context = product_context(plan)
+    return [p for s, files in sources for p in _pieces(plan, context, config.search, s, files)]
+
+
+def _sees_the_road(source: ReadingSource) -> bool:
+    return source.road is not None or looks_across(source.mountings.mountings[0])
+
+
+def _pieces(
+    plan: SurveyPlan,
+    context: ProductContext,
+    settings: RegionSettings,
+    source: ReadingSource,
+    files: Sequence[DataFile],
+) -> Iterator[RegionPiece]:
+    geometry = geometry_of(source)
+    held = [(f, np.array(source.spans(f.group_spans), np.int64).reshape(-1, 2)) for f in files if f.group_spans]
+    if geometry is None or not held:
+        return
+    every = np.concatenate([spans for _, spans in held])
+    seconds = max(float(every.max() - every.min()) / NS_PER_S, 1.0)
+    rate = geometry.readings * min(sum(f.rows for f in files) / seconds, NS_PER_S / _EVERY_NS)
+    length = _length_ns(rate)
+    code = code_digest("roadscan.surface.tasks.found_regions:regions_of_piece")
+    common = [code, source.key, *road_key(source), settings.model_dump(mode="json"), length]
+    near: dict[int, list[tuple[DataFile, npt.NDArray[np.int64]]]] = {}
+    for file, spans in held:
+        for number in sorted({n for a, b in _numbers(spans, length) for n in range(a, b + 1)}):
+            near.setdefault(number, []).append((file, spans))
+    numbers = {n for a, b in (every // length).tolist() for n in range(a, b + 1)}
+    for number in sorted(numbers):
+        start, end = number * length, (number + 1) * length
+        slices: list[RawSlice] = []
+        inputs: list[Any] = []
+        for file, spans in near[number]:
+            groups = np.flatnonzero((spans[:, 1] >= start - _MARGIN_NS) & (spans[:, 0] < end + _MARGIN_NS))
+            if groups.size:
+                whole = (int(spans[groups].min()), int(spans[groups].max()))
+                share = file.bytes * groups.size // len(spans)
+                slices.append(RawSlice(source, file.path, tuple(groups.tolist()), (whole,), share))
+                inputs.append([file.digest, groups.tolist()])
+        span = np.array([[start - _MARGIN_NS, end + _MARGIN_NS]])
+        corrections = plan.corrections.digests(source, span, plan.ground.max_gap_s).tolist()
+        work, key = round(rate * length / NS_PER_S), key_of(common, start, inputs, corrections)
+        yield RegionPiece(
+            plan.store, plan.ground, context, settings, source, tuple(slices), start, end, work, key
+        )  # fmt: skip
+
+
+def _numbers(spans: npt.NDArray[np.int64], length: int) -> list[list[int]]:
+    """First and last number of the pieces that spans (k, 2) may touch with their margins."""
+    found: list[list[int]] = ((spans + np.array([-_MARGIN_NS, _MARGIN_NS])) // length).tolist()
+    return found
+
+
+def _length_ns(readings_a_second: float) -> int:
+    """Length of pieces: the longest power of two of seconds whose readings fit."""
+    length_s = 1
+    while length_s < _LONGEST_S and 2 * length_s * readings_a_second <= _READINGS:
+        length_s *= 2
+    return length_s * NS_PER_S
+
+
+def find_due_regions(
+    plan: SurveyPlan, manifest: Manifest, compute: Compute, report: Callable[[int, int], None] = lambda _a, _b: None
+) -> list[tuple[str, str]]:
+    """Look for regions in the pieces that are missing or stale; returns what failed."""
+    due = _due(region_pieces(plan), manifest)
+    failed = run_bundles(regions_of_piece, due, lambda p: p.readings, _BUNDLE, manifest, compute, report)
+    return [(f"{REGIONS} {piece.unit}", reason) for piece, reason in failed]
+
+
+def regions_of_piece(piece: RegionPiece) -> OutputRecord:
+    """Find the regions of a piece of drive and write them, where there are any (runs on a worker)."""
+    found = [(part, one.roughness_m) for one in _found(piece) for part in _polygons(one)]
+    shapes = np.array([part for part, _ in found], object)
+    if not shapes.size:
+        return OutputRecord(REGIONS, piece.unit, piece.key, "", 0, "")
+    middle = shapely.get_coordinates(shapely.centroid(shapes))
+    columns = {
+        "run": [piece.source.run] * len(shapes),
+        "sensor": [piece.source.sensor] * len(shapes),
+        "start_gps_ns": [piece.start_gps_ns] * len(shapes),
+        "end_gps_ns": [piece.end_gps_ns] * len(shapes),
+        "roughness_m": [rough for _, rough in found],
+        "area_m2": shapely.area(shapes).tolist(),
+        "easting_m": middle[:, 0].tolist(),
+        "northing_m": middle[:, 1].tolist(),
+    }
+    target = f"tables/{REGIONS}/{piece.unit}.parquet"
+    with piece.store.scratch() as folder:
+        path = folder / "regions.parquet"
+        table = pa.table(columns).cast(table_schema(REGIONS).arrow())
+        write_geo_table(path, table, "outline", shapes, ["Polygon"], piece.context)
+        size, digest = path.stat().st_size, file_digest(path)
+        piece.store.publish(path, target)
+    return OutputRecord(REGIONS, piece.unit, piece.key, target, size, digest)
+
+
+def _found(piece: RegionPiece) -> list[Region]:
+    """Regions of a piece, from its coarse model: those that reach into its span, so that margins are told of once."""
+    placer = Placer(piece.store, piece.ground, piece.slices)
+    placement = placer.placement(piece.source)
+    points = _profiles(piece, placement)
+    poses = placement.trajectory.poses(points.epoch_gps_ns)
+    points, rows = _at(points, poses.found), np.flatnonzero(poses.found)
+    if not points.kept.any():
+        return []
+    body, rotation = poses.position_world_m[rows], poses.world_from_body[rows]
+    lever = np.empty((rows.size, 3))
+    for own, mounting in placement.mountings.pieces(points.epoch_gps_ns):
+        lever[own] = mounting.lever_arm_body_m
+    sensor = body + np.einsum("nij,nj->ni", rotation, lever)
+    path = piece.ground.map.map_from_world(placement.trajectory.world, sensor)[:, :2]
+    classes = np.where(points.kept, 0, 1).astype(np.uint8)
+    stretch = Stretch.of_points(points.easting_m, points.northing_m, points.height_m, classes, path)
+    inside = (points.epoch_gps_ns >= piece.start_gps_ns) & (points.epoch_gps_ns < piece.end_gps_ns)
+    within = stretch.along_m[inside]
+    found = find_regions(coarse_model(stretch, CoarseSettings()), piece.settings)
+    return [r for r in found if ((within >= r.span_m[0]) & (within <= r.span_m[1])).any()]
+
+
+def _profiles(piece: RegionPiece, placement: Placement) -> ProfilePoints:
+    """Profiles of the span and its margins by their epochs, one in each :data:`_EVERY_NS`."""
+    geometry = geometry_of(piece.source)
+    if geometry is None:
+        raise ConfigError(f"{piece.source.run}/{piece.source.sensor} has no profiles", expected="scans")
+    none = np.zeros((0, geometry.readings))
+    parts = [ProfilePoints(np.zeros(0, np.int64), none, none, none, none.astype(bool))]
+    for one in piece.slices:
+        for group in one.groups:
+            for batch in read_rows(piece.store, one.source, one.file, [group]).combine_chunks().to_batches():
+                epochs = batch.column("epoch_gps_ns").to_numpy()
+                near = (epochs >= piece.start_gps_ns - _MARGIN_NS) & (epochs < piece.end_gps_ns + _MARGIN_NS)
+                rows = np.flatnonzero(near)
+                rows = rows[np.sort(np.unique(epochs[rows] // _EVERY_NS, return_index=True)[1])]
+                chunks = (batch.take(rows[k : k + _CHUNK_ROWS]) for k in range(0, rows.size, _CHUNK_ROWS))
+                parts += [placement.by_profile(chunk, geometry) for chunk in chunks]
+    joined = ProfilePoints(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ProfilePoints)))
+    order = np.argsort(joined.epoch_gps_ns, kind="stable")
+    first = np.unique(joined.epoch_gps_ns[order] // _EVERY_NS, return_index=True)[1]
+    return _at(joined, order[first])
+
+
+def _at(points: ProfilePoints, rows: npt.NDArray[Any]) -> ProfilePoints:
+    return ProfilePoints(*(getattr(points, f.name)[rows] for f in fields(points)))
+
+
+def _polygons(one: Region) -> list[Any]:
+    """An outline as sound polygons: it may cross itself where the vehicle turned on the spot."""
+    parts = shapely.get_parts(shapely.make_valid(one.polygon))
+    return [p for p in shapely.get_parts(parts) if p.geom_type == "Polygon" and p.area > 0.0]
+
+
+@dataclass(frozen=True)
+class FoundRegions:
+    """What the pieces of all drives say."""
+
+    regions: Regions
+    """Of the pieces that are current."""
+    due: tuple[RegionPiece, ...]
+    """Pieces that were not looked at yet, or failed."""
+    gone: tuple[OutputRecord, ...]
+    """Records of pieces there are no more."""
+
+    def waiting(self, footprints: FootprintRanges) -> set[TileId]:
+        """Tiles in which a piece that is due may have readings."""
+        f = footprints
+        touched = np.zeros(f.tile_row.size, bool)
+        for piece in self.due:
+            own = np.array([s.source.key == piece.source.key for s in f.slices], bool)[f.slice_index]
+            touched |= own & (f.first_epoch_gps_ns < piece.end_gps_ns) & (f.last_epoch_gps_ns >= piece.start_gps_ns)
+        return set(map(TileId, f.tile_column[touched].tolist(), f.tile_row[touched].tolist()))
+
+
+def load_found_regions(plan: SurveyPlan, manifest: Manifest) -> FoundRegions:
+    """Regions that were found, of the readings as they are."""
+    pieces = region_pieces(plan)
+    due = _due(pieces, manifest)
+    current = {p.unit for p in pieces} - {p.unit for p in due}
+    records = manifest.of(REGIONS)
+    context = product_context(plan)
+    files = [records[unit] for unit in sorted(current) if records[unit].path]
+    shapes = [np.empty(0, object), *(read_geo_table(read_recorded(plan.store, r), context)[1] for r in files)]
+    known = {p.unit for p in pieces}
+    gone = tuple(r for unit, r in records.items() if unit not in known)
+    return FoundRegions(Regions(np.concatenate(shapes)), tuple(due), gone)
+
+
+def _due(pieces: Sequence[RegionPiece], manifest: Manifest) -> list[RegionPiece]:
+    return [p for p in pieces if not manifest.is_current(REGIONS, p.unit, p.key)]

@@ -1,0 +1,115 @@
+"""Colours of points of the ground from pictures, which are read one by one and kept while there is room."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.store.codecs.image_files import ImageError, image_size
+from roadscan.surface.tasks.pictures import Pictures
+from roadscan.surface.views import HEIGHT, NO_VIEW, WIDTH, Shown, best_views, sampled
+
+UInt8 = npt.NDArray[np.uint8]
+Float64 = npt.NDArray[np.float64]
+
+_KEPT_BYTES: Final = 160 << 20
+"""Decoded pictures that stay in memory for the tiles that follow; one does whatever its size."""
+_POINTS_AT_ONCE: Final = 1 << 18
+
+
+@dataclass(frozen=True)
+class PointColours:
+    """Colours of m points."""
+
+    colour: UInt8
+    """(m, 3) red, green, blue as the pictures have them (sRGB); 0 where no picture shows a point."""
+    seen: npt.NDArray[np.bool_]
+    """(m,)."""
+    pictures: int
+    """How many pictures gave a colour."""
+    unreadable: tuple[str, ...]
+    """Pictures that would have, and cannot be read: name and reason."""
+
+
+class ColourSource:
+    """Gives points their colours. What a point gets depends on it and on the survey's pictures, on nothing else."""
+
+    def __init__(self, pictures: Pictures) -> None:
+        self._kept: OrderedDict[str, UInt8] = OrderedDict()
+        self._unreadable: dict[str, str] = {}
+
+    def colours(self, pictures: Pictures, enh_m: Float64) -> PointColours:
+        """Colours of points (m, 3: easting, northing, height), from those pictures that may show one of them."""
+        colour, seen = np.zeros((len(enh_m), 3), np.uint8), np.zeros(len(enh_m), np.bool_)
+        unreadable: dict[int, str] = {}
+        used, left = set[int](), np.arange(len(enh_m))
+        while left.size:
+            shown = _shown(pictures, enh_m[left], unreadable)
+            again = []
+            for number in np.unique(shown.view[shown.view != NO_VIEW]).tolist():
+                own = np.flatnonzero(shown.view == number)
+                picture = self.picture(pictures, number)
+                if picture is None:
+                    unreadable[number] = self._unreadable[pictures.name(number)]
+                    again.append(left[own])
+                    continue
+                colour[left[own]], seen[left[own]] = sampled(picture, shown.pixel[own]), True
+                used.add(number)
+            left = np.concatenate(again) if again else left[:0]
+        told = tuple(f"{pictures.name(n)}: {reason}" for n, reason in sorted(unreadable.items()))
+        return PointColours(colour, seen, len(used), told)
+
+    def picture(self, pictures: Pictures, number: int) -> UInt8 | None:
+        """A picture (height, width, 3), red first; None where it cannot be read."""
+        name = pictures.name(number)
+        if name in self._unreadable:
+            return None
+        picture = self._kept.pop(name, None)
+        if picture is None:
+            try:
+                picture = _read(pictures, number)
+            except (ImageError, OSError) as error:
+                self._unreadable[name] = str(error)
+                return None
+        self._kept[name] = picture
+        while len(self._kept) > 1 and sum(p.nbytes for p in self._kept.values()) > _KEPT_BYTES:
+            self._kept.popitem(last=False)
+        return picture
+
+
+def _shown(pictures: Pictures, enh_m: Float64, without: Collection[int]) -> Shown:
+    """Which picture shows points of the map best, and where."""
+    parts = []
+    for start in range(0, len(enh_m), _POINTS_AT_ONCE):
+        part = enh_m[start : start + _POINTS_AT_ONCE]
+        worlds = [world_places(pictures, world, part) for world in pictures.worlds]
+        parts.append(best_views(worlds, pictures.views, pictures.rule, without))
+    return Shown(np.concatenate([p.view for p in parts]), np.concatenate([p.pixel for p in parts]))
+
+
+def world_places(pictures: Pictures, world: str, enh_m: Float64) -> Float64:
+    """Points (m, 3) of the map in a world frame."""
+    if len(enh_m) == 1:  # NumPy multiplies one row in another order than several
+        return world_places(pictures, world, np.repeat(enh_m, 2, axis=0))[:1]
+    return np.ascontiguousarray(pictures.map.world_from_map(world, enh_m))
+
+
+def _read(pictures: Pictures, number: int) -> UInt8:
+    """Decode a picture as the chip has it, whichever way up a viewer would show it."""
+    path = pictures.path(number)
+    lens = pictures.views.lenses[pictures.views.lens[number]].parameters
+    expected = round(lens[WIDTH]), round(lens[HEIGHT])
+    size = image_size(path)  # tells files that are cut short, which a decoder fills up
+    if (size.width_px, size.height_px) != expected:
+        raise ImageError(f"{size.width_px} × {size.height_px} pixels, not {expected[0]} × {expected[1]}")
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    picture = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None or picture.shape != (expected[1], expected[0], 3):
+        raise ImageError("the image cannot be decoded")
+    return np.ascontiguousarray(picture[:, :, ::-1])

@@ -1,0 +1,333 @@
+"""Which pictures a survey's ground can take its colours from: their poses, and which of them a tile may need."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError, RunError, nearest
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.rig import Mountings, Rig, Sensor
+from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
+from roadscan.navigation.trajectory import Poses, world_from_ned
+from roadscan.surface.views import Lens, PictureRule, Views
+from roadscan.tiles.grid import Bounds
+from roadscan.tiles.plan.plan import SurveyPlan, mountings_of, trajectory_source
+from roadscan.tiles.tasks.readings import TrajectorySource, load_mountings, load_trajectory
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_PIECE_NS: Final = 600 * NS_PER_S
+"""Poses of so long a time are loaded at once."""
+_CURVED: Final = 1.01
+"""The map's scale changes by far less within a picture's reach."""
+_WITHOUT: Final = 'set colours = "intensity" in the settings of the product'
+
+
+@dataclass(frozen=True)
+class PictureLog:
+    """A log of pictures."""
+
+    key: str
+    run: str
+    sensor: str
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """n pictures with what places them, in order of time. Sent to workers: it holds no picture."""
+
+    rule: PictureRule
+    map: MapFrame
+    worlds: tuple[str, ...]
+    """World frames that the views count."""
+    views: Views
+    place_m: Float64
+    """(n, 2) easting and northing of the cameras."""
+    reach_m: Float64
+    """(n,) how far the rule's reach is on the map."""
+    logs: tuple[PictureLog, ...]
+    log: Int64
+    """(n,) number of each picture's log."""
+    epochs_gps_ns: Int64
+    """(n,) when they were taken."""
+    files: tuple[str, ...]
+    """(n,) relative to the log's folder."""
+    lens_key: str
+    """Hash of the lenses and of what they hide."""
+    notes: tuple[str, ...] = ()
+    """What of the survey's pictures is left out, and why."""
+
+    def __len__(self) -> int:
+        """Pictures."""
+        return len(self.files)
+
+    def path(self, number: int) -> Path:
+        """File of a picture."""
+        return Path(self.logs[self.log[number]].folder, self.files[number])
+
+    def name(self, number: int) -> str:
+        """What a picture is called in messages."""
+        log = self.logs[self.log[number]]
+        return f"{log.run}/{log.sensor}/{self.files[number]}"
+
+    def near(self, *boxes: Bounds) -> Pictures:
+        """Those that may show a point in one of some boxes of the map, in the same order."""
+        if not len(self) or not boxes:
+            return self._picked(np.zeros(0, np.int64))
+        own = np.array([[b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m] for b in boxes])
+        widest = float(self.reach_m.max())
+        wide = shapely.box(*(own + widest * np.array([-1.0, -1.0, 1.0, 1.0])).T)
+        box, picture = self._places.query(wide)
+        beyond = np.maximum(own[box, :2] - self.place_m[picture], self.place_m[picture] - own[box, 2:])
+        far = np.hypot(*np.maximum(beyond, 0.0).T)
+        return self._picked(np.unique(picture[far <= self.reach_m[picture]]))
+
+    def key(self) -> str:
+        """Hash of all that the colours that come from these pictures depend on, beside the rule."""
+        digest = hashlib.blake2b(self.lens_key.encode(), digest_size=8)
+        views = self.views
+        for values in (views.eye_world_m, views.opencv_from_world, views.up_world, views.lens):
+            digest.update(np.ascontiguousarray(values).tobytes())
+        for number, file in enumerate(self.files):
+            digest.update(f"{self.worlds[views.world[number]]}\0{self.logs[self.log[number]].key}\0{file}\n".encode())
+        return digest.hexdigest()
+
+    @functools.cached_property
+    def _places(self) -> Any:
+        return shapely.STRtree(shapely.points(self.place_m))
+
+    def _picked(self, index: Int64) -> Pictures:
+        return replace(
+            self, views=self.views.picked(index), place_m=self.place_m[index], reach_m=self.reach_m[index],
+            log=self.log[index], epochs_gps_ns=self.epochs_gps_ns[index],
+            files=tuple(self.files[i] for i in index.tolist()), notes=(),
+        )  # fmt: skip
+
+
+def check_pictures(plan: SurveyPlan, rule: PictureRule) -> None:
+    """Raise where the survey has no pictures that the rule could take colours from; reads no pose and no picture."""
+    for camera, taken in _camera_logs(plan, rule):
+        _fits(camera, taken)
+
+
+def check_folders(plan: SurveyPlan, rule: PictureRule) -> None:
+    """Raise where the files of pictures are not there: the tables say when they were taken, and do not hold them."""
+    for _, taken in _camera_logs(plan, rule):
+        folder = plan.survey.resolve(Path(taken.record.path))
+        if not folder.exists():
+            raise ConfigError(
+                f"the pictures of {taken.record.run}/{taken.record.sensor} are not where the survey file says",
+                expected="the log as it was ingested",
+                change=f"bring it back, or {_WITHOUT}",
+                file=folder,
+            )
+
+
+def plan_pictures(plan: SurveyPlan, rule: PictureRule) -> Pictures:
+    """Place the survey's pictures.
+
+    Raises
+    ------
+    ConfigError
+        where no camera of the rig fits the rule, or one has no interior orientation that fits its pictures.
+    RunError
+        where no picture is in the store, or none has a pose.
+    """
+    placed: list[_Placed] = []
+    notes: list[str] = []
+    for camera, taken in _camera_logs(plan, rule):
+        placed.append(_placed(plan, camera, taken, rule))
+        notes += placed[-1].notes
+    if not any(one.files for one in placed):
+        raise RunError(
+            "none of the pictures has a pose: " + "; ".join(notes),
+            expected="pictures taken while the trajectory runs",
+            change="check the clock of the camera's log",
+        )
+    cameras = sorted({(one.log.sensor, one.camera) for one in placed}, key=lambda c: c[0])
+    lenses = {name: number for number, (name, _) in enumerate(cameras)}
+    worlds = tuple(sorted({one.world for one in placed}))
+    epoch = np.concatenate([one.epochs_gps_ns for one in placed])
+    log = np.repeat(np.arange(len(placed)), [one.epochs_gps_ns.size for one in placed])
+    files = [name for one in placed for name in one.files]
+    order = np.array(sorted(range(epoch.size), key=lambda i: (epoch[i], *placed[log[i]].names, files[i])), np.int64)
+    counted = [(worlds.index(one.world), lenses[one.log.sensor]) for one in placed]
+    views = Views(
+        np.concatenate([one.eye_world_m for one in placed]), np.concatenate([one.opencv_from_world for one in placed]),
+        np.concatenate([one.up_world for one in placed]), np.array([w for w, _ in counted])[log],
+        np.array([k for _, k in counted])[log], tuple(_lens(camera) for _, camera in cameras),
+    )  # fmt: skip
+    return Pictures(
+        rule, plan.ground.map, worlds, views.picked(order),
+        np.concatenate([one.place_m for one in placed])[order], np.concatenate([one.reach_m for one in placed])[order],
+        tuple(one.log for one in placed), log[order], epoch[order], tuple(files[i] for i in order.tolist()),
+        _lens_key(cameras), tuple(notes),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """Pictures of a log that have a pose."""
+
+    log: PictureLog
+    camera: Sensor
+    world: str
+    epochs_gps_ns: Int64
+    files: tuple[str, ...]
+    eye_world_m: Float64
+    opencv_from_world: Float64
+    up_world: Float64
+    place_m: Float64
+    reach_m: Float64
+    notes: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """What decides among pictures of one epoch."""
+        return self.log.run, self.log.sensor
+
+
+def _camera_logs(plan: SurveyPlan, rule: PictureRule) -> list[tuple[Sensor, TakenPictures]]:
+    """Logs of pictures with their cameras."""
+    cameras = rule_cameras(plan.survey.rig, rule)
+    found = [(c, taken) for name, c in cameras for taken in taken_pictures(plan.store, plan.records, name)]
+    usable = [(c, taken) for c, taken in found if taken.files and not _is_video(taken)]
+    if not usable:
+        names = ", ".join(name for name, _ in cameras)
+        raise RunError(
+            f"the pictures of the cameras ({names}) are frames of videos, which are not taken out one by one"
+            if any(taken.files for _, taken in found)
+            else f"the cameras ({names}) have no pictures in the store",
+            expected="a log of pictures (images): a folder of files with their stamps",
+            change=f"list it in the survey file, or {_WITHOUT}",
+        )
+    return usable
+
+
+def _is_video(taken: TakenPictures) -> bool:
+    return taken.record.attributes.get("kind") == "video"
+
+
+def rule_cameras(rig: Rig, rule: PictureRule) -> list[tuple[str, Sensor]]:
+    """Cameras of a rig that a rule takes; each has an interior orientation. ConfigError where there are none."""
+    known = {name: sensor for name, sensor in rig.sensors.items() if sensor.kind == "camera"}
+    for name in rule.cameras:
+        if name not in known:
+            raise ConfigError(
+                f"the rig has no camera '{name}'{nearest(name, known)}", expected=", ".join(known) or "one with cameras"
+            )
+    asked = {name: known[name] for name in rule.cameras or known}
+    if not asked:
+        raise ConfigError(
+            "colours of cameras are asked for, and the rig has no camera",
+            change=f"add it to the rig file, or {_WITHOUT}",
+        )
+    oriented = [(name, sensor) for name, sensor in asked.items() if sensor.interior is not None]
+    if not oriented or (rule.cameras and len(oriented) < len(asked)):
+        blind = next(name for name, sensor in asked.items() if sensor.interior is None)
+        raise ConfigError(
+            f"the camera '{blind}' has no interior orientation in the rig file",
+            expected=f"[sensors.{blind}.interior]",
+            change="find it from chessboard pictures: `roadscan camera interior`",
+        )
+    return oriented
+
+
+def _lens(camera: Sensor) -> Lens:
+    if camera.interior is None:
+        raise ConfigError("a camera has no interior orientation")
+    return Lens.of(camera.interior, camera.own_vehicle_px)
+
+
+def _lens_key(cameras: Sequence[tuple[str, Sensor]]) -> str:
+    stated = [(c.interior.model_dump(mode="json") if c.interior else None, c.own_vehicle_px) for _, c in cameras]
+    return hashlib.blake2b(repr(stated).encode(), digest_size=8).hexdigest()
+
+
+def _placed(plan: SurveyPlan, camera: Sensor, taken: TakenPictures, rule: PictureRule) -> _Placed:
+    """Poses of a log's pictures; those without one, or of another size than the lens is for, are left out."""
+    record = taken.record
+    log = PictureLog(record.key, record.run, record.sensor, plan.survey.resolve(Path(record.path)))
+    source = trajectory_source(record.run, plan.records)
+    mountings = mountings_of(record.run, record.sensor, camera.mounting(), load_mountings(plan.store))
+    order = np.argsort(taken.epochs_gps_ns, kind="stable")
+    fits = order[_fits(camera, taken)[order]]
+    poses = list(_poses(plan, source, taken.epochs_gps_ns[fits]))
+    found = np.concatenate([p.found for p in poses]) if poses else np.zeros(0, np.bool_)
+    eye, turn = (np.concatenate(a) for a in zip(*(_eyes(p, mountings) for p in poses), strict=True))
+    eye, turn, kept = eye[found], turn[found], fits[found]
+    place, reach = _reach(plan.ground.map, source.world, eye, rule.reach_m)
+    names = tuple(taken.files[i] for i in kept.tolist())
+    up = -world_from_ned(source.world, eye)[:, :, 2]
+    notes = _notes(log, camera, order.size - fits.size, fits.size - kept.size)
+    return _Placed(log, camera, source.world, taken.epochs_gps_ns[kept], names, eye, turn, up, place, reach, notes)
+
+
+def _fits(camera: Sensor, taken: TakenPictures) -> npt.NDArray[np.bool_]:
+    """(n,) pictures of the size that the interior orientation holds for; raises where there are none."""
+    if camera.interior is None:
+        raise ConfigError("a camera has no interior orientation")
+    size = camera.interior.width_px, camera.interior.height_px
+    fits: npt.NDArray[np.bool_] = ((taken.size_px == 0) | (taken.size_px == size)).all(axis=1)
+    if fits.size and not fits.any():
+        width, height = taken.size_px[0].tolist()
+        raise ConfigError(
+            f"the pictures of '{taken.record.sensor}' have {width} × {height} pixels, and its interior orientation "
+            f"holds for {size[0]} × {size[1]}",
+            expected="pictures as the camera was calibrated with: not scaled, not turned",
+            file=taken.record.path,
+        )
+    return fits
+
+
+def _poses(plan: SurveyPlan, source: TrajectorySource, epochs_gps_ns: Int64) -> Iterator[Poses]:
+    """Poses of the body, piece by piece, at epochs (n,) in order."""
+    pieces = epochs_gps_ns // _PIECE_NS
+    for part in np.split(epochs_gps_ns, np.flatnonzero(np.diff(pieces)) + 1):
+        span = (int(part[0]), int(part[-1]))
+        yield load_trajectory(plan.store, source, [span], plan.ground.max_gap_s).poses(part)
+
+
+def _eyes(poses: Poses, mountings: Mountings) -> tuple[Float64, Float64]:
+    """Projection centres (n, 3) in the world frame, and turns (n, 3, 3) from it to the camera's axes."""
+    eye, turn = np.empty_like(poses.position_world_m), np.empty_like(poses.world_from_body)
+    for part, mounting in mountings.pieces(poses.epochs_gps_ns):
+        rotation, lever = mounting.arrays()
+        body = poses.world_from_body[part]
+        eye[part] = poses.position_world_m[part] + (
+            body[:, :, 0] * lever[0] + body[:, :, 1] * lever[1] + body[:, :, 2] * lever[2]
+        )
+        turn[part] = (rotation @ SENSOR_FROM_OPENCV).T @ body.transpose(0, 2, 1)
+    return eye, turn
+
+
+def _reach(frame: MapFrame, world: str, eye_m: Float64, reach_m: float) -> tuple[Float64, Float64]:
+    """Easting and northing (n, 2) of cameras, and how far (n,) a distance around them is on the map."""
+    axes = world_from_ned(world, eye_m)
+    places = [frame.map_from_world(world, eye_m + reach_m * axes[:, :, k])[:, :2] for k in (0, 1)]
+    middle = frame.map_from_world(world, eye_m)[:, :2]
+    return middle, _CURVED * np.maximum(*(np.hypot(*(p - middle).T) for p in places))
+
+
+def _notes(log: PictureLog, camera: Sensor, misfits: int, unplaced: int) -> tuple[str, ...]:
+    name = f"{log.run}/{log.sensor}"
+    notes = []
+    if misfits:
+        size = "" if camera.interior is None else f"{camera.interior.width_px} × {camera.interior.height_px}"
+        notes.append(f"{name}: {misfits:,} pictures are not of the {size} pixels that its interior orientation is for")
+    if unplaced:
+        notes.append(f"{name}: {unplaced:,} pictures were taken where the trajectory has no pose")
+    return tuple(notes)

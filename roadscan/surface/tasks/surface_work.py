@@ -1,0 +1,74 @@
+"""What the stage `surfaces` has to do: the surfaces there are against those there should be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from roadscan.core.ids import TileId
+from roadscan.run.session import Session
+from roadscan.store.manifest import OutputRecord
+from roadscan.surface.tasks.found_regions import REGIONS, FoundRegions, load_found_regions
+from roadscan.surface.tasks.surface_colours import plan_colours
+from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, plan_surfaces
+from roadscan.tiles.mosaics.products import product_context, wanted_surface_products
+from roadscan.tiles.tasks.tile_files import surface_file_names
+from roadscan.tiles.tasks.tile_plan import TilePlan
+
+
+@dataclass(frozen=True)
+class SurfaceWork:
+    """What the stage `surfaces` has to do."""
+
+    planned: SurfacePlan | None
+    """None where no surface is asked for."""
+    chosen: Sequence[TileId]
+    """Tiles whose surface is made now."""
+    gone: Sequence[OutputRecord]
+    """Files of surfaces that are no longer due, and of products no longer wanted."""
+    note: str = ""
+
+
+def plan_surface_work(session: Session) -> SurfaceWork:
+    """Compare the surfaces there are with those there should be, once the tiles are done.
+
+    With a selection of tiles, these, and of those that depend on them the stale ones.
+    """
+    survey, manifest, selection = session.survey, session.manifest, session.selection
+    names = {SURFACE, REGIONS, *surface_file_names()}
+    if survey.config.surface is None:
+        return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()])
+    plan, footprints = session.plan, session.footprints
+    context = product_context(plan)
+    wanted = tuple(wanted_surface_products(survey, context))
+    if not wanted:
+        note = "the survey file has a section [surface], and no product of the surface is asked for"
+        return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()], note)
+    tiles = TilePlan(plan, footprints, session.tiles, (), context)
+    found = load_found_regions(plan, manifest)
+    pictures = plan_colours(plan, wanted)
+    planned = plan_surfaces(tiles, survey.config.surface, wanted, manifest, found, pictures)
+    units = {str(tile) for tile in (*planned.keys, *planned.waiting)}
+    names_wanted = {SURFACE, *surface_file_names({w.product.name for w in wanted})}
+    gone = [
+        r
+        for name in names - {REGIONS}
+        for u, r in manifest.of(name).items()
+        if u not in units or name not in names_wanted
+    ]
+    gone += found.gone
+    stale = planned.stale(manifest)
+    note = _waiting_note(len(planned.waiting), found)
+    if selection is None:
+        return SurfaceWork(planned, stale, gone, note)
+    own = set(selection.tiles(tiles.tiles, footprints, plan.ground.grid))
+    due = own | (planned.near(own) & set(stale))
+    return SurfaceWork(planned, [tile for tile in planned.keys if tile in due], gone, note)
+
+
+def _waiting_note(waiting: int, found: FoundRegions) -> str:
+    if not waiting:
+        return ""
+    if found.due:
+        return f"surfaces of {waiting:,} tiles wait for regions of interest: run `roadscan surfaces`"
+    return f"surfaces of {waiting:,} tiles wait for cells that are missing or out of date: run `roadscan tiles`"

@@ -1,0 +1,130 @@
+"""Surfaces: cells or points of a tile and its surroundings → its surface → files. One task a block of tiles."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import OrderedDict
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.ids import TileId
+from roadscan.run.engine.compute import damaged_file, reason_of
+from roadscan.store.manifest import OutputRecord
+from roadscan.surface.reconstruction import Patch, SurfaceGrid, patch_of_cells, patch_of_points, surface_of
+from roadscan.surface.tasks.surface_colours import Painter
+from roadscan.surface.tasks.surface_plan import SURFACE, SurfaceTask
+from roadscan.surface.tile import FILLED, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.georeferencing.cloud import TilePoints
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.tasks.tile_files import publish_product
+from roadscan.tiles.tasks.tile_plan import TileTask
+from roadscan.tiles.tasks.tile_points import load_points
+from roadscan.tiles.tasks.tiles import TaskResult
+
+_CELLS_KEPT = 24_000_000
+"""Cells that stay in memory for the tiles that follow: six tiles full of 5 mm, 700 MB."""
+
+
+def compute_surfaces(task: SurfaceTask) -> TaskResult:
+    """Make the surfaces of a task's tiles and write their files (runs on a worker)."""
+    source = source_of(task)
+    painter = Painter(task.pictures)
+    records: list[OutputRecord] = []
+    failures: list[tuple[str, str]] = []
+    damaged: set[str] = set()
+    for tile, key, date in zip(task.block.tiles, task.keys, task.dates, strict=True):
+        context = dataclasses.replace(task.context, date=date)
+        try:
+            wanted = None if task.regions is None else task.regions.holds(task.grid.window(tile))
+            surface = surface_of(tile, source.patch(tile, wanted), task.grid, wanted)
+            records += _write(task, key, surface, context, painter)
+        except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
+            failures.append((str(tile), reason_of(error)))
+            damaged.add(damaged_file(error))
+    return TaskResult.of(records, failures, damaged)
+
+
+class Source(Protocol):
+    """What the surface is made of."""
+
+    def patch(self, tile: TileId, wanted: npt.NDArray[np.bool_] | None) -> Patch:
+        """Heights of a tile and its surroundings before smoothing; `wanted` are the cells that will be kept."""
+
+
+def source_of(task: SurfaceTask) -> Source:
+    """Cells or points of a task, as it says."""
+    return _Cells(task) if task.readings is None else _Points(task.grid, task.readings)
+
+
+class _Cells:
+    """Cells of finished tiles, read once and kept while there is room."""
+
+    def __init__(self, task: SurfaceTask) -> None:
+        self._task = task
+        self._records = {TileId.parse(r.unit): r for r in task.cells}
+        self._kept: OrderedDict[TileId, TileCells] = OrderedDict()
+
+    def patch(self, tile: TileId, wanted: npt.NDArray[np.bool_] | None) -> Patch:
+        """What the cells say of a tile and its surroundings."""
+        grid = self._task.grid
+        near = [t for t in grid.tiles.tiles_in(grid.reach(tile)) if t in self._records]
+        return patch_of_cells(grid.window(tile), map(self._read, near))
+
+    def _read(self, tile: TileId) -> TileCells:
+        cells = self._kept.pop(tile, None)
+        if cells is None:
+            cells = read_cells(self._task.store, self._records[tile], self._task.grid.tiles.cells_per_edge)
+        self._kept[tile] = cells
+        while len(self._kept) > 1 and sum(map(len, self._kept.values())) > _CELLS_KEPT:
+            self._kept.popitem(last=False)
+        return cells
+
+
+class _Points:
+    """Points of a block and its surroundings, placed at once."""
+
+    def __init__(self, grid: SurfaceGrid, readings: TileTask) -> None:
+        self._grid = grid
+        self._points: dict[TileId, TilePoints] = dict(load_points(readings))
+
+    def patch(self, tile: TileId, wanted: npt.NDArray[np.bool_] | None) -> Patch:
+        """The detailed model of a tile and its surroundings."""
+        near = self._grid.tiles.tiles_in(self._grid.reach(tile))
+        own = [self._points[t] for t in near if t in self._points]
+        return patch_of_points(self._grid.window(tile), own, self._grid, wanted)
+
+
+def _write(
+    task: SurfaceTask, key: str, surface: SurfaceTile, context: ProductContext, painter: Painter
+) -> list[OutputRecord]:
+    """Files of a surface; its own record comes last, so that a tile is current only with all its files."""
+    unit, figures = str(surface.tile), _figures(surface)
+    records: list[OutputRecord] = []
+    with task.store.scratch() as folder:
+        for wanted in task.products if figures["cells"] else ():
+            painted, told = painter.paint(wanted, surface)
+            figures |= told
+            write = partial(wanted.product.write, painted, wanted.options, context)
+            records += publish_product(wanted, unit, write, key, task.store, folder)
+    return [*records, OutputRecord(SURFACE, unit, key, "", 0, "", json.dumps(figures))]
+
+
+def _figures(surface: SurfaceTile) -> dict[str, Any]:
+    origin = surface.origin[surface.inner]
+    change = (surface.height_m - surface.raw_m)[surface.inner]
+    known = change[~np.isnan(change)]
+    lowest = 0 if surface.lowest is None else np.count_nonzero(~np.isnan(surface.lowest.drop_m[surface.inner]))
+    return {
+        "cells": int(np.count_nonzero(origin)),
+        "measured": int(np.count_nonzero(origin == MEASURED)),
+        "interpolated": int(np.count_nonzero(origin == INTERPOLATED)),
+        "filled": int(np.count_nonzero(origin == FILLED)),
+        "lowest_known": int(lowest),
+        "change_rms_m": float(np.sqrt(np.mean(known * known))) if known.size else None,
+    }

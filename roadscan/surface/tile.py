@@ -1,0 +1,85 @@
+"""The reconstructed surface of one tile, as products get it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.ids import TileId
+from roadscan.surface.coarse import FILLED, INTERPOLATED, MEASURED, NOTHING
+from roadscan.surface.lowest import LowestReadings
+from roadscan.surface.window import GridWindow
+
+EMPTY: Final = NOTHING
+"""Origin of a cell without a height; the others are 1 measured, 2 interpolated, 3 filled."""
+
+__all__ = ["EMPTY", "FILLED", "INTERPOLATED", "MEASURED", "NodeColours", "SurfaceTile"]
+
+
+@dataclass(frozen=True)
+class NodeColours:
+    """Colours of some of a surface's cells, as the survey's pictures show them at their centres."""
+
+    colour: npt.NDArray[np.uint8]
+    """(rows, columns, 3) red, green, blue (sRGB) of the rows and columns that were asked for."""
+    seen: npt.NDArray[np.bool_]
+    """(rows, columns) False where no picture shows a cell, or it has no height: no colour."""
+
+
+@dataclass(frozen=True)
+class SurfaceTile:
+    """Heights of a tile's cells and of those around it, before and after smoothing.
+
+    All arrays are (rows, columns): row 0 is the southernmost, column 0 the westernmost. They hold the cells of
+    `window`: those of the tile and `halo` more on each side. A cell that several tiles see has the same bits in all
+    of them.
+    """
+
+    tile: TileId
+    window: GridWindow
+    """Cells of the arrays on the map; a cell of row r and column c covers eastings from (first_column + c) ·
+    cell_east_m and northings from (first_row + r) · cell_north_m."""
+    halo: int
+    """Cells of neighbours on each of the four sides; they reach 1 m or farther."""
+    raw_m: npt.NDArray[np.float64]
+    """Heights before smoothing (m, map frame), NaN where there is none: in filled cells as well."""
+    height_m: npt.NDArray[np.float64]
+    """Heights after smoothing (m, map frame), NaN where there is none; `raw_m` where smoothing is off."""
+    origin: npt.NDArray[np.uint8]
+    """0 empty, 1 measured, 2 interpolated, 3 filled; not empty where `height_m` is a number."""
+    intensity: npt.NDArray[np.float32]
+    """Mean intensity of the readings of a cell, of filled cells that of their rims; NaN where there is none."""
+    sigma_m: float
+    """1 σ of the noise of one cell's height before smoothing (m)."""
+    colours: NodeColours | None = None
+    """Colours of the cells that a product asked for; None for one that did not."""
+    around_m: npt.NDArray[np.float64] | None = None
+    """Heights before smoothing of more cells around the tile, as many as products ask for; None: those of `raw_m`."""
+    lowest: LowestReadings | None = None
+    """Of the same cells, filled ones and others without a height included; None where they are not known, as where the
+    surface is made of points or the files of cells lack them."""
+
+    @property
+    def around(self) -> tuple[npt.NDArray[np.float64], int]:
+        """Heights before smoothing (m), and how many of the neighbours' cells they hold on each side."""
+        wide = self.raw_m if self.around_m is None else self.around_m
+        return wide, self.halo + (wide.shape[0] - self.raw_m.shape[0]) // 2
+
+    @property
+    def cell_m(self) -> tuple[float, float]:
+        """Edges of a cell (m): east, north."""
+        return self.window.cell_east_m, self.window.cell_north_m
+
+    @property
+    def corner_m(self) -> tuple[float, float]:
+        """Easting and northing (m) of the arrays' south-western corner, halo included."""
+        return self.window.first_column * self.window.cell_east_m, self.window.first_row * self.window.cell_north_m
+
+    @property
+    def inner(self) -> tuple[slice, slice]:
+        """Rows and columns of the tile itself: the cells whose centre lies in it."""
+        rows, columns = self.height_m.shape
+        return slice(self.halo, rows - self.halo), slice(self.halo, columns - self.halo)

@@ -1,0 +1,114 @@
+"""Delaunay triangulation of a region that agrees, triangle by triangle, with that of its neighbours.
+
+Qhull triangulates. Its answer depends on tolerances of the whole region and, where four points lie on a circle (every
+mesh of gridded points), on chance. So its edges are then asked again in exact arithmetic and flipped where they are
+not Delaunay's; of four points on a circle, the diagonal of the first point (by northing, then easting) is taken. What
+comes out is the one Delaunay triangulation of the points, with ties broken as if the points had been moved by
+infinitely little, in the order of their absolute place (Lawson 1977; Edelsbrunner & Mücke 1990).
+
+Cut: a triangle is kept if the circle through its corners is at most ``max_gap_m`` wide. That circle holds no point, so
+this is "no surface over a hole in which a disc of that width has room"; the long thin triangles of a hull go with it.
+As a triangle depends only on the points in its circle, regions agree on all kept triangles that lie more than
+``max_gap_m`` inside both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import Delaunay, QhullError
+
+from roadscan.surface.kernels.delaunay import flip_edges
+from roadscan.surface.sites import Sites
+
+NUDGE_M: Final = 2.0**-24
+"""Qhull sees positions moved by up to this (60 nm), after a hash of the place: it is twice as fast without ties."""
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """Triangles over sites, in order of their corners."""
+
+    triangles: npt.NDArray[np.int64]
+    """(n, 3) sites, counter-clockwise from the first in the sites' order."""
+    opposite: npt.NDArray[np.int64]
+    """(n, 3): 3 · triangle + corner opposite the same edge beyond the edge opposite this corner, -1 on the rim."""
+
+    def __len__(self) -> int:
+        return int(self.triangles.shape[0])
+
+    def neighbours(self, sites: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Sites joined to each site by an edge: those of i from ``starts[i]`` to ``starts[i + 1]``, ascending.
+
+        Returns
+        -------
+        starts : (sites + 1,); neighbours : (``starts[-1]``,).
+        """
+        start, end = np.roll(self.triangles, -1, axis=1), np.roll(self.triangles, 1, axis=1)
+        rim = self.opposite < 0  # the other way of an edge comes from the other triangle, if there is one
+        ways = np.sort(np.concatenate([(start * sites + end).ravel(), end[rim] * sites + start[rim]]))
+        starts = np.searchsorted(ways, np.arange(sites + 1) * sites)
+        return starts, ways % max(sites, 1)
+
+
+def triangulate(sites: Sites, max_gap_m: float) -> Triangulation:
+    """Triangulate sites, and leave holes wider than `max_gap_m` (m) open.
+
+    Fewer than three sites, or sites on a line, give no triangle.
+    """
+    raw = _qhull(sites)
+    if raw is None:
+        return Triangulation(np.empty((0, 3), np.int64), np.empty((0, 3), np.int64))
+    triangles, across = raw
+    flip_edges(sites.x_steps, sites.y_steps, triangles, across)
+    first = np.argmin(triangles, axis=1)[:, None]
+    triangles, across = (np.take_along_axis(v, (first + np.arange(3)) % 3, axis=1) for v in (triangles, across))
+    kept = np.flatnonzero(_circle_at_most(max_gap_m, sites, triangles))
+    order = kept[np.argsort(triangles[kept, 0] * len(sites) + triangles[kept, 1])]  # an edge has one triangle
+    renumbered = np.full(len(triangles) + 1, -1)  # one more: no neighbour stays none
+    renumbered[order] = np.arange(order.size)
+    return _paired(triangles[order], renumbered[across[order]])
+
+
+def _circle_at_most(widest_m: float, sites: Sites, triangles: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """(n,) whether the circle through the corners is at most so wide; a triangle without area has none."""
+    x, y = (v[triangles.T] for v in sites.local_m())
+    dx, dy = (np.roll(v, -1, axis=0) - v for v in (x, y))
+    twice_area = dx[0] * dy[1] - dy[0] * dx[1]
+    sides = np.prod(dx * dx + dy * dy, axis=0)
+    small: npt.NDArray[np.bool_] = (twice_area > 0.0) & (sides <= (widest_m * twice_area) ** 2)
+    return small
+
+
+def _paired(triangles: npt.NDArray[np.int64], across: npt.NDArray[np.int64]) -> Triangulation:
+    """Find, in the triangle across each edge, the corner opposite it: the one before the edge's end over there."""
+    end = np.roll(triangles, 1, axis=1)
+    same = triangles[across] == end[:, :, None]
+    opposite = 3 * across + (np.argmax(same, axis=2) + 2) % 3
+    return Triangulation(triangles, np.where(across < 0, -1, opposite))
+
+
+def _qhull(sites: Sites) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+    """Triangles and neighbours as Qhull finds them; None where it finds no area."""
+    if len(sites) < 3:
+        return None
+    places = np.stack(sites.local_m(), axis=1) + _nudges(sites)
+    places -= places.mean(axis=0)
+    try:
+        found = Delaunay(places)
+    except QhullError:  # all on a line
+        return None
+    return found.simplices.astype(np.int64), found.neighbors.astype(np.int64)
+
+
+def _nudges(sites: Sites) -> npt.NDArray[np.float64]:
+    """(m, 2) moves (m) within ± NUDGE_M that depend on the place alone."""
+    with np.errstate(over="ignore"):
+        word = sites.x_steps.view(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        word = (word ^ (word >> np.uint64(29)) ^ sites.y_steps.view(np.uint64)) * np.uint64(0xBF58476D1CE4E5B9)
+        word = (word ^ (word >> np.uint64(32))) * np.uint64(0x94D049BB133111EB)
+    parts = np.stack([word >> np.uint64(32), word & np.uint64(0xFFFFFFFF)], axis=1).astype(np.float64)
+    return (parts * 2.0**-31 - 1.0) * NUDGE_M

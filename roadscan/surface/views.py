@@ -1,0 +1,230 @@
+"""Pictures as they look at points: which of them shows a point best, and where in it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final, Self
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.camera import Interior
+from roadscan.surface.kernels.picture_colours import AROUND, HEIGHT, WIDTH, sample, take_better
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+UInt8 = npt.NDArray[np.uint8]
+
+__all__ = ["AROUND", "HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Sights", "Views",
+           "best_views", "sampled", "sights"]  # fmt: skip
+
+NO_VIEW: Final = -1
+_LEAST_TURNED: Final = float(np.sin(np.radians(10.0)))
+"""Least cosine between the ray and the direction that a front looks to."""
+
+
+@dataclass(frozen=True)
+class PictureRule:
+    """Which pictures may give a point its colour."""
+
+    cameras: tuple[str, ...]
+    """Names in the rig; all of them where empty."""
+    reach_m: float
+    """Farthest distance from camera to point."""
+    least_angle_deg: float
+    """Least angle between the ray and the horizon at the camera, downwards."""
+    border_px: int
+    """Pixels along the picture's border that give none; at least 1."""
+
+    def limits(self) -> Float64:
+        """As the kernel takes them."""
+        return np.array([self.reach_m**2, np.sin(np.radians(self.least_angle_deg)), float(self.border_px)])
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Interior orientation of a camera, and what its pictures show of its own vehicle."""
+
+    parameters: Float64
+    """(13,) as the kernel takes them."""
+    own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
+    """Polygons of pixels (u, v) that show the own vehicle."""
+
+    @classmethod
+    def of(cls, interior: Interior, own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()) -> Self:
+        """From the rig's values."""
+        k1, k2, p1, p2, k3 = interior.distortion
+        size = float(interior.width_px), float(interior.height_px)
+        around = float(interior.model == "equirectangular")
+        lens = [*interior.focal_px, *interior.principal_px, k1, k2, p1, p2, k3, _fold(k1, k2, k3), *size, around]
+        return cls(np.array(lens), own_vehicle_px)
+
+    @property
+    def is_around(self) -> bool:
+        """True for pictures of 360°."""
+        return bool(self.parameters[AROUND])
+
+    @functools.cached_property
+    def hidden(self) -> Bool:
+        """(height, width) pixels that show the own vehicle; (0, 0) where none does. Drawn where it is needed."""
+        if not self.own_vehicle_px:
+            return np.zeros((0, 0), np.bool_)
+        drawn = np.zeros((round(self.parameters[HEIGHT]), round(self.parameters[WIDTH])), np.uint8)
+        for polygon in self.own_vehicle_px:
+            cv2.fillPoly(drawn, [np.rint(polygon).astype(np.int32)], 1)
+        return drawn.astype(np.bool_)
+
+
+def _fold(k1: float, k2: float, k3: float) -> float:
+    """Square of the tangent at which the distorted radius stops to grow: beyond it the model shows things twice."""
+    roots = np.polynomial.Polynomial([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3]).trim().roots()
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    return float(min(real[real > 0.0], default=np.inf))
+
+
+@dataclass(frozen=True)
+class Views:
+    """Where n pictures were taken from and how, in the order in which equals are preferred."""
+
+    eye_world_m: Float64
+    """(n, 3) projection centres."""
+    opencv_from_world: Float64
+    """(n, 3, 3) camera axes (x right, y down, z ahead) from world."""
+    up_world: Float64
+    """(n, 3) upwards at the camera."""
+    world: Int64
+    """(n,) number of the world frame that these are in."""
+    lens: Int64
+    """(n,) number of the lens."""
+    lenses: tuple[Lens, ...]
+
+    def __len__(self) -> int:
+        """Pictures."""
+        return len(self.lens)
+
+    def picked(self, index: Int64) -> Views:
+        """Some of them."""
+        return Views(
+            self.eye_world_m[index], self.opencv_from_world[index], self.up_world[index], self.world[index],
+            self.lens[index], self.lenses,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Which picture gives each of m points its colour, and where."""
+
+    view: npt.NDArray[np.int32]
+    """(m,) number of the picture; NO_VIEW where none shows the point."""
+    pixel: Float64
+    """(m, 2) u, v from the centre of the upper left pixel."""
+
+
+def best_views(
+    point_world_m: Sequence[Float64], views: Views, rule: PictureRule, without: Collection[int] = ()
+) -> Shown:
+    """The picture with the finest resolution (distance over focal length) of those that may show a point.
+
+    Parameters
+    ----------
+    point_world_m : (m, 3) the points in each of the world frames that the views count.
+    without : numbers of pictures that cannot be read.
+    """
+    count, limits = len(point_world_m[0]) if point_world_m else 0, rule.limits()
+    best, chosen = np.full(count, np.inf), np.full(count, NO_VIEW, np.int32)
+    pixel = np.full((count, 2), np.nan)
+    for number in range(len(views)):
+        if number in without:
+            continue
+        lens = views.lenses[views.lens[number]]
+        take_better(
+            point_world_m[views.world[number]], views.eye_world_m[number], views.opencv_from_world[number],
+            views.up_world[number], lens.parameters, limits, lens.hidden, number, best, chosen, pixel,
+        )  # fmt: skip
+    return Shown(chosen, pixel)
+
+
+@dataclass(frozen=True, eq=False)
+class Sights:
+    """Pictures that may show objects: n pairs, object by object, that with the finest look at it first."""
+
+    item: Int64
+    """(n,) number of the object."""
+    view: Int64
+    """(n,) number of the picture."""
+    pixel: Float64
+    """(n, 2) u, v of the object's first place, from the centre of the upper left pixel."""
+    distance_m: Float64
+    """(n,) from the camera to that place."""
+    resolution_m: Float64
+    """(n,) what a pixel spans there, across the ray (m)."""
+
+    def __len__(self) -> int:
+        """Pairs."""
+        return len(self.item)
+
+    def at(self, rows: Int64 | Bool) -> Sights:
+        """Some of them."""
+        return Sights(
+            self.item[rows], self.view[rows], self.pixel[rows], self.distance_m[rows], self.resolution_m[rows]
+        )
+
+
+def sights(
+    places_world_m: Sequence[Float64],
+    facing_world: Sequence[Float64],
+    views: Views,
+    rule: PictureRule,
+    near: Iterable[tuple[int, Int64]],
+) -> Sights:
+    """Which pictures show objects, each object's best first.
+
+    A picture shows an object where all its places lie in it, within the rule's reach, and where its front is turned
+    to the camera by 10 degrees or more. Best is what spans the least of the object with a pixel: distance over focal
+    length, over the cosine of the angle between ray and front; of equals the earlier picture. Whether something
+    stands between is not looked at.
+
+    Parameters
+    ----------
+    places_world_m : (m, k, 3) places of the objects in each of the world frames that the views count.
+    facing_world : (m, 3) unit vectors that their fronts look to, likewise; NaN where an object has no front.
+    near : pictures, and the objects that each may show.
+    """
+    found: list[tuple[Int64, Int64, Float64, Float64, Float64, Float64]] = []
+    limits = rule.limits()
+    for number, items in near:
+        if not items.size:
+            continue
+        world, lens = int(views.world[number]), views.lenses[views.lens[number]]
+        places = places_world_m[world][items]
+        count = places.shape[0] * places.shape[1]
+        best, chosen, pixel = np.full(count, np.inf), np.full(count, NO_VIEW, np.int32), np.full((count, 2), np.nan)
+        take_better(
+            np.ascontiguousarray(places.reshape(-1, 3)), views.eye_world_m[number], views.opencv_from_world[number],
+            views.up_world[number], lens.parameters, limits, lens.hidden, 0, best, chosen, pixel,
+        )  # fmt: skip
+        ray = views.eye_world_m[number] - places[:, 0]
+        distance = np.sqrt(np.einsum("ij,ij->i", ray, ray))
+        turned = np.einsum("ij,ij->i", ray, facing_world[world][items]) / np.maximum(distance, 1e-9)
+        turned = np.where(np.isnan(turned), 1.0, turned)
+        kept = (chosen.reshape(places.shape[:2]) != NO_VIEW).all(axis=1) & (turned >= _LEAST_TURNED)
+        resolution = distance[kept] / float(np.sqrt(np.prod(lens.parameters[:2])))
+        first = pixel.reshape(*places.shape[:2], 2)[kept, 0]
+        view = np.full(len(first), number, np.int64)
+        found.append((items[kept], view, first, distance[kept], resolution, resolution / turned[kept]))
+    if not found:
+        none, empty = np.zeros(0, np.int64), np.zeros(0)
+        return Sights(none, none, np.zeros((0, 2)), empty, empty)
+    item, view, first, distance, resolution, span = (np.concatenate(c) for c in zip(*found, strict=True))
+    return Sights(item, view, first, distance, resolution).at(np.lexsort((view, span, item)))
+
+
+def sampled(picture: UInt8, pixel: Float64) -> UInt8:
+    """Colours (m, 3) at places (m, 2: u, v) of a picture (height, width, 3), bilinear."""
+    colour = np.empty((len(pixel), 3), np.uint8)
+    sample(picture, np.ascontiguousarray(pixel), colour)
+    return colour

@@ -1,0 +1,1 @@
+"""Footprints: which raw block touches which tile."""

@@ -1,0 +1,66 @@
+"""Points of one tile: the view of the raw readings that products and cells are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.ids import TileId
+
+QUANTUM_M: Final = 1e-5
+"""Point coordinates are whole numbers of this (10 µm): sums are exact, so results do not depend on order."""
+QUANTA_PER_M: Final = 100_000
+
+
+@dataclass(frozen=True)
+class TilePoints:
+    """Points of one tile in canonical order (epoch, sensor, reading), so equal inputs give equal bytes.
+
+    All arrays are (n,). One quantum is 10 µm (:data:`QUANTUM_M`).
+    """
+
+    tile: TileId
+    x_quanta: npt.NDArray[np.int32]
+    """East of the tile's south-west corner, quanta."""
+    y_quanta: npt.NDArray[np.int32]
+    """North of the tile's south-west corner, quanta."""
+    height_quanta: npt.NDArray[np.int32]
+    """Height in the map frame, quanta above its zero."""
+    epoch_gps_ns: npt.NDArray[np.int64]
+    """GPS time of the reading."""
+    intensity: npt.NDArray[np.uint16]
+    """Intensity as recorded (scaled to 16 bits by the format)."""
+    classification: npt.NDArray[np.uint8]
+    """ASPRS class: 1 unclassified unless the raw data say otherwise."""
+    pass_id: npt.NDArray[np.uint16]
+    """Pass of the reading."""
+    extra: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
+    """Further recorded values by column name of the table ``cloud`` (return_number, number_of_returns,
+    scan_angle_deg, flags, user_data,
+    point_source_id, red, green, blue): for every point, where any reading has them."""
+
+    def __len__(self) -> int:
+        return int(self.x_quanta.size)
+
+    def and_then(self, other: TilePoints) -> TilePoints:
+        """These points, then `other` of the same tile; values that one side lacks are those of a single return."""
+        size, more = len(self), len(other)
+        extra: dict[str, npt.NDArray[Any]] = {}
+        for name in (*self.extra, *(n for n in other.extra if n not in self.extra)):
+            kind = (self.extra if name in self.extra else other.extra)[name].dtype
+            parts = (self.extra.get(name, fill_of(name, size, kind)), other.extra.get(name, fill_of(name, more, kind)))
+            extra[name] = np.concatenate(parts)
+        arrays = {
+            f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)])
+            for f in fields(self)
+            if f.name not in {"tile", "extra"}
+        }
+        return TilePoints(tile=self.tile, extra=extra, **arrays)
+
+
+def fill_of(column: str, size: int, kind: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Values (n,) of an extra column for points without recorded ones."""
+    return np.full(size, 1 if column in {"return_number", "number_of_returns"} else 0, kind)

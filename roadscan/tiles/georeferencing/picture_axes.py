@@ -1,0 +1,32 @@
+"""How a camera's axes lie on the map: what a page needs to put a point of the map into a picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.crs import MapFrame
+from roadscan.navigation.trajectory import world_from_ned
+
+Float64 = npt.NDArray[np.float64]
+
+
+def camera_from_map(
+    frame: MapFrame, world: str, eye_world_m: Float64, opencv_from_world: Float64
+) -> tuple[Float64, Float64]:
+    """Places (n, 3) of cameras on the map (m), and matrices (n, 3, 3) that take a difference on the map to their axes.
+
+    The matrix is the turn from the world to the camera times the inverse of the map's derivative at the camera, taken
+    over a metre; so convergence and scale of the map are in it. What the map's curvature adds stays below 1 mm within
+    100 m.
+
+    Parameters
+    ----------
+    world : frame of the poses.
+    eye_world_m : (n, 3) projection centres; opencv_from_world : (n, 3, 3) camera axes (x right, y down, z ahead).
+    """
+    axes = world_from_ned(world, eye_world_m)
+    place = frame.map_from_world(world, eye_world_m)
+    ends = [frame.map_from_world(world, eye_world_m + sign * axes[:, :, k]) for k in range(3) for sign in (0.5, -0.5)]
+    map_from_ned = np.stack([ends[2 * k] - ends[2 * k + 1] for k in range(3)], axis=-1)
+    return place, opencv_from_world @ axes @ np.linalg.inv(map_from_ned)

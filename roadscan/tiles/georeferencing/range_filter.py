@@ -1,0 +1,77 @@
+"""Range filter for turns (Yu and others 2007, eq. 3): readings beyond the crossing of successive profiles.
+
+    RF(r) = keep where r · cos θ ≤ d_crit = Δs / sin Δθ, else remove
+
+**What is meant.** Δs is the arc between successive profiles, measured along the path of the sensor, and Δθ, here, the
+change of heading between them. The paper calls Δθ the scanner's angular resolution, but takes the filter from work on
+scanning façades from a vehicle (Früh, Jain, Zakhor 2005, *Data processing algorithms for generating textured 3D
+building façade meshes from laser scans and camera images*), whose redundancy arises where the vehicle turns: the
+planes of two successive scans that differ in heading by Δθ cross at the distance Δs / sin Δθ, the radius of the turn,
+on its inner side. Nearer, the profiles cover the road in the order of driving. Beyond, they cover it again, the other
+way round, and where they lie around the crossing, one spot is read from many poses. On the outer side profiles fan
+out: they never overlap, and all readings are kept. A resolution of the scanner would cut every profile, straight
+ones too, at Δs / sin 0.5° (3.4 m at 3 cm a profile); :func:`resolution_limits` gives that reading of the paper for
+comparison, for turns alone.
+
+r · cos θ is the reading's horizontal distance from the sensor across the path.
+
+Heading and path are taken over at least `base_m` of path, centred, so that the noise of successive headings is no
+turn. A vehicle that stands has no arc: it is not turning.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.settings.segmentation import RangeFilter
+
+Float64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+
+
+def crossing_limits(path_m: Float64, heading_rad: Float64, settings: RangeFilter) -> Float64:
+    """How far (n, 2) to the left and right of the path readings are kept (m); infinite outside turns.
+
+    Parameters
+    ----------
+    path_m : (n,) position of each profile along the sensor's own path (m), not decreasing.
+    heading_rad : (n,) heading of each profile, clockwise positive; whole turns do not matter.
+    """
+    return limits_of_turns(*_arc_and_turn(path_m, heading_rad, settings.base_m), settings)
+
+
+def limits_of_turns(arc_m: Float64, turn_rad: Float64, settings: RangeFilter) -> Float64:
+    """Limits (n, 2) to the left and right (m), from arcs (n,), negative backwards, and changes of heading (n,)."""
+    limits = np.full((arc_m.size, 2), np.inf)
+    turning = (np.abs(turn_rad) > 1e-9) & (arc_m != 0.0)
+    critical = np.abs(arc_m) / np.sin(np.clip(np.abs(turn_rad), 1e-9, math.pi / 2))
+    critical[~turning | (critical > settings.radius_max_m)] = np.inf
+    left = arc_m * turn_rad < 0.0
+    limits[left, 0] = critical[left]
+    limits[~left, 1] = critical[~left]
+    return limits
+
+
+def resolution_limits(path_m: Float64, heading_rad: Float64, resolution_rad: float, settings: RangeFilter) -> Float64:
+    """Limits (n, 2) with the scanner's resolution in place of the turn, as the paper words it; only in turns."""
+    arc = np.diff(path_m, append=path_m[-1:] + (path_m[-1] - path_m[-2] if path_m.size > 1 else 0.0))
+    turning = np.isfinite(crossing_limits(path_m, heading_rad, settings)).any(axis=1)
+    critical = np.where(turning & (arc > 0.0), arc / math.sin(resolution_rad), np.inf)
+    return np.stack([critical, critical], axis=-1)
+
+
+def kept_in_turns(across_m: Float64, limits_m: Float64) -> Bool:
+    """Readings (n, m) that are kept, by their horizontal distance across the path (n, m), right positive (m)."""
+    kept: Bool = (across_m >= -limits_m[:, :1]) & (across_m <= limits_m[:, 1:])
+    return kept
+
+
+def _arc_and_turn(path_m: Float64, heading_rad: Float64, base_m: float) -> tuple[Float64, Float64]:
+    """Path (n,) and change of heading (n,) over at least `base_m` around each profile; less at the ends of a drive."""
+    turned = np.unwrap(heading_rad)
+    first = np.maximum(np.searchsorted(path_m, path_m - base_m / 2, side="right") - 1, 0)
+    last = np.minimum(np.searchsorted(path_m, path_m + base_m / 2, side="left"), path_m.size - 1)
+    return path_m[last] - path_m[first], turned[last] - turned[first]

@@ -1,0 +1,315 @@
+"""Readings counted into cells in one pass: each reading's height is kept until its tile is finished, nothing else.
+
+What is kept, and where, depends on the order of the readings only until it is sorted (``cells.cell_statistics``).
+
+Neighbouring readings of a profile mostly lie in one cell, so readings are counted in *streaks*: what has to be looked
+up is looked up once a streak, and the heights of a streak are stored as one vector.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner
+from roadscan.compute.kernels.cell_streaks import find_streaks, sum_up
+from roadscan.compute.kernels.height_slots import (
+    COUNTS,
+    FARTHEST,
+    LANES,
+    LAST,
+    LIGHT_SHIFT,
+    SLOT_HEADERS,
+    SLOT_HEIGHTS,
+    SLOT_SIZE,
+    VECTOR,
+    WORD_SHIFT,
+    WORDS,
+    prefetch,
+    store_heights,
+)
+from roadscan.compute.kernels.streak_slots import AT_ONCE, find_known_slots, lowest_bit
+from roadscan.tiles.georeferencing.kernels.readings import KEPT
+from roadscan.tiles.kernels.pool import header_of_pass, longer_chain, new_group, slot_with_room
+from roadscan.tiles.kernels.selection import bounds_of
+
+NOWHERE = -(1 << 30)
+"""Column of a reading that is not to be counted: outside every tile."""
+AHEAD = 12
+"""Streaks whose slots are fetched before their turn comes."""
+PIECE = 1024
+"""Readings worked on together: their working arrays stay in the first cache."""
+
+
+class Heights(NamedTuple):
+    """Cells and heights of readings."""
+
+    column: npt.NDArray[np.int32]
+    """(n,) cell from the south-west corner of the box of tiles; NOWHERE for readings that a filter leaves out."""
+    row: npt.NDArray[np.int32]
+    """(n,)"""
+    height: npt.NDArray[np.int32]
+    """(n + VECTOR,) quanta of the map; what follows the n-th is read, but not counted."""
+
+
+class Streaks(NamedTuple):
+    """Streaks of up to n readings in one cell each."""
+
+    starts: npt.NDArray[np.uint32]
+    """(n + 1,) first reading of each streak, and the end."""
+    sums: npt.NDArray[np.uint32]
+    """(n + 1,) sum of the intensities before each reading."""
+    columns: npt.NDArray[np.int32]
+    """(n + 16,) cell of each streak."""
+    rows: npt.NDArray[np.int32]
+    """(n + 16,)"""
+    slots: npt.NDArray[np.int32]
+    """(n + 16,) first slot of the streak's cell, −1 outside the active tiles."""
+
+
+class CountingWork(NamedTuple):
+    """Arrays that readings are worked on in, a piece at a time."""
+
+    readings: Heights
+    streaks: Streaks
+    touched: npt.NDArray[np.uint8]
+    """(a,) 1 for each active tile that got a reading."""
+
+
+def work_arrays(tiles: int) -> CountingWork:
+    """Arrays to count in, for so many active tiles."""
+    streaks = Streaks(
+        starts=np.empty(PIECE + 1, np.uint32),
+        sums=np.empty(PIECE + 1, np.uint32),
+        columns=np.zeros(PIECE + AT_ONCE, np.int32),
+        rows=np.zeros(PIECE + AT_ONCE, np.int32),
+        slots=np.empty(PIECE + AT_ONCE, np.int32),
+    )
+    readings = Heights(np.empty(PIECE, np.int32), np.empty(PIECE, np.int32), np.zeros(PIECE + VECTOR, np.int32))
+    return CountingWork(readings, streaks, np.zeros(tiles, np.uint8))
+
+
+@bare_inner
+def count_slowly(own, heights, intensity, gain, first, end, mark, pool):
+    """Count readings `first` to `end` − 1 into the cell that begins with the slot `own`, one by one."""
+    headers, bases = pool.headers, pool.bases
+    for j in range(first, end):
+        height = np.int64(heights[j])
+        word = mark & np.uint64(WORDS << WORD_SHIFT)
+        slot = slot_with_room(own, 1, height, height, word, pool)
+        if slot < 0:
+            slot = longer_chain(own, height, pool)
+        at = slot * SLOT_HEADERS + SLOT_HEADERS - 1
+        pool.slots[slot * SLOT_SIZE + np.int64(headers[at] & np.uint64(COUNTS))] = np.int16(height - bases[slot])
+        shine = np.uint64(gain) * np.uint64(intensity[j])
+        headers[at] = (headers[at] + np.uint64(1) + (shine << np.uint64(LIGHT_SHIFT))) | mark
+
+
+@bare_inlined
+def slot_of_streak(own, heights, first, end, word, pool):
+    """Slot of the cell that begins with `own` with room for a streak; −1 where its heights are too far apart."""
+    low, high = np.int64(heights[first]), np.int64(heights[first])
+    for j in range(first, end):
+        low, high = min(low, np.int64(heights[j])), max(high, np.int64(heights[j]))
+    slot = slot_with_room(own, np.int64(end - first), low, high, word, pool)
+    if slot < 0 and high - low <= FARTHEST:
+        slot = longer_chain(own, low, pool)
+    return slot
+
+
+@bare_inlined
+def store_streak(heights, first, size, base, slots, slot, used):
+    """Write the heights of a streak behind the `used` ones of the slot that begins at `slot`.
+
+    A whole vector is written, not the part of one, which takes AMD's Zen 4 twenty cycles: what lies beyond the streak's
+    heights is overwritten by the next streak, or by the header, which is written last.
+    """
+    if used <= np.uint64(LAST):
+        store_heights(heights, first, base, slots, slot + used)
+        return
+    for k in range(size):
+        slots[slot + used + k] = np.int16(heights[first + k] - base)
+
+
+@bare_inlined
+def tile_at(x, y, edge, tile_rows):
+    """South-west cell of the tile that holds cell (x, y), and its row in `groups`, −1 where it is not active."""
+    across, along = x // edge, y // edge
+    inside = (along >= 0) & (along < tile_rows.shape[0]) & (across >= 0) & (across < tile_rows.shape[1])
+    return across * edge, along * edge, np.int64(tile_rows[along, across]) if inside else np.int64(-1)
+
+
+@bare_inner
+def find_slots(heights, streaks, count, active, pool, touched):
+    """First slot of each streak's cell, −1 outside the active tiles, into `streaks`. Takes new groups.
+
+    heights : (n,) int32, of the readings; count : uint64, streaks.
+    """
+    starts, _, columns, rows, slots = streaks
+    groups, edge = active.groups, active.edge
+    per_row, per_tile = (edge + LANES - 1) // LANES, groups.shape[1]
+    table = groups.reshape(-1)
+    west, south, tile = np.int64(NOWHERE), np.int64(NOWHERE), np.int64(-1)
+    block = np.uint64(0)
+    while block < count:
+        own = (np.int32(west), np.int32(south), np.int32(edge if tile >= 0 else 0), np.int32(per_row))
+        at = np.uint64(max(tile, 0) * per_tile)
+        unknown = find_known_slots(columns, rows, block, count, own, np.int32(NOWHERE), table, at, slots)
+        while unknown:
+            streak = block + lowest_bit(unknown)
+            unknown &= unknown - np.uint64(1)
+            x, y = np.int64(columns[streak]), np.int64(rows[streak])
+            if not (west <= x < west + edge and south <= y < south + edge):
+                west, south, tile = tile_at(x, y, edge, active.rows)
+                if tile >= 0:
+                    touched[tile] = 1
+            if tile < 0:
+                continue
+            place = np.uint64(tile * per_tile + (y - south) * per_row + ((x - west) >> 4))
+            found = table[place]
+            if found < 0:
+                found = new_group(heights[np.uint64(starts[streak])], pool)
+                table[place] = found
+            slots[streak] = found * LANES + ((x - west) & 15)
+        block += np.uint64(AT_ONCE)
+
+
+@bare
+def accumulate(readings, bounds, intensity, gain, number, work, active, pool):
+    """Count readings into the cells of active tiles.
+
+    Parameters
+    ----------
+    readings : Heights; bounds : (2,) tuple of int, no height lies below the first or above the second.
+    intensity : (n,) unsigned; gain : uint32; their product takes at most 16 bits.
+    number : int, of the readings' pass among the accumulator's.
+    work : CountingWork, of which the readings are not used.
+    active : ActiveTiles; pool : Pool, of which at least 2 n elements have to be free.
+
+    Returns
+    -------
+    int, how many readings were counted; the other wanted ones lie outside the active tiles.
+    """
+    column, row, heights = readings
+    low, high = bounds
+    streaks = work.streaks
+    starts, sums, columns, rows, slots = streaks
+    bases, headers = pool.bases, pool.headers
+    mark = header_of_pass(number)
+    word = mark & np.uint64(WORDS << WORD_SHIFT)
+    sum_up(intensity, sums)
+    count = find_streaks(column, row, starts, columns, rows)
+    find_slots(heights, streaks, count, active, pool, work.touched)
+    counted = np.int64(0)
+    for streak in range(count):
+        prefetch(pool.slots, np.uint64(slots[streak + np.uint64(AHEAD)]) * np.uint64(SLOT_SIZE))
+        if slots[streak] < 0:
+            continue
+        own = np.uint64(slots[streak])
+        first, end = np.uint64(starts[streak]), np.uint64(starts[streak + np.uint64(1)])
+        counted += np.int64(end - first)
+        while first < end:
+            size = min(end - first, np.uint64(VECTOR))
+            slot, base = own, np.int64(bases[own])
+            at = slot * np.uint64(SLOT_HEADERS) + np.uint64(SLOT_HEADERS - 1)
+            header = headers[at]
+            used = header & np.uint64(COUNTS)
+            fits = (used + size <= np.uint64(SLOT_HEIGHTS)) & (low - base >= -FARTHEST) & (high - base <= FARTHEST)
+            if not (fits & (header & np.uint64(WORDS << WORD_SHIFT) == word)):
+                other = slot_of_streak(own, heights, first, first + size, word, pool)
+                if other < 0:
+                    count_slowly(own, heights, intensity, gain, first, first + size, mark, pool)
+                    first += size
+                    continue
+                slot = np.uint64(other)
+                base, at = np.int64(bases[slot]), slot * np.uint64(SLOT_HEADERS) + np.uint64(SLOT_HEADERS - 1)
+                header = headers[at]
+                used = header & np.uint64(COUNTS)
+            store_streak(heights, first, size, np.int32(base), pool.slots, slot * np.uint64(SLOT_SIZE), used)
+            shine = np.uint64(gain) * np.uint64(sums[first + size] - sums[first])
+            headers[at] = (header + size + (shine << np.uint64(LIGHT_SHIFT))) | mark
+            first += size
+    return counted
+
+
+@bare_inlined
+def end_of_pass(passes, start, most):
+    """End of the readings from `start` on of one pass, at most so many."""
+    end, last = start, min(start + most, passes.size)
+    while end < last and passes[end] == passes[start]:
+        end += 1
+    return end
+
+
+@bare
+def accumulate_cells(readings, passes, intensity, active, pool, work, fates, first):
+    """Count readings that know their cells, best in the order of cells.
+
+    Parameters
+    ----------
+    readings : Heights, all in active tiles.
+    passes : (n,) int32, number of the reading's pass among the accumulator's; intensity : (n,) uint16.
+    active : ActiveTiles; pool : Pool; work : CountingWork.
+    fates : (≥ FATES,) int64, in/out, readings that were kept.
+    first : int, reading to begin with.
+
+    Returns
+    -------
+    int, the reading before which the pool ran short of free elements; n at the end.
+    """
+    column, row, heights = readings
+    start = first
+    while start < column.size:
+        if pool.free.size - pool.held[0] < 2 * PIECE:
+            return start
+        end = end_of_pass(passes, start, PIECE)
+        own = Heights(column[start:end], row[start:end], heights[start : end + VECTOR])
+        bounds = bounds_of(heights[start:end])
+        fates[KEPT] += accumulate(
+            own, bounds, intensity[start:end], np.uint32(1), passes[start], work, active, pool
+        )  # fmt: skip
+        start = end
+    return start
+
+
+@bare
+def accumulate_points(x, y, height, passes, intensity, active, pool, work, first):
+    """Count the points of one tile into its cells.
+
+    Parameters
+    ----------
+    x, y, height : (n,) int32, quanta, x and y from the tile's south-west corner, not negative.
+    passes : (n,) int32, number of each point's pass among the accumulator's; intensity : (n,) uint16.
+    active : ActiveTiles, the tile alone; pool : Pool; work : CountingWork.
+    first : int, point to begin with.
+
+    Returns
+    -------
+    int, the point before which the pool ran short of free elements; n at the end.
+    """
+    column, row, heights = work.readings
+    start = first
+    while start < x.size:
+        if pool.free.size - pool.held[0] < 2 * PIECE:
+            return start
+        end = end_of_pass(passes, start, PIECE)
+        n = end - start
+        find_cells(x[start:end], y[start:end], 1.0 / active.cell_quanta, column, row)
+        for j in range(n):
+            heights[j] = height[start + j]
+        own = Heights(column[:n], row[:n], heights)
+        accumulate(
+            own, bounds_of(heights[:n]), intensity[start:end], np.uint32(1), passes[start], work, active, pool
+        )  # fmt: skip
+        start = end
+    return start
+
+
+@bare
+def find_cells(x, y, per_cell, column, row):
+    """Cells (≥ n,) int32, out, of points; x, y : (n,) int32, quanta from the tile's south-west corner."""
+    for j in range(x.size):
+        column[j] = np.int32(np.floor((x[j] + 0.5) * per_cell))
+        row[j] = np.int32(np.floor((y[j] + 0.5) * per_cell))

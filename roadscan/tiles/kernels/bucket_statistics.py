@@ -1,0 +1,190 @@
+"""Statistics of a tile's cells from its buckets, equal to the bit with those of ``cells.cell_statistics``.
+
+Cells of about as many readings are put side by side, wherever they lie: sixteen of up to 8, of up to 32 and of up to 64
+readings go through ``simd.column_statistics`` together. Fuller ones are taken one by one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner
+from roadscan.compute.kernels.column_statistics import LANES, statistics_of, statistics_of_64
+from roadscan.tiles.kernels.cell_columns import write_statistics
+from roadscan.tiles.kernels.large_cells import select_arrays, statistics_of_full
+from roadscan.tiles.kernels.row_buckets import (
+    BLOCK,
+    COLUMN,
+    LIGHT,
+    LIGHT_SHIFT,
+    fetch_block,
+    free_row,
+    height_of,
+    last_block,
+    size_of,
+)
+
+statistics_of_8, statistics_of_32 = statistics_of(8), statistics_of(32)
+
+SHORT, MEDIUM, LONG = 8, 32, 64
+"""Readings of the fullest cells that are taken side by side, by table."""
+WORD = 64
+"""Passes that a word of marks names."""
+COUNT_SHIFT = np.int64(40)
+"""A cell's readings and the sum of their intensities are one number, the intensities in so many bits …"""
+MOST = 1 << 23
+"""… which does for rows of fewer readings."""
+_LIGHTS = np.int64((1 << 40) - 1)
+_NUMBERS = 4
+_COUNT, _LIGHT, _BASE, _TARGET = range(_NUMBERS)
+
+
+def row_arrays(edge: int, passes: int, most: int) -> tuple[Any, ...]:
+    """Arrays that a row of `edge` cells with up to `most` readings of so many passes is worked on in."""
+    table, own = np.zeros((SHORT + MEDIUM + LONG, LANES), np.int32), np.zeros((3 * _NUMBERS, LANES), np.int32)
+    row = (
+        np.zeros(edge, np.int64), np.zeros((edge, -(-passes // WORD)), np.uint64), np.empty(edge, np.int32),
+        np.empty(edge + 1, np.int32), np.empty(most, np.int32),
+    )  # fmt: skip
+    return row, table, own, np.zeros(3, np.int64), np.zeros((6, LANES)), select_arrays(most)
+
+
+@bare_inner
+def mark_row(end, buckets, marks):
+    """Note the passes of a row's cells; marks : (edge, w) uint64, in/out, zeros. See :func:`sort_row`."""
+    records, before, sizes, owners, _, _ = buckets
+    block = last_block(end)
+    while block >= 0:
+        word, mark = np.int64(owners[block]) // WORD, np.uint64(1) << np.uint64(np.int64(owners[block]) % WORD)
+        for k in range(size_of(block, end, sizes)):
+            marks[records[block * BLOCK + k] & COLUMN, word] |= mark
+        block = np.int64(before[block])
+
+
+@bare_inner
+def sort_row(end, buckets, sums, ends, used, heights):
+    """Heights of a row cell by cell, in the order of the cells; returns how many cells have one.
+
+    Parameters
+    ----------
+    end : int32, of the row's bucket; buckets : Buckets.
+    sums : (edge,) int64, in/out, zeros: readings of each cell above COUNT_SHIFT, below it the sum of their intensities.
+    ends : (edge,) int32, out, end of each cell's heights; used : (edge + 1,) int32, out, cells that have some.
+    heights : (≥ readings,) int32, out.
+    """
+    records, before, sizes, _, _, _ = buckets
+    one = np.int64(1) << COUNT_SHIFT
+    block = last_block(end)
+    while block >= 0:
+        fetch_block(np.int64(before[block]), records)
+        first = np.uint64(block) * np.uint64(BLOCK)
+        for k in range(np.uint64(size_of(block, end, sizes))):
+            record = records[first + np.uint64(k)]
+            sums[record & COLUMN] += one + np.int64((record >> LIGHT_SHIFT) & LIGHT)
+        block = np.int64(before[block])
+    cells, at = 0, np.int32(0)
+    for cell in range(sums.size):
+        used[cells], ends[cell] = cell, at
+        cells += sums[cell] != 0
+        at += np.int32(sums[cell] >> COUNT_SHIFT)
+    block = last_block(end)
+    while block >= 0:
+        first = np.uint64(block) * np.uint64(BLOCK)
+        for k in range(np.uint64(size_of(block, end, sizes))):
+            record = records[first + np.uint64(k)]
+            cell = record & COLUMN
+            at = ends[cell]
+            heights[np.uint64(at)] = height_of(record)
+            ends[cell] = at + np.int32(1)
+        block = np.int64(before[block])
+    return cells
+
+
+@bare_inlined
+def put_aside(heights, first, n, light, target, kind, table, own, lane):
+    """Put the n heights of a cell from `first` on into a lane of the part of the table for its kind."""
+    base, at = heights[np.uint64(first)], np.uint64(0 if kind == 0 else (SHORT if kind == 1 else SHORT + MEDIUM))
+    numbers = np.uint64(_NUMBERS * kind)
+    own[numbers + np.uint64(_COUNT), lane], own[numbers + np.uint64(_LIGHT), lane] = n, np.int32(light)
+    own[numbers + np.uint64(_BASE), lane], own[numbers + np.uint64(_TARGET), lane] = base, target
+    for k in range(np.uint64(n)):
+        table[at + k, lane] = heights[np.uint64(first) + k] - base
+
+
+@bare_inner
+def finish_table(kind, table, owns, lanes, floor, quantum_m, out, columns):
+    """Write the statistics of the cells in a part of the table to their places; it is empty then."""
+    own = owns[_NUMBERS * kind : _NUMBERS * (kind + 1)]
+    for lane in range(lanes[kind], LANES):
+        own[_COUNT, lane] = 0
+    if kind == 0:
+        statistics_of_8(table[:SHORT], own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
+    elif kind == 1:
+        rows = table[SHORT : SHORT + MEDIUM]
+        statistics_of_32(rows, own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
+    else:
+        statistics_of_64(table[SHORT + MEDIUM :], own[_COUNT], own[_LIGHT], own[_BASE], floor, quantum_m, out)
+    for lane in range(lanes[kind]):
+        write_statistics(out, lane, np.int64(own[_TARGET, lane]), columns)
+    lanes[kind] = 0
+
+
+@bare_inlined
+def write_marked(marks, numbers, written, pass_ids):
+    """Ids of the passes of a cell, ascending; marks : (w,) uint64. Returns the end of what is written."""
+    for p in range(numbers.size):
+        if (marks[p // WORD] >> np.uint64(p % WORD)) & np.uint64(1):
+            pass_ids[written] = numbers[p]
+            written += 1
+    return written
+
+
+@bare
+def finish_buckets(bucket_ends, buckets, floor, quantum_m, numbers, work, columns):
+    """Write the statistics of all cells of a tile that hold a reading; its blocks are given back.
+
+    Parameters
+    ----------
+    bucket_ends : (edge,) int32, in/out, of the tile; buckets : Buckets. No row has `MOST` readings.
+    work : as :func:`row_arrays` makes them.
+    Others, and what is returned, as in ``cell_statistics.finish_cells``.
+    """
+    (sums, marks, ends, used, heights), table, owns, lanes, out, select = work
+    cell, written = 0, 0
+    for y in range(bucket_ends.size):
+        if bucket_ends[y] == 0:
+            continue
+        cells = sort_row(bucket_ends[y], buckets, sums, ends, used, heights)
+        if numbers.size > 1:
+            mark_row(bucket_ends[y], buckets, marks)
+        for k in range(cells):
+            x = np.int64(used[k])
+            n, light, end = sums[x] >> COUNT_SHIFT, sums[x] & _LIGHTS, np.int64(ends[x])
+            if n > LONG:
+                statistics_of_full(heights[end - n : end], light, floor, quantum_m, select, out, 0)
+                write_statistics(out, 0, cell, columns)
+            else:
+                kind = np.int64(n > SHORT) + np.int64(n > MEDIUM)
+                put_aside(heights, end - n, n, light, cell, kind, table, owns, np.uint64(lanes[kind]))
+                lanes[kind] += 1
+                if lanes[kind] == LANES:
+                    finish_table(kind, table, owns, lanes, floor, quantum_m, out, columns)
+            columns.column[cell], columns.row[cell], columns.readings[cell] = x, y, n
+            columns.pass_offsets[cell] = written
+            if numbers.size > 1:
+                written = write_marked(marks[x], numbers, written, columns.pass_ids)
+                marks[x] = 0
+            else:
+                columns.pass_ids[written] = numbers[0]
+                written += 1
+            sums[x] = 0
+            cell += 1
+        free_row(bucket_ends[y], buckets)
+        bucket_ends[y] = 0
+    for kind in range(3):
+        if lanes[kind]:
+            finish_table(kind, table, owns, lanes, floor, quantum_m, out, columns)
+    columns.pass_offsets[cell] = written
+    return cell, written

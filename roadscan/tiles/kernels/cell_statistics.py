@@ -1,0 +1,216 @@
+"""Statistics of a tile's cells from their heights, in whole numbers: equal to the bit whatever the readings' order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner
+from roadscan.compute.kernels.column_statistics import statistics_of_64
+from roadscan.compute.kernels.height_slots import (
+    COUNTS,
+    LANES,
+    LIGHT_SHIFT,
+    LIGHTS,
+    MARK_SHIFT,
+    PASSES,
+    SLOT_HEIGHTS,
+    SLOT_SIZE,
+    WORD_SHIFT,
+    WORDS,
+    prefetch,
+)
+from roadscan.compute.kernels.slot_groups import chained_cells, open_group, put_apart
+from roadscan.compute.kernels.slot_statistics import slot_statistics_of_8, slot_statistics_of_28
+from roadscan.compute.kernels.store_statistics import store_group
+from roadscan.compute.kernels.streak_slots import lowest_bit
+from roadscan.tiles.kernels.cell_columns import write_statistics
+from roadscan.tiles.kernels.large_cells import select_arrays, statistics_of_full
+from roadscan.tiles.kernels.pool import header_of, release
+
+AHEAD = 2
+"""Groups whose slots are fetched before their turn comes."""
+STATISTICS = 6
+"""Mean, robust, lowest and highest height, standard deviation, mean intensity."""
+AT_ONCE = 64
+"""Heights a cell of which sixteen cells are worked on together; fuller cells are taken one by one."""
+
+
+def work_arrays(most: int) -> tuple[Any, ...]:
+    """Arrays that `finish_cells` works in; `most` : heights that a cell may have."""
+    pairs, table = np.zeros((SLOT_HEIGHTS // 2, LANES), np.int32), np.zeros((AT_ONCE, LANES), np.int32)
+    rows, out = np.zeros((4, LANES), np.int32), np.zeros((STATISTICS, LANES))
+    return pairs, table, *rows, out, np.empty(most, np.int32), select_arrays(most)
+
+
+@bare
+def find_groups(groups, chain, found):
+    """Groups of a tile that have an element, in order, and the largest number of slots that a cell has.
+
+    groups : (g,) int32; found : (g + AHEAD,) int32, out, the numbers of these groups.
+
+    Returns
+    -------
+    count, most : int.
+    """
+    count, most = np.uint64(0), 1
+    for group in range(np.uint64(groups.size)):
+        found[count] = group
+        count += np.uint64(groups[group] >= 0)
+    for k in range(count):
+        first_slot = np.int64(groups[found[k]]) * LANES
+        longer = chained_cells(chain, np.uint64(first_slot))
+        while longer:
+            slots, slot = 0, first_slot + np.int64(lowest_bit(longer))
+            while slot >= 0:
+                slots += 1
+                slot = np.int64(chain[slot])
+            most = max(most, slots)
+            longer &= longer - np.uint64(1)
+    for k in range(np.uint64(AHEAD)):
+        found[count + k] = found[count - np.uint64(1)] if count > 0 else 0
+    return np.int64(count), most
+
+
+@bare_inlined
+def add_chains(first_slot, longer, pool, heights, counts, light, marks):
+    """Heights of the further slots of a group's cells, relative to the base of the cell's first slot.
+
+    longer : uint64, a bit for each cell that has further slots.
+    heights : (AT_ONCE, LANES) int32, in/out, as far as it reaches; counts, light, marks : (LANES,) int32, in/out; light
+    only serves cells of up to AT_ONCE heights: that of fuller ones may not fit.
+    """
+    bases, chain, slots = pool.bases, pool.chain, pool.slots
+    unseen = longer
+    while unseen:
+        further = np.uint64(chain[first_slot + np.int64(lowest_bit(unseen))])
+        prefetch(slots, further * np.uint64(SLOT_SIZE))
+        unseen &= unseen - np.uint64(1)
+    while longer:
+        lane = np.int64(lowest_bit(longer))
+        longer &= longer - np.uint64(1)
+        slot = np.int64(chain[first_slot + lane])
+        while slot >= 0:
+            header = header_of(slot, pool)
+            size = np.int32(header & np.uint64(COUNTS))
+            shift = bases[slot] - bases[first_slot + lane]
+            for k in range(min(size, AT_ONCE - counts[lane])):
+                heights[counts[lane] + k, lane] = np.int32(slots[slot * SLOT_SIZE + k]) + shift
+            counts[lane] += size
+            light[lane] += np.int32((header >> np.uint64(LIGHT_SHIFT)) & np.uint64(LIGHTS))
+            marks[lane] |= np.int32(header >> np.uint64(MARK_SHIFT))
+            slot = np.int64(chain[slot])
+
+
+@bare_inner
+def gather_many(first_slot, pool, heights):
+    """All heights (quanta) of a cell → heights, int32. Returns their number and the sum of their intensities."""
+    n, light, slot = 0, np.int64(0), first_slot
+    while slot >= 0:
+        header = header_of(slot, pool)
+        light += np.int64((header >> np.uint64(LIGHT_SHIFT)) & np.uint64(LIGHTS))
+        for k in range(np.int64(header & np.uint64(COUNTS))):
+            heights[n] = pool.bases[slot] + np.int32(pool.slots[slot * SLOT_SIZE + k])
+            n += 1
+        slot = np.int64(pool.chain[slot])
+    return n, light
+
+
+@bare_inlined
+def write_passes(first_slot, marks, numbers, pool, written, pass_ids):
+    """Ids of the passes of a cell, ascending. Returns the end of what is written."""
+    if numbers.size <= PASSES:
+        for p in range(numbers.size):
+            if (marks >> p) & 1:
+                pass_ids[written] = numbers[p]
+                written += 1
+        return written
+    for p in range(numbers.size):
+        slot, seen = first_slot, False
+        while slot >= 0:
+            header = header_of(slot, pool)
+            word = np.int64((header >> np.uint64(WORD_SHIFT)) & np.uint64(WORDS))
+            own = np.int64(header >> np.uint64(MARK_SHIFT))
+            seen |= (word == p // PASSES) & ((own >> (p % PASSES)) & 1 == 1)
+            slot = np.int64(pool.chain[slot])
+        if seen:
+            pass_ids[written] = numbers[p]
+            written += 1
+    return written
+
+
+@bare
+def finish_cells(groups, found, taken, edge, pool, floor, quantum_m, numbers, work, columns):
+    """Write the statistics of all cells of a tile that hold a reading; its groups are given back.
+
+    Parameters
+    ----------
+    groups : (g,) int32, in/out, of the tile, −1 everywhere when done; pool : Pool.
+    found, taken : from :func:`find_groups`.
+    edge : int64, cells along a tile's edge.
+    floor : float64, distance from the median (quanta) up to which heights always count; quantum_m : float64, m.
+    numbers : (p,) uint16, ascending, ids of the passes by their numbers.
+    work : as :func:`work_arrays` makes them, for all heights of the fullest cell.
+    columns : CellColumns, out, with room for all cells of the tile's groups.
+
+    Returns
+    -------
+    cells, ids : int, how many cells and pass ids were written.
+    """
+    slots, bases, chain = pool.slots, pool.bases, pool.chain
+    pairs, heights, counts, light, marks, own_bases, out, many, select = work
+    per_row = (edge + LANES - 1) // LANES
+    cell, written = 0, 0
+    for k in range(taken):
+        group = np.int64(found[k])
+        element = np.int64(groups[group])
+        later = np.uint64(groups[found[k + AHEAD]]) * np.uint64(LANES * SLOT_SIZE)
+        for lane in range(LANES):
+            prefetch(slots, later + np.uint64(lane * SLOT_SIZE))
+        prefetch(chain, later // np.uint64(SLOT_SIZE))
+        prefetch(bases, later // np.uint64(SLOT_SIZE))
+        first_slot = element * LANES
+        open_group(slots, np.uint64(first_slot * SLOT_SIZE), pairs, counts, light, marks)
+        longer = chained_cells(chain, np.uint64(first_slot))
+        if longer:
+            put_apart(pairs, heights)
+            add_chains(first_slot, longer, pool, heights, counts, light, marks)
+        most, least = np.int32(0), counts[0]
+        for lane in range(LANES):
+            most, least = max(most, counts[lane]), min(least, counts[lane])
+            own_bases[lane] = bases[first_slot + lane]
+        if most <= 8 and not longer:
+            slot_statistics_of_8(pairs, counts, light, own_bases, floor, quantum_m, out)
+        elif not longer:
+            slot_statistics_of_28(pairs, counts, light, own_bases, floor, quantum_m, out)
+        elif most <= AT_ONCE:
+            statistics_of_64(heights, counts, light, own_bases, floor, quantum_m, out)
+        else:
+            for lane in range(LANES):
+                if counts[lane] > 0:
+                    n, shine = gather_many(first_slot + lane, pool, many)
+                    statistics_of_full(many[:n], shine, floor, quantum_m, select, out, lane)
+        if least > 0 and numbers.size == 1:
+            store_group(
+                out, counts, np.uint16((group % per_row) * LANES), np.uint16(group // per_row), np.uint64(cell),
+                np.int32(written), numbers[0], columns,
+            )  # fmt: skip
+            cell += LANES
+            written += LANES
+            release(element, longer, pool)
+            groups[group] = -1
+            continue
+        for lane in range(LANES):
+            if counts[lane] > 0:
+                columns.column[cell] = (group % per_row) * LANES + lane
+                columns.row[cell] = group // per_row
+                columns.readings[cell] = counts[lane]
+                write_statistics(out, lane, cell, columns)
+                columns.pass_offsets[cell] = written
+                written = write_passes(first_slot + lane, marks[lane], numbers, pool, written, columns.pass_ids)
+                cell += 1
+        release(element, longer, pool)
+        groups[group] = -1
+    columns.pass_offsets[cell] = written
+    return cell, written

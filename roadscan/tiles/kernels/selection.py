@@ -1,0 +1,81 @@
+"""The k-th smallest of many whole numbers, by bins."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roadscan.compute.kernel_options import bare, bare_inner
+
+BINS = 256
+_BITS = 8
+_FEW = 48
+"""So many numbers are put in order one by one."""
+
+
+@bare
+def bounds_of(values):
+    """Least and greatest of (n,) int32, n > 0."""
+    low, high = values[0], values[0]
+    for i in range(values.size):
+        low, high = min(low, values[i]), max(high, values[i])
+    return np.int64(low), np.int64(high)
+
+
+@bare
+def _count(values, low, shift, bins):
+    bins[:] = 0
+    for i in range(values.size):
+        bins[np.uint64(np.int64(values[i]) - low) >> shift] += np.int32(1)
+
+
+@bare_inner
+def _of_bin(values, low, shift, wanted, found):
+    n = 0
+    for i in range(values.size):
+        found[n] = values[i]
+        n += np.int64((np.uint64(np.int64(values[i]) - low) >> shift) == wanted)
+    return n
+
+
+@bare
+def sort_few(values):
+    """Put few numbers (n,) in order, one by one."""
+    for i in range(1, values.size):
+        own, j = values[i], i
+        while j > 0 and values[j - 1] > own:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = own
+
+
+@bare
+def smallest(values, k, bins, found):
+    """The k-th smallest (from 0) of numbers.
+
+    Parameters
+    ----------
+    values : (n,) int32, n > k; they may change places. bins : (BINS,) int32, found : (≥ n + 1,) int32, work.
+
+    Returns
+    -------
+    int64
+    """
+    while values.size > _FEW:
+        low, high = bounds_of(values)
+        shift, span = np.uint64(0), high - low
+        while span >= BINS:
+            span >>= 1
+            shift += np.uint64(1)
+        _count(values, low, shift, bins)
+        bin_, before = 0, 0
+        while before + bins[bin_] <= k:
+            before += bins[bin_]
+            bin_ += 1
+        if shift == 0:
+            return low + bin_
+        n = _of_bin(values, low, shift, np.uint64(bin_), found)
+        for i in range(n):
+            values[i] = found[i]
+        values, k = values[:n], k - before
+    sort_few(values)
+    return np.int64(values[k])

@@ -1,0 +1,285 @@
+"""The contract of a product, and the registry that finds products by themselves.
+
+A product is one file in this folder (or one entry point of the group ``roadscan.tiles.products``) with one
+subclass of :class:`TileProduct`, :class:`SurfaceProduct` or :class:`SurveyProduct`. It writes whole files to the path
+it is given; keys, temporary names, checks and the manifest are done for it.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import functools
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Final, Literal, Protocol, Self, TypeAlias
+
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError, nearest
+from roadscan.core.ids import LanePass, TileId
+from roadscan.core.plugins import found_kinds
+from roadscan.core.strict import Strict
+from roadscan.surface.tile import SurfaceTile
+from roadscan.surface.views import PictureRule
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.georeferencing.cloud import TilePoints
+from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.products.lane_direction import LaneDirections
+from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
+
+ENTRY_POINT_GROUP: Final = "roadscan.tiles.products"
+"""Entry-point group through which a third party's package adds a product."""
+
+
+FINE_CELL_M: Final = 0.02
+"""Cells below this are those of profilers at line rate: a network of them is looked at tile by tile, or from far."""
+
+Cells = Literal["any", "fine", "coarse"]
+
+
+class NoOptions(Strict):
+    """Settings of a product without settings."""
+
+
+@dataclass(frozen=True)
+class ProductContext:
+    """What every product may need beside its data; nothing in it depends on how the work was batched."""
+
+    survey_id: str
+    title: str
+    map: MapFrame
+    grid: TileGrid
+    passes: tuple[LanePass, ...]
+    date: dt.date
+    """UTC date of the survey's first epoch; stands where files want a creation date."""
+    surface_cell_m: tuple[float, float] | None = None
+    """Edges (m), east and north, of a cell of the reconstructed surface; None for a survey without one."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A computed tile, as tile products receive it. Its arrays may be reused when the product has been written."""
+
+    points: TilePoints | None
+    """None unless one of the products wanted needs points."""
+    cells: TileCells
+    marked: TilePoints | None = None
+    """Points that filters leave out, withheld and marked by class, where the survey keeps them (`keep_marked`)."""
+    sigma_horizontal_m: float | None = None
+    """Largest horizontal 1 σ of the poses that placed the readings, √(σ_north² + σ_east²); None where not stated."""
+    sigma_height_m: float | None = None
+    """The same of the height."""
+
+    @functools.cached_property
+    def overviews(self) -> list[Level]:
+        """The cells in larger pixels, ascending; made once for all who want them."""
+        return pyramid_of(self.cells, overview_factors(self.cells.cells_per_edge))
+
+
+@dataclass(frozen=True)
+class TileSummary:
+    """One row of ``schemas/tiles.toml``, without the outline."""
+
+    tile: TileId
+    points: int
+    cells: int
+    height_min_m: float
+    height_mean_m: float
+    height_max_m: float
+    height_std_median_m: float
+    intensity_mean: float
+    passes: tuple[int, ...]
+    first_epoch_gps_ns: int
+    last_epoch_gps_ns: int
+    sigma_horizontal_m: float | None = None
+    sigma_down_m: float | None = None
+
+    @classmethod
+    def without_readings(cls, tile: TileId) -> Self:
+        """A tile that has a surface and no reading of its own."""
+        nan = math.nan
+        return cls(tile, 0, 0, nan, nan, nan, nan, nan, (), 0, 0)
+
+
+@dataclass(frozen=True)
+class Output:
+    """One file of a survey product."""
+
+    name: str
+    """File name below ``products/<product>/``."""
+    tiles: tuple[TileId, ...]
+    """Tiles its content depends on; it is rewritten when one of them changes."""
+
+
+class LoadCells(Protocol):
+    """Gives what the store holds of a tile, for products over many tiles."""
+
+    def __call__(self, tile: TileId) -> TileCells | None:
+        """Cells of a tile, or None where the survey has no such tile."""
+
+    def overview(self, tile: TileId, factor: int) -> Level | None:
+        """Overview of a tile in pixels of `factor` squared cells, or None where the survey has no such tile.
+
+        `factor` is one of :func:`roadscan.tiles.pyramid.overview_factors`.
+        """
+
+    def file(self, product: str, tile: TileId) -> bytes | None:
+        """Content of a tile's file of a surface product that this product `reads`, or None where there is none."""
+
+    def lanes(self) -> LaneDirections:
+        """Which way the lanes run, for a product that `needs_lanes`."""
+
+
+class TileFiles(ABC):
+    """What the two kinds of product with one file a tile share."""
+
+    name: ClassVar[str]
+    """Name in survey files, and of its folder below ``tiles/``."""
+    title: ClassVar[str]
+    """One line: what it is and who reads it."""
+    suffix: ClassVar[str]
+    """File suffix with its dot."""
+    version: ClassVar[int] = 1
+    """Raised when the written bytes change."""
+    options: ClassVar[type[Strict]] = NoOptions
+    """Model of its settings."""
+    default: ClassVar[bool] = True
+    """Made where the survey file does not list products."""
+    default_cells: ClassVar[Cells] = "any"
+    """Made by default only with fine cells (below 2 cm) or only with coarse ones, if it is made by default."""
+
+    def suffix_for(self, options: Strict) -> str:
+        """File suffix under these settings."""
+        return self.suffix
+
+    def companions(self, options: Strict) -> dict[str, str]:
+        """Small files that belong beside each file, such as a world file: suffix by name.
+
+        They are written with the file, under its path with their suffix instead of its own; the names do not
+        depend on the settings.
+        """
+        return {}
+
+    def check_options(self, options: Strict, context: ProductContext) -> None:
+        """Raise :class:`ConfigError` where the settings do not fit the survey; asked once, before any work."""
+        return
+
+    @abstractmethod
+    def check(self, path: Path) -> None:
+        """Raise :class:`roadscan.core.errors.StoreError` unless `path` is whole and readable."""
+
+
+class TileProduct(TileFiles):
+    """A product of one file a tile, written while the tile's points are in memory."""
+
+    needs_points: ClassVar[bool] = False
+    """True for a product of single points: they are placed and kept for it, which cells alone do not need."""
+
+    @abstractmethod
+    def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
+        """Write the tile's file to `path` (a temporary name on a local disk)."""
+
+
+class SurfaceProduct(TileFiles):
+    """A product of one file a tile, written while the tile's reconstructed surface is in memory.
+
+    It is made in the stage `surfaces`, which the section `[surface]` of the survey file turns on; without that
+    section none is made by default.
+    """
+
+    def around_m(self, options: Strict, cell_m: tuple[float, float]) -> float:
+        """How far beyond a tile the product looks at heights before smoothing (m); 0 where those after it are enough.
+
+        `cell_m` are a cell's edges, east and north.
+        """
+        return 0.0
+
+    def check_cells(self, options: Strict, cell_m: tuple[float, float], seen: int) -> None:
+        """Raise :class:`ConfigError` where the settings do not fit the surface's cells; asked once, before any work.
+
+        `cell_m` are a cell's edges, east and north; `seen` is how many of the neighbours' a tile shows on each side.
+        """
+        return
+
+    def picture_rule(self, options: Strict) -> PictureRule | None:
+        """Which of the survey's pictures give colours, for a product that wants such; asked before any work."""
+        return None
+
+    def coloured_nodes(self, surface: SurfaceTile, options: Strict) -> tuple[range, range]:
+        """Rows and columns of the surface's arrays whose colours such a product gets, as `surface.colours`."""
+        return range(0), range(0)
+
+    @abstractmethod
+    def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:
+        """Write the tile's file to `path` (a temporary name on a local disk); some cell of the tile has a height."""
+
+
+class SurveyProduct(ABC):
+    """A product over many tiles, made from their cells after all tiles are done."""
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    version: ClassVar[int] = 1
+    options: ClassVar[type[Strict]] = NoOptions
+    default: ClassVar[bool] = True
+    default_cells: ClassVar[Cells] = "any"
+    reads: ClassVar[tuple[str, ...]] = ()
+    """Surface products whose files of the tiles it is made from; they are made wherever this product is."""
+    table: ClassVar[str] = ""
+    """Table of ``schemas/`` that its file holds, where it holds one."""
+    needs_lanes: ClassVar[bool] = False
+    """True for a product that asks which way the lanes run."""
+
+    def check_reads(self, options: Strict, read: Mapping[str, Strict]) -> None:
+        """Raise :class:`ConfigError` where settings of the products that it `reads`, by name, do not fit its own."""
+        return
+
+    @abstractmethod
+    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+        """Files to write; none may read another."""
+
+    @abstractmethod
+    def write(
+        self,
+        output: Output,
+        tiles: Sequence[TileSummary],
+        load_cells: LoadCells,
+        options: Strict,
+        context: ProductContext,
+        path: Path,
+    ) -> None:
+        """Write one file to `path` (a temporary name) in bounded memory, whatever the survey's length.
+
+        `tiles` holds at least those of `output`, and nothing written may depend on others. Helper files are
+        written beside `path`, their names start with its name, and they are removed.
+        """
+
+    @abstractmethod
+    def check(self, path: Path) -> None:
+        """Raise :class:`roadscan.core.errors.StoreError` unless `path` is whole and readable."""
+
+
+Product: TypeAlias = TileProduct | SurfaceProduct | SurveyProduct
+
+
+def is_default(product: Product, cell_m: float) -> bool:
+    """True for a product that is made where the survey file does not list products."""
+    fits = product.default_cells in ("any", "fine" if cell_m < FINE_CELL_M else "coarse")
+    return product.default and fits
+
+
+@functools.cache
+def products() -> dict[str, Product]:
+    """All products by name: those of this folder, and installed entry points."""
+    kinds = (TileProduct, SurfaceProduct, SurveyProduct)
+    return {name: kind() for name, kind in found_kinds("roadscan.tiles.products", kinds, ENTRY_POINT_GROUP).items()}
+
+
+def product_named(name: str) -> Product:
+    """Product by name, or an error that names the nearest known one."""
+    known = products()
+    if name not in known:
+        raise ConfigError(f"unknown product '{name}'{nearest(name, known)}", expected="one of: " + ", ".join(known))
+    return known[name]

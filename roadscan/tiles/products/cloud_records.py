@@ -1,0 +1,67 @@
+"""Points of tiles as records of one point cloud: LAS 1.4 with one lattice of coordinates for all tiles of a sheet."""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import laspy
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.crs import MapFrame
+from roadscan.store.codecs.las import Layout
+from roadscan.tiles.georeferencing.cloud import TilePoints
+from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.products.las import fill_record
+from roadscan.tiles.products.las_axes import axis, set_coordinates
+
+SCALE_M: Final = 1e-4
+"""Step of the stored coordinates (m)."""
+PRODUCT: Final = "publish"
+
+_PLAIN, _COLOURED = 6, 7
+
+
+class Lattice(NamedTuple):
+    """What the records of a cloud share."""
+
+    map: MapFrame
+    grid: TileGrid
+    offsets: tuple[float, float, float]
+    """Whole units of the CRS that the stored coordinates count from."""
+
+
+def layout_of(frame: MapFrame, *, coloured: bool) -> Layout:
+    """Layout of the records: point format 6, or 7 where the points have colours; no further dimensions."""
+    empty = np.zeros(0, np.int32)
+    units = (frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m)
+    scales = tuple(axis(empty, 0, SCALE_M, unit_m, PRODUCT).scale for unit_m in units)
+    return Layout(_COLOURED if coloured else _PLAIN, (), scales, frame, PRODUCT)
+
+
+def records_of(points: TilePoints, lattice: Lattice) -> npt.NDArray[np.void]:
+    """(n,) records of format 7 of a tile's points; without colours these are black."""
+    size, frame = lattice.grid.size_quanta, lattice.map
+    units = (frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m)
+    corners = (points.tile.column * size, points.tile.row * size, 0)
+    quanta = (points.x_quanta, points.y_quanta, points.height_quanta)
+    axes = [axis(q, c, SCALE_M, u, PRODUCT) for q, c, u in zip(quanta, corners, units, strict=True)]
+    record: Any = laspy.ScaleAwarePointRecord.zeros(len(points), header=layout_of(frame, coloured=True).header)
+    set_coordinates(record, (axes[0], axes[1], axes[2]))
+    for name, one, offset in zip("XYZ", axes, lattice.offsets, strict=True):
+        record[name] += np.int32(round((one.offset - offset) / one.scale))
+    fill_record(record, points)
+    held: npt.NDArray[np.void] = record.array
+    return held
+
+
+def picked(records: npt.NDArray[np.void], numbers: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.void]:
+    """Some records (n,) by their numbers; as rows of bytes they are copied six times as fast as field by field."""
+    rows = np.ascontiguousarray(records).view(np.uint8).reshape(records.size, -1)
+    return np.take(rows, numbers, axis=0).view(records.dtype).ravel()
+
+
+def without_colours(records: npt.NDArray[np.void], plain: np.dtype[np.void]) -> npt.NDArray[np.void]:
+    """Records of format 7 as format 6, which begins alike."""
+    kept = np.ascontiguousarray(records).view(np.uint8).reshape(records.size, -1)[:, : plain.itemsize]
+    return np.ascontiguousarray(kept).view(plain).ravel()

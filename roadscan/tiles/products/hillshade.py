@@ -1,0 +1,277 @@
+"""``hillshade``: the surface as light from the north-west would show it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Final, Protocol, cast
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+from rasterio.windows import Window
+
+from roadscan.core.ids import TileId
+from roadscan.core.strict import Strict
+from roadscan.store.codecs.cog import Band
+from roadscan.store.codecs.gdal import raster_settings
+from roadscan.store.codecs.grey_picture import check_picture
+from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
+from roadscan.tiles.products.raster import CellBox, SparseRaster, cell_image, paste_tile
+from roadscan.tiles.products.relief_picture import PNG_SIGNATURE, MeanPixels, write_picture
+from roadscan.tiles.products.sheets import (
+    Sheet,
+    cells_of,
+    check_sheet,
+    cut_sheets,
+    dated,
+    index_name,
+    index_output,
+    sheet_of,
+    unknown_output,
+    write_index,
+)
+
+Float64 = npt.NDArray[np.float64]
+
+_STEM: Final = "hillshade"
+_PICTURE: Final = "hillshade.png"
+_EMPTY: Final = 0
+_STRIP_ROWS: Final = 128
+SHADE_BAND: Final = Band("hillshade", "")
+
+
+class HillshadeOptions(Strict):
+    """Settings of the hillshade."""
+
+    azimuth_deg: float = Field(default=315.0, ge=0, lt=360)
+    """Where the light comes from, clockwise from map north (degrees)."""
+    altitude_deg: float = Field(default=45.0, gt=0, le=90)
+    """Height of the light above the horizon (degrees)."""
+    z_factor: float = Field(default=3.0, gt=0)
+    """Exaggeration: heights are multiplied by this (ruts and cracks are flat things)."""
+    picture_px: int = Field(default=2000, ge=16, le=20_000)
+    """Longest edge of the PNG picture (pixels), before empty margins are cut off; a pixel is a whole number of
+    cells."""
+    sheet_m: float | None = Field(default=None, gt=0)
+    """Edge of a sheet (m), rounded down to whole tiles; a survey no larger than that is one file. Left out, an
+    edge has 20,000 cells: 1000 m at cells of 5 cm."""
+
+
+class Hillshade(SurveyProduct):
+    """8-bit hillshade (Horn 1981) as a cloud-optimised GeoTIFF, and a PNG picture of the whole survey.
+
+    Values are 1 (in the shade) to 255 (facing the light); 0, transparent in the picture, is empty. Slopes
+    across the borders of tiles and sheets use the neighbour's cells, so no seam shows. In the picture a
+    pixel of several cells is the mean of their heights, shaded after the averaging.
+    """
+
+    name: ClassVar[str] = "hillshade"
+    title: ClassVar[str] = "shaded relief of the surface, as a GeoTIFF and as a picture for pages and reports"
+    version: ClassVar[int] = 2
+    options: ClassVar[type[Strict]] = HillshadeOptions
+    default_cells: ClassVar[Cells] = "coarse"
+
+    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+        """Sheets, the index that joins them, and the picture."""
+        sheet_m = cast(HillshadeOptions, options).sheet_m
+        sheets = cut_sheets(_STEM, (t.tile for t in tiles), sheet_m, context.grid)
+        everything = tuple(sorted(t.tile for t in tiles))
+        known = frozenset(everything)
+        found = [Output(sheet.name, with_neighbours(sheet, known)) for sheet in sheets]
+        found += index_output(_STEM, sheets)
+        return [*found, Output(_PICTURE, everything)] if everything else []
+
+    def write(
+        self,
+        output: Output,
+        tiles: Sequence[TileSummary],
+        load_cells: LoadCells,
+        options: Strict,
+        context: ProductContext,
+        path: Path,
+    ) -> None:
+        """Write one sheet, the index, or the picture."""
+        settings = cast(HillshadeOptions, options)
+        sheet = sheet_of(_STEM, output, settings.sheet_m, context.grid)
+        if output.name == index_name(_STEM):
+            sheets = cut_sheets(_STEM, output.tiles, settings.sheet_m, context.grid)
+            write_index(path, sheets, SHADE_BAND, "uint8", context)
+        elif output.name == _PICTURE:
+            _write_picture(sorted(output.tiles), load_cells, settings, context, path)
+        elif sheet is not None:
+            surface = Surface(output.tiles, base_below(tiles, output), load_cells)
+            _write_sheet(sheet, surface, settings, dated(context, tiles, output.tiles), path)
+        else:
+            raise unknown_output(output)
+
+    def check(self, path: Path) -> None:
+        """Decode all of a sheet or picture; of an index, check its geometry."""
+        with path.open("rb") as stream:
+            start = stream.read(1)
+        if start == PNG_SIGNATURE[:1]:
+            check_picture(path, "LA")
+        else:
+            check_sheet(path)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Tiles whose heights are drawn, counted from a base near them to keep float arithmetic fine."""
+
+    tiles: Sequence[TileId]
+    base_m: float
+    load_cells: LoadCells
+
+    def images(self) -> Iterator[tuple[TileId, Float64]]:
+        """Tile and its (rows, columns) heights above the base (m), NaN where no point lies; row by row."""
+        for tile in sorted(self.tiles, key=lambda t: (-t.row, t.column)):
+            cells = cells_of(tile, self.load_cells)
+            yield tile, cell_image(cells, cells.height_robust_m - self.base_m, "float64")
+
+
+class Light(Protocol):
+    """Settings of a shaded picture."""
+
+    @property
+    def azimuth_deg(self) -> float:
+        """Where the light comes from, clockwise from map north (degrees)."""
+
+    @property
+    def altitude_deg(self) -> float:
+        """Height of the light above the horizon (degrees)."""
+
+    @property
+    def z_factor(self) -> float:
+        """Exaggeration of the heights."""
+
+
+def horn_slopes(heights_m: Float64, cell_m: float, cell_north_m: float | None = None) -> tuple[Float64, Float64]:
+    """Slopes towards east and north of the inner cells of a north-up raster.
+
+    The weighted differences of Horn, *Hill shading and the reflectance map* (Proc. IEEE 69, 1981), eq. for
+    the third-order finite difference with weights 1, 2, 1. A missing neighbour is the continuation of the
+    opposite one through the centre, or level with the centre where that is missing too.
+
+    Parameters
+    ----------
+    heights_m : (rows + 2, columns + 2), NaN where unknown.
+    cell_m : edge of a cell (m); that towards east, where that towards north is stated.
+
+    Returns
+    -------
+    east, north : (rows, columns) metres a metre, NaN where the centre is unknown.
+    """
+    north_west, north, north_east = (_neighbour(heights_m, -1, c) for c in (-1, 0, 1))
+    west, east = _neighbour(heights_m, 0, -1), _neighbour(heights_m, 0, 1)
+    south_west, south, south_east = (_neighbour(heights_m, 1, c) for c in (-1, 0, 1))
+    to_east = (north_east + 2 * east + south_east) - (north_west + 2 * west + south_west)
+    to_north = (north_west + 2 * north + north_east) - (south_west + 2 * south + south_east)
+    unknown = np.isnan(heights_m[1:-1, 1:-1])
+    to_east[unknown] = to_north[unknown] = np.nan  # eight neighbours would give the empty cell between them a slope
+    return to_east / (8 * cell_m), to_north / (8 * (cell_north_m or cell_m))
+
+
+def _neighbour(heights_m: Float64, down: int, right: int) -> Float64:
+    rows, columns = heights_m.shape
+    centre = heights_m[1:-1, 1:-1]
+    near = heights_m[1 + down : rows - 1 + down, 1 + right : columns - 1 + right]
+    missing = np.isnan(near)
+    if not missing.any():
+        return near
+    opposite = heights_m[1 - down : rows - 1 - down, 1 - right : columns - 1 - right]
+    continued = np.where(np.isnan(opposite), centre, 2 * centre - opposite)
+    return np.where(missing, continued, near)
+
+
+def shade(
+    heights_m: Float64, cell_m: float, options: Light, cell_north_m: float | None = None
+) -> npt.NDArray[np.uint8]:
+    """Shade of the inner cells of (rows + 2, columns + 2) heights: 1 to 255, 0 where the height is unknown.
+
+    The brightness of a matt surface: the cosine between its normal and the direction of the light. Cells whose edges
+    differ have that towards north stated, too.
+    """
+    east, north = horn_slopes(heights_m, cell_m, cell_north_m)
+    east *= options.z_factor
+    north *= options.z_factor
+    azimuth, altitude = math.radians(options.azimuth_deg), math.radians(options.altitude_deg)
+    horizontal = math.cos(altitude)
+    towards_light = math.sin(altitude) - horizontal * (math.sin(azimuth) * east + math.cos(azimuth) * north)
+    brightness = np.maximum(towards_light / np.sqrt(1.0 + east * east + north * north), 0.0)
+    grey = np.rint(1.0 + 254.0 * brightness)
+    return np.where(np.isnan(grey), _EMPTY, grey).astype(np.uint8)
+
+
+def with_empty_rim(heights_m: Float64) -> Float64:
+    """(rows + 2, columns + 2) heights with unknown ones around them."""
+    return np.pad(heights_m, 1, constant_values=np.nan)
+
+
+def shade_in_strips(
+    around_m: Float64, cell_m: float, options: Light, cell_north_m: float | None = None
+) -> npt.NDArray[np.uint8]:
+    """As :func:`shade`, few rows at a time to save memory."""
+    rows = around_m.shape[0] - 2
+    strips = [
+        shade(around_m[top : top + _STRIP_ROWS + 2], cell_m, options, cell_north_m)
+        for top in range(0, rows, _STRIP_ROWS)
+    ]
+    return np.concatenate(strips)
+
+
+def with_neighbours(sheet: Sheet, everything: frozenset[TileId]) -> tuple[TileId, ...]:
+    """Tiles of a sheet and those of the survey that touch one of them, in order."""
+    around = {TileId(t.column + right, t.row + up) for t in sheet.tiles for right in (-1, 0, 1) for up in (-1, 0, 1)}
+    return tuple(sorted(around & everything))
+
+
+def base_below(tiles: Sequence[TileSummary], output: Output) -> float:
+    """Whole metres at or below the lowest height of the tiles of `output`."""
+    members = set(output.tiles)
+    return float(math.floor(min(one.height_min_m for one in tiles if one.tile in members)))
+
+
+def _write_sheet(
+    sheet: Sheet, surface: Surface, options: HillshadeOptions, context: ProductContext, path: Path
+) -> None:
+    box = CellBox.around(sheet.tiles, context.grid)
+    shaded = SparseRaster(box, SHADE_BAND, "uint8", _EMPTY, context)
+    with raster_settings(), shaded.cog(path) as raster, _heights(surface, box, context, path) as heights:
+        for block in box.blocks_under(sheet.tiles, context.grid.cells_per_edge):
+            halo = Window(block.col_off, block.row_off, block.width + 2, block.height + 2)
+            raster.write(shade(heights.read(1, window=halo), context.grid.cell_m, options), 1, window=block)
+
+
+@contextmanager
+def _heights(surface: Surface, box: CellBox, context: ProductContext, path: Path) -> Iterator[Any]:
+    """Heights over `box` and one cell around it, in a scratch raster."""
+    around = SparseRaster(box.grown(1), Band("height", "metre"), "float64", np.nan, context)
+    with around.scratch(path.with_name(path.name + ".heights.scratch")) as raster:
+        for tile, image in surface.images():
+            paste_tile(raster, around.box, tile, image)
+        yield raster
+
+
+def _write_picture(
+    tiles: Sequence[TileId], load_cells: LoadCells, options: HillshadeOptions, context: ProductContext, path: Path
+) -> None:
+    box = CellBox.around(tiles, context.grid)
+    step = -(-max(box.width, box.height) // options.picture_px)
+    heights_m = _mean_heights(tiles, load_cells, box, step).trimmed()
+    cell_m = step * context.grid.cell_m
+    write_picture(path, shade_in_strips(with_empty_rim(heights_m), cell_m, options))
+
+
+def _mean_heights(tiles: Sequence[TileId], load_cells: LoadCells, box: CellBox, step: int) -> MeanPixels:
+    """Means of the heights in pixels of `step` squared cells, north up."""
+    pixels = MeanPixels.over(box.height, box.width, (step, step))
+    for tile in tiles:
+        cells = cells_of(tile, load_cells)
+        edge = cells.cells_per_edge
+        column = tile.column * edge - box.west + cells.column.astype(np.int64)
+        pixels.add(box.north - 1 - tile.row * edge - cells.row.astype(np.int64), column, cells.height_robust_m)
+    return pixels

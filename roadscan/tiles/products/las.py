@@ -1,0 +1,263 @@
+"""``las``: the points of a tile as LAS 1.4 or LAZ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar, Final, cast
+
+import laspy
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from roadscan.core.errors import ConfigError, StoreError
+from roadscan.core.gpstime import ADJUSTED_OFFSET_S, NS_PER_S
+from roadscan.core.strict import Strict
+from roadscan.store.codecs.las import ONE_OF_ONE, Layout, check_points, write_points
+from roadscan.tiles.georeferencing.cloud import TilePoints
+from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.product import Cells, ProductContext, Tile, TileProduct
+from roadscan.tiles.products.las_axes import Axes, axis, rounding_errors, set_coordinates
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_SCAN_ANGLE_STEP_DEG: Final = 0.006
+
+_FLAG_BITS: Final = {
+    "scan_direction_flag": 1,
+    "edge_of_flight_line": 2,
+    "synthetic": 4,
+    "key_point": 8,
+    "withheld": 16,
+    "overlap": 32,
+}
+"""LAS dimension by bit of the column ``flags``."""
+
+_AS_RECORDED: Final = ("return_number", "number_of_returns", "user_data", "red", "green", "blue")
+_HANDLED: Final = (*_AS_RECORDED, "flags", "scan_angle_deg")
+_RENAMED: Final = {"point_source_id": "recorded_source_id"}
+
+
+class LasOptions(Strict):
+    """Settings of the point files."""
+
+    compress: bool = True
+    """Write LAZ; otherwise LAS."""
+    scale_m: float = Field(default=1e-4, ge=1e-5, le=0.1)
+    """Step of the stored coordinates (m). In a CRS in feet the next finer of 1, 2 or 5 × 10ⁿ feet is taken."""
+    spacing_m: float | None = Field(default=None, ge=1e-3)
+    """Thin the points out to one in each square of this edge (m), which divides the tile's edge: the point
+    at the lower median of the square's heights. What covers less than half of a square's points, such as
+    loose aggregate or a crack, is not reported. All points are kept where this is left out."""
+
+
+class Las(TileProduct):
+    """LAS 1.4 with point format 6 (7 where the points have colours), usually compressed to LAZ.
+
+    The CRS is stated as WKT, coordinates are in its own unit, time is adjusted standard GPS time, and
+    point_source_id is the pass; what a vendor's program recorded otherwise comes back unchanged (its own
+    source numbers as the extra dimension ``recorded_source_id``). A variable-length record of the user
+    ``roadscan`` holds JSON: survey, tile, thinning, the largest rounding errors, and a digest of the points.
+
+    A point that is kept when the others are thinned out is a recorded one, with its own position, time and
+    pass; of several at the median height it is the first one recorded.
+
+    With `filters.keep_marked` the points that filters leave out follow the others, withheld, in the classes 7, 18 and
+    64 to 71 (see there); thinned-out files do not hold them.
+    """
+
+    name: ClassVar[str] = "las"
+    title: ClassVar[str] = "points of a tile (LAS 1.4 or LAZ), for CAD and point-cloud programs"
+    suffix: ClassVar[str] = ".laz"
+    version: ClassVar[int] = 3
+    options: ClassVar[type[Strict]] = LasOptions
+    default_cells: ClassVar[Cells] = "coarse"
+    needs_points: ClassVar[bool] = True
+
+    def suffix_for(self, options: Strict) -> str:
+        """``.laz`` or ``.las``."""
+        return ".laz" if cast(LasOptions, options).compress else ".las"
+
+    def check_options(self, options: Strict, context: ProductContext) -> None:
+        """Refuse a spacing that does not divide the tile."""
+        spacing_m = cast(LasOptions, options).spacing_m
+        if spacing_m is not None:
+            _squares_per_edge(spacing_m, context.grid)
+
+    def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
+        """Write the tile's points."""
+        settings = cast(LasOptions, options)
+        points = _points_of(tile, settings, context)
+        axes = _axes(points, settings.scale_m, context)
+        layout = _layout(points, axes, context)
+        records = _record(points, axes, layout.header).array
+        facts = _facts(points, tile, axes, settings, context)
+        write_points(path, layout, [one.offset for one in axes], records, facts, context.date, settings.compress)
+
+    def check(self, path: Path) -> None:
+        """Decode every point and compare number, box and digest with what the header states."""
+        check_points(path)
+
+
+def write_las(
+    path: Path,
+    points: TilePoints,
+    options: LasOptions,
+    context: ProductContext,
+    facts: Mapping[str, Any],
+    class_names: Mapping[int, str],
+) -> None:
+    """Write points (one or more) of a tile of the context's grid, as :class:`Las` does.
+
+    Parameters
+    ----------
+    facts : what the record of the user ``roadscan`` states beside the rounding errors.
+    class_names : names of classes that the file holds in its Classification Lookup, up to 15 letters each.
+    """
+    axes = _axes(points, options.scale_m, context)
+    layout = replace(_layout(points, axes, context), class_names=tuple(sorted(class_names.items())))
+    records = _record(points, axes, layout.header).array
+    stated = {
+        **facts, "rounding_error_max_m": rounding_errors(axes), "gps_time_step_ns": _gps_time_step_ns(points)
+    }  # fmt: skip
+    write_points(path, layout, [one.offset for one in axes], records, stated, context.date, options.compress)
+
+
+def _points_of(tile: Tile, options: LasOptions, context: ProductContext) -> TilePoints:
+    """Points to write: thinned out, or all, and behind them those that filters leave out, where they are kept."""
+    if tile.points is None:
+        raise StoreError(f"tile {tile.cells.tile} came without its points", expected="points, which the product needs")
+    if options.spacing_m is not None:
+        return thin_out(tile.points, options.spacing_m, context.grid)
+    return tile.points if tile.marked is None else tile.points.and_then(tile.marked)
+
+
+def thin_out(points: TilePoints, spacing_m: float, grid: TileGrid) -> TilePoints:
+    """One point in each square of `spacing_m`: the one at the lower median of the square's heights.
+
+    The squares are counted from the tile's south-west corner. Of several points at the median height the
+    first in canonical order is kept; the kept points stay in canonical order.
+    """
+    per_edge = _squares_per_edge(spacing_m, grid)
+    edge = grid.size_quanta // per_edge
+    square = (points.y_quanta // edge).astype(np.int64) * per_edge + points.x_quanta // edge
+    order = np.lexsort((points.height_quanta, square))  # stable: equal heights stay in canonical order
+    square, height = square[order], points.height_quanta[order]
+    new_square = np.diff(square, prepend=-1) != 0
+    first_of_height = np.flatnonzero(new_square | (np.diff(height, prepend=0) != 0))
+    start = np.flatnonzero(new_square)
+    size = np.diff(start, append=square.size)
+    median = start + (size - 1) // 2
+    first_at_median = first_of_height[np.searchsorted(first_of_height, median, side="right") - 1]
+    return _selected(points, np.sort(order[first_at_median]))
+
+
+def _squares_per_edge(spacing_m: float, grid: TileGrid) -> int:
+    squares = round(grid.size_m / spacing_m)
+    if squares < 1 or abs(squares * spacing_m - grid.size_m) > 1e-9 or grid.size_quanta % squares:
+        raise ConfigError(
+            f"las.spacing_m = {spacing_m:g}",
+            expected=f"a spacing of whole 10 µm that divides the tile's edge of {grid.size_m:g} m",
+            change="choose for example 0.1",
+        )
+    return squares
+
+
+def _selected(points: TilePoints, kept: Int64) -> TilePoints:
+    return replace(
+        points,
+        **{
+            name: getattr(points, name)[kept]
+            for name in (
+                "x_quanta",
+                "y_quanta",
+                "height_quanta",
+                "epoch_gps_ns",
+                "intensity",
+                "classification",
+                "pass_id",
+            )
+        },
+        extra={name: values[kept] for name, values in points.extra.items()},
+    )
+
+
+def _axes(points: TilePoints, scale_m: float, context: ProductContext) -> Axes:
+    size, frame = context.grid.size_quanta, context.map
+    horizontal_m, vertical_m = frame.horizontal_unit_m, frame.vertical_unit_m
+    return (
+        axis(points.x_quanta, points.tile.column * size, scale_m, horizontal_m, Las.name),
+        axis(points.y_quanta, points.tile.row * size, scale_m, horizontal_m, Las.name),
+        axis(points.height_quanta, 0, scale_m, vertical_m, Las.name),
+    )
+
+
+def _layout(points: TilePoints, axes: Axes, context: ProductContext) -> Layout:
+    further = tuple((_RENAMED.get(c, c), points.extra[c].dtype.str, "as recorded") for c in _further(points))
+    kind = 7 if "red" in points.extra else 6
+    return Layout(kind, further, tuple(one.scale for one in axes), context.map, Las.name)
+
+
+def _further(points: TilePoints) -> list[str]:
+    """Recorded columns that LAS has no dimension for."""
+    return sorted(name for name in points.extra if name not in _HANDLED)
+
+
+def _record(points: TilePoints, axes: Axes, header: laspy.LasHeader) -> Any:
+    record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+    set_coordinates(record, axes)
+    fill_record(record, points)
+    for column in _further(points):
+        record[_RENAMED.get(column, column)] = points.extra[column]
+    return record
+
+
+def fill_record(record: Any, points: TilePoints) -> None:
+    """Fill the dimensions of LAS, but for coordinates: those that all points have, and what a vendor recorded."""
+    record["intensity"] = points.intensity
+    record["classification"] = points.classification
+    record["point_source_id"] = points.pass_id
+    record["gps_time"] = adjusted_gps_s(points.epoch_gps_ns)
+    record.array["bit_fields"] = ONE_OF_ONE
+    extra = points.extra
+    for name in _AS_RECORDED:
+        if name in extra:
+            record[name] = extra[name]
+    if "scan_angle_deg" in extra:
+        steps = np.rint(np.nan_to_num(extra["scan_angle_deg"].astype(np.float64)) / _SCAN_ANGLE_STEP_DEG)
+        record["scan_angle"] = np.clip(steps, -30_000, 30_000).astype(np.int16)
+    if "flags" in extra:
+        for name, bit in _FLAG_BITS.items():
+            record[name] = (extra["flags"] & bit) != 0
+
+
+def adjusted_gps_s(epoch_gps_ns: Int64) -> Float64:
+    """Adjusted standard GPS time (s): the double nearest to GPS seconds minus 1e9 (LAS 1.4 R15, 2.4)."""
+    since_ns = epoch_gps_ns - ADJUSTED_OFFSET_S * NS_PER_S
+    whole = np.sign(since_ns) * (np.abs(since_ns) // NS_PER_S)  # towards zero: the parts never cancel
+    time_s: Float64 = whole + (since_ns - whole * NS_PER_S) / NS_PER_S
+    return time_s
+
+
+def _gps_time_step_ns(points: TilePoints) -> float:
+    """Distance of the doubles that hold the last epoch (ns): twice the largest rounding error of time."""
+    last = adjusted_gps_s(points.epoch_gps_ns.max(keepdims=True))
+    return round(float(np.spacing(np.abs(last))[0]) * NS_PER_S, 3)
+
+
+def _facts(points: TilePoints, tile: Tile, axes: Axes, options: LasOptions, context: ProductContext) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "survey": context.survey_id,
+        "tile": str(points.tile),
+        "height": context.map.height,
+        "points_of_tile": int(tile.cells.count.sum()),
+        "spacing_m": options.spacing_m,
+        "rounding_error_max_m": rounding_errors(axes),
+        "gps_time_step_ns": _gps_time_step_ns(points),
+    }
+    if tile.marked is not None and options.spacing_m is None:
+        facts["marked_points"] = len(tile.marked)
+    return facts

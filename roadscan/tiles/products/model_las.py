@@ -1,0 +1,133 @@
+"""``model_las``, ``model_las_fine``: the pavement's surface as few, even points, for CAD and paver guidance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar, cast
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from roadscan.core.strict import Strict
+from roadscan.store.codecs.las import ONE_OF_ONE, Layout, check_points, write_points
+from roadscan.tiles.decimate import Squares, cells_per_square, decimate
+from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
+from roadscan.tiles.product import Cells, ProductContext, Tile, TileProduct
+from roadscan.tiles.products.las_axes import Axes, axis, rounding_errors, set_coordinates
+
+_UNCLASSIFIED = 1
+_WITHHELD = np.uint8(4)
+"""Among the flags of a point."""
+_FURTHER = (("cells", "u2", "cells that count"), ("points", "u2", "readings in them"))
+_MOST = 65_535
+
+
+class ModelLasOptions(Strict):
+    """Settings of the pavement model."""
+
+    spacing_m: float = Field(default=0.1, ge=1e-3)
+    """Distance of the points (m): a whole number of cells that divides the tile's edge."""
+    min_cover: float = Field(default=0.25, ge=0, le=1)
+    """Share of a square's cells that its height has to come from; points of less (at the edge of what was seen, beside
+    gaps) are written withheld."""
+    compress: bool = True
+    """Write LAZ; otherwise LAS."""
+    scale_m: float = Field(default=1e-4, ge=1e-5, le=0.1)
+    """Step of the stored coordinates (m). In a CRS in feet the next finer of 1, 2 or 5 × 10ⁿ feet is taken."""
+
+
+class ModelLasFineOptions(ModelLasOptions):
+    """Settings of the fine pavement model."""
+
+    spacing_m: float = Field(default=0.02, ge=1e-3)
+    """Distance of the points (m): a whole number of cells that divides the tile's edge."""
+
+
+class ModelLas(TileProduct):
+    """LAS 1.4 (point format 6), one point at the centre of each square of 0.1 m, made from the tile's cells alone.
+
+    The height is filtered so that it is neither that of loose aggregate nor that of a crack (Laurent, Petitclerc
+    and Fox-Ivey, *3D laser road profiling*: "points are decimated to fixed resolutions, and the vertical
+    position is filtered"): with the slope of the patch taken off, the cells within 3 · 1.4826 · MAD (at least
+    1 mm) of the median count, and their mean is the height at the centre. Slopes are medians as well, so neither
+    cross-fall nor gradient lets a stone pass (`roadscan/tiles/decimate.py` states the rule). What covers more than
+    half of a square, as a wide pothole, is surface.
+
+    Intensity is the mean of the cells that count; the extra dimensions ``cells`` and ``points`` say how many they
+    are, and how many readings lie in them (65,535 stands for more). All points are unclassified (1), first of one
+    return, and of the source 0; a model has no time, so gps_time is 0. Points of squares that are hardly covered, or
+    where too few cells lie to tell the slope, are withheld.
+    """
+
+    name: ClassVar[str] = "model_las"
+    title: ClassVar[str] = "pavement surface every 100 mm, without stones and cracks (LAS 1.4 or LAZ), for CAD"
+    suffix: ClassVar[str] = ".laz"
+    version: ClassVar[int] = 3
+    options: ClassVar[type[Strict]] = ModelLasOptions
+    default_cells: ClassVar[Cells] = "fine"
+
+    def suffix_for(self, options: Strict) -> str:
+        """``.laz`` or ``.las``."""
+        return ".laz" if cast(ModelLasOptions, options).compress else ".las"
+
+    def check_options(self, options: Strict, context: ProductContext) -> None:
+        """Refuse a spacing that is no whole number of cells."""
+        self._side(cast(ModelLasOptions, options), context)
+
+    def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
+        """Write the tile's model."""
+        settings = cast(ModelLasOptions, options)
+        side = self._side(settings, context)
+        squares = decimate(tile.cells, side, context.grid.cell_m)
+        axes = self._axes(squares, tile, side, settings, context)
+        layout = Layout(6, _FURTHER, tuple(one.scale for one in axes), context.map, self.name)
+        records = _records(squares, axes, layout, settings.min_cover * side * side)
+        facts = {
+            "survey": context.survey_id,
+            "tile": str(tile.cells.tile),
+            "height": context.map.height,
+            "spacing_m": settings.spacing_m,
+            "min_cover": settings.min_cover,
+            "rounding_error_max_m": rounding_errors(axes),
+        }
+        write_points(path, layout, [one.offset for one in axes], records, facts, context.date, settings.compress)
+
+    def check(self, path: Path) -> None:
+        """Decode every point and compare number, box and digest with what the header states."""
+        check_points(path)
+
+    def _side(self, options: ModelLasOptions, context: ProductContext) -> int:
+        return cells_per_square(options.spacing_m, context.grid, f"{self.name}.spacing_m")
+
+    def _axes(self, squares: Squares, tile: Tile, side: int, options: ModelLasOptions, context: ProductContext) -> Axes:
+        size, frame, place = context.grid.size_quanta, context.map, tile.cells.tile
+        edge_quanta = side * context.grid.cell_quanta
+        scale_m = options.scale_m
+        return (
+            axis(
+                (squares.column + 0.5) * edge_quanta, place.column * size, scale_m, frame.horizontal_unit_m, self.name
+            ),
+            axis((squares.row + 0.5) * edge_quanta, place.row * size, scale_m, frame.horizontal_unit_m, self.name),
+            axis(squares.height_m * QUANTA_PER_M, 0, scale_m, frame.vertical_unit_m, self.name),
+        )
+
+
+class ModelLasFine(ModelLas):
+    """As [`model_las`](#model_las), a point each 20 mm."""
+
+    name: ClassVar[str] = "model_las_fine"
+    title: ClassVar[str] = "pavement surface every 20 mm, without stones and cracks (LAS 1.4 or LAZ), for CAD"
+    options: ClassVar[type[Strict]] = ModelLasFineOptions
+    default: ClassVar[bool] = False
+
+
+def _records(squares: Squares, axes: Axes, layout: Layout, enough_cells: float) -> npt.NDArray[np.void]:
+    records = np.zeros(len(squares), layout.records)
+    set_coordinates(records, axes)
+    records["intensity"] = np.clip(np.rint(squares.intensity), 0, 65_535).astype(np.uint16)
+    records["classification"] = _UNCLASSIFIED
+    records["bit_fields"] = ONE_OF_ONE
+    records["classification_flags"] = _WITHHELD * ((squares.cells < enough_cells) | ~squares.sloped)
+    records["cells"], records["points"] = np.minimum(squares.cells, _MOST), np.minimum(squares.points, _MOST)
+    return records

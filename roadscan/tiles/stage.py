@@ -1,0 +1,98 @@
+"""Stage `tiles`: readings into cells and tile files, by way of points where these are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.core.ids import TileId
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding
+from roadscan.run.engine.compute import Made
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, StageState
+from roadscan.store.logs import LogRecord
+from roadscan.store.manifest import Manifest
+from roadscan.surface.tasks.surface_colours import check_colours
+from roadscan.tiles.footprints.footprints import PRODUCT as FOOTPRINTS
+from roadscan.tiles.footprints.stage import faults_of_plan
+from roadscan.tiles.tasks.passes_apart import apart_findings
+from roadscan.tiles.tasks.tile_fates import fate_words, lost_findings, of_all, told_by_log
+from roadscan.tiles.tasks.tile_files import tile_file_names
+from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
+from roadscan.tiles.tasks.tile_work import memory_of, plan_tile_work
+from roadscan.tiles.tasks.tiles import compute_tiles, run_tasks
+
+
+class Tiles(Stage):
+    """Cells, overviews and tile products of each tile that a reading touches."""
+
+    name = "tiles"
+    title = "readings into points, cells and tile files"
+    after = ("adjust",)
+    command = "tile"
+
+    def run(self, session: Session) -> None:
+        """Compute the tiles that are missing or stale, or those that are chosen."""
+        manifest, work = session.manifest, plan_tile_work(session)
+        if work.chosen:
+            check_colours(session.plan, folders=True)  # before the tiles are computed for them
+        manifest.remove(work.gone)
+
+        def counted(task: TileTask) -> TileTask:
+            session.raw_bytes_read += task.raw_bytes
+            return task
+
+        tasks = Made(work.planned.tasks(work.chosen, session.compute.workers), counted)
+        failures = run_tasks(
+            compute_tiles, tasks, len(work.chosen), work.planned.singly, manifest, session.compute,
+            session.bar(self.name),
+        )  # fmt: skip
+        manifest.forget(TILE, [unit for unit, _ in failures])
+        empty = manifest.without_file(TILE)
+        names = {OVERVIEWS, *tile_file_names()} if empty else ()
+        manifest.remove([r for name in names for unit, r in manifest.of(name).items() if unit in empty])
+        if work.chosen:
+            held = len({str(tile) for tile in work.chosen} - empty - {unit for unit, _ in failures})
+            session.reporter.line(f"tiles: {len(work.chosen):,} looked at, {held:,} of them hold readings")
+        session.failed(self.name, failures)
+        self._tell_of_readings(session, work.chosen)
+
+    def _tell_of_readings(self, session: Session, chosen: Sequence[TileId]) -> None:
+        """Fail logs that give nothing, and the survey where no tile holds anything; say how much of what was computed
+        has no pose.
+        """
+        manifest = session.manifest
+        session.failed(self.name, faults_of_plan(session))
+        computed = [manifest.get(TILE, str(tile)) for tile in chosen]
+        logs = told_by_log([*manifest.of(FOOTPRINTS).values(), *(record for record in computed if record is not None)])
+        if manifest.without_file(TILE) and not manifest.files().get(TILE):
+            why = (
+                fate_words(of_all(logs)) or "all lie off the centre lines of filters.centre_line, or outside all passes"
+            )
+            reason = f"no tile holds a reading: {why}; check the settings that leave them out"
+            session.failed(self.name, [("as a whole", reason)])
+
+    def state(self, session: Session) -> StageState:
+        """Tiles, tasks and memory."""
+        work = plan_tile_work(session)
+        tasks = list(work.planned.tasks(work.chosen))
+        stale = {str(tile) for t in tasks for tile in t.block.tiles}
+        current = sum(1 for r in session.manifest.of(TILE).values() if r.path and r.unit not in stale)
+        doing = {
+            "tasks": len(tasks),
+            "tiles": len(stale),
+            "raw_bytes": sum(t.raw_bytes for t in tasks),
+            "worker_memory_bytes": memory_of(tasks),
+        }
+        empty = len(session.manifest.without_file(TILE) - stale)
+        return StageState(current, len(stale), empty, next_run=doing)
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """Logs of which many readings have no pose, and passes that lie at different heights."""
+        tiles = list(manifest.of(TILE).values())
+        logs = told_by_log([*manifest.of(FOOTPRINTS).values(), *tiles])
+        return [*lost_findings(logs, records, survey.config.checks.lost_share), *apart_findings(tiles)]
+
+    def folders(self) -> Sequence[str]:
+        """Files a tile, those of surfaces too."""
+        return ("tiles",)

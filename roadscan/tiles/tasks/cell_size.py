@@ -1,0 +1,114 @@
+"""Whether the survey's cells hold enough readings, and which cells would: from the tiles that are there.
+
+The rule: a cell of the road that holds a reading should hold :data:`ENOUGH` of them, so that its robust height is a
+median and not the reading itself. What counts is the median over the cells of the fullest tiles, those that together
+hold half of all readings: a lidar sees far beside the road, too. Larger cells are put together from the cells that are
+there, so the numbers are counted and not modelled; no reading is read again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.errors import RoadscanError
+from roadscan.core.survey import Survey
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.store import Store
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.grid import ENOUGH, LARGEST_M, TileGrid
+from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.tasks.tile_plan import TILE
+
+_SAMPLED: Final = 4
+"""Tiles that are looked at: their cells are read from their files."""
+_PLENTY: Final = 3 * ENOUGH
+"""Where the cells of a tile hold so many readings on average, they are not looked at."""
+
+
+@dataclass(frozen=True)
+class CellDensity:
+    """Median readings of a cell that holds one, by the cell's edge (m), from the survey's own edge upwards."""
+
+    readings: dict[float, float]
+
+    @property
+    def now(self) -> float:
+        """Those of the survey's own cells."""
+        return next(iter(self.readings.values()))
+
+    @property
+    def proposed_m(self) -> float | None:
+        """Smallest edge (m) of a cell that holds enough; None where none up to a metre does."""
+        return next((edge for edge, held in self.readings.items() if held >= ENOUGH), None)
+
+
+def density_notes(survey: Survey, store: Store, manifest: Manifest) -> list[str]:
+    """What to say of the cells' size, if anything: where cells hold one reading each, or a default size too few."""
+    config = survey.config.tiles
+    try:
+        found = _density(TileGrid(config.size_m, config.cell_m), store, manifest)
+    except RoadscanError:
+        return []  # a damaged file of cells is told, and made again, elsewhere
+    if found is None or found.now >= ENOUGH:
+        return []
+    stated = "cell_m" in config.model_fields_set
+    if stated and found.now > 1:
+        return []
+    held = f"cells of {config.cell_m:g} m hold {_readings(found.now)} each where half of all readings lie (median)"
+    if found.proposed_m is None:
+        return [f"{held}; cells of {LARGEST_M:g} m would hold fewer than {ENOUGH}"]
+    default = "" if stated else " in [tiles], which states none,"
+    return [f"{held}; cell_m = {found.proposed_m:g}{default} would hold {found.readings[found.proposed_m]:g}"]
+
+
+def _readings(number: float) -> str:
+    return f"{number:g} reading" if number == 1 else f"{number:g} readings"
+
+
+def _density(grid: TileGrid, store: Store, manifest: Manifest) -> CellDensity | None:
+    """What the fullest tiles hold; None where there are none, or they hold plenty."""
+    chosen = _fullest([r for r in manifest.of(TILE).values() if r.path])
+    figures = [record.figures() for record in chosen]
+    if not chosen or sum(f["points"] for f in figures) >= _PLENTY * sum(f["cells"] for f in figures):
+        return None
+    tiles = [read_cells(store, record, grid.cells_per_edge) for record in chosen]
+    return cell_density(tiles, grid)
+
+
+def _fullest(records: Sequence[OutputRecord]) -> list[OutputRecord]:
+    """Some of the tiles that together hold half of all readings, from the fullest to the least full of them."""
+    points = [(int(r.figures().get("points", 0)), r) for r in records]
+    ordered = sorted((one for one in points if one[0]), key=lambda one: (-one[0], one[1].unit))
+    if not ordered:
+        return []
+    held = np.cumsum([number for number, _ in ordered])
+    half = ordered[: int(np.searchsorted(held, held[-1] / 2)) + 1]
+    numbers = np.unique(np.linspace(0, len(half) - 1, _SAMPLED).round().astype(int))
+    return [half[k][1] for k in numbers.tolist()]
+
+
+def cell_density(tiles: Sequence[TileCells], grid: TileGrid) -> CellDensity:
+    """Readings of the cells of some tiles, and of larger cells that a tile could be cut into."""
+    edge = grid.cells_per_edge
+    found: dict[float, float] = {}
+    for factor in range(1, edge + 1):
+        size_m = grid.size_m / (edge // factor)
+        if edge % factor or (edge // factor % 2 and factor > 1) or (found and size_m > LARGEST_M * (1 + 1e-9)):
+            continue
+        found[round(size_m, 9)] = float(np.median(np.concatenate([_counts(t, factor) for t in tiles])))
+        if found[round(size_m, 9)] >= ENOUGH:
+            break
+    return CellDensity(found)
+
+
+def _counts(cells: TileCells, factor: int) -> npt.NDArray[np.float64]:
+    """Readings of each cell of `factor` squared ones that holds one."""
+    across = -(-cells.cells_per_edge // factor)
+    number = (cells.row.astype(np.int64) // factor) * across + cells.column.astype(np.int64) // factor
+    counts = np.bincount(number, weights=cells.count)
+    return np.asarray(counts[counts > 0], dtype=np.float64)

@@ -1,0 +1,236 @@
+"""Cells of a task's tiles straight from the raw readings: each row group is read once, and no point is made.
+
+Tiles are finished one after another, in the order of the drive. For the next one, the row groups that may touch it
+and have not been read yet are counted, into all tiles of the task that they touch. So a row group is read once, and
+what memory holds at any time are the cells of the few tiles that are begun and not finished.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.errors import StoreError
+from roadscan.core.ids import LanePass, TileId
+from roadscan.store.profiles import ProfileReader
+from roadscan.store.returns import ReturnsReader
+from roadscan.store.schema import table_schema
+from roadscan.tiles.accumulator import Accumulator, Pool, PoolExhaustedError, TileEvidence
+from roadscan.tiles.cells import TileCells
+from roadscan.tiles.counting import Counting
+from roadscan.tiles.georeferencing.place import pass_numbers
+from roadscan.tiles.tasks.readings import Placer, RawSlice, geometry_of
+from roadscan.tiles.tasks.tile_fates import Fates
+from roadscan.tiles.tasks.tile_plan import TileTask
+
+_RETURNS_AT_ONCE = 1 << 18
+_READINGS_AT_ONCE = 1 << 20
+_PIECES_AHEAD = 4
+"""Pieces of 2 to 3 MB that are on their way while one is counted; several, because requests wait for a network."""
+_KEPT = threading.local()
+
+
+@dataclass(frozen=True)
+class CountedTile:
+    """A finished tile, or the reason why there is none."""
+
+    tile: TileId
+    cells: TileCells | None
+    """None where no reading fell into it."""
+    evidence: TileEvidence | None
+    failure: str = ""
+
+
+def count_tiles(task: TileTask, fates: Fates) -> Iterator[CountedTile]:
+    """Cells of all tiles of a task that needs no points, in the task's order."""
+    yield from _Stretch(task, fates).tiles(range(len(task.block.tiles)))
+
+
+class _Stretch:
+    """A task at work."""
+
+    def __init__(self, task: TileTask, fates: Fates) -> None:
+        self._task, self._fates = task, fates
+        self._placer = Placer(task.store, task.ground, task.slices)
+        self._sources = [_Source.of(task, number) for number in range(len(task.slices))]
+        self._accumulator = Accumulator(task.ground.grid, task.block.tiles, [p.pass_id for p in task.passes], _pool())
+        self._counting = [self._counting_of(one) for one in task.slices]
+        self._told: set[tuple[int, int]] = set()
+        self._owners = {(s, k): tile for s, k, tile in task.owned}
+
+    def tiles(self, numbers: Sequence[int]) -> Iterator[CountedTile]:
+        """Finish tiles by their numbers in the task; half of them at a time where memory is too small."""
+        left = list(numbers)
+        try:
+            for finished in self._finished(numbers):
+                left.pop(0)
+                yield finished
+        except PoolExhaustedError:
+            if len(left) == 1:
+                raise
+            self._accumulator.drop()
+            yield from self.tiles(left[: len(left) // 2])
+            yield from self.tiles(left[len(left) // 2 :])
+
+    def _finished(self, numbers: Sequence[int]) -> Iterator[CountedTile]:
+        wanted = set(numbers)
+        done: set[tuple[int, int]] = set()
+        damaged: dict[TileId, str] = {}
+        begun: set[TileId] = set()
+        touched = self._tiles_by_group(wanted)
+        announced = self._announced(numbers)
+        for number in numbers:
+            tile = self._task.block.tiles[number]
+            self._accumulator.activate([tile])
+            begun.add(tile)
+            for touch in self._task.touches[number]:
+                for start, end in _unread(touch.slice_index, touch.first, touch.end, done):
+                    for group in range(start, end):
+                        near = touched[touch.slice_index, group]
+                        self._accumulator.activate([t for t in near if t not in begun])
+                        begun.update(near)
+                    for first, last in self._sources[touch.slice_index].pieces(start, end):
+                        next(announced, None)
+                        try:
+                            self._count(touch.slice_index, first, last)
+                        except StoreError as error:
+                            for group in range(first, last):
+                                damaged |= dict.fromkeys(touched[touch.slice_index, group], str(error))
+            finished = self._accumulator.finish(tile)
+            if tile in damaged:
+                yield CountedTile(tile, None, None, damaged[tile])
+            else:
+                yield CountedTile(tile, *(finished or (None, None)))
+
+    def _announced(self, numbers: Sequence[int]) -> Iterator[None]:
+        """Goes on once a piece that is counted, and lets those that follow be on their way."""
+        done: set[tuple[int, int]] = set()
+        pieces = (
+            (touch.slice_index, *piece)
+            for number in numbers
+            for touch in self._task.touches[number]
+            for run in _unread(touch.slice_index, touch.first, touch.end, done)
+            for piece in self._sources[touch.slice_index].pieces(*run)
+        )
+        for k, (index, first, last) in enumerate(pieces):
+            self._sources[index].expect(self._task.slices[index].groups[first:last])
+            if k >= _PIECES_AHEAD:
+                yield
+
+    def _tiles_by_group(self, wanted: set[int]) -> dict[tuple[int, int], list[TileId]]:
+        """Wanted tiles that each group of a slice may touch."""
+        found: dict[tuple[int, int], list[TileId]] = defaultdict(list)
+        for number in sorted(wanted):
+            for touch in self._task.touches[number]:
+                for group in range(touch.first, touch.end):
+                    found[touch.slice_index, group].append(self._task.block.tiles[number])
+        return found
+
+    def _count(self, index: int, first: int, end: int) -> None:
+        """Count the row groups `first` to `end` − 1 (positions) of a slice."""
+        one, counting = self._task.slices[index], self._counting[index]
+        owners = [self._owners.get((index, k)) for k in range(first, end)]
+        start = first
+        for k in range(first + 1, end + 1):
+            if k == end or owners[k - first] != owners[start - first]:
+                before = counting.fates.copy()
+                self._sources[index].count(counting, self._accumulator, one.groups[start:k])
+                owner = owners[start - first]
+                if owner is not None and (index, start) not in self._told:
+                    self._told.update((index, g) for g in range(start, k))
+                    self._fates.add(owner, one.file, counting.fates - before)
+                start = k
+
+    def _counting_of(self, one: RawSlice) -> Counting:
+        return Counting(self._placer.placement(one.source), self._accumulator, geometry_of(one.source))
+
+
+def _unread(index: int, first: int, end: int, done: set[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """Runs of positions from `first` to `end` − 1 that have not been read; they count as read from now on."""
+    start = first
+    while start < end:
+        if (index, start) in done:
+            start += 1
+            continue
+        stop = start
+        while stop < end and (index, stop) not in done:
+            done.add((index, stop))
+            stop += 1
+        yield start, stop
+        start = stop
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A data file whose readings are counted."""
+
+    task: TileTask
+    slice: RawSlice
+    passes: tuple[LanePass, ...]
+    """Those of its run."""
+    reader: ProfileReader | ReturnsReader
+    at_once: int
+    """Row groups that are read together."""
+
+    @classmethod
+    def of(cls, task: TileTask, number: int) -> _Source:
+        one = task.slices[number]
+        geometry = geometry_of(one.source)
+        rows = table_schema(one.source.table).row_group_rows
+        most = _RETURNS_AT_ONCE // rows if geometry is None else _READINGS_AT_ONCE // (rows * geometry.readings)
+        reader = (ReturnsReader if geometry is None else ProfileReader)(task.store, one.file)
+        return cls(task, one, tuple(p for p in task.passes if p.run == one.source.run), reader, max(1, most))
+
+    def pieces(self, first: int, end: int) -> Iterator[tuple[int, int]]:
+        """Positions `first` to `end` − 1 in pieces that are read together."""
+        for start in range(first, end, self.at_once):
+            yield start, min(start + self.at_once, end)
+
+    def expect(self, groups: Sequence[int]) -> None:
+        """Let row groups be on their way that will be counted soon."""
+        self.reader.expect(groups)
+
+    def count(self, counting: Counting, accumulator: Accumulator, groups: Sequence[int]) -> None:
+        """Read row groups and count their readings."""
+        if isinstance(self.reader, ReturnsReader):
+            self._count_returns(self.reader, counting, accumulator, groups)
+        else:
+            self._count_profiles(self.reader, counting, accumulator, groups)
+
+    def _count_profiles(
+        self, reader: ProfileReader, counting: Counting, accumulator: Accumulator, groups: Sequence[int]
+    ) -> None:
+        rows, clock, geometry = reader.read(groups), self.slice.source.clock, geometry_of(self.slice.source)
+        epochs = rows.epoch_gps_ns if clock is None else clock.applied(rows.epoch_gps_ns)
+        own = epochs
+        if geometry is not None and geometry.reading_period_ns:
+            own = geometry.all_epochs(epochs)
+        counting.profiles(epochs, rows.range, rows.intensity, self._passes(own, accumulator))
+
+    def _count_returns(
+        self, reader: ReturnsReader, counting: Counting, accumulator: Accumulator, groups: Sequence[int]
+    ) -> None:
+        rows, clock = reader.read(groups), self.slice.source.clock
+        epochs, pose_epochs = rows.epoch_gps_ns, rows.pose_epoch_gps_ns
+        if clock is not None:
+            epochs, pose_epochs = clock.applied(epochs), clock.applied(pose_epochs)
+        xyz = rows.x_sensor_m, rows.y_sensor_m, rows.z_sensor_m
+        counting.returns(epochs, pose_epochs, xyz, rows.intensity, self._passes(epochs, accumulator))
+
+    def _passes(self, epochs: npt.NDArray[np.int64], accumulator: Accumulator) -> npt.NDArray[np.int32]:
+        """Index of each epoch's pass among the accumulator's, −1 for none."""
+        return pass_numbers(epochs, self.passes, accumulator.passes)
+
+
+def _pool() -> Pool:
+    """The worker's memory for cells: fresh memory is dear, so it serves one task after another."""
+    pool: Pool | None = getattr(_KEPT, "pool", None)
+    if pool is None:
+        pool = _KEPT.pool = Pool()
+    pool.clear()
+    return pool

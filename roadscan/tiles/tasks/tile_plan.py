@@ -1,0 +1,275 @@
+"""What the tiles stage has to do: keys of tiles, which are stale, and the tasks that compute them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.ids import LanePass, TileId
+from roadscan.core.survey import CellColumns
+from roadscan.run.engine.compute import Made
+from roadscan.run.engine.fingerprint import key_of, keys_of
+from roadscan.store.manifest import Manifest
+from roadscan.store.store import Store
+from roadscan.tiles.blocks import Block, cut_blocks
+from roadscan.tiles.footprints.footprints import FootprintRanges
+from roadscan.tiles.footprints.row_groups import GroupsByTile
+from roadscan.tiles.plan.centre_line import CentreLines
+from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.plan.road import road_key
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.tasks.readings import Ground, RawSlice
+from roadscan.tiles.tasks.stretches import DrivenTiles, cut_stretches
+from roadscan.tiles.tasks.tile_files import WantedProduct
+
+TILE = "tile"
+"""Manifest name of a tile as a whole; its file holds the cells."""
+
+OVERVIEWS = "overviews"
+"""Manifest name of a tile's overviews; their record has the key of the tile's own."""
+
+
+@dataclass(frozen=True)
+class PlannedTiles(DrivenTiles):
+    """Every tile that readings may touch, by row and column, with its key."""
+
+    keys: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __iter__(self) -> Iterator[TileId]:
+        return iter(self.ids)
+
+    def __contains__(self, tile: object) -> bool:
+        return tile in self.number
+
+    @cached_property
+    def ids(self) -> tuple[TileId, ...]:
+        """All tiles."""
+        return tuple(map(TileId._make, zip(self.column.tolist(), self.row.tolist(), strict=True)))
+
+    @cached_property
+    def number(self) -> dict[TileId, int]:
+        """Place of each tile in the arrays."""
+        return {tile: number for number, tile in enumerate(self.ids)}
+
+    def numbers(self, tiles: Iterable[TileId]) -> npt.NDArray[np.int64]:
+        """Places of some tiles; a `KeyError` where one is none of these."""
+        wanted = np.array([(tile.row, tile.column) for tile in tiles], dtype=np.int64).reshape(-1, 2)
+        place = _places(*wanted.T)
+        found = np.searchsorted(self._place, place)
+        missing = self._place.take(found, mode="clip") != place if len(self) else np.ones(found.shape, bool)
+        if missing.any():
+            raise KeyError(TileId(*wanted[missing][0, ::-1].tolist()))
+        return found
+
+    @cached_property
+    def _place(self) -> npt.NDArray[np.int64]:
+        return _places(self.row, self.column)
+
+
+def _places(row: npt.NDArray[Any], column: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Numbers that order tiles by row and column."""
+    return (row.astype(np.int64) << 32) + column.astype(np.int64)
+
+
+@dataclass(frozen=True)
+class TileTouch:
+    """Row groups that may touch a tile of a task: positions in the groups of one of its slices."""
+
+    slice_index: int
+    first: int
+    end: int
+
+
+@dataclass(frozen=True)
+class TileTask:
+    """Everything a worker needs to compute some tiles; it holds no data, and no epoch of single row groups."""
+
+    store: Store
+    ground: Ground
+    block: Block
+    """The tiles, and the halo whose points are loaded as well."""
+    keys: tuple[str, ...]
+    """Key of each core tile."""
+    slices: tuple[RawSlice, ...]
+    """Raw blocks that may touch the tiles, sorted by run, sensor and time."""
+    touched: npt.NDArray[np.int32]
+    """(n, 4) core tile by its place in the block, slice, first position and end in its groups."""
+    owned_runs: npt.NDArray[np.int32]
+    """(n, 4) slice, first position, end, core tile: groups whose readings are told by fate with that tile."""
+    readings: int
+    """Readings expected."""
+    passes: tuple[LanePass, ...]
+    centre_lines: CentreLines | None
+    products: tuple[WantedProduct, ...]
+    context: ProductContext
+    cell_table: CellColumns = "full"
+
+    @cached_property
+    def touches(self) -> tuple[tuple[TileTouch, ...], ...]:
+        """What may touch each core tile."""
+        found: list[list[TileTouch]] = [[] for _ in self.block.tiles]
+        for place, index, first, end in self.touched.tolist():
+            found[place].append(TileTouch(index, first, end))
+        return tuple(map(tuple, found))
+
+    @property
+    def owned(self) -> Iterator[tuple[int, int, TileId]]:
+        """(slice, position of the group, tile), group by group."""
+        tiles = self.block.tiles
+        return ((s, k, tiles[place]) for s, first, end, place in self.owned_runs.tolist() for k in range(first, end))
+
+    @property
+    def raw_bytes(self) -> int:
+        """Compressed bytes to read, about."""
+        return sum(s.bytes for s in self.slices)
+
+    @property
+    def needs_points(self) -> bool:
+        """True where single points have to be placed: for a product, for a filter, or because they are given."""
+        return (
+            any(w.product.needs_points for w in self.products)
+            or self.centre_lines is not None
+            or self.ground.marks
+            or any(s.source.table == "cloud" for s in self.slices)
+        )
+
+
+def plan_tiles(footprints: FootprintRanges, plan: SurveyPlan) -> PlannedTiles:
+    """Every tile that a raw block may touch."""
+    f = footprints
+    order = np.lexsort((f.first_group, f.slice_index, f.tile_column, f.tile_row))
+    column, row = f.tile_column[order], f.tile_row[order]
+    is_first = np.concatenate([np.ones(min(order.size, 1), bool), (np.diff(column) != 0) | (np.diff(row) != 0)])
+    starts = np.flatnonzero(is_first)
+    ends = np.append(starts[1:], order.size)[: starts.size]
+    digests = {one.path: one.digest for _, files in plan.sources for one in files}
+    names = np.array(
+        [key_of(s.source.key, digests[s.file], plan.pass_key(s.source.run), *road_key(s.source)) for s in f.slices],
+        "S16",
+    )
+    content = np.empty(order.size, dtype=[("name", "S16"), ("corrections", "<u8"), ("first", "<i4"), ("last", "<i4")])
+    content["name"] = names[f.slice_index[order]]
+    content["corrections"] = _correction_digests(f, plan)[order]
+    content["first"], content["last"] = f.first_group[order], f.last_group[order]
+    return PlannedTiles(
+        column=column[starts],
+        row=row[starts],
+        keys=tuple(keys_of(plan.tile_key, content, ends)),
+        readings=np.add.reduceat(f.readings[order], starts) if starts.size else f.readings[:0],
+        first_epoch_gps_ns=np.minimum.reduceat(f.first_epoch_gps_ns[order], starts)
+        if starts.size
+        else f.first_epoch_gps_ns[:0],
+        groups=GroupsByTile(f, order, np.append(starts, order.size)),
+    )
+
+
+def _correction_digests(f: FootprintRanges, plan: SurveyPlan) -> npt.NDArray[np.uint64]:
+    """Digest (n,) of the corrections that place the readings of each run of row groups."""
+    found = np.zeros(f.slice_index.size, np.uint64)
+    order = np.argsort(f.slice_index, kind="stable")
+    ends = np.searchsorted(f.slice_index[order], np.arange(len(f.slices)), side="right").tolist()
+    for one, (first, end) in zip(f.slices, itertools.pairwise([0, *ends]), strict=True):
+        if one.source.run in plan.corrections.by_run or one.source.mounting_change is not None:
+            own = order[first:end]
+            spans = np.column_stack([f.first_epoch_gps_ns[own], f.last_epoch_gps_ns[own]])
+            found[own] = plan.corrections.digests(one.source, spans, plan.ground.max_gap_s)
+    return found
+
+
+def stale_tiles(tiles: PlannedTiles, products: Sequence[WantedProduct], manifest: Manifest) -> list[TileId]:
+    """Tiles that are missing, changed, or lack a wanted product."""
+    if not manifest.of(TILE):
+        return list(tiles)
+    pairs = zip(tiles.ids, tiles.keys, strict=True)
+    return [tile for tile, key in pairs if not _is_current(tile, key, products, manifest)]
+
+
+@dataclass(frozen=True)
+class TilePlan:
+    """Tiles of a survey and what is to be made of them."""
+
+    plan: SurveyPlan
+    footprints: FootprintRanges
+    tiles: PlannedTiles
+    products: tuple[WantedProduct, ...]
+    context: ProductContext
+
+    def tasks(self, chosen: Sequence[TileId], workers: int = 1) -> Sequence[TileTask]:
+        """Tasks over the chosen tiles: two kilometres each, or less where there are few for that many workers.
+
+        Where products need points, a task is a block that fits into memory.
+        """
+        config = self.plan.survey.config.tiles
+        if not chosen:
+            return []
+        numbers = self.tiles.numbers(chosen)
+        if self._points_of(self.task(Block(()))):
+            readings = dict(zip(chosen, self.tiles.readings[numbers].tolist(), strict=True))
+            return [self.task(b) for b in cut_blocks(readings, config.block_tiles, config.max_block_readings)]
+        return Made(cut_stretches(self.tiles, numbers, config.size_m, workers), self._stretch)
+
+    def _stretch(self, own: npt.NDArray[np.int64]) -> TileTask:
+        """A task over tiles by their numbers, without halo."""
+        return self._task(Block(tuple(map(self.tiles.ids.__getitem__, own.tolist()))), own, own)
+
+    def singly(self, chosen: Sequence[TileId]) -> list[TileTask]:
+        """A task for each tile."""
+        return [self.task(Block((tile,))) for tile in chosen]
+
+    def _points_of(self, task: TileTask) -> bool:
+        return task.needs_points or any(s.source.table == "cloud" for s in self.footprints.slices)
+
+    def task(self, block: Block) -> TileTask:
+        """A task over a block."""
+        near = self.tiles.numbers(t for t in block.with_halo() if t in self.tiles)
+        return self._task(block, self.tiles.numbers(block.tiles), near)
+
+    def _task(self, block: Block, core: npt.NDArray[np.int64], near: npt.NDArray[np.int64]) -> TileTask:
+        """A task over the tiles numbered `core`, with the row groups of those numbered `near`."""
+        tiles = self.tiles
+        runs = tiles.groups.runs(near)
+        cuts = np.flatnonzero(np.diff(runs.slice, prepend=-1))
+        spans = list(zip(runs.first_epoch_gps_ns.tolist(), runs.last_epoch_gps_ns.tolist(), strict=True))
+        slices: list[RawSlice] = []
+        for start, end in itertools.pairwise([*cuts.tolist(), len(spans)]):
+            whole = self.footprints.slices[int(runs.source[start])]
+            groups = tiles.groups.groups(runs, start, end)
+            share = whole.bytes * len(groups) // max(len(whole.groups), 1)
+            slices.append(RawSlice(whole.source, whole.file, groups, tuple(spans[start:end]), share))
+        return TileTask(
+            store=self.plan.store,
+            ground=self.plan.ground,
+            block=block,
+            keys=tuple(map(tiles.keys.__getitem__, core.tolist())),
+            slices=tuple(slices),
+            touched=tiles.groups.touched(runs, core),
+            owned_runs=tiles.groups.owned(runs, core),
+            readings=int(tiles.readings[core].sum()),
+            passes=self.plan.passes,
+            centre_lines=self.plan.centre_lines,
+            products=self.products,
+            context=self.context,
+            cell_table=self.plan.survey.config.tiles.cell_table,
+        )
+
+
+def _is_current(tile: TileId, key: str, products: Sequence[WantedProduct], manifest: Manifest) -> bool:
+    if not manifest.is_current(TILE, str(tile), key):
+        return False
+    record = manifest.get(TILE, str(tile))
+    if record is not None and not record.path:
+        return True  # without points there are no files
+    if not manifest.is_current(OVERVIEWS, str(tile), key):
+        return False
+    return all(
+        manifest.is_current(name, str(tile), key_of(key, wanted.key)) for wanted in products for name in wanted.files
+    )

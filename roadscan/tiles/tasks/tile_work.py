@@ -1,0 +1,61 @@
+"""What the stage `tiles` has to do: the tiles there are against those there should be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from roadscan.core.ids import TileId
+from roadscan.run.session import Session
+from roadscan.store.manifest import OutputRecord
+from roadscan.surface.tasks.found_regions import searched_sources
+from roadscan.surface.tasks.surface_colours import check_colours
+from roadscan.surface.tasks.surface_plan import checked_surface
+from roadscan.tiles.accumulator import MOST_BYTES
+from roadscan.tiles.mosaics.products import product_context, wanted_tile_products
+from roadscan.tiles.tasks.tile_files import tile_file_names
+from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, stale_tiles
+
+BYTES_PER_READING: Final = 100
+"""Memory of a worker per reading of its block, measured: points, sorting and one tile's products."""
+WORKER_BASE_BYTES: Final = 400 << 20
+"""Memory of a worker before its first block: Python and its libraries."""
+
+
+@dataclass(frozen=True)
+class TileWork:
+    """What the stage has to do."""
+
+    planned: TilePlan
+    chosen: list[TileId]
+    """Tiles to compute now."""
+    gone: list[OutputRecord]
+    """Files of tiles that no reading touches any more, and of products no longer wanted."""
+
+
+def plan_tile_work(session: Session) -> TileWork:
+    """Compare what there is with what there should be."""
+    plan, manifest, survey = session.plan, session.manifest, session.survey
+    context = product_context(plan)
+    if survey.config.surface is not None:
+        checked_surface(survey, survey.config.surface)  # before the tiles are computed for it
+        searched_sources(plan)
+        check_colours(plan)
+    wanted = tuple(wanted_tile_products(survey, context))
+    tiles, footprints = session.tiles, session.footprints
+    if session.selection is not None:
+        chosen = session.selection.tiles(tiles, footprints, plan.ground.grid)
+    else:
+        chosen = stale_tiles(tiles, wanted, manifest)
+    per_tile = tile_file_names()
+    dropped = per_tile - tile_file_names({w.product.name for w in wanted})
+    gone = manifest.beside({TILE, OVERVIEWS, *per_tile} - dropped, {str(t) for t in tiles})
+    gone += manifest.beside(dropped, ())
+    return TileWork(TilePlan(plan, footprints, tiles, wanted, context), chosen, gone)
+
+
+def memory_of(tasks: Sequence[TileTask]) -> int:
+    """Memory (bytes) that a worker needs for the largest of some tasks, about."""
+    largest = max((t.readings * BYTES_PER_READING if t.needs_points else MOST_BYTES for t in tasks), default=0)
+    return WORKER_BASE_BYTES + largest if tasks else 0

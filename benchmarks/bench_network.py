@@ -1,6 +1,6 @@
 """A network of 20,000 km in blocks: planning, the scheduler and the manifest at work; the kernels do nothing.
 
-Everything but the readings is real: plans and tasks of :mod:`roadscan.jobs`, a Dask scheduler with two workers in
+Everything but the readings is real: plans and tasks of the stages, a Dask scheduler with two workers in
 processes of their own, and the loops that hand tasks out and keep the records. A survey is a day's drive; footprints
 and tiles of all are scheduled as in a run, products of one. The network is run twice: its graph alone, where a task of
 tiles ends at once and leaves nothing, and then with four records of each tile, which are made, packed, sent and kept.

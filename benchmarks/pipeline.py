@@ -76,8 +76,8 @@ class _Counted:
 
 def _imports(_: int) -> None:
     """What a worker does once, before its first task: import the code of the stages that are timed."""
-    for name in ("ingest", "navigate", "footprints", "tiles", "products"):
-        importlib.import_module(f"roadscan.jobs.stages.{name}")
+    for name in ("ingest", "navigation", "tiles.footprints", "tiles", "tiles.mosaics"):
+        importlib.import_module(f"roadscan.{name}.stage")
 
 
 def _timed(run: Session, stage: Stage) -> dict[str, float]:

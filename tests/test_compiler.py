@@ -152,14 +152,15 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = """
 from pathlib import Path
 from roadscan.compute.kernel_options import _folder_of_source
-kernels = Path("roadscan/kernels").resolve()
+kernels = Path("roadscan/feature/kernels").resolve()
 for file in sorted(kernels.rglob("*.py")):
     print(file.relative_to(kernels), _folder_of_source(str(file)))
 """
+COMPUTE = ("__init__.py", "compiler.py", "kernel_options.py")
 CHAIN = {
-    "rooms/first.py": "from roadscan.kernels.rooms import second\n",
+    "rooms/first.py": "from roadscan.feature.kernels.rooms import second\n",
     "rooms/second.py": "from .deep.third import doubled\n",
-    "rooms/deep/third.py": "def f():\n    import roadscan.kernels.fourth\n",
+    "rooms/deep/third.py": "def f():\n    import roadscan.feature.kernels.fourth\n",
     "fourth.py": "from . import fifth as other\n",
     "fifth.py": "FACTOR = 2\n",
     "rooms/alone.py": "from roadscan.compute.kernel_options import kernel\n",
@@ -169,13 +170,10 @@ CHAIN = {
 @pytest.mark.parametrize("changed", CHAIN)
 def test_a_changed_kernel_changes_the_folder_of_all_that_import_it(tmp_path: Path, changed: str) -> None:
     """Whatever the form of the import and the depth of the folder; no other kernel is compiled again."""
-    (tmp_path / "roadscan").mkdir()
-    for name in ("__init__.py", "compiler.py", "private_folder.py"):
+    for name in ("__init__.py", "core/__init__.py", "core/private_folder.py", *(f"compute/{n}" for n in COMPUTE)):
+        (tmp_path / "roadscan" / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / "roadscan" / name, tmp_path / "roadscan" / name)
-    kernels = tmp_path / "roadscan/kernels"
-    for name in ("__init__.py", "options.py"):
-        (kernels / name).parent.mkdir(exist_ok=True)
-        shutil.copy(ROOT / "roadscan/kernels" / name, kernels / name)
+    kernels = tmp_path / "roadscan/feature/kernels"
     for name, text in CHAIN.items():
         (kernels / name).parent.mkdir(parents=True, exist_ok=True)
         (kernels / name).write_text(text, encoding="utf-8")

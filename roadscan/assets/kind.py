@@ -112,5 +112,5 @@ class AssetKind(ABC):
 @functools.cache
 def asset_kinds() -> dict[str, AssetKind]:
     """All kinds by name."""
-    found = found_kinds("roadscan.assets.kinds", AssetKind, ENTRY_POINT_GROUP)
+    found = found_kinds("assets/kinds/*.py", AssetKind, ENTRY_POINT_GROUP)
     return {name: kind() for name, kind in found.items()}

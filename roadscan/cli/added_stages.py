@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from importlib.metadata import entry_points
-from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import typer
 from typer.core import TyperGroup
 
 from roadscan.cli.arguments import AsJson, Dashboard, Scheduler, SurveyFile, Workers
+from roadscan.core.plugins import files_at
 
-_FOLDER = Path(__file__).resolve().parents[1] / "jobs" / "stages"
-_GROUP = "roadscan.stages"
+_PLACE: Final = "**/stage.py"
+_GROUP: Final = "roadscan.stages"
+_NAME: Final = re.compile(r'^    name = "(\w+)"$', re.MULTILINE)
+"""How a stage states its name."""
 
 
 class Commands(TyperGroup):
@@ -29,10 +32,10 @@ class Commands(TyperGroup):
 
 
 def _added() -> list[str]:
-    """Names of stages that may be there, without importing them: files of the folder, and entry points."""
+    """Names of stages that may be there, without importing them: as their files state them, and entry points."""
     own = {"ingest", "navigate", "footprints", "tiles", "surfaces", "products"}
-    files = {file.stem for file in _FOLDER.glob("[a-z]*.py")} | {f.parent.name for f in _FOLDER.glob("*/__init__.py")}
-    return sorted((files | {entry.name for entry in entry_points(group=_GROUP)}) - own)
+    stated = {name for file in files_at(_PLACE) for name in _NAME.findall(file.read_text(encoding="utf-8"))}
+    return sorted((stated | {entry.name for entry in entry_points(group=_GROUP)}) - own)
 
 
 def _stage_command(word: str) -> Any:

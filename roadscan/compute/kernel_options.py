@@ -78,14 +78,14 @@ def _folder_of_source(source: str) -> str:
 
 @functools.cache
 def _imported_kernels(file: Path) -> list[Path]:
-    """Files of this package that a file imports, anywhere in it, whatever form the import has."""
-    here = Path(__file__).parent
-    within = ("roadscan", "kernels", *file.parent.relative_to(here).parts) if file.is_relative_to(here) else ()
+    """Kernel files of roadscan (in folders named `kernels`) that a file imports, anywhere in it, in any form."""
+    library = Path(__file__).parents[1]
+    within = ("roadscan", *file.parent.relative_to(library).parts) if file.is_relative_to(library) else ()
     found = []
     for node in _statements(ast.parse(file.read_bytes())):
         for name in _imported_names(node, within):
-            if name[:2] == ("roadscan", "kernels"):
-                module = here.joinpath(*name[2:])
+            if name[:1] == ("roadscan",) and "kernels" in name:
+                module = library.joinpath(*name[1:])
                 found += [file for file in (module.with_suffix(".py"), module / "__init__.py") if file.is_file()]
     return found
 

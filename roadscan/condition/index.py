@@ -75,7 +75,7 @@ class ConditionIndex(ABC):
 @functools.cache
 def condition_indices() -> dict[str, ConditionIndex]:
     """All indices by name."""
-    found = found_kinds("roadscan.condition.indices", ConditionIndex, ENTRY_POINT_GROUP)
+    found = found_kinds("condition/indices/*.py", ConditionIndex, ENTRY_POINT_GROUP)
     return {name: kind() for name, kind in found.items()}
 
 

@@ -1,25 +1,26 @@
-"""Formats, products and stages are found: they lie in a folder of roadscan, or another package names them."""
+"""Formats, products and stages are found: they lie at a place of roadscan, or another package names them."""
 
 from __future__ import annotations
 
 import importlib
-import pkgutil
 from collections.abc import Iterator
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from roadscan.core.errors import ConfigError
 
 Kind = TypeVar("Kind")
+_LIBRARY: Final = Path(__file__).parents[1]
 
 
-def found_kinds(package: str, base: type[Kind] | tuple[type[Kind], ...], group: str) -> dict[str, Any]:
-    """Classes derived from `base`, by their `name`: those of a package's modules, and installed entry points.
+def found_kinds(place: str, base: type[Kind] | tuple[type[Kind], ...], group: str) -> dict[str, Any]:
+    """Classes derived from `base`, by their `name`: those of roadscan's modules at a place, and installed entry points.
 
     Parameters
     ----------
-    package : dotted name; folders below it are looked into as well.
+    place : pattern of the files of these modules, below the folder of roadscan (``"*/stage.py"``).
     group : name of the entry points.
 
     Raises
@@ -29,7 +30,7 @@ def found_kinds(package: str, base: type[Kind] | tuple[type[Kind], ...], group: 
     """
     found: dict[str, Any] = {}
     origins: dict[str, str] = {}
-    for kind, origin in _candidates(package, base, group):
+    for kind, origin in _candidates(place, base, group):
         if kind.__abstractmethods__:
             continue
         if kind.name in found:
@@ -40,8 +41,8 @@ def found_kinds(package: str, base: type[Kind] | tuple[type[Kind], ...], group: 
     return dict(sorted(found.items()))
 
 
-def _candidates(package: str, base: Any, group: str) -> Iterator[tuple[Any, str]]:
-    for module in _modules(package):
+def _candidates(place: str, base: Any, group: str) -> Iterator[tuple[Any, str]]:
+    for module in modules_at(place):
         for value in vars(module).values():
             if isinstance(value, type) and issubclass(value, base) and value.__module__ == module.__name__:
                 yield value, module.__name__
@@ -49,7 +50,12 @@ def _candidates(package: str, base: Any, group: str) -> Iterator[tuple[Any, str]
         yield entry.load(), f"entry point {entry.value}"
 
 
-def _modules(package: str) -> Iterator[ModuleType]:
-    there = importlib.import_module(package)
-    for one in pkgutil.walk_packages(there.__path__, f"{package}."):
-        yield importlib.import_module(one.name)
+def modules_at(place: str) -> Iterator[ModuleType]:
+    """Modules of roadscan whose files match a pattern, imported one by one."""
+    for file in files_at(place):
+        yield importlib.import_module(".".join(file.relative_to(_LIBRARY.parent).with_suffix("").parts))
+
+
+def files_at(place: str) -> list[Path]:
+    """Files of roadscan that match a pattern, without importing them; those of packages themselves are left out."""
+    return sorted(file for file in _LIBRARY.glob(place) if not file.name.startswith("__"))

@@ -379,7 +379,7 @@ class LogFormat(ABC):
 @functools.cache
 def log_formats() -> dict[str, LogFormat]:
     """All formats by name: those of this folder, and installed entry points."""
-    found = found_kinds("roadscan.formats", LogFormat, ENTRY_POINT_GROUP)
+    found = found_kinds("formats/**/*.py", LogFormat, ENTRY_POINT_GROUP)
     return {name: kind() for name, kind in found.items()}
 
 

@@ -1,4 +1,4 @@
-"""What a section of the report is, and which there are: modules of `jobs/report/sections/`, and entry points."""
+"""What a section of the report is, and which there are: modules of `report/sections/`, and entry points."""
 
 from __future__ import annotations
 
@@ -61,5 +61,5 @@ class Section(ABC):
 @functools.cache
 def sections() -> tuple[Section, ...]:
     """All sections, in the order of the page."""
-    known = found_kinds("roadscan.report.sections", Section, ENTRY_POINT_GROUP)
+    known = found_kinds("report/sections/*.py", Section, ENTRY_POINT_GROUP)
     return tuple(sorted((kind() for kind in known.values()), key=lambda s: (s.position, s.name)))

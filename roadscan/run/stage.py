@@ -1,4 +1,4 @@
-"""What a stage is, and which there are: the modules of `jobs/stages/`, and entry points of other packages."""
+"""What a stage is, and which there are: the modules `stage` of the features, and entry points of other packages."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 
 ENTRY_POINT_GROUP: Final = "roadscan.stages"
+PLACE: Final = "**/stage.py"
+"""Where the stages of roadscan stand: a file a feature."""
 
 
 @dataclass
@@ -101,7 +103,7 @@ def findings_of(
 @functools.cache
 def stages() -> tuple[Stage, ...]:
     """All stages, each after those that it needs; neighbours by name."""
-    known = found_kinds("roadscan.jobs.stages", Stage, ENTRY_POINT_GROUP)
+    known = found_kinds(PLACE, Stage, ENTRY_POINT_GROUP)
     waiting = {name: kind() for name, kind in known.items()}
     ordered: list[Stage] = []
     while waiting:

@@ -1,4 +1,4 @@
-"""A layer of vectors: what it is, and which there are: modules of `jobs/publish/layers/`, and entry points."""
+"""A layer of vectors: what it is, and which there are: modules of `site/layers/`, and entry points."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ class LayerKind(ABC):
 @functools.cache
 def layer_kinds() -> tuple[LayerKind, ...]:
     """All kinds of layers, by name."""
-    known = found_kinds("roadscan.site.layers", LayerKind, ENTRY_POINT_GROUP)
+    known = found_kinds("site/layers/*.py", LayerKind, ENTRY_POINT_GROUP)
     return tuple(kind() for kind in known.values())
 
 

@@ -1,4 +1,4 @@
-"""A part of the site: modules of `jobs/publish/parts/`, and entry points."""
+"""A part of the site: modules of `site/parts/`, and entry points."""
 
 from __future__ import annotations
 
@@ -42,5 +42,5 @@ class SitePart(ABC):
 @functools.cache
 def site_parts() -> tuple[SitePart, ...]:
     """All parts, in the order in which they are written."""
-    known = found_kinds("roadscan.site.parts", SitePart, ENTRY_POINT_GROUP)
+    known = found_kinds("site/parts/*.py", SitePart, ENTRY_POINT_GROUP)
     return tuple(sorted((kind() for kind in known.values()), key=lambda p: (p.position, p.name)))

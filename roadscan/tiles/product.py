@@ -274,7 +274,7 @@ def is_default(product: Product, cell_m: float) -> bool:
 def products() -> dict[str, Product]:
     """All products by name: those of this folder, and installed entry points."""
     kinds = (TileProduct, SurfaceProduct, SurveyProduct)
-    return {name: kind() for name, kind in found_kinds("roadscan.tiles.products", kinds, ENTRY_POINT_GROUP).items()}
+    return {name: kind() for name, kind in found_kinds("**/products/*.py", kinds, ENTRY_POINT_GROUP).items()}
 
 
 def product_named(name: str) -> Product:

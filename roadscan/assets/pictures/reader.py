@@ -112,7 +112,7 @@ class ColourReader(PictureReader, ABC):
 @functools.cache
 def picture_readers() -> dict[str, CutOutReader | ColourReader]:
     """All readers by the kind that they read."""
-    found = found_kinds("roadscan.assets.pictures.readers", PictureReader, ENTRY_POINT_GROUP)
+    found = found_kinds("assets/pictures/readers/*.py", PictureReader, ENTRY_POINT_GROUP)
     return {name: kind() for name, kind in found.items()}
 
 

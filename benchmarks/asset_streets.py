@@ -13,13 +13,13 @@ import pandas as pd
 import pyproj
 import shapely
 
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import objects_table
 from roadscan.store.asset_schema import asset_tables
+from roadscan.survey.run import run_stages
 
 Float64 = npt.NDArray[np.float64]
 

@@ -79,7 +79,7 @@ def _used(survey_file: Path, stages: str) -> tuple[float, float]:
     """Peak resident memory (MiB) and processor time (s) of a process of its own that does some stages."""
     script = (
         "import json, resource, sys, time; from pathlib import Path; from benchmarks.bench_lanes import RoughSurvey;"
-        "from roadscan.run.run import run_stages; from roadscan.run.stage import stage_named;"
+        "from roadscan.survey.run import run_stages; from roadscan.run.stage import stage_named;"
         "run_stages(RoughSurvey(Path(sys.argv[1])).session('store'), [stage_named(n) for n in sys.argv[2].split()]);"
         "print(json.dumps([resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, time.process_time()]))"
     )

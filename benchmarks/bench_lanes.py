@@ -23,12 +23,12 @@ from benchmarks.timing import Figure
 from roadscan.condition.tasks.against_truth import Compared, compared_values
 from roadscan.core.strict import load_toml
 from roadscan.core.survey import Survey
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.surface import Surface
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 
 Float64 = npt.NDArray[np.float64]
 

@@ -171,7 +171,7 @@ def _timed(stage: _Stage, region: Region, client: Any, work: _Work) -> Iterator[
 
 def _imports() -> None:
     """What every worker does once, before its first task."""
-    importlib.import_module("roadscan.run.run")
+    importlib.import_module("roadscan.survey.run")
 
 
 class _NoKernels(OnDask):

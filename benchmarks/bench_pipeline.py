@@ -14,13 +14,13 @@ from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.demo.demo import summarise
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.simulate import Scene, simulate
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 from roadscan.tiles.tasks.selection import Selection
 
 
@@ -66,7 +66,7 @@ def peak_mb(survey_file: Path) -> float:
     """Peak resident memory of `roadscan run --workers 0` (MB)."""
     script = (
         "import json, resource, sys; from benchmarks.bench_pipeline import run_of; from pathlib import Path;"
-        "from roadscan.run.run import run_stages; run_stages(run_of(Path(sys.argv[1])));"
+        "from roadscan.survey.run import run_stages; run_stages(run_of(Path(sys.argv[1])));"
         "print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))"
     )
     out = subprocess.run([sys.executable, "-c", script, str(survey_file)], check=True, capture_output=True, text=True)

@@ -17,7 +17,6 @@ from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure, thread_seconds
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.store import Store
@@ -25,6 +24,7 @@ from roadscan.surface.reconstruction import surface_of
 from roadscan.surface.tasks.surface_plan import SurfacePlan
 from roadscan.surface.tasks.surface_work import plan_surface_work
 from roadscan.surface.tasks.surfaces import compute_surfaces, source_of
+from roadscan.survey.run import run_stages
 
 PAIR_M, SICK_S = 5.0, 60.0
 _PIECES = ("crack_pieces", "pothole_pieces")

@@ -38,13 +38,13 @@ from roadscan.adjust.tasks import adjustment
 from roadscan.adjust.tasks.solution import Evidence, Solution
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute_on import compute_on
-from roadscan.run.run import run_stages
 from roadscan.run.session import Reporter, Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.earth import Earth
 from roadscan.store.sql import query
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 from roadscan.tiles.tasks.readings import load_recorded
 
 Float64 = npt.NDArray[np.float64]

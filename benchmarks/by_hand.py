@@ -16,11 +16,11 @@ from benchmarks.pipeline import survey_with
 from benchmarks.surveys import BenchSurvey
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.logs import LogRecord, read_log_records
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 
 CELL_M, THINNED_M = 0.005, 0.1
 _MARGIN_NS = 1_000_000_000

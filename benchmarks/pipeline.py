@@ -17,12 +17,12 @@ from roadscan.core.strict import load_toml
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute
 from roadscan.run.engine.compute_on import compute_on
-from roadscan.run.run import close_run, run_stage
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, stages
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
+from roadscan.survey.run import close_run, run_stage
 from roadscan.tiles.product import products
 from roadscan.tiles.tasks.tile_plan import TILE
 

@@ -23,10 +23,10 @@ from matplotlib.colors import LightSource
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.bench_assets import simulated
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.store.asset_schema import asset_schema, asset_tables
+from roadscan.survey.run import run_stages
 
 PICTURE: Final = Path(__file__).resolve().parent / "pictures" / "assets-street.png"
 POINTS: Final = "os^vDPX*"

@@ -23,10 +23,10 @@ from roadscan.core.strict import load_toml
 from roadscan.core.survey import Survey
 from roadscan.ingest.format import LogSource, format_named, log_formats
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 

@@ -33,10 +33,10 @@ from roadscan.core.survey import Survey
 from roadscan.ingest.format import LogSource, Reject, Rows, format_of, log_formats
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
-from roadscan.run.status import survey_status, verify_store
 from roadscan.store.asset_schema import _files, asset_schema, asset_tables
 from roadscan.store.schema import _schema_files, table_schema
 from roadscan.store.sql import query
+from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.product import ProductContext, SurveyProduct, Tile, TileProduct, product_named, products

@@ -33,8 +33,8 @@ def sql(
     answer, or in it.
     """
     from roadscan.core.errors import AnswerError, StoreError
-    from roadscan.run.ask import ask
     from roadscan.run.session import Session
+    from roadscan.survey.ask import ask
 
     session = Session.open(survey_file)
     damaged: list[StoreError] = []

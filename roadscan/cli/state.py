@@ -11,7 +11,7 @@ from roadscan.cli.arguments import SurveyFile
 from roadscan.cli.terminal import new_reporter, print_table
 
 if TYPE_CHECKING:
-    from roadscan.run.status import Status
+    from roadscan.survey.status import Status
 
 
 def status(survey_file: SurveyFile) -> None:
@@ -34,11 +34,11 @@ def verify(
     """Read every file the store should hold, and say which are missing or damaged, and which rows are lost."""
     from roadscan.core.counted import counted
     from roadscan.inventory.of_survey import inventory_faults
-    from roadscan.run.repair import accept_losses as accept
-    from roadscan.run.repair import repair_store
     from roadscan.run.session import Session
-    from roadscan.run.status import verify_store
     from roadscan.store.salvage import read_lost
+    from roadscan.survey.repair import accept_losses as accept
+    from roadscan.survey.repair import repair_store
+    from roadscan.survey.status import verify_store
 
     session, reporter = Session.open(survey_file), new_reporter()
     told: list[str] = []
@@ -65,7 +65,7 @@ def verify(
 def found_status(survey_file: Path) -> Status:
     """The state of a survey's store."""
     from roadscan.run.session import Session
-    from roadscan.run.status import survey_status
+    from roadscan.survey.status import survey_status
 
     return survey_status(Session.open(survey_file))
 

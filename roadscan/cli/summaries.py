@@ -12,7 +12,7 @@ from roadscan.core.counted import counted
 
 if TYPE_CHECKING:
     from roadscan.core.survey import Survey
-    from roadscan.run.summary import LogSummary, Spread, SurveySummary, TilesSummary
+    from roadscan.report.summary import LogSummary, Spread, SurveySummary, TilesSummary
     from roadscan.store.store import Store
 
 _MOST_REASONS = 10
@@ -23,7 +23,7 @@ _UNITS = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 
 def print_summary(survey: Survey, store: Store, *, as_json: bool = False, beside: dict[str, Any] | None = None) -> None:
     """Print what the store holds, as lines or as one JSON object (with `beside` in it)."""
-    from roadscan.run.summary import survey_summary
+    from roadscan.report.summary import survey_summary
 
     found = survey_summary(survey, store)
     if as_json:

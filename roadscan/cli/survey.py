@@ -45,9 +45,9 @@ def run_survey(
     """
     from roadscan.core.stopping import Stopped
     from roadscan.run.engine.compute_on import compute_on
-    from roadscan.run.preflight import preflight
-    from roadscan.run.run import run_stages
     from roadscan.run.session import Session
+    from roadscan.survey.preflight import preflight
+    from roadscan.survey.run import run_stages
 
     run, reporter = Session.open(survey_file), new_reporter()
     run.selection, run.reporter = selection, reporter

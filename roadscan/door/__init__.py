@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from roadscan.core.witness import Finding
     from roadscan.ingest.format import Reject
     from roadscan.inventory.inventory import Inventory
-    from roadscan.run.status import Status
     from roadscan.store.store import Store
+    from roadscan.survey.status import Status
     from roadscan.tiles.grid import Bounds
     from roadscan.tiles.tasks.selection import Selection
 
@@ -103,8 +103,8 @@ class OpenSurvey:
             at the end, if a unit failed; everything else is finished and kept.
         """
         from roadscan.run.engine.compute_on import compute_on
-        from roadscan.run.run import run_stages
         from roadscan.run.stage import stage_named
+        from roadscan.survey.run import run_stages
 
         chosen = None if stages is None else [stage_named(name) for name in stages]
         with compute_on(workers, scheduler) as compute:
@@ -114,7 +114,7 @@ class OpenSurvey:
 
     def status(self) -> Status:
         """What is ingested, current, stale and failed, and what the next run would do."""
-        from roadscan.run.status import survey_status
+        from roadscan.survey.status import survey_status
 
         return survey_status(self.session)
 
@@ -123,8 +123,8 @@ class OpenSurvey:
         the ingested rows that are lost.
         """
         from roadscan.inventory.of_survey import inventory_faults
-        from roadscan.run.status import verify_store
         from roadscan.store.salvage import read_lost
+        from roadscan.survey.status import verify_store
 
         return (
             verify_store(self.store)
@@ -183,8 +183,8 @@ class OpenSurvey:
         """
         import duckdb
 
-        from roadscan.run.ask import not_made
         from roadscan.store.sql import missing_table
+        from roadscan.survey.ask import not_made
 
         try:
             return self.connect(unconfined=unconfined).sql(statement)
@@ -225,7 +225,7 @@ class OpenSurvey:
             where there is no such table (yet), no such column, run or sensor, the span ends before it starts, or
             a file of the answer is damaged.
         """
-        from roadscan.run.ask import ask, not_made
+        from roadscan.survey.ask import ask, not_made
 
         known = self.tables
         if name not in known:
@@ -344,7 +344,7 @@ class OpenSurvey:
 
     def _check_values(self, table: str, wanted: dict[str, str | None]) -> None:
         """Refuse a run or sensor that neither the survey file nor the table knows."""
-        from roadscan.run.ask import ask
+        from roadscan.survey.ask import ask
 
         for column, value in wanted.items():
             stated = self.runs if column == "run" else self.survey.rig.sensors

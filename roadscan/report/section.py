@@ -12,8 +12,8 @@ from typing import ClassVar, Final
 from roadscan.core.plugins import found_kinds
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.report.blocks import Block
+from roadscan.report.summary import SurveySummary, survey_summary
 from roadscan.run.session import Session
-from roadscan.run.summary import SurveySummary, survey_summary
 from roadscan.store.logs import LogRecord, read_log_records
 
 ENTRY_POINT_GROUP: Final = "roadscan.report_sections"

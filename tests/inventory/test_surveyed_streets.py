@@ -28,11 +28,11 @@ from roadscan.demo.demo_street import (
 )
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.of_survey import FOUND
-from roadscan.run.run import run_stages
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate
 from roadscan.simulate.surface import Surface
 from roadscan.store.asset_schema import asset_schema
+from roadscan.survey.run import run_stages
 from tests.inventory.streets import AUTUMN as IN_AUTUMN
 from tests.inventory.streets import found, poles
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, truth
@@ -17,6 +16,7 @@ from roadscan.store.held import held_path
 from roadscan.store.manifest import Manifest
 from roadscan.store.sql import query
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 from roadscan.tiles.plan.plan import plan_survey
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE

@@ -17,13 +17,13 @@ from roadscan.report.section import Material
 from roadscan.report.sections.adjustment import Adjustment
 from roadscan.run.engine.compute import Done, Inline
 from roadscan.run.engine.embedded import embedded
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
-from roadscan.run.status import survey_status
 from roadscan.store.held import held_path, read_held, write_held
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
+from roadscan.survey.status import survey_status
 from roadscan.tiles.footprints.footprints import load_ranges, stale_footprints
 from roadscan.tiles.plan.plan import plan_survey
 from roadscan.tiles.tasks.tile_plan import plan_tiles

@@ -23,7 +23,6 @@ from roadscan.report.blocks import Picture
 from roadscan.report.section import Material
 from roadscan.report.sections.assets import Assets as AssetsSection
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
@@ -34,6 +33,7 @@ from roadscan.site.parts.pictures import Pictures
 from roadscan.site.parts.vectors import site_layers
 from roadscan.store.inventory_schema import editable_columns
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 from tests.jobs.conftest import Lines, Simulated, changed
 from tests.jobs.known_assets import KnownLines, KnownSigns, true_lines, true_signs
 from tests.jobs.posts import only_kinds

@@ -35,13 +35,13 @@ from roadscan.report.page import report_page
 from roadscan.report.section import Material
 from roadscan.report.sections.assets import Assets as AssetsSection
 from roadscan.run.engine.compute import Done, Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene as Street
 from roadscan.simulate import simulate
 from roadscan.store.sql import query
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 from roadscan.tiles.tasks.selection import Selection
 from tests.jobs.conftest import Lines, Simulated, changed
 from tests.jobs.posts import Posts, only_kinds

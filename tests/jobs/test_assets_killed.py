@@ -12,9 +12,9 @@ import pytest
 from roadscan.run.engine.embedded import embedded
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
-from roadscan.run.status import verify_store
 from roadscan.simulate import Scene, simulate
 from roadscan.store.store import Store
+from roadscan.survey.status import verify_store
 from tests.conftest import REPOSITORY
 from tests.jobs.conftest import Simulated
 

@@ -16,13 +16,13 @@ from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.rig import Rig
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
-from roadscan.run.status import survey_status, verify_store
 from roadscan.simulate import Scene, simulate
 from roadscan.store.held import held_path
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
+from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.plan.plan import plan_survey
 from roadscan.tiles.tasks.readings import load_mountings
 from tests.jobs.conftest import changed

@@ -12,11 +12,11 @@ from roadscan.core.errors import RunError
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.session import Session
-from roadscan.run.status import survey_status
 from roadscan.simulate import simulate
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
+from roadscan.survey.status import survey_status
 from roadscan.tiles.accumulator import Accumulator
 from tests.jobs.conftest import Simulated, outputs, small_scene
 

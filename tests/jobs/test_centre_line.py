@@ -15,11 +15,11 @@ import shapely
 from roadscan.core.errors import ConfigError, CrsError
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.sql import query
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 from roadscan.tiles.georeferencing.centre_line import CentreLineBuffer
 from roadscan.tiles.plan.centre_line import CentreLines, load_buffer
 from roadscan.tiles.plan.plan import plan_survey

@@ -25,11 +25,11 @@ from roadscan.ingest.clock_pairs import log_pairs
 from roadscan.ingest.ingest import ingest, survey_records
 from roadscan.navigation.tasks.clocks import estimate_clocks, load_clocks
 from roadscan.run.session import Session
-from roadscan.run.status import survey_status, verify_store
 from roadscan.simulate import Scene, simulate
 from roadscan.store.logs import write_log_record
 from roadscan.store.sql import query
 from roadscan.store.store import Store
+from roadscan.survey.status import survey_status, verify_store
 from tests.jobs.conftest import changed
 from tests.pictures import drawn
 

@@ -11,10 +11,10 @@ import pytest
 from roadscan.core.errors import RunError
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 from tests.jobs.conftest import outputs
 
 

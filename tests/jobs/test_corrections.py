@@ -15,7 +15,6 @@ from roadscan.core.errors import DamagedError
 from roadscan.core.frames import quaternion_from_rotation
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.simulate import simulate
@@ -23,6 +22,7 @@ from roadscan.store.held import held_path, read_held, write_held
 from roadscan.store.schema import table_schema
 from roadscan.store.sql import query
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 from roadscan.tiles.plan.plan import plan_survey
 from tests.jobs.conftest import Simulated, changed, outputs, small_scene
 

@@ -14,11 +14,11 @@ from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.code_reach import name_of, reached_code
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.simulate.truth import load
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.store import Store, bytes_digest
+from roadscan.survey.run import run_stages
 from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.mosaics import products
 from roadscan.tiles.mosaics.products import StoredTiles, wanted_products

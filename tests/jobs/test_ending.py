@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.run.status import verify_store
 from roadscan.simulate import simulate
+from roadscan.survey.status import verify_store
 from tests.conftest import REPOSITORY
 from tests.jobs.conftest import Simulated, outputs, small_scene
 

@@ -22,13 +22,13 @@ from pyogrio.raw import write as write_vector
 from roadscan.core.errors import FullDiskError, RoadscanError
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
-from roadscan.run.status import verify_store
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import write_parquet
+from roadscan.survey.run import run_stages
+from roadscan.survey.status import verify_store
 from tests.jobs.conftest import Simulated, changed, outputs
 from tests.pictures import drawn
 

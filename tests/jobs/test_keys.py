@@ -47,7 +47,7 @@ class Another(LogFormat):
 LOOK = """
 import sys
 from roadscan.run.session import Session
-from roadscan.run.status import survey_status
+from roadscan.survey.status import survey_status
 
 found = survey_status(Session.open(sys.argv[1]))
 stale = [found.of(stage).stale for stage in ("footprints", "tiles", "products")]

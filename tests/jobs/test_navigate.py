@@ -15,10 +15,10 @@ from roadscan.core.frames import rotation_from_quaternion
 from roadscan.core.survey import Survey
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.run.session import Session
-from roadscan.run.status import survey_status
 from roadscan.simulate import Scene, simulate
 from roadscan.store.logs import NAVIGATION, read_log_records
 from roadscan.store.sql import query
+from roadscan.survey.status import survey_status
 from tests.jobs.conftest import Simulated, changed, outputs
 
 FEW = {"products__make": ["tile_table"]}

@@ -13,11 +13,11 @@ from roadscan.formats.motion.nmea_writer import Fix, write_nmea
 from roadscan.ingest.ingest import ingest
 from roadscan.ingest.planned_logs import plan_logs
 from roadscan.run.session import Session
-from roadscan.run.status import survey_status, verify_store
 from roadscan.simulate import Scene
 from roadscan.store.logs import read_log_records
 from roadscan.store.sql import query
 from roadscan.store.store import Store
+from roadscan.survey.status import survey_status, verify_store
 from tests.jobs.conftest import Simulated, outputs
 
 POS = (

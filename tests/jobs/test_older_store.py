@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from roadscan.cli import app
 from roadscan.ingest.format import log_formats
 from roadscan.run.session import Session
-from roadscan.run.status import survey_status, verify_store
 from roadscan.store.sql import query
+from roadscan.survey.status import survey_status, verify_store
 
 OLD = Path(__file__).resolve().parents[1] / "stores" / "version-0.1.tar.xz"
 ROWS = {"scans": (164, 80328896), "trajectory": (580, 350080502)}

@@ -13,8 +13,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from roadscan.run.status import verify_store
 from roadscan.store.store import Store
+from roadscan.survey.status import verify_store
 from tests.conftest import REPOSITORY
 from tests.jobs.conftest import Simulated, outputs
 

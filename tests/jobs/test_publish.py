@@ -32,7 +32,6 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
 from roadscan.inventory.of_survey import truth_of
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.simulate import simulate, truth
@@ -53,6 +52,7 @@ from roadscan.site.site_rasters import Place, Raster, coarser_picture
 from roadscan.site.thumbnail import thumbnail
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.store import bytes_digest
+from roadscan.survey.run import run_stages
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE

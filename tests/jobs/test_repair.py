@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from roadscan.core.errors import RoadscanError, StoreError
-from roadscan.run.status import verify_store
 from roadscan.store.held import held_path, write_held
 from roadscan.store.logs import copy_path, read_log_records, record_path
 from roadscan.store.schema import table_schema
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.store.verified import Stamp
+from roadscan.survey.status import verify_store
 from tests.jobs.conftest import Simulated, outputs
 from tests.jobs.test_damage import MAKE, say
 

@@ -25,11 +25,11 @@ from roadscan.ingest.ingest import ingest
 from roadscan.run.engine.compute import Inline
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.session import Session
-from roadscan.run.status import survey_status, verify_store
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.sql import query
 from roadscan.store.store import Store
+from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.blocks import Block
 from roadscan.tiles.grid import Bounds
 from roadscan.tiles.tasks.selection import Selection

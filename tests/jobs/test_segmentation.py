@@ -15,13 +15,13 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
 from roadscan.export.classes import write_classes
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
-from roadscan.run.status import survey_status
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
+from roadscan.survey.status import survey_status
 from roadscan.tiles.georeferencing.classes import LAS_CLASSES, NOT_ROAD, OVERLAPPING, READING_CLASSES
 from roadscan.tiles.plan.plan import plan_survey
 from tests.jobs.conftest import Simulated, changed, outputs

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from roadscan.run import session as session_module
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
-from roadscan.run.status import survey_status
+from roadscan.survey.run import run_stages
+from roadscan.survey.status import survey_status
 from tests.jobs.conftest import Simulated
 
 PLANS = ("plan_logs", "plan_survey", "load_ranges", "plan_tiles")

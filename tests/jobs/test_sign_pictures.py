@@ -11,11 +11,11 @@ import pytest
 
 import roadscan
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 from tests.jobs.conftest import Lines, changed
 
 SIGNS = [

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, stages
 from roadscan.simulate import simulate, truth
@@ -29,6 +28,7 @@ from roadscan.store.store import Store
 from roadscan.surface.tasks.pictures import Pictures
 from roadscan.surface.tasks.surface_plan import SURFACE
 from roadscan.surface.tasks.surface_work import plan_surface_work
+from roadscan.survey.run import run_stages
 from tests.jobs.conftest import Lines, Simulated, changed, outputs, small_scene
 from tests.jobs.test_surfaces import SURFACES, TwoThreads
 

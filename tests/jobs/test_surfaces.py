@@ -24,10 +24,8 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Done, Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
-from roadscan.run.status import verify_store
 from roadscan.simulate import simulate
 from roadscan.simulate.truth import load
 from roadscan.store.manifest import Manifest
@@ -38,6 +36,8 @@ from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, SurfaceTas
 from roadscan.surface.tasks.surface_work import plan_surface_work
 from roadscan.surface.tasks.surfaces import _Cells, source_of
 from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.survey.run import run_stages
+from roadscan.survey.status import verify_store
 from roadscan.tiles.tasks.selection import Selection
 from roadscan.tiles.tasks.tile_plan import TILE
 from tests.jobs.conftest import Lines, Simulated, changed, outputs, small_scene

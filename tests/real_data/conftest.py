@@ -17,11 +17,11 @@ import pytest
 
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Reporter, Session
 from roadscan.run.stage import stages
 from roadscan.store.logs import LogRecord, read_log_records
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "real-data"
 sys.path.insert(0, str(EXAMPLES))

@@ -13,7 +13,7 @@ import scan_matching
 
 from roadscan.core.survey import Survey
 from roadscan.run.session import Session
-from roadscan.run.status import survey_status
+from roadscan.survey.status import survey_status
 from tests.real_data.conftest import Place
 
 OFFSET_S = 10**9

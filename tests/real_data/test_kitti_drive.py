@@ -15,7 +15,7 @@ from las_points import read_points
 
 from roadscan.core.survey import Survey
 from roadscan.run.session import Session
-from roadscan.run.status import survey_status
+from roadscan.survey.status import survey_status
 from tests.real_data.conftest import Place
 
 

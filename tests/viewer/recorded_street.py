@@ -14,12 +14,12 @@ import numpy.typing as npt
 
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.run import run_stages
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.site.material import Material, Wishes
 from roadscan.site.site import publish
 from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
 
 Float64 = npt.NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from roadscan.report.blocks import Block, Paragraph, Table
 from roadscan.report.section import Material, Section
-from roadscan.run.summary import SurveySummary
+from roadscan.report.summary import SurveySummary
 
 
 class Overview(Section):

@@ -16,7 +16,6 @@ from roadscan.ingest.overlap import NothingPlacedError
 from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog
 from roadscan.ingest.sources import damaged_sources
 from roadscan.navigation.tasks.navigate import known_keys
-from roadscan.run.preflight import preflight
 from roadscan.run.session import Session
 from roadscan.run.stage import StageState, findings_of, stages
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
@@ -26,6 +25,7 @@ from roadscan.store.salvage import Lost, read_lost
 from roadscan.store.sql_files import Stamp, stamp_of
 from roadscan.store.store import Store
 from roadscan.store.verified import held_faults, note_verified
+from roadscan.survey.preflight import preflight
 from roadscan.tiles.footprints.footprints import PRODUCT
 from roadscan.tiles.plan.plan import NothingToPlaceError
 from roadscan.tiles.product import products

@@ -16,13 +16,13 @@ from roadscan.ingest.ingest import IngestTask, read_log, record_of, with_span
 from roadscan.ingest.planned_logs import PlannedLog, plan_logs
 from roadscan.ingest.sources import is_unchanged
 from roadscan.navigation.tasks.navigate import keep_trajectory, plan_trajectories
-from roadscan.run.status import find_damage
 from roadscan.store.logs import NAVIGATION, DataFile, LogRecord, read_log_records, write_log_record
 from roadscan.store.mend import mend_records
 from roadscan.store.salvage import Lost, read_lost, salvaged, write_lost
 from roadscan.store.sql_files import stamp_of
 from roadscan.store.store import Store
 from roadscan.store.verified import note_verified
+from roadscan.survey.status import find_damage
 
 
 @dataclass

@@ -23,6 +23,8 @@ from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene as Street
 from roadscan.simulate import simulate
 from roadscan.survey.run import run_stages
+from roadscan.tiles.footprints.footprints import footprints_of
+from roadscan.tiles.plan.plan import plan_of
 
 LENGTH_M = 60.0
 OFF = {"on": False}
@@ -31,8 +33,8 @@ OFF = {"on": False}
 def figures(folder: Path) -> Iterator[Figure]:
     """All parts together, then each."""
     session = simulated(folder)
-    plan = plan_assets(session.plan, session.footprints)
-    returns = sum(f.rows for _, files in session.plan.sources for f in files)
+    plan = plan_assets(plan_of(session), footprints_of(session))
+    returns = sum(f.rows for _, files in plan_of(session).sources for f in files)
     search(plan)  # what is compiled, and what the disk holds, does not count
     seconds, pieces = search(plan)
     seconds["join"] = join(plan, pieces)

@@ -16,13 +16,13 @@ from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.spatial import Delaunay
 
 from benchmarks.timing import Figure, in_turns, thread_seconds
+from roadscan.core.grid import Bounds
 from roadscan.surface.clough_tocher import cubic_surface
 from roadscan.surface.detailed import DetailedSettings, detailed_surface
 from roadscan.surface.normals import slopes_at
 from roadscan.surface.sites import sites
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow
-from roadscan.tiles.grid import Bounds
 from tests.surfaces.test_detailed import franke
 
 ORIGIN = np.array([431_000.0, 5_400_000.0, 0.0])

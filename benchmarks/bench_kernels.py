@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.timing import Figure, best_seconds
 from roadscan.core.crs import MapFrame, world_from_geodetic
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.rig import Mountings, Sensor
 from roadscan.core.scan_geometry import ScanGeometry
@@ -23,7 +24,6 @@ from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.georeferencing.kernels.readings import FATES, Placed, Returns
 from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK, place_returns
 from roadscan.tiles.georeferencing.place import EVERYWHERE, HeightLimits, Placement
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.statistics import cells_of
 
 N = 4_000_000

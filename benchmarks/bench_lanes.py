@@ -23,7 +23,7 @@ from benchmarks.timing import Figure
 from roadscan.condition.tasks.against_truth import Compared, compared_values
 from roadscan.core.strict import load_toml
 from roadscan.core.survey import Survey
-from roadscan.run.session import Session
+from roadscan.run.session import Session, manifest_of
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.surface import Surface
@@ -197,7 +197,7 @@ def _cost(session: Session) -> Iterator[Figure]:
     for name in ("tables/profiles_longitudinal", "tables/cross_sections", "tables/condition_values"):
         for path in session.store.files(name):
             session.store.remove(path)
-    session.renew("manifest")
+    session.forget(manifest_of)
     begun = time.process_time()
     stage_named("condition").run(session)
     spent = time.process_time() - begun

@@ -14,6 +14,7 @@ from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.demo.demo import summarise
 from roadscan.run.engine.compute import Inline
+from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.simulate import Scene, simulate
@@ -21,7 +22,6 @@ from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.tasks.selection import Selection
 
 
 def figures(folder: Path) -> Iterator[Figure]:

@@ -37,6 +37,7 @@ from roadscan.adjust.observations import KINDS, Observations
 from roadscan.adjust.tasks import adjustment
 from roadscan.adjust.tasks.solution import Evidence, Solution
 from roadscan.core.survey import Survey
+from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.session import Reporter, Session
 from roadscan.run.stage import stage_named
@@ -45,7 +46,7 @@ from roadscan.simulate.earth import Earth
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.tasks.readings import load_recorded
+from roadscan.tiles.plan.plan import plan_of
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -309,7 +310,7 @@ def true_corrections(session: Session, run: str, epochs_gps_ns: Int64) -> Float6
     """(n, 6) from the recorded to the true poses: north, east, down (m), turn about the body's axes (rad)."""
     true = pq.read_table(truth.load(session.survey.folder).trajectory_file(run)).to_pandas()
     known = true["epoch_gps_ns"].to_numpy()
-    source = next(s for s, _ in session.plan.sources if s.run == run)
+    source = next(s for s, _ in plan_of(session).sources if s.run == run)
     recorded = load_recorded(session.store, source.trajectory, [(int(known.min()), int(known.max()))], 1.0)
     poses = recorded.poses(known)
     position = true[["x_world_m", "y_world_m", "z_world_m"]].to_numpy()

@@ -22,6 +22,7 @@ from benchmarks.timing import Figure
 from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.tasks import solution
 from roadscan.core.survey import Survey
+from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.session import Reporter, Session
 from roadscan.run.stage import stage_named
@@ -29,7 +30,7 @@ from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.earth import Earth
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.tasks.readings import load_trajectory
+from roadscan.tiles.plan.plan import plan_of
 
 Float64 = npt.NDArray[np.float64]
 
@@ -147,7 +148,7 @@ def placed_error(session: Session, true_poses: Path, run: str, road_map_m: Float
     # The scanners stand behind the body's origin: a point is seen when it is as far behind it as they are.
     seen = np.array([np.argmin(np.abs(((p - position) * ahead).sum(axis=1) - behind_m)) for p in world])
     body = turns[seen].inv().apply(world - position[seen])
-    source = next(s for s, _ in session.plan.sources if s.run == run)
+    source = next(s for s, _ in plan_of(session).sources if s.run == run)
     epochs = true["epoch_gps_ns"].to_numpy()[seen]
     trajectory = load_trajectory(session.store, source.trajectory, [(int(epochs.min()), int(epochs.max()))], 1.0)
     poses = trajectory.poses(epochs, strict=True)

@@ -17,12 +17,12 @@ from roadscan.core.errors import RoadscanError, RunError
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.progress import LineReporter
+from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, stages
 from roadscan.store.store import Store
 from roadscan.survey.preflight import preflight
 from roadscan.survey.run import close_run, run_stage
-from roadscan.tiles.tasks.selection import Selection
 
 
 class FlowReporter(LineReporter):

@@ -11,9 +11,9 @@ from prefect.client.schemas.objects import State
 from flows.conduct import conduct, failed, run_name
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
-from roadscan.tiles.grid import Bounds
-from roadscan.tiles.tasks.selection import Selection
+from roadscan.run.selection import Selection
 
 
 @flow(name="reprocess", flow_run_name=run_name, persist_result=False)

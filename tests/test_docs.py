@@ -28,6 +28,7 @@ from roadscan.cli import app
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.ingest.format import LogSource, Reject, Rows, format_of, log_formats
@@ -38,7 +39,6 @@ from roadscan.store.schema import _schema_files, table_schema
 from roadscan.store.sql import query
 from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.product import ProductContext, SurveyProduct, Tile, TileProduct, product_named, products
 from tests.jobs.conftest import Simulated, finished, simulated  # noqa: F401  fixtures
 

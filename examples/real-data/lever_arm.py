@@ -18,9 +18,9 @@ from scipy.spatial import KDTree
 
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import survey_records
+from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.store.store import Store
-from roadscan.tiles.tasks.readings import TrajectorySource, load_trajectory
 
 SURVEY_FILE = Path("two_pass.toml")
 MAX_GAP_S = 1.0

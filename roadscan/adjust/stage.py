@@ -15,7 +15,8 @@ from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.store.schema import table_schema
-from roadscan.tiles.footprints.footprints import index_footprints
+from roadscan.tiles.footprints.footprints import footprints_of, index_footprints
+from roadscan.tiles.plan.plan import plan_of
 
 
 class Adjust(Stage):
@@ -27,16 +28,16 @@ class Adjust(Stage):
 
     def run(self, session: Session) -> None:
         """Adjust where evidence, settings or code are others than those of the last solution."""
-        if is_current(session.plan, session.manifest):
+        if is_current(plan_of(session), session.manifest):
             return
         if session.survey.config.adjust.on:
             adjust_survey(session)
         else:
             withdraw(session)
-        session.replan(session.plan.corrected_anew())
+        session.take(plan_of, plan_of(session).corrected_anew())
         # Corrections beyond what footprints leave room for make these anew, and nothing else does.
-        found = index_footprints(session.plan, session.manifest, session.compute, session.bar("footprints"))
-        session.renew("footprints")
+        found = index_footprints(plan_of(session), session.manifest, session.compute, session.bar("footprints"))
+        session.forget(footprints_of)
         session.failed(self.name, found)
 
     def check(self, survey: Survey) -> list[RoadscanError]:
@@ -58,7 +59,7 @@ class Adjust(Stage):
 
     def state(self, session: Session) -> StageState:
         """Whether the corrections are those of the survey as it is, and what they are worth."""
-        due = int(not is_current(session.plan, session.manifest))
+        due = int(not is_current(plan_of(session), session.manifest))
         notes = []
         if due and session.survey.config.adjust.on:
             notes = ["the adjustment is due: it may make more tiles stale than these"]

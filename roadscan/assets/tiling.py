@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from roadscan.assets.scene import Box
+from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
-from roadscan.tiles.grid import Bounds, TileGrid
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from roadscan.cli.survey import Where, run_and_sum_up, run_survey, stages_named,
 from roadscan.cli.terminal import print_table
 
 if TYPE_CHECKING:
-    from roadscan.tiles.tasks.selection import Selection
+    from roadscan.run.selection import Selection
 
 
 def run(
@@ -159,9 +159,9 @@ def selected(tiles: list[str] | None, bbox: str | None, span: str | None) -> Sel
 
     from roadscan.core.errors import ConfigError
     from roadscan.core.gpstime import gps_ns_from_utc
+    from roadscan.core.grid import Bounds
     from roadscan.core.ids import TileId
-    from roadscan.tiles.grid import Bounds
-    from roadscan.tiles.tasks.selection import Selection
+    from roadscan.run.selection import Selection
 
     box = times = None
     if bbox is not None:

@@ -9,10 +9,10 @@ from roadscan.cli.summaries import print_summary
 from roadscan.cli.terminal import new_reporter
 
 if TYPE_CHECKING:
+    from roadscan.run.selection import Selection
     from roadscan.run.session import Session
     from roadscan.run.stage import Stage
     from roadscan.store.store import Store
-    from roadscan.tiles.tasks.selection import Selection
 
 
 class Where(NamedTuple):

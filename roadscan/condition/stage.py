@@ -28,6 +28,7 @@ from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.tiles import TaskResult
 
 _PICTURES = 20
@@ -60,13 +61,13 @@ class Condition(Stage):
             session.manifest.remove(work.gone)
             return
         if work.lines_due:
-            session.manifest.add(write_lines(session.plan, config, work.lines_key))
+            session.manifest.add(write_lines(plan_of(session), config, work.lines_key))
             work = plan_condition(session)
         session.manifest.remove(work.gone)
         if not work.stretches:
             session.note("condition: no drive of 20 m or more lies on the tiles that hold cells")
-        settings, grid = config.sections(), session.plan.ground.grid
-        context = product_context(session.plan)
+        settings, grid = config.sections(), plan_of(session).ground.grid
+        context = product_context(plan_of(session))
         tasks = stretch_tasks(work.due_stretches, session.store, context, settings)
         bar = session.bar("profiles of lanes")
         session.failed(self.name, run_units(survey_stretches, tasks, session.manifest, session.compute, bar))
@@ -99,7 +100,7 @@ class Condition(Stage):
         """Pieces of roads, one to a task; none without settings."""
         if settings is None:
             return
-        grid, context = session.plan.ground.grid, product_context(session.plan)
+        grid, context = plan_of(session).ground.grid, product_context(plan_of(session))
         tasks = [PieceTask(session.store, grid, context, settings, (one,)) for one in due]
         session.failed(self.name, run_units(function, tasks, session.manifest, session.compute, session.bar(title)))
 

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from roadscan.core.gpstime import Clock
+    from roadscan.core.grid import Bounds
     from roadscan.core.survey import Survey
     from roadscan.core.witness import Finding
     from roadscan.ingest.format import Reject
     from roadscan.inventory.inventory import Inventory
+    from roadscan.run.selection import Selection
     from roadscan.store.store import Store
     from roadscan.survey.status import Status
-    from roadscan.tiles.grid import Bounds
-    from roadscan.tiles.tasks.selection import Selection
 
 __all__ = ["LogTables", "MadeProduct", "OpenSurvey", "open_survey", "read_log"]
 
@@ -471,13 +471,13 @@ class _Heard(Reporter):
 
 def _selection(tiles: Sequence[str] | None) -> Selection | None:
     from roadscan.core.ids import TileId
-    from roadscan.tiles.tasks.selection import Selection
+    from roadscan.run.selection import Selection
 
     return None if tiles is None else Selection(tuple(map(TileId.parse, tiles)))
 
 
 def _box(bbox: Box | None) -> Bounds | None:
-    from roadscan.tiles.grid import Bounds
+    from roadscan.core.grid import Bounds
 
     if bbox is None:
         return None

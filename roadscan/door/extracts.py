@@ -11,18 +11,20 @@ import pyarrow as pa
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion, rph_from_rotation
+from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
 from roadscan.core.witness import Finding
 from roadscan.ingest.format import LogFormat, LogSource, Reject
+from roadscan.navigation.tasks.navigate import records_of
+from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.run.session import Session
 from roadscan.store.schema import table_schema
 from roadscan.tiles.blocks import Block
-from roadscan.tiles.grid import Bounds
+from roadscan.tiles.footprints.footprints import footprints_of
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import trajectory_source
+from roadscan.tiles.plan.plan import plan_of, trajectory_source
 from roadscan.tiles.tasks.cell_files import read_cells
-from roadscan.tiles.tasks.readings import load_trajectory
-from roadscan.tiles.tasks.tile_plan import TILE, TilePlan
+from roadscan.tiles.tasks.tile_plan import TILE, TilePlan, tiles_of
 from roadscan.tiles.tasks.tile_points import load_points
 
 if TYPE_CHECKING:
@@ -44,7 +46,7 @@ def poses_on_map(session: Session, run: str, first_gps_ns: int | None, end_gps_n
     """
     import pandas as pd
 
-    source, ground = trajectory_source(run, session.records), session.plan.ground
+    source, ground = trajectory_source(run, records_of(session)), plan_of(session).ground
     held = [f.span for f in source.files if f.span is not None]
     first = max(min(s[0] for s in held), first_gps_ns if first_gps_ns is not None else 0)
     last = min(max(s[1] for s in held), end_gps_ns - 1 if end_gps_ns is not None else 2**62)
@@ -81,7 +83,7 @@ def cell_grid(session: Session, box: Bounds | None, tile: str | None) -> xr.Data
     """
     import xarray as xr
 
-    grid = session.plan.ground.grid
+    grid = plan_of(session).ground.grid
     records = {TileId.parse(unit): r for unit, r in session.manifest.of(TILE).items() if r.path}
     if tile is not None:
         chosen = {t for t in records if str(t) == tile}
@@ -130,10 +132,12 @@ def points_of_tile(session: Session, tile: str) -> pd.DataFrame:
     """
     import pandas as pd
 
-    wanted, grid = TileId.parse(tile), session.plan.ground.grid
-    if wanted not in session.tiles:
+    wanted, grid = TileId.parse(tile), plan_of(session).ground.grid
+    if wanted not in tiles_of(session):
         raise ConfigError(f"no reading touches tile {tile}", expected="a tile of the survey (see the tile table)")
-    planned = TilePlan(session.plan, session.footprints, session.tiles, (), product_context(session.plan))
+    planned = TilePlan(
+        plan_of(session), footprints_of(session), tiles_of(session), (), product_context(plan_of(session))
+    )
     found = [points for one, points in load_points(planned.task(Block((wanted,)))) if one == wanted]
     columns = ["easting_m", "northing_m", "height_m", "epoch_gps_ns", "intensity", "classification", "pass_id"]
     if not found:

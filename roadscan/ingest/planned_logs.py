@@ -20,6 +20,7 @@ from roadscan.ingest.pose_checks import FIXES, POSES
 from roadscan.ingest.pose_checks import VERSION as POSE_CHECKS
 from roadscan.ingest.sources import Known, Sources, open_sources
 from roadscan.run.engine.fingerprint import grid_key, key_of
+from roadscan.run.session import Session, found_once
 from roadscan.store.logs import has_log
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
@@ -223,3 +224,9 @@ def log_source(
         map=survey.frame() if format_.needs_map or not is_log else None,
         defaults=_source_defaults(survey, config),
     )
+
+
+@found_once
+def logs_of(session: Session) -> Logs:
+    """Logs of the survey file with their keys, trajectories first; and those that cannot be planned."""
+    return plan_logs(session.survey, session.store)

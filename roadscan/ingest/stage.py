@@ -16,7 +16,9 @@ from roadscan.ingest.overlap import (
     empty_logs,
     reject_findings,
 )
+from roadscan.ingest.planned_logs import logs_of
 from roadscan.ingest.same_content import same_content_findings
+from roadscan.navigation.tasks.navigate import records_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord, has_log
@@ -38,10 +40,10 @@ class Ingest(Stage):
         wanted_products(session.survey)  # a wrong name or option is told before a log is read
         check_cameras(session.survey)
         try:
-            ingest(session.survey, session.store, session.reporter.line, session.compute, session.logs)
+            ingest(session.survey, session.store, session.reporter.line, session.compute, logs_of(session))
         finally:
-            session.renew("records")
-        records = survey_records(session.survey, session.store, session.logs)
+            session.forget(records_of)
+        records = survey_records(session.survey, session.store, logs_of(session))
         faults = [*_empty(session, records), *apart_logs(session.survey, records, {}, estimated=False)]
         faults += one_stamp_logs(records)
         has_readings = any(r.tables.get(table) for r in records for table in DATA_TABLES)
@@ -51,10 +53,10 @@ class Ingest(Stage):
 
     def state(self, session: Session) -> StageState:
         """Logs that wait to be read."""
-        planned, unplanned = session.logs
+        planned, unplanned = logs_of(session)
         waiting = [log for log in planned if not has_log(session.store, log.key)]
         if not waiting and not unplanned:
-            records = survey_records(session.survey, session.store, session.logs)
+            records = survey_records(session.survey, session.store, logs_of(session))
             return StageState(len(planned), faults=[fault.told for fault in _empty(session, records)])
         most = session.survey.config.tiles.max_block_readings
         doing = {

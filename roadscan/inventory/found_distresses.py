@@ -19,14 +19,15 @@ from scipy.spatial import cKDTree
 from roadscan.assets.object_table import object_names
 from roadscan.assets.tasks.along_roads import along_roads
 from roadscan.condition.tasks.lines import survey_roads
+from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.ids import TileId
 from roadscan.inventory.state import reference_points
 from roadscan.inventory.visibility import Visibility
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.store.manifest import OutputRecord, read_recorded
-from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
 from roadscan.tiles.mosaics.products import StoredTiles, product_context
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.product import ProductContext, TileSummary
 from roadscan.tiles.products.geo_table import in_crs_unit, read_geo_table
 from roadscan.tiles.pyramid import Level, overview_factors
@@ -57,7 +58,7 @@ def found_distresses(session: Session) -> Iterator[FoundKind]:
     if not searched:
         return
     ground = Ground(session)
-    roads, _ = survey_roads(session.plan, session.manifest)
+    roads, _ = survey_roads(plan_of(session), session.manifest)
     for kind, records in searched.items():
         rows, shapes_m = _read(session, records, ground.context)
         yield FoundKind(kind, _Rows(asset_schema(kind), rows, ground.raised(shapes_m)).table(ground, roads), records)
@@ -83,7 +84,7 @@ class Ground:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self.context = product_context(session.plan)
+        self.context = product_context(plan_of(session))
         cells = {r.unit: r for r in session.manifest.of(TILE).values() if r.path}
         overviews = [r for r in session.manifest.of(OVERVIEWS).values() if r.path and r.unit in cells]
         tiles = StoredTiles(
@@ -97,7 +98,7 @@ class Ground:
     @cached_property
     def first_gps_ns(self) -> int:
         """GPS time at which the survey's first pass began."""
-        return min((one.start_gps_ns for one in self._session.plan.passes), default=0)
+        return min((one.start_gps_ns for one in plan_of(self._session).passes), default=0)
 
     def summaries(self, places_m: Floats) -> list[TileSummary | None]:
         """Figures of the tile of each place (n, 2); None where there are no readings."""

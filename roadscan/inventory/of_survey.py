@@ -27,6 +27,7 @@ from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from roadscan.store.asset_truth import AssetTruth
 from roadscan.store.manifest import read_recorded
 from roadscan.store.store import Store, bytes_digest
+from roadscan.tiles.plan.plan import plan_of
 
 FOUND: Final = "products/assets"
 """Folder of the tables of found assets, one a kind."""
@@ -137,7 +138,7 @@ def found_assets(session: Session) -> Found | None:
         return None
     key = bytes_digest("\n".join(digests).encode())
     nothing = not any(rows.num_rows for rows in tables.values())
-    began = min((p.start_gps_ns for p in session.plan.passes), default=0) if nothing else 0
+    began = min((p.start_gps_ns for p in plan_of(session).passes), default=0) if nothing else 0
     return Found(tables, key, f"survey {session.survey.config.id}", session.survey.config.inventory.epoch, began)
 
 

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from roadscan.calibrate.tasks.calibrate import renew_reports
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
+from roadscan.ingest.planned_logs import logs_of
 from roadscan.navigation.tasks.clock_tables import set_damaged_clocks_aside
 from roadscan.navigation.tasks.clocks import estimate_clocks
-from roadscan.navigation.tasks.navigate import navigate
+from roadscan.navigation.tasks.navigate import navigate, records_of
 from roadscan.navigation.tasks.navigation_status import navigation_status, trajectory_findings
-from roadscan.run.session import Session
+from roadscan.run.session import Session, manifest_of
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord, read_log_records
 from roadscan.store.manifest import Manifest
@@ -32,18 +33,18 @@ class Navigate(Stage):
             session.note(done)
         try:
             if any(evidence.against != "trajectory" for evidence in survey.config.clocks):
-                estimate_clocks(survey, store, before_navigation=True, logs=session.logs)
-            navigate(survey, store, say, session.logs)
-            estimate_clocks(survey, store, say, logs=session.logs)
+                estimate_clocks(survey, store, before_navigation=True, logs=logs_of(session))
+            navigate(survey, store, say, logs_of(session))
+            estimate_clocks(survey, store, say, logs=logs_of(session))
             renew_reports(store, say)
         finally:
-            session.renew("records")
-            session.renew("manifest")  # pictures were recorded beside it
+            session.forget(records_of)
+            session.forget(manifest_of)  # pictures were recorded beside it
 
     def state(self, session: Session) -> StageState:
         """Computed trajectories, estimated clocks, calibrated mountings."""
         held = {r.key: r for r in read_log_records(session.store, damaged=[])}
-        own = [held[log.key] for log in session.logs[0] if log.key in held]
+        own = [held[log.key] for log in logs_of(session)[0] if log.key in held]
         found = navigation_status(session.survey, session.store, own, held)
         waiting = sum(one["state"] != "computed" for one in found.trajectories)
         lines = list(found.lines())

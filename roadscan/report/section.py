@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import ClassVar, Final
 
 from roadscan.core.plugins import found_kinds
+from roadscan.ingest.planned_logs import logs_of
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.report.blocks import Block
 from roadscan.report.summary import SurveySummary, survey_summary
@@ -38,7 +39,7 @@ class Material:
     @cached_property
     def logs(self) -> list[LogRecord]:
         """Records of the survey file's logs and of the trajectories computed from them."""
-        listed = set(known_keys(self.session.survey, self.session.store, self.session.logs))
+        listed = set(known_keys(self.session.survey, self.session.store, logs_of(self.session)))
         return [record for key, record in self.records.items() if key in listed]
 
 

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Self, TypeVar, cast
 
 from roadscan.core.errors import StoreError
 from roadscan.core.survey import Survey
-from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog, plan_logs
-from roadscan.navigation.tasks.navigate import records_with_trajectories
 from roadscan.run.engine.compute import Compute, Inline
-from roadscan.store.logs import LogRecord
+from roadscan.run.selection import Selection
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
-from roadscan.tiles.footprints.footprints import FootprintRanges, load_ranges
-from roadscan.tiles.plan.plan import SurveyPlan, plan_survey
-from roadscan.tiles.tasks.selection import Selection
-from roadscan.tiles.tasks.tile_plan import PlannedTiles, plan_tiles
 
-_IN_ORDER: Final = ("logs", "records", "plan", "footprints", "tiles")
-"""What a session finds, each from those before it."""
+T = TypeVar("T")
 
 
 class Reporter:
@@ -59,6 +52,11 @@ class Session:
     """When the first stage began (Unix ns)."""
     damaged: list[StoreError] | None = None
     """Hears of damaged records; what is sound counts then. None where damage is an error."""
+    _found: dict[Callable[[Session], Any], Any] = field(default_factory=dict)
+    _followers: dict[Callable[[Session], Any], set[Callable[[Session], Any]]] = field(default_factory=dict)
+    """What asked for what a function found, while it was looking itself."""
+    _finding: list[Callable[[Session], Any]] = field(default_factory=list)
+    """What is looking now, the innermost last."""
 
     @classmethod
     def open(cls, survey_file: str | Path) -> Self:
@@ -72,60 +70,39 @@ class Session:
         survey = Survey.load(survey_file)
         return cls(survey, Store(survey.store_url, survey.config.id))
 
-    @cached_property
-    def logs(self) -> tuple[list[PlannedLog], list[UnplannedLog]]:
-        """Logs of the survey file with their keys, trajectories first; and those that cannot be planned."""
-        return plan_logs(self.survey, self.store)
+    def found(self, find: Callable[[Session], T], make: Callable[[Session], T]) -> T:
+        """What `make` returns, kept under the name `find` (:func:`found_once`)."""
+        if self._finding:
+            self._followers.setdefault(find, set()).add(self._finding[-1])
+        if find not in self._found:
+            self._finding.append(find)
+            try:
+                self._found[find] = make(self)
+            finally:
+                self._finding.pop()
+        return cast("T", self._found[find])
 
-    @cached_property
-    def records(self) -> tuple[LogRecord, ...]:
-        """Records of the survey file's logs and of the trajectories computed from them.
+    def forget(self, find: Callable[[Session], Any]) -> None:
+        """Forget what a function found, and all that followed from it: it has changed."""
+        self._found.pop(find, None)
+        for follower in self._followers.pop(find, ()):
+            self.forget(follower)
 
-        Raises
-        ------
-        RunError
-            where one is missing.
-        """
-        return tuple(records_with_trajectories(self.survey, self.store, self.logs))
+    def take(self, find: Callable[[Session], T], value: T) -> None:
+        """Take a value in place of what a function found, and forget what followed from that."""
+        self.forget(find)
+        self._found[find] = value
 
-    @cached_property
-    def plan(self) -> SurveyPlan:
-        """What places the readings: sources, ground, passes."""
-        return plan_survey(self.survey, self.store, records=self.records)
-
-    @cached_property
-    def footprints(self) -> FootprintRanges:
-        """Which row group touches which tile."""
-        return load_ranges(self.plan, self.manifest)
-
-    @cached_property
-    def tiles(self) -> PlannedTiles:
-        """Tiles that a reading may touch, with their keys."""
-        return plan_tiles(self.footprints, self.plan)
-
-    @cached_property
+    @property
     def manifest(self) -> Manifest:
         """Records of all outputs."""
-        return Manifest(self.store, self.damaged)
-
-    def renew(self, name: str) -> None:
-        """Forget what was found under a name, and all that follows from it: it has changed."""
-        if name == "manifest":
-            self.__dict__.pop(name, None)
-            name = "footprints"
-        for known in _IN_ORDER[_IN_ORDER.index(name) :]:
-            self.__dict__.pop(known, None)
-
-    def replan(self, plan: SurveyPlan) -> None:
-        """Take a plan in place of the one that was found, and forget what follows from that."""
-        self.renew("plan")
-        self.__dict__["plan"] = plan
+        return manifest_of(self)
 
     def hear_of_damage(self) -> list[StoreError]:
         """Let damaged records be no error; returns the list that hears of them."""
         if self.damaged is None:
             self.damaged = []
-            self.__dict__.pop("manifest", None)
+            self._found.pop(manifest_of, None)
         return self.damaged
 
     def failed(self, stage: str, found: Sequence[tuple[str, object]]) -> None:
@@ -143,3 +120,19 @@ class Session:
     def note(self, text: str) -> None:
         """Tell what the user should know."""
         self.reporter.line(f"note: {text}")
+
+
+def found_once(make: Callable[[Session], T]) -> Callable[[Session], T]:
+    """A function of a session that looks once, until what it found, or what that came from, is forgotten."""
+
+    @functools.wraps(make)
+    def find(session: Session) -> T:
+        return session.found(find, make)
+
+    return find
+
+
+@found_once
+def manifest_of(session: Session) -> Manifest:
+    """Records of all outputs."""
+    return Manifest(session.store, session.damaged)

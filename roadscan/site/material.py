@@ -24,7 +24,7 @@ from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.tiles.mosaics.products import StoredTiles, product_context
-from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.plan.plan import SurveyPlan, plan_of
 from roadscan.tiles.product import ProductContext, TileSummary
 from roadscan.tiles.products.geo_table import read_geo_table
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
@@ -104,7 +104,7 @@ class Material:
     @cached_property
     def plan(self) -> SurveyPlan:
         """What places the readings."""
-        return self.session.plan
+        return plan_of(self.session)
 
     @cached_property
     def context(self) -> ProductContext:

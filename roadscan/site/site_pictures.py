@@ -8,12 +8,12 @@ from typing import Final
 
 from roadscan.assets.tasks.picture_work import CUT_OUTS
 from roadscan.core.errors import RoadscanError
+from roadscan.core.grid import Bounds
 from roadscan.site.material import Material
 from roadscan.store.manifest import OutputRecord
 from roadscan.surface.tasks.pictures import Pictures as PlacedPictures
 from roadscan.surface.tasks.pictures import plan_pictures
 from roadscan.surface.views import PictureRule
-from roadscan.tiles.grid import Bounds
 
 _RULE: Final = PictureRule((), 30.0, 0.0, 1)
 """All cameras with an interior orientation."""

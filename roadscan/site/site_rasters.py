@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import StoreError
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.product import LoadCells, TileSummary
 from roadscan.tiles.products.hillshade import HillshadeOptions, shade
 from roadscan.tiles.products.pavement import IntensityOptions, ShadedOptions

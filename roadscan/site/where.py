@@ -9,11 +9,12 @@ from typing import Final
 import numpy as np
 
 from roadscan.core.errors import ConfigError
+from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
 from roadscan.run.session import Session
 from roadscan.surface.tasks.pictures import plan_pictures
 from roadscan.surface.views import PictureRule, sights
-from roadscan.tiles.grid import Bounds
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 
@@ -61,8 +62,8 @@ def pictures_of_place(
     if height_m is None:
         height_m = ground_height_m(session, easting_m, northing_m)
     rule = PictureRule((), reach_m, _ANY_ANGLE_DEG, _BORDER_PX)
-    pictures = plan_pictures(session.plan, rule).near(Bounds(easting_m, northing_m, easting_m, northing_m))
-    frame, place = session.plan.ground.map, np.array([[easting_m, northing_m, height_m]])
+    pictures = plan_pictures(plan_of(session), rule).near(Bounds(easting_m, northing_m, easting_m, northing_m))
+    frame, place = plan_of(session).ground.map, np.array([[easting_m, northing_m, height_m]])
     worlds = [frame.world_from_map(world, place)[None] for world in pictures.worlds]
     no_front = [np.full((1, 3), np.nan)] * len(worlds)
     near = ((number, np.zeros(1, np.int64)) for number in range(len(pictures)))
@@ -84,7 +85,7 @@ def ground_height_m(session: Session, easting_m: float, northing_m: float) -> fl
     ConfigError
         where there is none.
     """
-    grid = session.plan.ground.grid
+    grid = plan_of(session).ground.grid
     box = Bounds(easting_m - _NEAR_M, northing_m - _NEAR_M, easting_m + _NEAR_M, northing_m + _NEAR_M)
     heights = [np.empty(0, np.float32)]
     for record in session.manifest.of(TILE).values():

@@ -19,6 +19,7 @@ from roadscan.compute.ways import way_along
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.ids import TileId
 from roadscan.navigation.tasks.pose_sigma import median_pose_sigma
+from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.fingerprint import key_of
@@ -29,17 +30,11 @@ from roadscan.store.store import Store
 from roadscan.strips.lag import Lag, lag_of
 from roadscan.strips.strip import HALF_WIDTH_M, Strip, Way
 from roadscan.tiles.footprints.footprints import PRODUCT as FOOTPRINTS
-from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.footprints.footprints import footprints_of
+from roadscan.tiles.plan.plan import SurveyPlan, plan_of
 from roadscan.tiles.plan.road import road_key
-from roadscan.tiles.tasks.readings import (
-    Ground,
-    Placer,
-    RawSlice,
-    TrajectorySource,
-    geometry_of,
-    load_recorded,
-    read_rows,
-)
+from roadscan.tiles.tasks.readings import Ground, Placer, RawSlice, geometry_of, read_rows
+from roadscan.tiles.tasks.tile_plan import tiles_of
 
 Float64 = npt.NDArray[np.float64]
 
@@ -103,7 +98,7 @@ def compare_strips(session: Session, manifest: Manifest) -> list[tuple[str, str]
 
 
 def _tasks(session: Session) -> Iterator[StripTask]:
-    plan, code = session.plan, code_digest(f"{__name__}:compare_strip")
+    plan, code = plan_of(session), code_digest(f"{__name__}:compare_strip")
     files = {one.path: one for _, own in plan.sources for one in own}
     by_run: dict[str, list[RawSlice]] = defaultdict(list)
     trajectories: dict[str, TrajectorySource] = {}
@@ -177,14 +172,14 @@ def _others(session: Session, way: Way, runs: Sequence[str]) -> list[RawSlice]:
     """Row groups of some runs that may touch the tiles along a way."""
     if not runs:
         return []
-    tiles, size_m = session.tiles, session.survey.config.tiles.size_m
+    tiles, size_m = tiles_of(session), session.survey.config.tiles.size_m
     corners = np.floor(np.stack([way.easting_m, way.northing_m], axis=-1) / size_m).astype(np.int64)
     around = {TileId(c + i, r + k) for c, r in np.unique(corners, axis=0).tolist() for i in _BESIDE for k in _BESIDE}
     runs_of_groups = tiles.groups.runs(tiles.numbers(tile for tile in around if tile in tiles))
     cuts = np.flatnonzero(np.diff(runs_of_groups.slice, prepend=-1)).tolist()
     found: list[RawSlice] = []
     for start, end in itertools.pairwise([*cuts, runs_of_groups.slice.size]):
-        whole = session.footprints.slices[int(runs_of_groups.source[start])]
+        whole = footprints_of(session).slices[int(runs_of_groups.source[start])]
         if whole.source.run in runs and whole.source.trajectory is not None:
             first, last = runs_of_groups.first_epoch_gps_ns[start:end], runs_of_groups.last_epoch_gps_ns[start:end]
             spans = tuple(zip(first.tolist(), last.tolist(), strict=True))

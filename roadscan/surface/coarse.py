@@ -25,11 +25,10 @@ import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.compute.ways import way_along
+from roadscan.core.grid import QUANTA_PER_M, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.surface.kernels import coarse as kernels
-from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
-from roadscan.tiles.grid import TileGrid
 
 Float64 = npt.NDArray[np.float64]
 UInt8 = npt.NDArray[np.uint8]

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.grid import QUANTUM_M, Bounds, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.settings.surface import SurfaceConfig
 from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
@@ -30,8 +31,7 @@ from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, Surface
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.georeferencing.cloud import QUANTUM_M, TilePoints
-from roadscan.tiles.grid import Bounds, TileGrid
+from roadscan.tiles.georeferencing.cloud import TilePoints
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]

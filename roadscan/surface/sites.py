@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import RoadscanError
-from roadscan.tiles.georeferencing.cloud import QUANTUM_M
+from roadscan.core.grid import QUANTUM_M
 
 STEPS_PER_M: Final = 2.0**36
 """Steps of the lattice in a metre."""
@@ -51,7 +51,7 @@ class Sites:
 def sites(points_m: npt.NDArray[np.float64]) -> Sites:
     """Order points, and merge those that are at one place.
 
-    Points whose coordinates round to the same multiples of 10 µm (:data:`roadscan.tiles.georeferencing.cloud.QUANTUM_M`) are one
+    Points whose coordinates round to the same multiples of 10 µm (:data:`roadscan.core.grid.QUANTUM_M`) are one
     site, at the mean of their positions and of their heights. The result does not depend on the points' order.
 
     Parameters

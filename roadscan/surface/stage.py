@@ -11,6 +11,7 @@ from roadscan.surface.tasks.surface_colours import check_colours, colour_notes
 from roadscan.surface.tasks.surface_plan import SURFACE, files_without_surface
 from roadscan.surface.tasks.surface_work import plan_surface_work
 from roadscan.surface.tasks.surfaces import compute_surfaces
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.tiles import run_tasks
 
 
@@ -26,14 +27,14 @@ class Surfaces(Stage):
         manifest, surface = session.manifest, session.survey.config.surface
         if surface is not None and surface.regions == "found":
             bar = session.bar("regions of interest")
-            session.failed(self.name, find_due_regions(session.plan, manifest, session.compute, bar))
+            session.failed(self.name, find_due_regions(plan_of(session), manifest, session.compute, bar))
         work = plan_surface_work(session)
         manifest.remove(work.gone)
         if work.note:
             session.note(work.note)
         if work.planned is None or not work.chosen:
             return
-        check_colours(session.plan, folders=True)
+        check_colours(plan_of(session), folders=True)
         tasks = work.planned.tasks(work.chosen, session.compute.workers)
         failures = run_tasks(
             compute_surfaces, tasks, len(work.chosen), work.planned.singly, manifest, session.compute,

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError
-from roadscan.tiles.grid import Bounds
+from roadscan.core.grid import Bounds
 
 
 @dataclass(frozen=True)

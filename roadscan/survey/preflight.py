@@ -29,6 +29,7 @@ from roadscan.core.crs import (
 )
 from roadscan.core.errors import ConfigError, CrsError, FormatError, RoadscanError, StoreError
 from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.core.grid import TileGrid
 from roadscan.core.rig import SensorKind
 from roadscan.core.survey import ControlConfig, LogConfig, Survey
 from roadscan.core.witness import Witness
@@ -41,18 +42,17 @@ from roadscan.ingest.place_checks import without_fix
 from roadscan.ingest.planned_logs import CONTROL_RUN, log_source
 from roadscan.ingest.sources import listed_name, remembered_formats
 from roadscan.navigation.tasks.clocks import check_clocks
+from roadscan.run.selection import Selection
 from roadscan.run.stage import stages
 from roadscan.store.logs import read_log_records
 from roadscan.store.store import Store
 from roadscan.surface.tasks.surface_colours import check_cameras
 from roadscan.surface.tasks.surface_plan import checked_surface
 from roadscan.tiles.georeferencing.place import CloudFrame
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.mosaics.products import check_product, wanted_tile_products
 from roadscan.tiles.plan.centre_line import CentreLines, load_buffer
 from roadscan.tiles.plan.road import looks_across
 from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.selection import Selection
 
 FARTHEST_DEG: Final = 10.0
 """Positions farther than this outside the area of the map's CRS are refused (degrees): a metre of such a map is no

@@ -9,8 +9,10 @@ from typing import Final
 
 from roadscan.core.counted import counted
 from roadscan.core.errors import RoadscanError, RunError
+from roadscan.ingest.planned_logs import logs_of
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.engine.compute import damaged_file, rare_collections
+from roadscan.run.selection import SelectionError
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, findings_of, stages
 from roadscan.store.logs import read_log_records
@@ -18,7 +20,6 @@ from roadscan.store.manifest import begin_changes, end_changes, write_failures
 from roadscan.store.mend import mend_records
 from roadscan.store.verified import note_written, recorded_files
 from roadscan.tiles.plan.plan import NothingToPlaceError
-from roadscan.tiles.tasks.selection import SelectionError
 
 _CLOCK_TICK_NS: Final = 50_000_000
 """A file's time may lie that much before the clock's."""
@@ -71,7 +72,7 @@ def run_stage(session: Session, stage: Stage) -> None:
 def _tell_findings(session: Session, stage: Stage) -> None:
     if type(stage).findings is Stage.findings:  # it asks nobody: no record need be read
         return
-    listed = set(known_keys(session.survey, session.store, session.logs))
+    listed = set(known_keys(session.survey, session.store, logs_of(session)))
     records = [r for r in read_log_records(session.store, damaged=[]) if r.key in listed]
     for one in findings_of(session.survey, records, session.manifest, [stage]):
         session.note(one.line)

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.witness import Finding
 from roadscan.ingest.overlap import NothingPlacedError
-from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog
+from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog, logs_of
 from roadscan.ingest.sources import damaged_sources
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.session import Session
@@ -93,7 +93,7 @@ def survey_status(session: Session) -> Status:
     found = preflight(session.survey, store)
     causes = [*map(str, found.causes), *found.failing]
     status = Status(failures=read_failures(store), would_fail=causes.copy(), checked=list(found.notes))
-    planned, unplanned = session.logs
+    planned, unplanned = logs_of(session)
     unsaid = [u for u in unplanned if not causes]  # else it is said there, once for a cause
     status.failures += [{"stage": "ingest", "unit": u.path, "reason": str(u.error)} for u in unsaid]
     manifest = session.manifest
@@ -102,7 +102,7 @@ def survey_status(session: Session) -> Status:
     status.lost = read_lost(store)
     status.logs = [_log_state(store, log, records.get(log.key)) for log in planned]
     status.logs += [_unplanned_state(one) for one in unplanned]
-    keys = {*(log.key for log in planned), *known_keys(session.survey, store, session.logs)}
+    keys = {*(log.key for log in planned), *known_keys(session.survey, store, logs_of(session))}
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
     status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
     status.readings = told([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])

@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.errors import ConfigError
+from roadscan.core.grid import TileGrid
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.kernels import decimate as kernels
 from roadscan.tiles.kernels.decimate_2x2 import decimate_2x2
 

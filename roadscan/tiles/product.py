@@ -18,6 +18,7 @@ from typing import ClassVar, Final, Literal, Protocol, Self, TypeAlias
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError, nearest
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import LanePass, TileId
 from roadscan.core.plugins import found_kinds
 from roadscan.core.strict import Strict
@@ -25,7 +26,6 @@ from roadscan.surface.tile import SurfaceTile
 from roadscan.surface.views import PictureRule
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.georeferencing.cloud import TilePoints
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.products.lane_direction import LaneDirections
 from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
 

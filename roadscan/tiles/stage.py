@@ -15,6 +15,7 @@ from roadscan.store.manifest import Manifest
 from roadscan.surface.tasks.surface_colours import check_colours
 from roadscan.tiles.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.tiles.footprints.stage import faults_of_plan
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.passes_apart import apart_findings
 from roadscan.tiles.tasks.tile_fates import fate_words, lost_findings, of_all, told_by_log
 from roadscan.tiles.tasks.tile_files import tile_file_names
@@ -35,7 +36,7 @@ class Tiles(Stage):
         """Compute the tiles that are missing or stale, or those that are chosen."""
         manifest, work = session.manifest, plan_tile_work(session)
         if work.chosen:
-            check_colours(session.plan, folders=True)  # before the tiles are computed for them
+            check_colours(plan_of(session), folders=True)  # before the tiles are computed for them
         manifest.remove(work.gone)
 
         def counted(task: TileTask) -> TileTask:

@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.grid import TileGrid
 from roadscan.tiles.accumulator import Accumulator
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.kernels.accumulate import PIECE, CountingWork, accumulate_points
 from roadscan.tiles.kernels.active_tiles import ActiveTiles
 from roadscan.tiles.kernels.bucket_readings import bucket_points

@@ -25,7 +25,7 @@ from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status
 from roadscan.tiles.footprints.footprints import load_ranges, stale_footprints
-from roadscan.tiles.plan.plan import plan_survey
+from roadscan.tiles.plan.plan import plan_of, plan_survey
 from roadscan.tiles.tasks.tile_plan import plan_tiles
 from tests.jobs.adjusted_site import CIRCLES, NO_FILES, TARGETS, adjust, cell_errors, corrections, rows
 from tests.jobs.conftest import Lines, Simulated, changed
@@ -173,7 +173,7 @@ def test_corrections_leave_footprints_current_and_switching_off_takes_them_away(
     session = adjust(copy, adjust__on=False)
     assert not copy.store().exists(held_path("corrections"))
     assert not rows(copy.store(), "SELECT * FROM outputs WHERE product = 'ties'")
-    assert stale_footprints(session.plan, session.manifest) == []
+    assert stale_footprints(plan_of(session), session.manifest) == []
     survey = changed(Survey.load(copy.survey_file), {**CIRCLES, **NO_FILES})
     again = Session(survey, copy.store())
     assert survey_status(again).of("adjust").stale == 1

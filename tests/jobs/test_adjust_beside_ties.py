@@ -17,11 +17,11 @@ from roadscan.adjust.tasks.outcome import known_findings
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
+from roadscan.navigation.tasks.trajectories import load_recorded, load_trajectory
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.store.held import held_path
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
-from roadscan.tiles.tasks.readings import load_recorded, load_trajectory
 from tests.jobs.adjusted_site import CIRCLES, NO_FILES, OFF, adjust, cell_errors, corrections, rows
 from tests.jobs.conftest import Simulated, changed
 

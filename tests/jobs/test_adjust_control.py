@@ -24,6 +24,7 @@ from roadscan.simulate import Scene, simulate
 from roadscan.store.held import held_path, read_held
 from roadscan.store.sql import query
 from roadscan.survey.run import run_stages
+from roadscan.tiles.plan.plan import plan_of
 from tests.jobs.conftest import Lines, Simulated, changed
 from tests.pictures import drawn
 
@@ -61,7 +62,7 @@ class Outcome:
     """What an adjustment with changed control said and made."""
 
     def __init__(self, session: Session, store: Any) -> None:
-        records = list(session.plan.records)
+        records = list(plan_of(session).records)
         self.findings: list[Finding] = list(
             findings_of(session.survey, records, session.manifest, [stage_named("adjust")])
         )

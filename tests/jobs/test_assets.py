@@ -35,6 +35,7 @@ from roadscan.report.page import report_page
 from roadscan.report.section import Material
 from roadscan.report.sections.assets import Assets as AssetsSection
 from roadscan.run.engine.compute import Done, Inline
+from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene as Street
@@ -42,7 +43,6 @@ from roadscan.simulate import simulate
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.tasks.selection import Selection
 from tests.jobs.conftest import Lines, Simulated, changed
 from tests.jobs.posts import Posts, only_kinds
 

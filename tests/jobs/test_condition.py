@@ -39,6 +39,7 @@ from roadscan.store.sql import query
 from roadscan.store.store import bytes_digest
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
@@ -112,7 +113,7 @@ def test_steps_are_as_high_as_those_of_the_truth(surveyed: RoughSurvey) -> None:
     config = session.survey.config.condition
     assert config is not None
     group = next(g for g in plan_condition(session).groups if g.lane.name == "2")
-    lane = load_lane(GroupTask(session.store, config.sections(), 0.05, product_context(session.plan), group))
+    lane = load_lane(GroupTask(session.store, config.sections(), 0.05, product_context(plan_of(session)), group))
     true = true_lane(group, lane, surveyed.height_at)
     for side in ("left", "right"):
         found, right = (
@@ -132,7 +133,7 @@ def test_sections_of_ten_metres_have_a_roughness(surveyed: RoughSurvey) -> None:
     config = session.survey.config.condition
     assert config is not None
     group = next(g for g in plan_condition(session).groups if g.lane.name == "2")
-    lane = load_lane(GroupTask(session.store, config.sections(), 0.05, product_context(session.plan), group))
+    lane = load_lane(GroupTask(session.store, config.sections(), 0.05, product_context(plan_of(session)), group))
     short = lane.config.model_copy(update={"section_m": 10.0})
     tens = tuple((at, at + 10.0) for at in np.arange(50.0, 100.0, 10.0).tolist())
     found = {}
@@ -246,7 +247,7 @@ def test_heights_do_not_depend_on_the_stretch(surveyed: RoughSurvey) -> None:
     config = session.survey.config.condition
     assert config is not None
     one = next(s for s in plan_condition(session).stretches if s.unit.startswith("A1/2/") and s.from_m == 50.0)
-    edge = session.plan.ground.grid.cells_per_edge
+    edge = plan_of(session).ground.grid.cells_per_edge
     table = cell_table([read_cells(session.store, r, edge) for r in one.cells], 0.05)
     whole = survey_lane(table, one.line, one.lane, (one.from_m, one.to_m), config.sections())
     part = survey_lane(table, one.line, one.lane, (61.3, 72.0), config.sections())
@@ -259,7 +260,7 @@ def test_only_what_depends_on_a_tile_is_computed_again(surveyed: RoughSurvey, tm
     work = plan_condition(session)
     first = next(s for s in work.stretches if s.unit == "A1/2/000000")
     place = first.line.places(np.array([30.0]), first.lane.offsets(np.array([30.0])))[0]
-    record = session.manifest.of(TILE)[str(session.plan.ground.grid.tile_at(place[0], place[1]))]
+    record = session.manifest.of(TILE)[str(plan_of(session).ground.grid.tile_at(place[0], place[1]))]
     session.manifest.add([record._replace(digest="another")])
     due = {s.unit for s in plan_condition(session).due_stretches}
     assert first.unit in due
@@ -326,7 +327,7 @@ def test_cracks_are_counted_by_section(surveyed: RoughSurvey, tmp_path: Path) ->
     rows = [{f.name: "" if f.type == "string" else 0 for f in CRACKS} for _ in lines]
     rows[0] |= {"type": "longitudinal", "width_mean_m": 0.004}
     rows[1] |= {"type": "transverse", "width_mean_m": 0.010}
-    context, file = product_context(session.plan), tmp_path / "cracks.parquet"
+    context, file = product_context(plan_of(session)), tmp_path / "cracks.parquet"
     write_geo_table(file, pa.Table.from_pylist(rows, CRACKS), "line", lines, ["MultiLineString"], context)
     session.store.publish(file, "products/cracks/cracks.parquet")
     content = session.store.read_bytes("products/cracks/cracks.parquet")

@@ -13,6 +13,7 @@ from roadscan.core.errors import RoadscanError, RunError
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
+from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.logs import copy_path, read_log_records, record_path
@@ -21,7 +22,6 @@ from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status, verify_store
-from roadscan.tiles.tasks.selection import Selection
 from tests.jobs.conftest import Simulated, changed, outputs
 
 MAKE = {"products__make": ["las", "geotiff", "mosaic", "kilometre", "tile_table"]}

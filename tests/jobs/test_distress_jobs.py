@@ -10,6 +10,7 @@ import pytest
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.code_reach import name_of, reached_code
@@ -19,7 +20,6 @@ from roadscan.simulate.truth import load
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.store import Store, bytes_digest
 from roadscan.survey.run import run_stages
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.mosaics import products
 from roadscan.tiles.mosaics.products import StoredTiles, wanted_products
 from roadscan.tiles.plan.drives import Drives

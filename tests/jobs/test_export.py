@@ -24,10 +24,10 @@ from roadscan.formats.scanners.psi_container import read_psi
 from roadscan.ingest.format import format_of
 from roadscan.ingest.ingest import ingest
 from roadscan.simulate import simulate, truth
+from roadscan.store.group_reader import read_groups
 from roadscan.store.store import Store
 from roadscan.tiles.georeferencing.curved_grid import CurvedHeights, fill_holes, inner_holes
 from roadscan.tiles.plan.plan import plan_survey
-from roadscan.tiles.tasks.readings import read_groups
 from tests.jobs.conftest import small_scene
 from tests.sensors.readings import read
 

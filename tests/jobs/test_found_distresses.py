@@ -23,6 +23,7 @@ from roadscan.store.manifest import OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import bytes_digest
 from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.products.geo_table import write_geo_table
 from tests.jobs.conftest import Simulated
 
@@ -54,7 +55,7 @@ def put(session: Session, name: str, rows: pa.Table, shapes: Sequence[Any]) -> N
     path = f"{table_schema(name).location}/{name}.parquet"
     with session.store.scratch() as folder:
         kinds = sorted({one.geom_type for one in shapes})
-        write_geo_table(folder / name, rows, "line", np.array(shapes, object), kinds, product_context(session.plan))
+        write_geo_table(folder / name, rows, "line", np.array(shapes, object), kinds, product_context(plan_of(session)))
         session.store.publish(folder / name, path)
     content = session.store.read_bytes(path)
     session.manifest.add([OutputRecord(name, f"{name}.parquet", "k", path, len(content), bytes_digest(content))])
@@ -72,7 +73,7 @@ def test_rows_have_heights_accuracy_epochs_and_severity(session: Session) -> Non
     assert held["pothole"]["severity"].to_pylist() == ["high"]
     assert rows[0]["road"] is not None and rows[0]["station_m"] is not None
     first, last = (rows[0][f"{name}_epoch_gps_ns"] for name in ("first", "last"))
-    passes = session.plan.passes
+    passes = plan_of(session).passes
     assert min(p.start_gps_ns for p in passes) <= first < last <= max(p.end_gps_ns for p in passes)
     assert 0.0 < rows[0]["sigma_horizontal_m"] < 0.1 and rows[0]["probability"] is None
 

@@ -53,6 +53,7 @@ from roadscan.site.thumbnail import thumbnail
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.store import bytes_digest
 from roadscan.survey.run import run_stages
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
@@ -150,7 +151,7 @@ def test_every_document_that_is_named_is_there_and_every_member_is_told(publishe
 
 def test_heights_read_back_are_those_of_the_cells(survey_file: Path, published: Published) -> None:
     session, entry = opened(survey_file), read(published, "survey.json")
-    grid, level = session.plan.ground.grid, entry["raster_grid"]["levels"][0]
+    grid, level = plan_of(session).ground.grid, entry["raster_grid"]["levels"][0]
     height = next(r for r in entry["rasters"] if r["name"] == "height")
     assert level["pixel_m"] == grid.cell_m
     compared = 0
@@ -482,7 +483,7 @@ def test_layers_open_in_other_programs(survey_file: Path, published: Published, 
         shown = {f["id"]: f for part in layer["parts"] for f in read(published, part["url"])["features"]}
         names = [column["name"] for column in layer["columns"]]
         assert len(table) == len(shown) and set(table.columns) == {*names, "geometry"}
-        assert table.crs == pyproj.CRS(session.plan.ground.map.crs)
+        assert table.crs == pyproj.CRS(plan_of(session).ground.map.crs)
         places = [shapely.geometry.shape(f["geometry"]) for f in shown.values()]
         nearest = [min(one.hausdorff_distance(place) for place in places) for one in table.geometry]
         assert max(nearest) <= 1e-5  # the page's documents state 10 µm

@@ -20,6 +20,7 @@ from roadscan.run.stage import stage_named
 from roadscan.simulate.surface import Surface
 from roadscan.store.sql import query
 from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import plan_of
 
 HALF_M = 3.5
 KERB_M = 0.1
@@ -131,11 +132,11 @@ def test_polygons_of_the_survey_file_are_the_edges(surveyed: RoughSurvey, tmp_pa
     assert stage_named("condition").check(session.survey) == []
     work = plan_condition(session)
     assert work.due_edges
-    grid = session.plan.ground.grid
+    grid = plan_of(session).ground.grid
     config = session.survey.config.condition
     assert config is not None and config.road_edges is not None
     task = road_edges.EdgeTask(
-        session.store, grid, product_context(session.plan), config.road_edges, tuple(work.due_edges)
+        session.store, grid, product_context(plan_of(session)), config.road_edges, tuple(work.due_edges)
     )
     found = road_edges._edges(task, work.due_edges[0])
     inner = (found.station_m > 12.0) & (found.station_m < 38.0)

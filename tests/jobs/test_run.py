@@ -19,11 +19,13 @@ from typer.testing import CliRunner
 
 from roadscan.cli import app
 from roadscan.core.errors import ConfigError, RunError
+from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingest
 from roadscan.run.engine.compute import Inline
 from roadscan.run.engine.compute_on import compute_on
+from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
@@ -31,8 +33,6 @@ from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.blocks import Block
-from roadscan.tiles.grid import Bounds
-from roadscan.tiles.tasks.selection import Selection
 from roadscan.tiles.tasks.tile_points import load_points
 from roadscan.tiles.tasks.tile_work import plan_tile_work
 from tests.conftest import REPOSITORY

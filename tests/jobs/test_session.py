@@ -12,6 +12,8 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status
+from roadscan.tiles.footprints.footprints import footprints_of
+from roadscan.tiles.tasks.tile_plan import tiles_of
 from tests.jobs.conftest import Simulated
 
 PLANS = ("plan_logs", "plan_survey", "load_ranges", "plan_tiles")
@@ -49,9 +51,9 @@ def test_status_plans_once(finished: Simulated, counted: Counter[str]) -> None:
 
 def test_renewing_forgets_what_follows_and_nothing_before(finished: Simulated, counted: Counter[str]) -> None:
     session = Session.open(finished.survey_file)
-    assert session.tiles is session.tiles
-    session.renew("footprints")
-    assert len(session.tiles) > 0
+    assert tiles_of(session) is tiles_of(session)
+    session.forget(footprints_of)
+    assert len(tiles_of(session)) > 0
     assert dict(counted) == {"plan_logs": 1, "plan_survey": 1, "load_ranges": 2, "plan_tiles": 2}
 
 

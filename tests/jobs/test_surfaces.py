@@ -24,6 +24,7 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Done, Inline
+from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.simulate import simulate
@@ -38,7 +39,6 @@ from roadscan.surface.tasks.surfaces import _Cells, source_of
 from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import verify_store
-from roadscan.tiles.tasks.selection import Selection
 from roadscan.tiles.tasks.tile_plan import TILE
 from tests.jobs.conftest import Lines, Simulated, changed, outputs, small_scene
 

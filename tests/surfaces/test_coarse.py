@@ -7,10 +7,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import generic_filter
 
+from roadscan.core.grid import TileGrid
 from roadscan.surface.coarse import FILLED, INTERPOLATED, MEASURED, NOTHING, CoarseSettings, Stretch, coarse_model
 from roadscan.surface.kernels.coarse import median_filter, natural_spline
 from roadscan.surface.regions import FOUND, STATED, RegionSettings, find_regions, stated_regions
-from roadscan.tiles.grid import TileGrid
 
 EAST, NORTH = 2_683_200.0, 1_247_900.0
 

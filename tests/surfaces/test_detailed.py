@@ -8,13 +8,13 @@ from scipy.interpolate import CloughTocher2DInterpolator, RBFInterpolator
 from scipy.spatial import Delaunay
 
 from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.core.grid import Bounds
 from roadscan.surface.clough_tocher import CubicSurface, cubic_surface
 from roadscan.surface.detailed import DetailedSettings, detailed_surface, surface_through
 from roadscan.surface.normals import slopes_at
 from roadscan.surface.sites import sites
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow
-from roadscan.tiles.grid import Bounds
 
 UNIT = GridWindow(0, 0, 80, 60, 1.0 / 80, 1.0 / 60)
 EAST, NORTH = np.meshgrid(*UNIT.nodes_m())

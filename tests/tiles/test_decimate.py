@@ -7,10 +7,10 @@ import pytest
 
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.errors import ConfigError
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.decimate import FLOOR_UM, cells_per_square, decimate, patch_cells
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.kernels.decimate import Cells, Squares, decimate_cells
 from roadscan.tiles.kernels.decimate_2x2 import decimate_2x2
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.tiles.blocks import Block, cut_blocks
-from roadscan.tiles.grid import Bounds, TileGrid
 
 GRID = TileGrid(10.0, 0.05)
 coordinate = st.floats(-6e6, 6e6, allow_nan=False)

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.tiles.accumulator import Accumulator
 from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.georeferencing.kernels.readings import CLASS_KEPT, CLASS_TOO_HIGH, FATES, KEPT, OUTSIDE, Placed
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.kernels.active_tiles import ActiveTiles, Measured
 from roadscan.tiles.kernels.row_buckets import TAKEN, Buckets, Places, fill_buckets
 from roadscan.tiles.statistics import cells_of

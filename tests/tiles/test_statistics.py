@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.tiles.georeferencing.cloud import TilePoints
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.statistics import cells_of
 
 GRID = TileGrid(10.0, 0.5)

@@ -66,7 +66,7 @@ from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import file_digest
-from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.plan.plan import SurveyPlan, plan_of
 from roadscan.tiles.plan.road import road_key
 
 Float64 = npt.NDArray[np.float64]
@@ -144,7 +144,7 @@ def is_current(plan: SurveyPlan, manifest: Manifest) -> bool:
 
 def withdraw(session: Session) -> None:
     """Take away what the stage made: the poses hold as they were recorded."""
-    manifest, plan = session.manifest, session.plan
+    manifest, plan = session.manifest, plan_of(session)
     manifest.remove([r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()])
     publish(session.store, {}, plan.survey.config.adjust)
     publish_mountings(session.store, None, plan.survey.config.adjust)
@@ -156,14 +156,14 @@ class _Collector:
 
     def __init__(self, session: Session, sources: Sources, priors: tuple[RunPrior, ...], mounted: Mounted) -> None:
         self.session, self.sources, self.priors, self.mounted = session, sources, priors, mounted
-        self.runs = runs_of(session.plan)
-        self.work = plan_work(session.plan, sources, priors)
+        self.runs = runs_of(plan_of(session))
+        self.work = plan_work(plan_of(session), sources, priors)
         self.lacks = False
         """Whether some of the evidence failed."""
         self._seams = {place.number for task in self.work.ties for place in task.places if place.seam}
         self.of_heads, self._useless = self._heads()
         """Findings on heads that do not meet as they should."""
-        self.again = first_ties(session.plan, sources, self.work.ties, self.work.control, (self.observe, self.load))
+        self.again = first_ties(plan_of(session), sources, self.work.ties, self.work.control, (self.observe, self.load))
 
     def observe(self, tasks: Sequence[TieTask]) -> None:
         """Bring ties up to date."""
@@ -182,8 +182,8 @@ class _Collector:
         A run in which heads meet otherwise than in the others gets mountings of its own.
         """
         self.observe(self.work.ties)
-        steps = steps_of(self._loaded(self.work.ties), self.session.plan.survey.config.adjust.ties.return_s)
-        swapped = exchanged(self.session.plan, self.sources, steps)
+        steps = steps_of(self._loaded(self.work.ties), plan_of(self.session).survey.config.adjust.ties.return_s)
+        swapped = exchanged(plan_of(self.session), self.sources, steps)
         useless = {one.run for one, _ in swapped}
         odd = odd_steps([one for one in steps if one.run not in useless])
         if self.mounted.priors and odd:
@@ -204,12 +204,12 @@ class _Collector:
 
     def solve(self, ties: KnownTies, control: Sequence[ControlTask]) -> Solution:
         """Corrections of all runs."""
-        return solve(self.session.plan, self.evidence(ties, control).evidence)
+        return solve(plan_of(self.session), self.evidence(ties, control).evidence)
 
 
 def adjust_survey(session: Session) -> None:
     """Collect what evidence is missing, solve, and publish the corrections, tables and pictures."""
-    plan, manifest, config = session.plan, session.manifest, session.plan.survey.config.adjust
+    plan, manifest, config = plan_of(session), session.manifest, plan_of(session).survey.config.adjust
     key = solution_key(plan)
     foreign = foreign_runs(session.store)
     sources = [pair for pair in adjusted_sources(plan) if pair[0].run not in foreign]

@@ -51,9 +51,9 @@ from roadscan.core.settings.adjustment import AdjustmentSettings, ControlRules
 from roadscan.core.witness import Finding
 from roadscan.navigation.mounting_change import NO_SEAT
 from roadscan.navigation.tasks.pose_sigma import stated_pose_sigma
+from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.navigation.trajectory import Corrections
 from roadscan.tiles.plan.plan import SurveyPlan
-from roadscan.tiles.tasks.readings import TrajectorySource, load_recorded
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]

@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from roadscan.assets.classes import CLASS_NAMES
 from roadscan.assets.returns import Returns
+from roadscan.core.grid import QUANTA_PER_M, TileGrid
 from roadscan.core.ids import TileId
-from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M, TilePoints
-from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.las import LasOptions, write_las
 

@@ -19,6 +19,7 @@ from roadscan.assets.tasks.picture_rule import picture_rule
 from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.assets.tiling import AssetGrid
 from roadscan.core.errors import ConfigError, RunError
+from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
 from roadscan.core.settings.asset_pictures import AssetPicturesSettings
 from roadscan.run.code_reach import code_digest, name_of
@@ -26,7 +27,6 @@ from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.store import Store, bytes_digest, file_digest
 from roadscan.surface.tasks.pictures import Pictures, plan_pictures
-from roadscan.tiles.grid import Bounds
 
 SEEN: Final = "asset_pictures"
 """Manifest name of what pictures told of a kind's objects in a square."""

@@ -21,13 +21,13 @@ from roadscan.assets.screens import SCREENS
 from roadscan.assets.tasks.picture_work import CUT_OUTS, SEEN, PictureTask, SquareObjects, around, rows_by_square
 from roadscan.assets.tasks.recognition import recognition_of
 from roadscan.assets.tasks.sights import best_sights, named
+from roadscan.core.grid import Bounds
 from roadscan.run.engine.compute import reason_of
 from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.store import bytes_digest
 from roadscan.surface.tasks.picture_colours import ColourSource, world_places
 from roadscan.surface.tasks.pictures import Pictures
 from roadscan.surface.views import NO_VIEW, WIDTH, Sights, best_views
-from roadscan.tiles.grid import Bounds
 from roadscan.tiles.tasks.tiles import TaskResult
 
 Float64 = npt.NDArray[np.float64]

@@ -24,6 +24,10 @@ from roadscan.assets.tasks.tables import TABLES
 from roadscan.core.ids import TileId
 from roadscan.run.session import Session
 from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.tiles.footprints.footprints import footprints_of
+from roadscan.tiles.plan.plan import plan_of
+from roadscan.tiles.tasks.selection import chosen_tiles
+from roadscan.tiles.tasks.tile_plan import tiles_of
 
 MADE = (
     SAMPLES, GAINS, EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, VISIBILITY, OBJECTS, SEEN, CUT_OUTS, TABLES, SECTIONS,
@@ -57,12 +61,14 @@ def plan_evidence(session: Session) -> AssetsWork:
     manifest = session.manifest
     if session.survey.config.assets is None:
         return AssetsWork(gone=manifest.beside(set(MADE), ()))
-    plan = plan_assets(session.plan, session.footprints)
+    plan = plan_assets(plan_of(session), footprints_of(session))
     gains = plan_gains(plan)
     samples, held = gains.due(manifest), current_gains(gains, manifest)
     forced: list[TileId] = []
     if session.selection is not None:
-        chosen = session.selection.tiles(session.tiles, session.footprints, session.plan.ground.grid)
+        chosen = chosen_tiles(
+            session.selection, tiles_of(session), footprints_of(session), plan_of(session).ground.grid
+        )
         forced = sorted({plan.grid.of_tile(t) for t in chosen} & set(plan.keys))
         near = plan.near(chosen)
         due = [one for one in due_squares(plan, manifest, held, forced) if one.square in near]

@@ -34,10 +34,11 @@ from roadscan.core.survey import Survey
 from roadscan.navigation.tasks.navigate import records_with_trajectories
 from roadscan.navigation.tasks.pose_sigma import pose_sigma
 from roadscan.navigation.tasks.taken_pictures import taken_pictures
+from roadscan.navigation.tasks.trajectories import load_trajectory
+from roadscan.store.group_reader import read_groups
 from roadscan.store.logs import LogRecord
 from roadscan.store.store import Store
 from roadscan.tiles.plan.plan import trajectory_source
-from roadscan.tiles.tasks.readings import load_trajectory, read_groups
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -15,6 +15,7 @@ from roadscan.condition.tasks.values import Group, GroupTask, load_lane
 from roadscan.condition.tasks.work import plan_condition
 from roadscan.run.session import Session
 from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import plan_of
 
 Float64 = npt.NDArray[np.float64]
 HeightAt: TypeAlias = Callable[[Float64, Float64], Float64]
@@ -36,9 +37,9 @@ def compared_values(session: Session, height_at: HeightAt) -> Iterator[Compared]
     config = session.survey.config.condition
     if config is None:
         return
-    context = product_context(session.plan)
+    context = product_context(plan_of(session))
     for group in plan_condition(session).groups:
-        task = GroupTask(session.store, config.sections(), session.plan.ground.grid.cell_m, context, group)
+        task = GroupTask(session.store, config.sections(), plan_of(session).ground.grid.cell_m, context, group)
         lane = load_lane(task)
         true = true_lane(group, lane, height_at)
         for index in condition_indices().values():

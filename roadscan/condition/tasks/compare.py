@@ -17,6 +17,7 @@ from roadscan.run.session import Session
 from roadscan.store.manifest import Manifest, read_recorded
 from roadscan.store.sql import query
 from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
 
@@ -92,7 +93,7 @@ def compare_surveys(before: Session, after: Session) -> Changes:
     StoreError
         where one has no sections.
     """
-    one, other = product_context(before.plan), product_context(after.plan)
+    one, other = product_context(plan_of(before)), product_context(plan_of(after))
     if one.map != other.map:
         raise ConfigError(
             f"'{before.survey.config.id}' is in {one.map.crs}, '{after.survey.config.id}' in {other.map.crs}",
@@ -140,5 +141,5 @@ def _sections(session: Session) -> tuple[pd.DataFrame, npt.NDArray[Any]]:
             expected="a run with a section [condition] in its survey file",
             change=f"run 'roadscan run' with it ({session.store.path('')})",
         )
-    table, lines = read_geo_table(read_recorded(session.store, record), product_context(session.plan))
+    table, lines = read_geo_table(read_recorded(session.store, record), product_context(plan_of(session)))
     return table.to_pandas(), lines

@@ -25,8 +25,10 @@ from roadscan.core.survey import Survey
 from roadscan.formats.vectors.road_lines import LineLayer, RoadLinesOptions, place_in_map, read_lines, sidecars
 from roadscan.ingest.format import Reject
 from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
+from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.group_reader import read_groups
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, file_digest
@@ -34,7 +36,6 @@ from roadscan.tiles.mosaics.products import product_context
 from roadscan.tiles.plan.plan import SurveyPlan, trajectory_source
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
-from roadscan.tiles.tasks.readings import TrajectorySource, read_groups
 
 LINES: Final = "reference_lines"
 LANES: Final = "lanes"

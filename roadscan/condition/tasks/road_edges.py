@@ -26,6 +26,7 @@ from roadscan.condition.road_edges.raster import tile_points
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.tasks import PieceTask
 from roadscan.condition.tasks.tiles_beside import tiles_beside
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.settings.road_edges import RoadEdgesConfig
 from roadscan.core.survey import Survey
@@ -38,7 +39,6 @@ from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import bytes_digest, file_digest
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.plan.plan import SurveyPlan
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells

@@ -18,6 +18,7 @@ from roadscan.condition.roughness_regions.regions import Region, SectionRegions
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.tasks import PieceTask
 from roadscan.condition.tasks.tiles_beside import tiles_beside
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.settings.roughness_regions import RoughnessRegionsConfig
 from roadscan.run.code_reach import code_digest
@@ -27,7 +28,6 @@ from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import bytes_digest, file_digest
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tiles import TaskResult

@@ -22,6 +22,7 @@ from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.survey_lane import LaneHeights, reach_m, survey_lane
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.surface_cells import read_surface
+from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.settings.condition import SectionConfig
 from roadscan.run.code_reach import code_digest
@@ -32,7 +33,6 @@ from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, bytes_digest
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.grid import Bounds, TileGrid
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tiles import TaskResult

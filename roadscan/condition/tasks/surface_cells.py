@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.core.errors import ConfigError, StoreError
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.store import Store
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.product import ProductContext
 
 

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, Self, TypeVar
 
+from roadscan.core.grid import TileGrid
 from roadscan.core.strict import Strict
 from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.tiles import TaskResult
 

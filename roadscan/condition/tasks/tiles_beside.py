@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 
 from roadscan.condition.road_line import RoadLine
+from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
-from roadscan.tiles.grid import Bounds, TileGrid
 
 
 def tiles_beside(line: RoadLine, from_m: float, to_m: float, away_m: float, grid: TileGrid) -> list[TileId]:

@@ -32,6 +32,7 @@ from roadscan.core.settings.condition import ConditionConfig
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
 from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.tile_plan import TILE
 
 MADE = (
@@ -79,14 +80,14 @@ def plan_condition(session: Session) -> ConditionWork:
     config, manifest = session.survey.config.condition, session.manifest
     if config is None:
         return ConditionWork(gone=manifest.beside(set(MADE), ()))
-    key = lines_key(session.plan, config)
+    key = lines_key(plan_of(session), config)
     if not current_lines(manifest, key):
         return ConditionWork(lines_key=key, lines_due=True)
     return _along_lines(session, config, key)
 
 
 def _along_lines(session: Session, config: ConditionConfig, key: str) -> ConditionWork:
-    plan, manifest = session.plan, session.manifest
+    plan, manifest = plan_of(session), session.manifest
     context = product_context(plan)
     roads: Roads = load_roads(session.store, manifest, context)
     made = manifest.of(TILE if config.heights == "cells" else SURFACE_FILES)

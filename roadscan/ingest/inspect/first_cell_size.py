@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator
 from typing import Final
 
+from roadscan.core.grid import ENOUGH, LARGEST_M
 from roadscan.core.survey import TileConfig
 from roadscan.ingest.inspect.first_survey import FoundFolder, FoundLog, FoundRun
 from roadscan.ingest.inspect.log_figures import TableFigures
-from roadscan.tiles.grid import ENOUGH, LARGEST_M
 
 EDGES_M: Final = (0.005, 0.01, 0.02, 0.025, 0.05, 0.1, 0.2, 0.25, 0.5, 1.0)
 """Edges that are proposed: all divide a tile of 10 m into an even number of cells."""

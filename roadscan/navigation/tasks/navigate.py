@@ -11,11 +11,12 @@ from collections.abc import Callable, Sequence
 from roadscan.core.errors import ConfigError, DamagedError, RoadscanError, RunError
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import survey_records
-from roadscan.ingest.planned_logs import Logs, plan_logs
+from roadscan.ingest.planned_logs import Logs, logs_of, plan_logs
 from roadscan.navigation.tasks.computed_trajectory import PlannedTrajectory
 from roadscan.navigation.tasks.navigation_pictures import draw_trajectories
 from roadscan.navigation.tasks.solve_trajectory import plan_solutions
 from roadscan.navigation.tasks.spline_trajectory import plan_splines
+from roadscan.run.session import Session, found_once
 from roadscan.store.logs import NAVIGATION, LogRecord, has_log, read_log_records, retire_log, write_log_record
 from roadscan.store.store import Store
 from roadscan.store.writer import LogWriter
@@ -142,3 +143,15 @@ def _figures(record: LogRecord) -> str:
     if "outliers" in a:
         text += f", {a['outliers']:,} of {a['updates']:,} updates are outliers"
     return text
+
+
+@found_once
+def records_of(session: Session) -> tuple[LogRecord, ...]:
+    """Records of the survey file's logs and of the trajectories computed from them.
+
+    Raises
+    ------
+    RunError
+        where one is missing.
+    """
+    return tuple(records_with_trajectories(session.survey, session.store, logs_of(session)))

@@ -13,9 +13,9 @@ import pyarrow as pa
 from roadscan.core.errors import ConfigError, NavigationError
 from roadscan.core.rig import Rig, Sensor
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
+from roadscan.store.group_reader import read_groups
 from roadscan.store.logs import LogRecord
 from roadscan.store.store import Store
-from roadscan.tiles.tasks.readings import read_groups
 
 Float64 = npt.NDArray[np.float64]
 

@@ -11,9 +11,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.core.settings.calibration import CalibrationSettings
+from roadscan.navigation.tasks.trajectories import TrajectorySource
+from roadscan.store.group_reader import read_groups
 from roadscan.store.logs import LogRecord
 from roadscan.store.store import Store
-from roadscan.tiles.tasks.readings import TrajectorySource, read_groups
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from roadscan.core.ids import of_run
 from roadscan.navigation.tasks.clock_tables import load_clocks
+from roadscan.store.group_reader import read_groups
 from roadscan.store.logs import LogRecord
 from roadscan.store.store import Store
-from roadscan.tiles.tasks.readings import read_groups
 
 _COLUMNS = ["epoch_gps_ns", "file", "width_px", "height_px"]
 

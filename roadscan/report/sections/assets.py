@@ -19,6 +19,7 @@ from roadscan.report.map_page import COLOURS, WIDTH, MapPage
 from roadscan.report.section import Material, Section
 from roadscan.store.asset_schema import AssetSchema, asset_schema, asset_tables
 from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.plan.plan import plan_of
 
 _CROSS: Final = 3.0
 _MOST_LINES: Final = 6000
@@ -62,7 +63,7 @@ def _layers(material: Material) -> list[tuple[AssetSchema, Layer]]:
     held = {unit.removesuffix(".parquet"): r for unit, r in session.manifest.of(TABLES).items()}
     if not held.keys() & tables.keys():
         return []
-    context = product_context(session.plan)
+    context = product_context(plan_of(session))
     found = [(asset_schema(kind), held[name]) for name, kind in tables.items() if name in held]
     return [(schema, read_layer(schema, record, session.store, context)) for schema, record in found]
 

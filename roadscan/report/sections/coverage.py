@@ -19,7 +19,7 @@ from roadscan.report.section import Material, Section
 from roadscan.report.sections.recorded import seconds_of
 from roadscan.store.manifest import OutputRecord
 from roadscan.tiles.plan.drives import Drives
-from roadscan.tiles.plan.plan import NothingToPlaceError
+from roadscan.tiles.plan.plan import NothingToPlaceError, plan_of
 from roadscan.tiles.tasks.tile_plan import TILE
 
 _ONE_PASS: Final = "#cfd6dd"
@@ -41,7 +41,7 @@ class Coverage(Section):
         """A map of runs over tiles; a row a pass."""
         session = material.session
         try:
-            plan = session.plan
+            plan = plan_of(session)
         except NothingToPlaceError:
             return
         drives = Drives.of(plan)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import shapely
 
 from roadscan.core.gpstime import utc_from_gps_ns
+from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.site import evidence
 from roadscan.site.layer import (
     BLUE,
@@ -27,8 +28,8 @@ from roadscan.site.layer import (
     line_of,
 )
 from roadscan.site.material import Material
+from roadscan.store.group_reader import read_groups
 from roadscan.tiles.products.lane_direction import STEP_M
-from roadscan.tiles.tasks.readings import TrajectorySource, read_groups
 
 RUN_COLOURS = (BLUE, RED, GREEN, PURPLE, SKY, ORANGE)
 _FAITHFUL_M = 0.02

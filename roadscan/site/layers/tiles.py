@@ -26,7 +26,7 @@ from roadscan.site.layer import (
 from roadscan.site.material import Material
 from roadscan.store.manifest import read_failures
 from roadscan.tiles.product import TileSummary
-from roadscan.tiles.tasks.tile_plan import TILE
+from roadscan.tiles.tasks.tile_plan import TILE, tiles_of
 
 _STATES = {"done": BLUE, "stale": ORANGE, "failed": RED, "not known": GREY}
 _SHOWN = (
@@ -75,7 +75,7 @@ class Tiles(LayerKind):
 def _keys(material: Material) -> tuple[dict[TileId, str], bool]:
     """Keys of the tiles that readings may touch; False where they cannot be told, as without the raw logs."""
     try:
-        planned = material.session.tiles
+        planned = tiles_of(material.session)
     except RoadscanError:
         return {}, False
     return dict(zip(planned.ids, planned.keys, strict=True)), True

@@ -21,9 +21,11 @@ from roadscan.site.layers.passes import RUN_COLOURS
 from roadscan.site.material import Material
 from roadscan.site.part import SitePart
 from roadscan.tiles.blocks import cut_blocks
+from roadscan.tiles.footprints.footprints import footprints_of
 from roadscan.tiles.georeferencing.cloud import TilePoints
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.products.cloud_records import Lattice
-from roadscan.tiles.tasks.tile_plan import TilePlan
+from roadscan.tiles.tasks.tile_plan import TilePlan, tiles_of
 from roadscan.tiles.tasks.tile_points import load_points
 
 _CODE: Final = ("roadscan.site.cloud_file:write_cloud", "roadscan.tiles.tasks.tile_points:load_points")
@@ -78,7 +80,7 @@ def cloud_sheets(material: Material) -> dict[str, tuple[TileId, ...]]:
     if not material.wishes.clouds:
         return {}
     try:
-        known = material.session.tiles
+        known = tiles_of(material.session)
     except RoadscanError:
         return {}
     held = {
@@ -130,9 +132,9 @@ def _writer(material: Material, name: str, tiles: Sequence[TileId]) -> Any:
 def _points(material: Material, tiles: Sequence[TileId]) -> Generator[TilePoints, None, None]:
     """Points of tiles, block by block."""
     session, config = material.session, material.session.survey.config.tiles
-    planned = TilePlan(session.plan, session.footprints, session.tiles, (), material.context)
-    numbers = session.tiles.numbers(tiles)
-    readings = dict(zip(tiles, session.tiles.readings[numbers].tolist(), strict=True))
+    planned = TilePlan(plan_of(session), footprints_of(session), tiles_of(session), (), material.context)
+    numbers = tiles_of(session).numbers(tiles)
+    readings = dict(zip(tiles, tiles_of(session).readings[numbers].tolist(), strict=True))
     for block in cut_blocks(readings, config.block_tiles, config.max_block_readings):
         wanted = frozenset(block.tiles)
         for tile, points in load_points(planned.task(block)):

@@ -13,11 +13,11 @@ from rasterio.io import MemoryFile
 from rasterio.windows import Window
 
 from roadscan.core.errors import ConfigError, StoreError
+from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.surface.products.surface import SurfaceBand, SurfaceOptions, surface_band
 from roadscan.surface.window import GridWindow
-from roadscan.tiles.grid import Bounds
 from roadscan.tiles.product import LoadCells, ProductContext
 from roadscan.tiles.products.raster import CellBox
 

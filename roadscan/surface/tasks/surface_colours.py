@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.store.manifest import OutputRecord
@@ -15,7 +16,6 @@ from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.tasks.picture_colours import ColourSource
 from roadscan.surface.tasks.pictures import Pictures, check_folders, check_pictures, plan_pictures, rule_cameras
 from roadscan.surface.tile import NodeColours, SurfaceTile
-from roadscan.tiles.grid import Bounds
 from roadscan.tiles.mosaics.products import product_context, wanted_products, wanted_surface_products
 from roadscan.tiles.plan.plan import SurveyPlan
 from roadscan.tiles.product import SurfaceProduct

@@ -10,6 +10,7 @@ import shapely
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import utc_from_gps_ns
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.settings.surface import SurfaceConfig
 from roadscan.core.survey import Survey
@@ -23,7 +24,6 @@ from roadscan.surface.tasks.pictures import Pictures
 from roadscan.surface.tasks.surface_colours import shown_box
 from roadscan.surface.tasks.surface_regions import Regions, stated_regions
 from roadscan.tiles.blocks import Block, cut_blocks
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.tile_files import WantedSurface, surface_file_names
 from roadscan.tiles.tasks.tile_plan import TILE, TilePlan, TileTask

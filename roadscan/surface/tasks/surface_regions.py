@@ -12,6 +12,7 @@ import shapely
 
 from roadscan.core.crs import LOCAL_WORLD, MapFrame
 from roadscan.core.errors import ConfigError
+from roadscan.core.grid import Bounds
 from roadscan.core.survey import Survey
 from roadscan.formats.vectors.road_lines import place_in_map
 from roadscan.formats.vectors.vector_layer import (
@@ -23,7 +24,6 @@ from roadscan.formats.vectors.vector_layer import (
     shapes_of,
 )
 from roadscan.surface.window import GridWindow
-from roadscan.tiles.grid import Bounds
 
 _EXPECTED: Final = "a layer of polygons"
 _POLYGONS: Final = (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)

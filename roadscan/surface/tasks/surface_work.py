@@ -11,9 +11,12 @@ from roadscan.store.manifest import OutputRecord
 from roadscan.surface.tasks.found_regions import REGIONS, FoundRegions, load_found_regions
 from roadscan.surface.tasks.surface_colours import plan_colours
 from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, plan_surfaces
+from roadscan.tiles.footprints.footprints import footprints_of
 from roadscan.tiles.mosaics.products import product_context, wanted_surface_products
+from roadscan.tiles.plan.plan import plan_of
+from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import surface_file_names
-from roadscan.tiles.tasks.tile_plan import TilePlan
+from roadscan.tiles.tasks.tile_plan import TilePlan, tiles_of
 
 
 @dataclass(frozen=True)
@@ -38,13 +41,13 @@ def plan_surface_work(session: Session) -> SurfaceWork:
     names = {SURFACE, REGIONS, *surface_file_names()}
     if survey.config.surface is None:
         return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()])
-    plan, footprints = session.plan, session.footprints
+    plan, footprints = plan_of(session), footprints_of(session)
     context = product_context(plan)
     wanted = tuple(wanted_surface_products(survey, context))
     if not wanted:
         note = "the survey file has a section [surface], and no product of the surface is asked for"
         return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()], note)
-    tiles = TilePlan(plan, footprints, session.tiles, (), context)
+    tiles = TilePlan(plan, footprints, tiles_of(session), (), context)
     found = load_found_regions(plan, manifest)
     pictures = plan_colours(plan, wanted)
     planned = plan_surfaces(tiles, survey.config.surface, wanted, manifest, found, pictures)
@@ -61,7 +64,7 @@ def plan_surface_work(session: Session) -> SurfaceWork:
     note = _waiting_note(len(planned.waiting), found)
     if selection is None:
         return SurfaceWork(planned, stale, gone, note)
-    own = set(selection.tiles(tiles.tiles, footprints, plan.ground.grid))
+    own = set(chosen_tiles(selection, tiles.tiles, footprints, plan.ground.grid))
     due = own | (planned.near(own) & set(stale))
     return SurfaceWork(planned, [tile for tile in planned.keys if tile in due], gone, note)
 

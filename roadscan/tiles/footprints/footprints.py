@@ -21,6 +21,7 @@ from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.compute import Compute
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.session import Session, found_once
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, bytes_digest
@@ -28,7 +29,7 @@ from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.footprints.reach import group_spans, opened, touched_tiles
 from roadscan.tiles.georeferencing.place import FATE_NAMES, Window
 from roadscan.tiles.georeferencing.reach import Touched, joined
-from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.plan.plan import SurveyPlan, plan_of
 from roadscan.tiles.tasks.readings import Ground, Placer, RawSlice
 from roadscan.tiles.tasks.tile_fates import fate_words, told
 
@@ -291,3 +292,9 @@ def _is_apart(record: OutputRecord, window: Window | None) -> bool:
 
 def _digests(plan: SurveyPlan) -> Sequence[str]:
     return [f.digest for _, files in plan.sources for f in files]
+
+
+@found_once
+def footprints_of(session: Session) -> FootprintRanges:
+    """Which row group touches which tile."""
+    return load_ranges(plan_of(session), session.manifest)

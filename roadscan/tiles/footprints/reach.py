@@ -14,11 +14,12 @@ import pyarrow.parquet as pq
 from roadscan.core.errors import NavigationError, StoreError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.store.profiles import ProfileReader
 from roadscan.store.store import Store
 from roadscan.tiles.georeferencing.charts import charts_along
 from roadscan.tiles.georeferencing.reach import RangeSpans, Reach, Touched, joined
-from roadscan.tiles.tasks.readings import Ground, RawSlice, ReadingSource, geometry_of, load_recorded
+from roadscan.tiles.tasks.readings import Ground, RawSlice, ReadingSource, geometry_of
 
 _SPAN_COLUMNS = ["range_low", "range_high"]
 _CHUNK_READINGS = 1 << 22

@@ -13,14 +13,20 @@ from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.strips.findings import strip_findings
 from roadscan.strips.work import compare_strips
-from roadscan.tiles.footprints.footprints import PRODUCT, index_footprints, stale_footprints, unplaced_logs
-from roadscan.tiles.plan.plan import empty_passes
+from roadscan.tiles.footprints.footprints import (
+    PRODUCT,
+    footprints_of,
+    index_footprints,
+    stale_footprints,
+    unplaced_logs,
+)
+from roadscan.tiles.plan.plan import empty_passes, plan_of
 from roadscan.tiles.tasks.tick_clocks import check_tick_clocks, tick_findings
 
 
 def faults_of_plan(session: Session) -> list[tuple[str, str]]:
     """Logs that give nothing, and passes without a reading."""
-    plan = session.plan
+    plan = plan_of(session)
     return [*(fault.told for fault in plan.apart), *empty_passes(plan), *unplaced_logs(plan, session.manifest)]
 
 
@@ -33,24 +39,24 @@ class Footprints(Stage):
 
     def run(self, session: Session) -> None:
         """Index the data files whose footprints are missing or stale."""
-        plan, manifest = session.plan, session.manifest
+        plan, manifest = plan_of(session), session.manifest
         session.failed(self.name, [*(fault.told for fault in plan.apart), *empty_passes(plan)])
         for note in outdated_calibrations(plan):
             session.note(note)
         found = index_footprints(plan, manifest, session.compute, session.bar(self.name))
-        session.renew("footprints")
+        session.forget(footprints_of)
         found += check_tick_clocks(plan, manifest, session.compute, session.bar("clocks by ticks"))
         found += compare_strips(session, manifest)
         session.failed(self.name, [*found, *unplaced_logs(plan, manifest)])
 
     def state(self, session: Session) -> StageState:
         """Data files of which it is not known, or not known any more, which tiles they touch."""
-        stale, current = len(stale_footprints(session.plan, session.manifest)), len(session.manifest.of(PRODUCT))
+        stale, current = len(stale_footprints(plan_of(session), session.manifest)), len(session.manifest.of(PRODUCT))
         state = StageState(current - stale, stale, next_run={"footprints": stale})
-        state.notes = outdated_calibrations(session.plan)
+        state.notes = outdated_calibrations(plan_of(session))
         state.faults = faults_of_plan(session)
         if not current:
-            state.next_run["raw_bytes"] = session.plan.raw_bytes
+            state.next_run["raw_bytes"] = plan_of(session).raw_bytes
             state.hides_rest = True
         elif stale:
             state.notes.append(

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.ids import TileId
-
-QUANTUM_M: Final = 1e-5
-"""Point coordinates are whole numbers of this (10 µm): sums are exact, so results do not depend on order."""
-QUANTA_PER_M: Final = 100_000
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from roadscan.compute.kernels.curved_grid import accumulate_curved
 from roadscan.compute.reference_line import ReferenceLine
-from roadscan.tiles.georeferencing.cloud import QUANTUM_M
+from roadscan.core.grid import QUANTUM_M
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

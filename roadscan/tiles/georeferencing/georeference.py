@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.rig import Mounting
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.tiles.georeferencing.charts import Charts
-from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
 from roadscan.tiles.georeferencing.kernels import charts as kernels
 from roadscan.tiles.georeferencing.kernels.readings import Georeference, Limits
 

@@ -22,13 +22,13 @@ from roadscan.core.crs import (
     world_frame_of,
 )
 from roadscan.core.errors import CrsError
+from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.ids import LanePass
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.tiles.georeferencing.charts import Charts
 from roadscan.tiles.georeferencing.classes import KEPT, NOT_ROAD, READING_CLASSES, TOO_HIGH, TOO_LOW
-from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
 from roadscan.tiles.georeferencing.flat_profiles import EVERY_RAW_RANGE, flat_profiles
 from roadscan.tiles.georeferencing.georeference import georeference_of
 from roadscan.tiles.georeferencing.kernels import readings as kernels

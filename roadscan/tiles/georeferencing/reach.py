@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.kernel_options import read_only
+from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.navigation.movement import NO_CORRECTION, Allowance
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.tiles.georeferencing.charts import Charts
-from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
 from roadscan.tiles.georeferencing.georeference import georeference_of
 from roadscan.tiles.georeferencing.kernels.block_ranges import block_ranges
 from roadscan.tiles.georeferencing.kernels.reach import SpannedProfiles, reach_of_profiles, reach_of_returns

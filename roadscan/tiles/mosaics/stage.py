@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.tiles.mosaics.products import make_products, plan_outputs
+from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.product import SurveyProduct, products
 from roadscan.tiles.tasks.cell_size import density_notes
 
@@ -20,14 +21,14 @@ class Products(Stage):
 
     def run(self, session: Session) -> None:
         """Make the files that are missing or stale."""
-        failures = make_products(session.plan, session.manifest, session.compute, session.bar(self.name))
+        failures = make_products(plan_of(session), session.manifest, session.compute, session.bar(self.name))
         session.failed(self.name, failures)
         for note in density_notes(session.survey, session.store, session.manifest):
             session.note(note)
 
     def state(self, session: Session) -> StageState:
         """Files that are missing or stale."""
-        stale = len(plan_outputs(session.plan, session.manifest)[0])
+        stale = len(plan_outputs(plan_of(session), session.manifest)[0])
         made = sum(session.manifest.files().get(name, 0) for name in _of_survey())
         notes = density_notes(session.survey, session.store, session.manifest)
         return StageState(made - stale, stale, next_run={"products": stale}, notes=notes)

@@ -14,16 +14,11 @@ import numpy.typing as npt
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.movement import Allowance, allowance_for, largest
+from roadscan.navigation.tasks.trajectories import load_all_corrections
 from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections
 from roadscan.store.store import Store
 from roadscan.tiles.georeferencing.turns import TICK_NS, WINDOW_NS
-from roadscan.tiles.tasks.readings import (
-    MountingChanges,
-    ReadingSource,
-    change_of,
-    load_all_corrections,
-    load_mounting_changes,
-)
+from roadscan.tiles.tasks.readings import MountingChanges, ReadingSource, change_of, load_mounting_changes
 
 Int64 = npt.NDArray[np.int64]
 UInt64 = npt.NDArray[np.uint64]

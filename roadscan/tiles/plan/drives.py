@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import MapFrame
+from roadscan.navigation.tasks.trajectories import TrajectorySource
+from roadscan.store.group_reader import read_groups
 from roadscan.store.store import Store
 from roadscan.tiles.plan.plan import SurveyPlan
 from roadscan.tiles.products.lane_direction import STEP_M, LaneDirections
-from roadscan.tiles.tasks.readings import TrajectorySource, read_groups
 
 _POSITION = [f"{a}_world_m" for a in "xyz"]
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.gpstime import iso_from_gps_ns, utc_from_gps_ns
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import LanePass, RunId, of_run
 from roadscan.core.rig import UNMOUNTED, Mounting, Mountings, Rig, Sensor
 from roadscan.core.survey import Survey
@@ -21,24 +22,18 @@ from roadscan.ingest.one_stamp import one_stamp_logs
 from roadscan.ingest.overlap import Fault, NothingPlacedError, apart_logs
 from roadscan.ingest.same_content import same_points
 from roadscan.navigation.tasks.clocks import load_clocks
-from roadscan.navigation.tasks.navigate import records_with_trajectories
+from roadscan.navigation.tasks.navigate import records_of, records_with_trajectories
+from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import grid_key, key_of
+from roadscan.run.session import Session, found_once
 from roadscan.store.logs import NAVIGATION, DataFile, LogRecord
 from roadscan.store.store import Store
 from roadscan.tiles.georeferencing.place import HeightLimits
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.plan.centre_line import CentreLines
 from roadscan.tiles.plan.corrections import KnownCorrections
 from roadscan.tiles.plan.road import check_road, road_of
-from roadscan.tiles.tasks.readings import (
-    Ground,
-    RawSlice,
-    ReadingSource,
-    TrajectorySource,
-    change_of,
-    load_mountings,
-)
+from roadscan.tiles.tasks.readings import Ground, RawSlice, ReadingSource, change_of, load_mountings
 
 DatedMountings: TypeAlias = Mapping[tuple[str, str], Sequence[tuple[int, Mounting]]]
 """Calibrated mountings by run ('*' for all) and sensor, with the epochs from which they hold, ascending."""
@@ -310,3 +305,9 @@ def _profile_ns(source: ReadingSource) -> int:
     """Time from a profile's epoch to that of its last reading (ns)."""
     geometry = source.attribute.get("scan_geometry", {})
     return math.ceil(float(geometry.get("reading_period_ns", 0.0)) * int(geometry.get("readings", 1)))
+
+
+@found_once
+def plan_of(session: Session) -> SurveyPlan:
+    """What places the readings: sources, ground, passes."""
+    return plan_survey(session.survey, session.store, records=records_of(session))

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.core.errors import StoreError
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band, write_sparse_cog
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.hillshade import SHADE_BAND, Light, base_below, shade, with_neighbours
 from roadscan.tiles.products.quantities import band_of

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError
-from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
+from roadscan.core.grid import QUANTA_PER_M
 
 _INT32_MAX: Final = 2**31 - 1
 

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.las import ONE_OF_ONE, Layout, check_points, write_points
 from roadscan.tiles.decimate import Squares, cells_per_square, decimate
-from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
 from roadscan.tiles.product import Cells, ProductContext, Tile, TileProduct
 from roadscan.tiles.products.las_axes import Axes, axis, rounding_errors, set_coordinates
 

@@ -16,11 +16,10 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from roadscan.core.crs import MapFrame
+from roadscan.core.grid import QUANTA_PER_M, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.store.codecs.cog import BLOCK, About, Band, write_sparse_cog
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
-from roadscan.tiles.grid import TileGrid
 from roadscan.tiles.product import ProductContext
 
 

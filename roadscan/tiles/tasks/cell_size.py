@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import RoadscanError
+from roadscan.core.grid import ENOUGH, LARGEST_M, TileGrid
 from roadscan.core.survey import Survey
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.grid import ENOUGH, LARGEST_M, TileGrid
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 

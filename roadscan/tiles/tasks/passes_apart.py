@@ -9,11 +9,11 @@ from typing import Any, Final
 import numpy as np
 
 from roadscan.compute.robust import scatter_about
+from roadscan.core.grid import QUANTUM_M, TileGrid
 from roadscan.core.ids import LanePass
 from roadscan.core.witness import Finding, Witness
 from roadscan.store.records import OutputRecord
-from roadscan.tiles.georeferencing.cloud import QUANTUM_M, TilePoints
-from roadscan.tiles.grid import TileGrid
+from roadscan.tiles.georeferencing.cloud import TilePoints
 
 PASSES_APART: Final = Witness(
     "passes_apart",

@@ -13,6 +13,7 @@ import numpy as np
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.resolution import COARSE_VALUES
+from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.navigation.wheel_ticks import (
     LEAST_SAMPLES,
     SAMPLES_PER_S,
@@ -30,7 +31,7 @@ from roadscan.store.logs import DataFile, LogRecord
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.tiles.plan.plan import SurveyPlan
-from roadscan.tiles.tasks.readings import ReadingSource, TrajectorySource, load_recorded, read_rows
+from roadscan.tiles.tasks.readings import ReadingSource, read_rows
 
 PRODUCT: Final = "tick_clocks"
 """Name in the manifest of what the ticks of a sensor say in a run; it has no file of its own."""

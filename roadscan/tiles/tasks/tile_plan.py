@@ -15,13 +15,14 @@ from roadscan.core.ids import LanePass, TileId
 from roadscan.core.survey import CellColumns
 from roadscan.run.engine.compute import Made
 from roadscan.run.engine.fingerprint import key_of, keys_of
+from roadscan.run.session import Session, found_once
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.tiles.blocks import Block, cut_blocks
-from roadscan.tiles.footprints.footprints import FootprintRanges
+from roadscan.tiles.footprints.footprints import FootprintRanges, footprints_of
 from roadscan.tiles.footprints.row_groups import GroupsByTile
 from roadscan.tiles.plan.centre_line import CentreLines
-from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.plan.plan import SurveyPlan, plan_of
 from roadscan.tiles.plan.road import road_key
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.readings import Ground, RawSlice
@@ -273,3 +274,9 @@ def _is_current(tile: TileId, key: str, products: Sequence[WantedProduct], manif
     return all(
         manifest.is_current(name, str(tile), key_of(key, wanted.key)) for wanted in products for name in wanted.files
     )
+
+
+@found_once
+def tiles_of(session: Session) -> PlannedTiles:
+    """Tiles that a reading may touch, with their keys."""
+    return plan_tiles(footprints_of(session), plan_of(session))

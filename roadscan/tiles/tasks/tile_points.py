@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.grid import QUANTUM_M
 from roadscan.core.ids import TileId
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.tiles.accumulator import TileEvidence
 from roadscan.tiles.georeferencing.centre_line import CentreLineBuffer
 from roadscan.tiles.georeferencing.classes import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
-from roadscan.tiles.georeferencing.cloud import QUANTUM_M, TilePoints, fill_of
+from roadscan.tiles.georeferencing.cloud import TilePoints, fill_of
 from roadscan.tiles.georeferencing.order import canonical_order
 from roadscan.tiles.georeferencing.place import EXTRA_COLUMNS, Placed, Window, passes_of
 from roadscan.tiles.plan.centre_line import load_buffer

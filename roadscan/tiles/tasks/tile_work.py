@@ -13,9 +13,12 @@ from roadscan.surface.tasks.found_regions import searched_sources
 from roadscan.surface.tasks.surface_colours import check_colours
 from roadscan.surface.tasks.surface_plan import checked_surface
 from roadscan.tiles.accumulator import MOST_BYTES
+from roadscan.tiles.footprints.footprints import footprints_of
 from roadscan.tiles.mosaics.products import product_context, wanted_tile_products
+from roadscan.tiles.plan.plan import plan_of
+from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import tile_file_names
-from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, stale_tiles
+from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, stale_tiles, tiles_of
 
 BYTES_PER_READING: Final = 100
 """Memory of a worker per reading of its block, measured: points, sorting and one tile's products."""
@@ -36,16 +39,16 @@ class TileWork:
 
 def plan_tile_work(session: Session) -> TileWork:
     """Compare what there is with what there should be."""
-    plan, manifest, survey = session.plan, session.manifest, session.survey
+    plan, manifest, survey = plan_of(session), session.manifest, session.survey
     context = product_context(plan)
     if survey.config.surface is not None:
         checked_surface(survey, survey.config.surface)  # before the tiles are computed for it
         searched_sources(plan)
         check_colours(plan)
     wanted = tuple(wanted_tile_products(survey, context))
-    tiles, footprints = session.tiles, session.footprints
+    tiles, footprints = tiles_of(session), footprints_of(session)
     if session.selection is not None:
-        chosen = session.selection.tiles(tiles, footprints, plan.ground.grid)
+        chosen = chosen_tiles(session.selection, tiles, footprints, plan.ground.grid)
     else:
         chosen = stale_tiles(tiles, wanted, manifest)
     per_tile = tile_file_names()

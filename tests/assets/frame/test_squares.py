@@ -13,12 +13,12 @@ from roadscan.assets.tiling import AssetGrid
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.tasks.lines import Roads
 from roadscan.core.crs import MapFrame
+from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.settings.assets import AssetsConfig
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.tiles.georeferencing.sensor_places import sensor_places
-from roadscan.tiles.grid import TileGrid
 
 
 def test_squares_are_whole_tiles() -> None:

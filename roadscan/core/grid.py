@@ -8,8 +8,11 @@ from typing import Final
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.ids import TileId
-from roadscan.tiles.georeferencing.cloud import QUANTA_PER_M
 
+QUANTUM_M: Final = 1e-5
+"""Point coordinates are whole numbers of this (10 µm): sums are exact, so results do not depend on order."""
+QUANTA_PER_M: Final = 100_000
+"""A metre in these."""
 ENOUGH: Final = 4
 """Readings that a cell should hold: fewer have no median that leaves an outlier out."""
 LARGEST_M: Final = 1.0

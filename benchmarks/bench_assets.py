@@ -18,13 +18,13 @@ from roadscan.assets.make_scene import make_scene
 from roadscan.assets.tasks.kinds import wanted_kinds
 from roadscan.assets.tasks.load_returns import load_squares
 from roadscan.assets.tasks.plan import AssetPlan, plan_assets
+from roadscan.footprints.footprints import footprints_of
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene as Street
 from roadscan.simulate import simulate
 from roadscan.survey.run import run_stages
-from roadscan.tiles.footprints.footprints import footprints_of
-from roadscan.tiles.plan.plan import plan_of
 
 LENGTH_M = 60.0
 OFF = {"on": False}

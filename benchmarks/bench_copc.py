@@ -12,8 +12,8 @@ from benchmarks.timing import Figure
 from roadscan.core.crs import MapFrame
 from roadscan.core.grid import QUANTA_PER_M, TileGrid
 from roadscan.core.ids import TileId
+from roadscan.georeference.cloud import TilePoints
 from roadscan.site.cloud_file import PointSpool, write_cloud
-from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.products.cloud_records import Lattice
 
 TILES, POINTS = 12, 500_000

@@ -14,10 +14,10 @@ from benchmarks.timing import Figure, best_seconds
 from roadscan.core.crs import MapFrame, world_from_geodetic
 from roadscan.core.rig import Mountings, Sensor
 from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.georeference.charts import charts_along
+from roadscan.georeference.place import HeightLimits, Placement
+from roadscan.georeference.reach import RangeSpans, Reach
 from roadscan.navigation.trajectory import Trajectory, world_from_ned
-from roadscan.tiles.georeferencing.charts import charts_along
-from roadscan.tiles.georeferencing.place import HeightLimits, Placement
-from roadscan.tiles.georeferencing.reach import RangeSpans, Reach
 
 SECONDS = 10.0
 TILE_QUANTA = 1_000_000

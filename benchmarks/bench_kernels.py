@@ -18,12 +18,12 @@ from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.rig import Mountings, Sensor
 from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.georeference.charts import charts_along
+from roadscan.georeference.cloud import TilePoints
+from roadscan.georeference.kernels.readings import FATES, Placed, Returns
+from roadscan.georeference.kernels.timed_readings import CHUNK, place_returns
+from roadscan.georeference.place import EVERYWHERE, HeightLimits, Placement
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.tiles.georeferencing.charts import charts_along
-from roadscan.tiles.georeferencing.cloud import TilePoints
-from roadscan.tiles.georeferencing.kernels.readings import FATES, Placed, Returns
-from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK, place_returns
-from roadscan.tiles.georeferencing.place import EVERYWHERE, HeightLimits, Placement
 from roadscan.tiles.statistics import cells_of
 
 N = 4_000_000

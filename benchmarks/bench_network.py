@@ -23,13 +23,13 @@ from benchmarks.network import Region
 from benchmarks.scheduler import Watched, running_scheduler
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
+from roadscan.footprints.footprints import PRODUCT, FootprintTask, index_footprints
 from roadscan.run.engine.bundles import Bundle, Ended
 from roadscan.run.engine.compute import Made, rare_collections
 from roadscan.run.engine.on_dask import OnDask
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.records import Packed, Row
 from roadscan.store.store import Store
-from roadscan.tiles.footprints.footprints import PRODUCT, FootprintTask, index_footprints
 from roadscan.tiles.mosaics.products import OutputTask, make_products, product_context, wanted_tile_products
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
 from roadscan.tiles.tasks.tiles import TaskResult, compute_tiles, run_tasks

@@ -37,6 +37,7 @@ from roadscan.adjust.observations import KINDS, Observations
 from roadscan.adjust.tasks import adjustment
 from roadscan.adjust.tasks.solution import Evidence, Solution
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.session import Reporter, Session
@@ -46,7 +47,6 @@ from roadscan.simulate.earth import Earth
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.plan.plan import plan_of
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

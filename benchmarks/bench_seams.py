@@ -22,6 +22,7 @@ from benchmarks.timing import Figure
 from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.tasks import solution
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.session import Reporter, Session
@@ -30,7 +31,6 @@ from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.earth import Earth
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.plan.plan import plan_of
 
 Float64 = npt.NDArray[np.float64]
 

@@ -20,16 +20,16 @@ from roadscan.core.grid import TileGrid
 from roadscan.core.ids import LanePass, PassId, RunId
 from roadscan.core.rig import Mountings, Sensor
 from roadscan.core.survey import Survey
+from roadscan.footprints.footprints import FootprintRanges
+from roadscan.georeference.place import HeightLimits
+from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.sources import Ground, ReadingSource
 from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.logs import DataFile
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
-from roadscan.tiles.footprints.footprints import FootprintRanges
-from roadscan.tiles.georeferencing.place import HeightLimits
-from roadscan.tiles.plan.plan import SurveyPlan
-from roadscan.tiles.tasks.readings import Ground, ReadingSource
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]

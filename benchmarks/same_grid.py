@@ -21,8 +21,8 @@ from benchmarks.skilled_user import Cells, Points, to_cells
 from benchmarks.timing import Figure, best_seconds
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
+from roadscan.georeference.cloud import TilePoints
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.statistics import cells_of
 
 CELL_M = 0.02

@@ -159,7 +159,7 @@ def test_the_tiles_reach_what_shapes_them_and_no_settings_of_other_stages() -> N
     modules = {place.partition(":")[0] for place in reached}
     assert {
         "roadscan.navigation.trajectory:Corrections",
-        "roadscan.tiles.georeferencing.charts:Charts",
+        "roadscan.georeference.charts:Charts",
     } <= reached.keys()
     assert {"roadscan.navigation.clocks.correction", "roadscan.tiles.cells", "roadscan.core.crs"} <= modules
     rooms = ("inspect", "simulate", "surfaces", "condition", "assets", "adjust", "cli", "products.hillshade")

@@ -55,7 +55,7 @@ def test_hooks_call_make_targets_that_exist() -> None:
 
 VIOLATIONS = {
     "a neighbour": ("roadscan/formats/zz.py", "from roadscan.store import schema", "Layers"),
-    "upward": ("roadscan/navigation/zz.py", "from roadscan.tiles.georeferencing import cloud", "Layers"),
+    "upward": ("roadscan/navigation/zz.py", "from roadscan.georeference import cloud", "Layers"),
     "dask below jobs": ("roadscan/tiles/zz.py", "import dask.array", "Only flows and jobs know Dask"),
     "prefect in jobs": ("roadscan/jobs/zz.py", "import prefect", "Only flows and the command line know Prefect"),
     "files in kernels": ("roadscan/kernels/zz.py", "import pyarrow as pa", "Kernels see arrays only"),
@@ -66,7 +66,7 @@ VIOLATIONS = {
     ),
     "shared geometry": (
         "roadscan/simulate/zz.py",
-        "from roadscan.tiles.georeferencing import readings",
+        "from roadscan.georeference import readings",
         "The simulator knows the model only",
     ),
 }

@@ -10,13 +10,13 @@ from roadscan.adjust.tasks.outcome import FOLDER, TABLES, known_findings, known_
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
+from roadscan.footprints.footprints import footprints_of, index_footprints
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.store.schema import table_schema
-from roadscan.tiles.footprints.footprints import footprints_of, index_footprints
-from roadscan.tiles.plan.plan import plan_of
 
 
 class Adjust(Stage):

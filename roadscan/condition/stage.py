@@ -22,13 +22,13 @@ from roadscan.condition.tasks.work import ConditionWork, plan_condition
 from roadscan.core.errors import RoadscanError
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.tiles import TaskResult
 
 _PICTURES = 20

@@ -13,12 +13,12 @@ import numpy.typing as npt
 from roadscan.compute.robust import scatter_about
 from roadscan.condition.tasks.against_truth import compared_values
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import plan_survey
 from roadscan.run.session import Session
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
-from roadscan.tiles.plan.plan import plan_survey
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 

@@ -17,14 +17,14 @@ from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.ids import LanePass, TileId
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.survey import Survey
+from roadscan.georeference.centre_line import CentreLineBuffer
+from roadscan.georeference.classes import KEPT, OFF_CENTRE_LINE, OUTSIDE_PASS, READING_CLASSES
+from roadscan.georeference.place import Placed, passes_of
+from roadscan.georeference.plan.centre_line import load_buffer
+from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
+from roadscan.georeference.sources import Placer, RawSlice, geometry_of
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
-from roadscan.tiles.georeferencing.centre_line import CentreLineBuffer
-from roadscan.tiles.georeferencing.classes import KEPT, OFF_CENTRE_LINE, OUTSIDE_PASS, READING_CLASSES
-from roadscan.tiles.georeferencing.place import Placed, passes_of
-from roadscan.tiles.plan.centre_line import load_buffer
-from roadscan.tiles.plan.plan import SurveyPlan, plan_survey
-from roadscan.tiles.tasks.readings import Placer, RawSlice, geometry_of
 from roadscan.tiles.tasks.tile_points import near_lines
 
 TABLE: Final = "reading_classes"

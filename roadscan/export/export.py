@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from roadscan.core.errors import ConfigError, nearest
+from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.sources import ReadingSource
 from roadscan.store.logs import DataFile
-from roadscan.tiles.plan.plan import SurveyPlan
-from roadscan.tiles.tasks.readings import ReadingSource
 
 
 @dataclass(frozen=True)

@@ -17,16 +17,16 @@ from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.grid import QUANTUM_M
 from roadscan.core.ids import LanePass
 from roadscan.core.survey import Survey
+from roadscan.export.curved_grid import CurvedHeights, fill_holes, inner_holes
 from roadscan.export.export import Exported, published, source_in
 from roadscan.formats.clouds.opencrg_file import CurvedRegularGrid, write_crg
 from roadscan.formats.clouds.opencrg_header import encoding_named
+from roadscan.georeference.place import EVERYWHERE
+from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
+from roadscan.georeference.sources import Placer, RawSlice, ReadingSource
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
-from roadscan.tiles.georeferencing.curved_grid import CurvedHeights, fill_holes, inner_holes
-from roadscan.tiles.georeferencing.place import EVERYWHERE
-from roadscan.tiles.plan.plan import SurveyPlan, plan_survey
-from roadscan.tiles.tasks.readings import Placer, RawSlice, ReadingSource
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -19,12 +19,12 @@ from roadscan.core.survey import Survey
 from roadscan.export.export import Exported, published, source_in
 from roadscan.formats.scanners.psi import PsiStatement, statement_text
 from roadscan.formats.scanners.psi_container import PsiContainer, PsiHeader, write_psi
+from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
+from roadscan.georeference.sources import ReadingSource, read_rows
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.navigation.travel import Travel
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
-from roadscan.tiles.plan.plan import SurveyPlan, plan_survey
-from roadscan.tiles.tasks.readings import ReadingSource, read_rows
 
 Int64 = npt.NDArray[np.int64]
 

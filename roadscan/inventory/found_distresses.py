@@ -21,13 +21,13 @@ from roadscan.assets.tasks.along_roads import along_roads
 from roadscan.condition.tasks.lines import survey_roads
 from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.ids import TileId
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.inventory.state import reference_points
 from roadscan.inventory.visibility import Visibility
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.tiles.mosaics.products import StoredTiles, product_context
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.product import ProductContext, TileSummary
 from roadscan.tiles.products.geo_table import in_crs_unit, read_geo_table
 from roadscan.tiles.pyramid import Level, overview_factors

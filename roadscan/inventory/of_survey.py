@@ -14,6 +14,7 @@ from roadscan.assets.tasks.plan import asset_grid
 from roadscan.core.crs import crs_from_text
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.inventory.found_distresses import SeenByCells, found_distresses
 from roadscan.inventory.home import Home, HomeError
 from roadscan.inventory.homes.geopackage import GeoPackage
@@ -27,7 +28,6 @@ from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from roadscan.store.asset_truth import AssetTruth
 from roadscan.store.manifest import read_recorded
 from roadscan.store.store import Store, bytes_digest
-from roadscan.tiles.plan.plan import plan_of
 
 FOUND: Final = "products/assets"
 """Folder of the tables of found assets, one a kind."""

@@ -20,13 +20,13 @@ from roadscan.adjust.tasks.outcome import known_lines
 from roadscan.core.errors import StoreError
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
+from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
+from roadscan.georeference.reading_counts import told
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.stage import findings_of
 from roadscan.store.logs import LogRecord, read_log_records
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
 from roadscan.store.store import Store
-from roadscan.tiles.footprints.footprints import PRODUCT as FOOTPRINTS
-from roadscan.tiles.tasks.tile_fates import told
 from roadscan.tiles.tasks.tile_plan import TILE
 
 

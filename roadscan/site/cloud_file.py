@@ -17,9 +17,9 @@ import numpy.typing as npt
 from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.core.ids import TileId
+from roadscan.georeference.cloud import TilePoints
+from roadscan.site.octree import CELL_M, Cube, NodeCutter
 from roadscan.store.codecs.copc import CopcWriter, Key
-from roadscan.tiles.georeferencing.cloud import TilePoints
-from roadscan.tiles.georeferencing.octree import CELL_M, Cube, NodeCutter
 from roadscan.tiles.products.cloud_records import SCALE_M, Lattice, layout_of, picked, records_of, without_colours
 
 _SQUARE_M: Final = 16.0

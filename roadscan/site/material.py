@@ -15,6 +15,7 @@ import shapely
 
 from roadscan.core.errors import ConfigError, DamagedError, nearest
 from roadscan.core.ids import TileId
+from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.inventory.of_survey import truth_of
 from roadscan.inventory.state import State
 from roadscan.run.engine.fingerprint import key_of
@@ -24,7 +25,6 @@ from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.tiles.mosaics.products import StoredTiles, product_context
-from roadscan.tiles.plan.plan import SurveyPlan, plan_of
 from roadscan.tiles.product import ProductContext, TileSummary
 from roadscan.tiles.products.geo_table import read_geo_table
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE

@@ -11,10 +11,10 @@ import numpy as np
 from roadscan.core.errors import ConfigError
 from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.surface.tasks.pictures import plan_pictures
 from roadscan.surface.views import PictureRule, sights
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 

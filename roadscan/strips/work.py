@@ -18,6 +18,11 @@ from roadscan.compute.robust import scatter_about
 from roadscan.compute.ways import way_along
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.ids import TileId
+from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
+from roadscan.footprints.footprints import footprints_of
+from roadscan.georeference.plan.plan import SurveyPlan, plan_of
+from roadscan.georeference.plan.road import road_key
+from roadscan.georeference.sources import Ground, Placer, RawSlice, geometry_of, read_rows
 from roadscan.navigation.tasks.pose_sigma import median_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.run.code_reach import code_digest
@@ -29,11 +34,6 @@ from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.strips.lag import Lag, lag_of
 from roadscan.strips.strip import HALF_WIDTH_M, Strip, Way
-from roadscan.tiles.footprints.footprints import PRODUCT as FOOTPRINTS
-from roadscan.tiles.footprints.footprints import footprints_of
-from roadscan.tiles.plan.plan import SurveyPlan, plan_of
-from roadscan.tiles.plan.road import road_key
-from roadscan.tiles.tasks.readings import Ground, Placer, RawSlice, geometry_of, read_rows
 from roadscan.tiles.tasks.tile_plan import tiles_of
 
 Float64 = npt.NDArray[np.float64]

@@ -20,6 +20,7 @@ from roadscan.core.grid import QUANTUM_M, Bounds, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.settings.surface import SurfaceConfig
 from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
+from roadscan.georeference.cloud import TilePoints
 from roadscan.surface.clough_tocher import cubic_surface
 from roadscan.surface.detailed import DetailedSettings
 from roadscan.surface.holes import RIM, Holes, cells_across
@@ -31,7 +32,6 @@ from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, Surface
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.georeferencing.cloud import TilePoints
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]

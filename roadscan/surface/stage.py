@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.surface.tasks.found_regions import find_due_regions
@@ -11,7 +12,6 @@ from roadscan.surface.tasks.surface_colours import check_colours, colour_notes
 from roadscan.surface.tasks.surface_plan import SURFACE, files_without_surface
 from roadscan.surface.tasks.surface_work import plan_surface_work
 from roadscan.surface.tasks.surfaces import compute_surfaces
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.tiles import run_tasks
 
 

@@ -33,6 +33,9 @@ from roadscan.core.grid import TileGrid
 from roadscan.core.rig import SensorKind
 from roadscan.core.survey import ControlConfig, LogConfig, Survey
 from roadscan.core.witness import Witness
+from roadscan.georeference.place import CloudFrame
+from roadscan.georeference.plan.centre_line import CentreLines, load_buffer
+from roadscan.georeference.plan.road import looks_across
 from roadscan.ingest.first_look import LookedAt, key_of_look, look_at, named, never_meeting
 from roadscan.ingest.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
@@ -48,10 +51,7 @@ from roadscan.store.logs import read_log_records
 from roadscan.store.store import Store
 from roadscan.surface.tasks.surface_colours import check_cameras
 from roadscan.surface.tasks.surface_plan import checked_surface
-from roadscan.tiles.georeferencing.place import CloudFrame
 from roadscan.tiles.mosaics.products import check_product, wanted_tile_products
-from roadscan.tiles.plan.centre_line import CentreLines, load_buffer
-from roadscan.tiles.plan.road import looks_across
 from roadscan.tiles.product import ProductContext
 
 FARTHEST_DEG: Final = 10.0

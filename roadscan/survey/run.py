@@ -9,6 +9,7 @@ from typing import Final
 
 from roadscan.core.counted import counted
 from roadscan.core.errors import RoadscanError, RunError
+from roadscan.georeference.plan.plan import NothingToPlaceError
 from roadscan.ingest.planned_logs import logs_of
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.engine.compute import damaged_file, rare_collections
@@ -19,7 +20,6 @@ from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
 from roadscan.store.mend import mend_records
 from roadscan.store.verified import note_written, recorded_files
-from roadscan.tiles.plan.plan import NothingToPlaceError
 
 _CLOCK_TICK_NS: Final = 50_000_000
 """A file's time may lie that much before the clock's."""

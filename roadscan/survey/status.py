@@ -12,6 +12,9 @@ import pyarrow.parquet as pq
 
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.witness import Finding
+from roadscan.footprints.footprints import PRODUCT
+from roadscan.georeference.plan.plan import NothingToPlaceError
+from roadscan.georeference.reading_counts import told
 from roadscan.ingest.overlap import NothingPlacedError
 from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog, logs_of
 from roadscan.ingest.sources import damaged_sources
@@ -26,10 +29,7 @@ from roadscan.store.sql_files import Stamp, stamp_of
 from roadscan.store.store import Store
 from roadscan.store.verified import held_faults, note_verified
 from roadscan.survey.preflight import preflight
-from roadscan.tiles.footprints.footprints import PRODUCT
-from roadscan.tiles.plan.plan import NothingToPlaceError
 from roadscan.tiles.product import products
-from roadscan.tiles.tasks.tile_fates import told
 from roadscan.tiles.tasks.tile_plan import TILE
 
 

@@ -13,8 +13,8 @@ from roadscan.compute.kernels.height_slots import LANES, SLOT_HEIGHTS, SLOT_SIZE
 from roadscan.core.errors import RoadscanError
 from roadscan.core.grid import QUANTUM_M, TileGrid
 from roadscan.core.ids import TileId
+from roadscan.georeference.kernels.readings import FATES
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.georeferencing.kernels.readings import FATES
 from roadscan.tiles.kernels import cell_statistics as finishing
 from roadscan.tiles.kernels import pool as kernels
 from roadscan.tiles.kernels.accumulate import PIECE, CountingWork, Heights, accumulate_cells, work_arrays

@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.georeference.flat_profiles import flat_profiles
+from roadscan.georeference.kernels.flat_profiles import FlatProfiles
+from roadscan.georeference.kernels.readings import Georeference, MirrorProfiles, Returns
+from roadscan.georeference.kernels.timed_readings import CHUNK
+from roadscan.georeference.place import COUNTED_FATES, EIGHT_TO_SIXTEEN_BITS, Placement, mirror_profiles
 from roadscan.tiles.accumulator import Accumulator
-from roadscan.tiles.georeferencing.flat_profiles import flat_profiles
-from roadscan.tiles.georeferencing.kernels.flat_profiles import FlatProfiles
-from roadscan.tiles.georeferencing.kernels.readings import Georeference, MirrorProfiles, Returns
-from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK
-from roadscan.tiles.georeferencing.place import COUNTED_FATES, EIGHT_TO_SIXTEEN_BITS, Placement, mirror_profiles
 from roadscan.tiles.kernels.accumulate import CountingWork
 from roadscan.tiles.kernels.active_tiles import ActiveTiles, Measured
 from roadscan.tiles.kernels.bucket_readings import bucket_mirror, bucket_returns

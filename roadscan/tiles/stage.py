@@ -7,17 +7,17 @@ from collections.abc import Sequence
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
+from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
+from roadscan.footprints.stage import faults_of_plan
+from roadscan.georeference.plan.plan import plan_of
+from roadscan.georeference.reading_counts import fate_words, lost_findings, of_all, told_by_log
 from roadscan.run.engine.compute import Made
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.surface.tasks.surface_colours import check_colours
-from roadscan.tiles.footprints.footprints import PRODUCT as FOOTPRINTS
-from roadscan.tiles.footprints.stage import faults_of_plan
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.passes_apart import apart_findings
-from roadscan.tiles.tasks.tile_fates import fate_words, lost_findings, of_all, told_by_log
 from roadscan.tiles.tasks.tile_files import tile_file_names
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.tiles.tasks.tile_work import memory_of, plan_tile_work

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.grid import TileGrid
+from roadscan.georeference.cloud import TilePoints
+from roadscan.georeference.kernels.timed_readings import CHUNK
 from roadscan.tiles.accumulator import Accumulator
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.georeferencing.cloud import TilePoints
-from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK
 from roadscan.tiles.kernels.accumulate import PIECE, CountingWork, accumulate_points
 from roadscan.tiles.kernels.active_tiles import ActiveTiles
 from roadscan.tiles.kernels.bucket_readings import bucket_points

@@ -12,10 +12,10 @@ import pytest
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import StoreError
+from roadscan.site.octree import Cube, NodeCutter
 from roadscan.store.codecs import copc
 from roadscan.store.codecs.copc import CopcWriter
 from roadscan.store.codecs.las import Layout
-from roadscan.tiles.georeferencing.octree import Cube, NodeCutter
 from roadscan.tiles.products.cloud_records import picked
 
 LAYOUT = Layout(6, (), (1e-4,) * 3, MapFrame("EPSG:32632"), "publish")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import plan_survey
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
@@ -17,7 +18,6 @@ from roadscan.store.manifest import Manifest
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.plan.plan import plan_survey
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 from tests.jobs.conftest import Lines, Simulated, changed

@@ -12,6 +12,8 @@ import pytest
 import rasterio
 
 from roadscan.core.survey import Survey
+from roadscan.footprints.footprints import load_ranges, stale_footprints
+from roadscan.georeference.plan.plan import plan_of, plan_survey
 from roadscan.report.blocks import Picture, Table
 from roadscan.report.section import Material
 from roadscan.report.sections.adjustment import Adjustment
@@ -24,8 +26,6 @@ from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status
-from roadscan.tiles.footprints.footprints import load_ranges, stale_footprints
-from roadscan.tiles.plan.plan import plan_of, plan_survey
 from roadscan.tiles.tasks.tile_plan import plan_tiles
 from tests.jobs.adjusted_site import CIRCLES, NO_FILES, TARGETS, adjust, cell_errors, corrections, rows
 from tests.jobs.conftest import Lines, Simulated, changed

@@ -17,6 +17,7 @@ import pytest
 
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import findings_of, stage_named
@@ -24,7 +25,6 @@ from roadscan.simulate import Scene, simulate
 from roadscan.store.held import held_path, read_held
 from roadscan.store.sql import query
 from roadscan.survey.run import run_stages
-from roadscan.tiles.plan.plan import plan_of
 from tests.jobs.conftest import Lines, Simulated, changed
 from tests.pictures import drawn
 

@@ -13,15 +13,15 @@ import pytest
 
 from roadscan.core.errors import StoreError
 from roadscan.core.survey import Survey
+from roadscan.footprints import footprints
+from roadscan.footprints.footprints import PRODUCT, index_footprints
+from roadscan.georeference.plan.plan import plan_survey
 from roadscan.run.engine.bundles import cut_bundles, run_bundles
 from roadscan.run.engine.compute import Done, Inline
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
-from roadscan.tiles.footprints import footprints
-from roadscan.tiles.footprints.footprints import PRODUCT, index_footprints
 from roadscan.tiles.mosaics import products
 from roadscan.tiles.mosaics.products import make_products, plan_outputs
-from roadscan.tiles.plan.plan import plan_survey
 from tests.jobs.conftest import Simulated
 
 

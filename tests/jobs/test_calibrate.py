@@ -15,6 +15,8 @@ from roadscan.calibrate.tasks.calibrate import PICTURE, TEXT, Calibrated, calibr
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.rig import Rig
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import plan_survey
+from roadscan.georeference.sources import load_mountings
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
@@ -23,8 +25,6 @@ from roadscan.store.held import held_path
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status, verify_store
-from roadscan.tiles.plan.plan import plan_survey
-from roadscan.tiles.tasks.readings import load_mountings
 from tests.jobs.conftest import changed
 
 OBJECT = {

@@ -12,12 +12,12 @@ import pytest
 from roadscan.core.errors import StoreError
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
+from roadscan.georeference.cloud import TilePoints
 from roadscan.ingest.inspect.inspect import inspect
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.pyramid import overview_factors, pyramid_of
 from roadscan.tiles.statistics import cells_of
 from roadscan.tiles.tasks.cell_files import read_cells, read_overview, write_cells, write_overviews

@@ -14,15 +14,15 @@ import shapely
 
 from roadscan.core.errors import ConfigError, CrsError
 from roadscan.core.survey import Survey
+from roadscan.georeference.centre_line import CentreLineBuffer
+from roadscan.georeference.plan.centre_line import CentreLines, load_buffer
+from roadscan.georeference.plan.plan import plan_survey
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.georeferencing.centre_line import CentreLineBuffer
-from roadscan.tiles.plan.centre_line import CentreLines, load_buffer
-from roadscan.tiles.plan.plan import plan_survey
 
 NORTH = np.arange(-39.5, 60.0)
 """Northings of the points, a metre apart; the road's centre line runs at 5 m."""

@@ -20,12 +20,12 @@ from roadscan.cli import app
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
 from roadscan.export.classes import write_classes
+from roadscan.georeference.classes import LAS_CLASSES, READING_CLASSES
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.georeferencing.classes import LAS_CLASSES, READING_CLASSES
 from tests.jobs.conftest import outputs
 
 PROFILES, READINGS = 60, 40

@@ -30,6 +30,7 @@ from roadscan.condition.tasks.values import GroupTask, load_lane
 from roadscan.condition.tasks.work import MADE, plan_condition
 from roadscan.core.errors import ConfigError
 from roadscan.distress.products.cracks import COLUMNS as CRACKS
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.code_reach import name_of
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
@@ -39,7 +40,6 @@ from roadscan.store.sql import query
 from roadscan.store.store import bytes_digest
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE

@@ -14,6 +14,7 @@ import pytest
 from roadscan.core.errors import DamagedError
 from roadscan.core.frames import quaternion_from_rotation
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import plan_survey
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
@@ -23,7 +24,6 @@ from roadscan.store.schema import table_schema
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.plan.plan import plan_survey
 from tests.jobs.conftest import Simulated, changed, outputs, small_scene
 
 SHORT = {"length_m": 12.0, "lidar": {"on": False}, "passes": [{"lane": 2}]}

@@ -13,6 +13,7 @@ from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import plan_survey
 from roadscan.run.code_reach import name_of, reached_code
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
@@ -20,10 +21,9 @@ from roadscan.simulate.truth import load
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.store import Store, bytes_digest
 from roadscan.survey.run import run_stages
+from roadscan.tiles.drives import Drives
 from roadscan.tiles.mosaics import products
 from roadscan.tiles.mosaics.products import StoredTiles, wanted_products
-from roadscan.tiles.plan.drives import Drives
-from roadscan.tiles.plan.plan import plan_survey
 from roadscan.tiles.product import ProductContext, product_named
 from tests.jobs.conftest import changed
 

@@ -17,17 +17,17 @@ from roadscan.cli import app
 from roadscan.compute.reference_line import ReferenceLine
 from roadscan.core.errors import ConfigError, FormatError, RunError
 from roadscan.core.survey import Survey
+from roadscan.export.curved_grid import CurvedHeights, fill_holes, inner_holes
 from roadscan.export.export_opencrg import CrgSettings, export_opencrg
 from roadscan.export.export_psi import PsiSettings, export_psi
 from roadscan.formats.clouds.opencrg_file import read_crg
 from roadscan.formats.scanners.psi_container import read_psi
+from roadscan.georeference.plan.plan import plan_survey
 from roadscan.ingest.format import format_of
 from roadscan.ingest.ingest import ingest
 from roadscan.simulate import simulate, truth
 from roadscan.store.group_reader import read_groups
 from roadscan.store.store import Store
-from roadscan.tiles.georeferencing.curved_grid import CurvedHeights, fill_holes, inner_holes
-from roadscan.tiles.plan.plan import plan_survey
 from tests.jobs.conftest import small_scene
 from tests.sensors.readings import read
 

@@ -10,13 +10,13 @@ import pytest
 
 from roadscan.core.errors import StoreError
 from roadscan.core.survey import Survey
+from roadscan.footprints.footprints import FootprintRanges, load_ranges
+from roadscan.footprints.reach import opened, touched_tiles
+from roadscan.georeference.place import Window
+from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
+from roadscan.georeference.sources import Placer
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
-from roadscan.tiles.footprints.footprints import FootprintRanges, load_ranges
-from roadscan.tiles.footprints.reach import opened, touched_tiles
-from roadscan.tiles.georeferencing.place import Window
-from roadscan.tiles.plan.plan import SurveyPlan, plan_survey
-from roadscan.tiles.tasks.readings import Placer
 from tests.jobs.conftest import Simulated
 
 

@@ -13,6 +13,7 @@ import shapely
 
 from roadscan.distress.products.cracks import COLUMNS as CRACKS
 from roadscan.distress.products.potholes import COLUMNS as POTHOLES
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.inventory.found_distresses import Ground, found_distresses
 from roadscan.inventory.of_survey import found_assets, open_inventory
 from roadscan.run.session import Session
@@ -23,7 +24,6 @@ from roadscan.store.manifest import OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import bytes_digest
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.products.geo_table import write_geo_table
 from tests.jobs.conftest import Simulated
 

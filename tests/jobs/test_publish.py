@@ -30,6 +30,7 @@ from typer.testing import CliRunner
 from roadscan.cli import app
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.inventory.of_survey import truth_of
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
@@ -53,7 +54,6 @@ from roadscan.site.thumbnail import thumbnail
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.store import bytes_digest
 from roadscan.survey.run import run_stages
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE

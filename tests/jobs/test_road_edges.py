@@ -15,12 +15,12 @@ from roadscan.condition.tasks import road_edges
 from roadscan.condition.tasks.values import GroupTask, load_lane
 from roadscan.condition.tasks.work import plan_condition
 from roadscan.core.errors import RoadscanError
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate.surface import Surface
 from roadscan.store.sql import query
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import plan_of
 
 HALF_M = 3.5
 KERB_M = 0.1

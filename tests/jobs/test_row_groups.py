@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from roadscan.core.survey import Survey
+from roadscan.footprints.footprints import FootprintRanges
+from roadscan.footprints.row_groups import GroupsByTile
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
-from roadscan.tiles.footprints.footprints import FootprintRanges
-from roadscan.tiles.footprints.row_groups import GroupsByTile
 from roadscan.tiles.tasks.tile_work import plan_tile_work
 from roadscan.tiles.tasks.tiles import TaskResult
 from tests.jobs.conftest import Simulated

@@ -14,6 +14,8 @@ import pytest
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
 from roadscan.export.classes import write_classes
+from roadscan.georeference.classes import LAS_CLASSES, NOT_ROAD, OVERLAPPING, READING_CLASSES
+from roadscan.georeference.plan.plan import plan_survey
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
@@ -22,8 +24,6 @@ from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status
-from roadscan.tiles.georeferencing.classes import LAS_CLASSES, NOT_ROAD, OVERLAPPING, READING_CLASSES
-from roadscan.tiles.plan.plan import plan_survey
 from tests.jobs.conftest import Simulated, changed, outputs
 
 CELLS = {"products__make": ["geotiff", "tile_table"]}

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from roadscan.footprints.footprints import footprints_of
 from roadscan.run import session as session_module
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status
-from roadscan.tiles.footprints.footprints import footprints_of
 from roadscan.tiles.tasks.tile_plan import tiles_of
 from tests.jobs.conftest import Simulated
 

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from roadscan.tiles.footprints.footprints import FootprintRanges
-from roadscan.tiles.footprints.row_groups import GroupsByTile
+from roadscan.footprints.footprints import FootprintRanges
+from roadscan.footprints.row_groups import GroupsByTile
 from roadscan.tiles.tasks.stretches import DrivenTiles, cut_stretches
 
 

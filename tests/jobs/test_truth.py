@@ -10,12 +10,12 @@ import pytest
 
 from roadscan.core.survey import Survey
 from roadscan.demo.demo import summarise
+from roadscan.georeference.place import EVERYWHERE
+from roadscan.georeference.plan.plan import plan_survey
+from roadscan.georeference.sources import Placer
 from roadscan.ingest.ingest import ingest
 from roadscan.simulate import simulate, truth
 from roadscan.store.store import Store
-from roadscan.tiles.georeferencing.place import EVERYWHERE
-from roadscan.tiles.plan.plan import plan_survey
-from roadscan.tiles.tasks.readings import Placer
 from tests.jobs.conftest import Simulated, small_scene
 
 

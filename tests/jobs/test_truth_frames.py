@@ -18,12 +18,12 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from roadscan.core.survey import Survey
+from roadscan.georeference.place import EVERYWHERE
+from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
+from roadscan.georeference.sources import Placer
 from roadscan.ingest.ingest import ingest
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.store.store import Store
-from roadscan.tiles.georeferencing.place import EVERYWHERE
-from roadscan.tiles.plan.plan import SurveyPlan, plan_survey
-from roadscan.tiles.tasks.readings import Placer
 
 FRAMES = {
     "UTM north": ("EPSG:32632", 691_000.0, 5_335_000.0, 560.0),

@@ -7,8 +7,8 @@ import pytest
 
 from roadscan.compute.kernels.copies import copy_values
 from roadscan.compute.kernels.height_slots import LANES, SLOT_SIZE, VECTOR
-from roadscan.tiles.georeferencing.kernels.readings import FATES, KEPT
-from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK
+from roadscan.georeference.kernels.readings import FATES, KEPT
+from roadscan.georeference.kernels.timed_readings import CHUNK
 from roadscan.tiles.kernels import cell_statistics
 from roadscan.tiles.kernels.accumulate import (
     PIECE,

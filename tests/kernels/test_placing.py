@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.crs import LOCAL_WORLD, Anchor, MapFrame
 from roadscan.core.rig import Mounting
-from roadscan.navigation.trajectory import Trajectory
-from roadscan.tiles.georeferencing.charts import charts_along
-from roadscan.tiles.georeferencing.georeference import georeference_of
-from roadscan.tiles.georeferencing.kernels.readings import (
+from roadscan.georeference.charts import charts_along
+from roadscan.georeference.georeference import georeference_of
+from roadscan.georeference.kernels.readings import (
     CLASS_KEPT,
     CLASS_NO_POSE,
     CLASS_NO_RETURN,
@@ -27,7 +26,8 @@ from roadscan.tiles.georeferencing.kernels.readings import (
     Placed,
     Returns,
 )
-from roadscan.tiles.georeferencing.kernels.timed_readings import STEP_NS, place_mirror, place_returns
+from roadscan.georeference.kernels.timed_readings import STEP_NS, place_mirror, place_returns
+from roadscan.navigation.trajectory import Trajectory
 
 START = 10**18
 WIDE = (0.0, 1e4, -1e5, 1e5, -1e5, 1e5)

@@ -15,6 +15,10 @@ from roadscan.compute.kernels.curved_grid import accumulate_curved, thin_path
 from roadscan.compute.kernels.profile_bounds import range_bounds
 from roadscan.distress.kernels.crack_response import add_bend, deepen, fill_holes, line_sums
 from roadscan.distress.kernels.thinning import thin
+from roadscan.georeference.kernels.block_ranges import block_ranges
+from roadscan.georeference.kernels.road_ranges import keep_road
+from roadscan.georeference.kernels.tick_places import between_ticks
+from roadscan.georeference.kernels.tile_set import add_tile, empty, mark_zonotope, take, tile_set
 from roadscan.navigation.inertial.kernels.strapdown import geodetic_of, gravity_at, turned_frame
 from roadscan.surface.kernels.coarse import CellSums, Profiles, rasterise, spline_profiles, sum_patches
 from roadscan.surface.kernels.delaunay import flip_edges
@@ -25,10 +29,6 @@ from roadscan.surface.kernels.picture_colours import sample, take_better
 from roadscan.surface.kernels.smoothing import descend
 from roadscan.surface.kernels.vertex_neighbourhoods import units
 from roadscan.surface.kernels.vertex_rings import grow, is_narrow, whitening
-from roadscan.tiles.georeferencing.kernels.block_ranges import block_ranges
-from roadscan.tiles.georeferencing.kernels.road_ranges import keep_road
-from roadscan.tiles.georeferencing.kernels.tick_places import between_ticks
-from roadscan.tiles.georeferencing.kernels.tile_set import add_tile, empty, mark_zonotope, take, tile_set
 
 
 def test_spans_of_ranges() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from roadscan.core.crs import MapFrame, world_frame_of, world_from_geodetic
-from roadscan.tiles.georeferencing.charts import BOX_M, charts_along
+from roadscan.georeference.charts import BOX_M, charts_along
 
 
 def chart_value(coefficients: np.ndarray, d: np.ndarray) -> np.ndarray:

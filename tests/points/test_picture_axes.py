@@ -7,7 +7,7 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.crs import MapFrame
-from roadscan.tiles.georeferencing.picture_axes import camera_from_map
+from roadscan.georeference.picture_axes import camera_from_map
 
 GEOCENTRIC, UTM = "EPSG:4978", "EPSG:32632"
 

@@ -14,9 +14,9 @@ from roadscan.core.crs import Anchor, MapFrame, world_frame_of
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import Mountings, Sensor
 from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.georeference.charts import charts_along
+from roadscan.georeference.place import EVERYWHERE, HeightLimits, Placement, Window, pass_numbers, passes_of
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.tiles.georeferencing.charts import charts_along
-from roadscan.tiles.georeferencing.place import EVERYWHERE, HeightLimits, Placement, Window, pass_numbers, passes_of
 
 TILE_QUANTA = 1_000_000
 

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from roadscan.core.settings.segmentation import RangeFilter
-from roadscan.tiles.georeferencing.range_filter import crossing_limits, kept_in_turns, resolution_limits
+from roadscan.georeference.range_filter import crossing_limits, kept_in_turns, resolution_limits
 
 REACH_M, RADIUS_M = 8.0, 6.0
 

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from roadscan.core.crs import Anchor, MapFrame, world_frame_of
 from roadscan.core.rig import Mountings, Sensor
 from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.georeference.charts import charts_along
+from roadscan.georeference.place import HeightLimits, Placement
+from roadscan.georeference.reach import RangeSpans, Reach, Touched
 from roadscan.navigation.movement import Allowance
 from roadscan.navigation.trajectory import Corrections, Trajectory
-from roadscan.tiles.georeferencing.charts import charts_along
-from roadscan.tiles.georeferencing.place import HeightLimits, Placement
-from roadscan.tiles.georeferencing.reach import RangeSpans, Reach, Touched
 
 TILE_QUANTA = 100_000
 """Tiles of 1 m: many edges to get wrong."""

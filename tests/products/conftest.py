@@ -15,8 +15,8 @@ import pytest
 from roadscan.core.crs import MapFrame
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import LanePass, PassId, RunId, TileId
+from roadscan.georeference.cloud import TilePoints
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.product import ProductContext, Tile, TileSummary
 
 Surface = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64]], npt.NDArray[np.float64]]

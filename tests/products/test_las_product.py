@@ -24,7 +24,7 @@ from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
-from roadscan.tiles.georeferencing.cloud import TilePoints
+from roadscan.georeference.cloud import TilePoints
 from roadscan.tiles.product import Tile, product_named
 from roadscan.tiles.products.las import Las, LasOptions, adjusted_gps_s, thin_out
 

@@ -9,9 +9,9 @@ import pytest
 
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
+from roadscan.georeference.cloud import TilePoints
+from roadscan.georeference.kernels.readings import CLASS_KEPT, CLASS_TOO_HIGH, FATES, KEPT, OUTSIDE, Placed
 from roadscan.tiles.accumulator import Accumulator
-from roadscan.tiles.georeferencing.cloud import TilePoints
-from roadscan.tiles.georeferencing.kernels.readings import CLASS_KEPT, CLASS_TOO_HIGH, FATES, KEPT, OUTSIDE, Placed
 from roadscan.tiles.kernels.active_tiles import ActiveTiles, Measured
 from roadscan.tiles.kernels.row_buckets import TAKEN, Buckets, Places, fill_buckets
 from roadscan.tiles.statistics import cells_of

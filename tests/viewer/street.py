@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from roadscan.core.crs import MapFrame
 from roadscan.site.layer import title_of
+from roadscan.site.octree import Cube, NodeCutter
 from roadscan.site.parts import edits
 from roadscan.store.codecs.copc import CopcWriter
 from roadscan.store.codecs.mesh import Mesh, write_glb
-from roadscan.tiles.georeferencing.octree import Cube, NodeCutter
 from roadscan.tiles.products.cloud_records import layout_of
 
 Float64 = npt.NDArray[np.float64]

@@ -59,6 +59,8 @@ from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
 from roadscan.core.counted import counted as count_of
 from roadscan.core.settings.tie_settings import PlaceSettings
 from roadscan.core.witness import Finding
+from roadscan.georeference.plan.plan import SurveyPlan, plan_of
+from roadscan.georeference.plan.road import road_key
 from roadscan.navigation.movement import largest
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
@@ -66,8 +68,6 @@ from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import file_digest
-from roadscan.tiles.plan.plan import SurveyPlan, plan_of
-from roadscan.tiles.plan.road import road_key
 
 Float64 = npt.NDArray[np.float64]
 

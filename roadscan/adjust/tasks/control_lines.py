@@ -16,8 +16,8 @@ from roadscan.adjust.targets.shapes import SurveyedLine
 from roadscan.compute.ways import way_along
 from roadscan.core.settings.adjust import LineUse
 from roadscan.core.witness import Finding, Witness
+from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.store.group_reader import read_groups
-from roadscan.tiles.plan.plan import SurveyPlan
 
 TABLE: Final = "control_lines"
 CONTROL_LINE: Final = Witness(

@@ -23,6 +23,9 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.frames import rotation_from_rph, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.settings.adjust import AdjustConfig, TargetConfig
+from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.plan.road import road_key
+from roadscan.georeference.sources import Ground
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.group_reader import read_groups
@@ -30,9 +33,6 @@ from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, bytes_digest
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.plan.plan import SurveyPlan
-from roadscan.tiles.plan.road import road_key
-from roadscan.tiles.tasks.readings import Ground
 
 SIGHTINGS: Final = "control_sightings"
 """Table, and product of its files in the manifest."""

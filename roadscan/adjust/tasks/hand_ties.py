@@ -34,7 +34,7 @@ from roadscan.core.gpstime import NS_PER_S, gps_ns_from_utc
 from roadscan.core.settings.adjust import HandTies
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
-from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.georeference.plan.plan import SurveyPlan
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]

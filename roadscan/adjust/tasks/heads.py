@@ -26,8 +26,8 @@ from roadscan.compute.robust import scatter_about
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.settings.tie_settings import PlaceSettings
 from roadscan.core.witness import Finding, Witness
+from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.tiles.plan.plan import SurveyPlan
 
 Float64 = npt.NDArray[np.float64]
 

@@ -21,11 +21,11 @@ from roadscan.adjust.unknowns import sharing
 from roadscan.core.rig import Mountings
 from roadscan.core.settings.adjust import AdjustConfig
 from roadscan.core.witness import Finding, Witness
+from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.sources import MOUNTING_COLUMNS, MountingChanges, key_of_row, mounting_change_of
 from roadscan.navigation.mounting_change import MountingChange, Seat
 from roadscan.store.held import held_path, read_held, write_held
 from roadscan.store.store import Store
-from roadscan.tiles.plan.plan import SurveyPlan
-from roadscan.tiles.tasks.readings import MOUNTING_COLUMNS, MountingChanges, key_of_row, mounting_change_of
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -14,10 +14,10 @@ from roadscan.adjust.level import LevelPoses, level_poses
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Traverse
 from roadscan.core.grid import QUANTA_PER_M
+from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, EVERYWHERE, Placement
+from roadscan.georeference.sources import Ground, Placer, RawSlice, ReadingSource, geometry_of, read_rows
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
-from roadscan.tiles.georeferencing.place import EIGHT_TO_SIXTEEN_BITS, EVERYWHERE, Placement
-from roadscan.tiles.tasks.readings import Ground, Placer, RawSlice, ReadingSource, geometry_of, read_rows
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -49,11 +49,11 @@ from roadscan.adjust.tasks.tracks import span_of
 from roadscan.core.settings.adjust import AdjustConfig, PosePriors
 from roadscan.core.settings.adjustment import AdjustmentSettings, ControlRules
 from roadscan.core.witness import Finding
+from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.navigation.mounting_change import NO_SEAT
 from roadscan.navigation.tasks.pose_sigma import stated_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.navigation.trajectory import Corrections
-from roadscan.tiles.plan.plan import SurveyPlan
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]

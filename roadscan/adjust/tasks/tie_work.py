@@ -19,6 +19,9 @@ from roadscan.adjust.ties.at_place import Ties, ties_at
 from roadscan.adjust.ties.tie import HEIGHT, SAME_PASS
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.settings.tie_settings import TieSettings
+from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.plan.road import road_key
+from roadscan.georeference.sources import Ground
 from roadscan.navigation.mounting_change import Seat
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
@@ -26,9 +29,6 @@ from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, bytes_digest
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.plan.plan import SurveyPlan
-from roadscan.tiles.plan.road import road_key
-from roadscan.tiles.tasks.readings import Ground
 
 TIES: Final = "ties"
 """Table, and product of its files in the manifest."""

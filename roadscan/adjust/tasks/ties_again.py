@@ -27,8 +27,8 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.settings.adjust import AdjustConfig
 from roadscan.core.settings.tie_settings import TieSettings
 from roadscan.core.witness import Finding, Witness
+from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.navigation.trajectory import Corrections
-from roadscan.tiles.plan.plan import SurveyPlan
 
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]

@@ -12,10 +12,10 @@ from roadscan.adjust.level import LevelPoses, level_poses
 from roadscan.adjust.places import Track
 from roadscan.adjust.swath import Swath, swath_of
 from roadscan.adjust.tasks.near import PlacedReadings, Sources, placed_readings
+from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.sources import Placer, RawSlice, ReadingSource, read_rows
 from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.store.logs import DataFile
-from roadscan.tiles.plan.plan import SurveyPlan
-from roadscan.tiles.tasks.readings import Placer, RawSlice, ReadingSource, read_rows
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -13,7 +13,7 @@ from roadscan.assets.classes import CLASS_NAMES
 from roadscan.assets.returns import Returns
 from roadscan.core.grid import QUANTA_PER_M, TileGrid
 from roadscan.core.ids import TileId
-from roadscan.tiles.georeferencing.cloud import TilePoints
+from roadscan.georeference.cloud import TilePoints
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.las import LasOptions, write_las
 

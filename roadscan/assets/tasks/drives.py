@@ -12,13 +12,13 @@ import scipy.spatial
 
 from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.core.rig import UNMOUNTED, Mountings
+from roadscan.georeference.plan.plan import trajectory_source
+from roadscan.georeference.sensor_places import sensor_places
 from roadscan.navigation.tasks.pose_sigma import pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.held import held_path
 from roadscan.store.store import bytes_digest
-from roadscan.tiles.georeferencing.sensor_places import sensor_places
-from roadscan.tiles.plan.plan import trajectory_source
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -18,13 +18,13 @@ from roadscan.core.grid import QUANTA_PER_M, QUANTUM_M
 from roadscan.core.ids import TileId
 from roadscan.core.rig import UNMOUNTED, Mountings
 from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.georeference.centre_line import CentreLineBuffer
+from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, Located, Window, passes_of
+from roadscan.georeference.plan.centre_line import load_buffer
+from roadscan.georeference.sensor_places import sensor_places
+from roadscan.georeference.sources import Placer, RawSlice, ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.tiles.georeferencing.centre_line import CentreLineBuffer
-from roadscan.tiles.georeferencing.place import EIGHT_TO_SIXTEEN_BITS, Located, Window, passes_of
-from roadscan.tiles.georeferencing.sensor_places import sensor_places
-from roadscan.tiles.plan.centre_line import load_buffer
-from roadscan.tiles.tasks.readings import Placer, RawSlice, ReadingSource, geometry_of
 from roadscan.tiles.tasks.tile_plan import TileTask
 
 Float64 = npt.NDArray[np.float64]

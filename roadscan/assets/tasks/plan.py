@@ -18,16 +18,16 @@ from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.settings.assets import AssetsConfig
 from roadscan.core.survey import Survey
+from roadscan.footprints.footprints import FootprintRanges
+from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
+from roadscan.georeference.sources import ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.store import bytes_digest
 from roadscan.surface.tasks.pictures import rule_cameras
 from roadscan.tiles.blocks import Block, cut_blocks
-from roadscan.tiles.footprints.footprints import FootprintRanges
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import SurveyPlan, trajectory_source
 from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.readings import ReadingSource, geometry_of
 from roadscan.tiles.tasks.tile_plan import TilePlan, plan_tiles
 
 _BLOCK_SQUARES: Final = 16

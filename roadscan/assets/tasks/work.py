@@ -22,10 +22,10 @@ from roadscan.assets.tasks.plan import AssetPlan, plan_assets
 from roadscan.assets.tasks.sections import SECTIONS
 from roadscan.assets.tasks.tables import TABLES
 from roadscan.core.ids import TileId
+from roadscan.footprints.footprints import footprints_of
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import Manifest, OutputRecord
-from roadscan.tiles.footprints.footprints import footprints_of
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_plan import tiles_of
 

@@ -20,6 +20,8 @@ from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.ids import ALL_RUNS
 from roadscan.core.settings.calibration import CalibrationSettings, ObjectEvidence, OverlapEvidence
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import DatedMountings, SurveyPlan, plan_survey
+from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.recorded_pictures import CALIBRATION, keep_file, picture_key
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
@@ -27,8 +29,6 @@ from roadscan.store.held import held_path, read_held, write_held
 from roadscan.store.manifest import Manifest
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
-from roadscan.tiles.plan.plan import DatedMountings, SurveyPlan, plan_survey
-from roadscan.tiles.tasks.readings import load_mountings
 
 Report = Callable[[str], None]
 

@@ -31,6 +31,8 @@ from roadscan.core.settings.calibration import (
     ReferenceEvidence,
     StopAndGoEvidence,
 )
+from roadscan.georeference.place import CloudFrame
+from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.ingest.format import Rows, format_named
 from roadscan.ingest.inspect.diagnosis import claimed_format
 from roadscan.ingest.inspect.provisional import Stated, open_log
@@ -38,8 +40,6 @@ from roadscan.navigation.tasks.navigation_logs import imu_readings
 from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.navigation.trajectory import world_from_ned
-from roadscan.tiles.georeferencing.place import CloudFrame
-from roadscan.tiles.plan.plan import SurveyPlan, trajectory_source
 
 Float64 = npt.NDArray[np.float64]
 

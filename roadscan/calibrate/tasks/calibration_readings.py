@@ -14,11 +14,11 @@ from roadscan.calibrate.surfaces.readings import Readings
 from roadscan.core.errors import ConfigError, RunError, nearest
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.settings.calibration import Area
+from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.sources import ReadingSource, geometry_of, read_rows
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.store.logs import DataFile
-from roadscan.tiles.plan.plan import SurveyPlan
-from roadscan.tiles.tasks.readings import ReadingSource, geometry_of, read_rows
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

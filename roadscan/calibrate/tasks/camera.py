@@ -31,6 +31,7 @@ from roadscan.core.rig import Mounting, Rig, Sensor
 from roadscan.core.rig_text import update_rig_file
 from roadscan.core.settings.calibration import CalibrationSettings
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import trajectory_source
 from roadscan.navigation.tasks.navigate import records_with_trajectories
 from roadscan.navigation.tasks.pose_sigma import pose_sigma
 from roadscan.navigation.tasks.taken_pictures import taken_pictures
@@ -38,7 +39,6 @@ from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.store.group_reader import read_groups
 from roadscan.store.logs import LogRecord
 from roadscan.store.store import Store
-from roadscan.tiles.plan.plan import trajectory_source
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

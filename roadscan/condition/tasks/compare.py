@@ -13,11 +13,11 @@ import pyarrow.csv as pa_csv
 from roadscan.condition.comparison import VERDICTS, change_of, matched_sections
 from roadscan.condition.tasks.sections import SECTIONS
 from roadscan.core.errors import ConfigError, StoreError
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import Manifest, read_recorded
 from roadscan.store.sql import query
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
 

@@ -23,6 +23,7 @@ from roadscan.core.ids import LanePass, PassId
 from roadscan.core.settings.condition import ConditionConfig
 from roadscan.core.survey import Survey
 from roadscan.formats.vectors.road_lines import LineLayer, RoadLinesOptions, place_in_map, read_lines, sidecars
+from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.ingest.format import Reject
 from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource
@@ -33,7 +34,6 @@ from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, file_digest
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import SurveyPlan, trajectory_source
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
 

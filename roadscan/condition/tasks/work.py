@@ -29,10 +29,10 @@ from roadscan.condition.tasks.tile_summary import TILES, due_tiles
 from roadscan.condition.tasks.values import VALUES, Group, GroupTask, due_groups, plan_groups
 from roadscan.core.ids import TileId
 from roadscan.core.settings.condition import ConditionConfig
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.tile_plan import TILE
 
 MADE = (

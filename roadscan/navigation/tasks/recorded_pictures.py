@@ -19,7 +19,7 @@ NAVIGATION_PICTURE: Final = "navigation_picture"
 CLOCK_PICTURE: Final = "clock_picture"
 CALIBRATION: Final = "calibration"
 """Products of the records."""
-_DRAWN_BY: Final = tuple(f"roadscan.tiles.products.pictures.{name}" for name in ("calibration", "clocks", "navigation"))
+_DRAWN_BY: Final = ("roadscan.calibrate.picture", "roadscan.navigation.clocks.picture", "roadscan.navigation.picture")
 
 
 def picture_key(*shown: object) -> str:

@@ -13,13 +13,13 @@ import shapely
 
 from roadscan.assets.files.layers import Layer
 from roadscan.assets.tasks.tables import TABLES, read_layer
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.report.asset_thumbnails import Thumbnails
 from roadscan.report.blocks import Block, Drawing, Line, Picture, Table
 from roadscan.report.map_page import COLOURS, WIDTH, MapPage
 from roadscan.report.section import Material, Section
 from roadscan.store.asset_schema import AssetSchema, asset_schema, asset_tables
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import plan_of
 
 _CROSS: Final = 3.0
 _MOST_LINES: Final = 6000

@@ -13,13 +13,13 @@ import numpy.typing as npt
 
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.ids import TileId
+from roadscan.georeference.plan.plan import NothingToPlaceError, plan_of
 from roadscan.report.blocks import Block, Drawing, Line, Table
 from roadscan.report.map_page import COLOURS, WIDTH, MapPage
 from roadscan.report.section import Material, Section
 from roadscan.report.sections.recorded import seconds_of
 from roadscan.store.manifest import OutputRecord
-from roadscan.tiles.plan.drives import Drives
-from roadscan.tiles.plan.plan import NothingToPlaceError, plan_of
+from roadscan.tiles.drives import Drives
 from roadscan.tiles.tasks.tile_plan import TILE
 
 _ONE_PASS: Final = "#cfd6dd"

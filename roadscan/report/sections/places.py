@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 from urllib.parse import quote
 
+from roadscan.georeference.plan.plan import NothingToPlaceError
 from roadscan.report.blocks import Block, Paragraph, Picture
 from roadscan.report.section import Material, Section
 from roadscan.site.layer import SiteLayer, Style
@@ -14,7 +15,6 @@ from roadscan.site.material import Box
 from roadscan.site.material import Material as Site
 from roadscan.site.parts.vectors import site_layers
 from roadscan.site.thumbnail import thumbnail
-from roadscan.tiles.plan.plan import NothingToPlaceError
 
 _WHOLE_PX: Final = (900, 420)
 _PLACE_PX: Final = (440, 300)

@@ -12,6 +12,9 @@ from typing import Any, Final
 
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.ids import TileId
+from roadscan.footprints.footprints import footprints_of
+from roadscan.georeference.cloud import TilePoints
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.site.cloud_file import PointSpool, write_cloud
@@ -21,9 +24,6 @@ from roadscan.site.layers.passes import RUN_COLOURS
 from roadscan.site.material import Material
 from roadscan.site.part import SitePart
 from roadscan.tiles.blocks import cut_blocks
-from roadscan.tiles.footprints.footprints import footprints_of
-from roadscan.tiles.georeferencing.cloud import TilePoints
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.products.cloud_records import Lattice
 from roadscan.tiles.tasks.tile_plan import TilePlan, tiles_of
 from roadscan.tiles.tasks.tile_points import load_points

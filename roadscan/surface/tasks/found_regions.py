@@ -19,6 +19,11 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.ids import TileId
 from roadscan.core.settings.surface_regions import RegionSettings
+from roadscan.footprints.footprints import FootprintRanges
+from roadscan.georeference.place import Placement, ProfilePoints
+from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.plan.road import looks_across, road_key
+from roadscan.georeference.sources import Ground, Placer, RawSlice, ReadingSource, geometry_of, read_rows
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.compute import Compute
@@ -30,14 +35,9 @@ from roadscan.store.store import Store, file_digest
 from roadscan.surface.coarse import CoarseSettings, Stretch, coarse_model
 from roadscan.surface.regions import Region, find_regions
 from roadscan.surface.tasks.surface_regions import Regions
-from roadscan.tiles.footprints.footprints import FootprintRanges
-from roadscan.tiles.georeferencing.place import Placement, ProfilePoints
 from roadscan.tiles.mosaics.products import product_context
-from roadscan.tiles.plan.plan import SurveyPlan
-from roadscan.tiles.plan.road import looks_across, road_key
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
-from roadscan.tiles.tasks.readings import Ground, Placer, RawSlice, ReadingSource, geometry_of, read_rows
 
 REGIONS: Final = "regions"
 

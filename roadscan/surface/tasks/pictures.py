@@ -19,12 +19,12 @@ from roadscan.core.errors import ConfigError, RunError, nearest
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.grid import Bounds
 from roadscan.core.rig import Mountings, Rig, Sensor
+from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
+from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.navigation.trajectory import Poses, world_from_ned
 from roadscan.surface.views import Lens, PictureRule, Views
-from roadscan.tiles.plan.plan import SurveyPlan, mountings_of, trajectory_source
-from roadscan.tiles.tasks.readings import load_mountings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -11,13 +11,13 @@ import numpy as np
 from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.store.manifest import OutputRecord
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.tasks.picture_colours import ColourSource
 from roadscan.surface.tasks.pictures import Pictures, check_folders, check_pictures, plan_pictures, rule_cameras
 from roadscan.surface.tile import NodeColours, SurfaceTile
 from roadscan.tiles.mosaics.products import product_context, wanted_products, wanted_surface_products
-from roadscan.tiles.plan.plan import SurveyPlan
 from roadscan.tiles.product import SurfaceProduct
 from roadscan.tiles.tasks.tile_files import WantedSurface
 

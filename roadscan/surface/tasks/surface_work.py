@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from roadscan.core.ids import TileId
+from roadscan.footprints.footprints import footprints_of
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
 from roadscan.surface.tasks.found_regions import REGIONS, FoundRegions, load_found_regions
 from roadscan.surface.tasks.surface_colours import plan_colours
 from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, plan_surfaces
-from roadscan.tiles.footprints.footprints import footprints_of
 from roadscan.tiles.mosaics.products import product_context, wanted_surface_products
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import surface_file_names
 from roadscan.tiles.tasks.tile_plan import TilePlan, tiles_of

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.ids import TileId
+from roadscan.georeference.cloud import TilePoints
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.store.manifest import OutputRecord
 from roadscan.surface.reconstruction import Patch, SurfaceGrid, patch_of_cells, patch_of_points, surface_of
@@ -19,7 +20,6 @@ from roadscan.surface.tasks.surface_colours import Painter
 from roadscan.surface.tasks.surface_plan import SURFACE, SurfaceTask
 from roadscan.surface.tile import FILLED, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_files import publish_product

@@ -31,7 +31,7 @@ from roadscan.compute.kernels.height_slots import (
     store_heights,
 )
 from roadscan.compute.kernels.streak_slots import AT_ONCE, find_known_slots, lowest_bit
-from roadscan.tiles.georeferencing.kernels.readings import KEPT
+from roadscan.georeference.kernels.readings import KEPT
 from roadscan.tiles.kernels.pool import header_of_pass, longer_chain, new_group, slot_with_room
 from roadscan.tiles.kernels.selection import bounds_of
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.compute.kernel_options import inlined, kernel
-from roadscan.tiles.georeferencing.kernels.timed_points import places
-from roadscan.tiles.georeferencing.kernels.timed_readings import CHUNK, place_mirror, place_returns
+from roadscan.georeference.kernels.timed_points import places
+from roadscan.georeference.kernels.timed_readings import CHUNK, place_mirror, place_returns
 from roadscan.tiles.kernels.accumulate import end_of_pass, find_cells
 from roadscan.tiles.kernels.active_tiles import Measured
 from roadscan.tiles.kernels.row_buckets import TAKEN, Places, fill_buckets, put_in_own_buckets

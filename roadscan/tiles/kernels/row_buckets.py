@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner
 from roadscan.compute.kernels.height_slots import prefetch
-from roadscan.tiles.georeferencing.kernels.readings import CLASS_KEPT, KEPT, OUTSIDE
+from roadscan.georeference.kernels.readings import CLASS_KEPT, KEPT, OUTSIDE
 
 BLOCK = 64
 """Readings of a block."""

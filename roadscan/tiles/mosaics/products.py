@@ -11,6 +11,7 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.compute import Compute
@@ -19,8 +20,7 @@ from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.store import Store, file_digest
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.plan.drives import Drives
-from roadscan.tiles.plan.plan import SurveyPlan
+from roadscan.tiles.drives import Drives
 from roadscan.tiles.product import (
     Output,
     Product,
@@ -43,7 +43,7 @@ from roadscan.tiles.tasks.tiles import summary_of
 _TILES_DRAWN = 2000
 """Tiles that one task draws, each as often as it draws it: `kilometre`, with its six rasters, over two kilometres."""
 _NOWHERE = TileId(0, 0)
-_OF_SURVEY = ("roadscan.tiles.plan.drives:Drives", "roadscan.tiles.mosaics.products:StoredTiles")
+_OF_SURVEY = ("roadscan.tiles.drives:Drives", "roadscan.tiles.mosaics.products:StoredTiles")
 """Code by which survey products get what they draw."""
 
 

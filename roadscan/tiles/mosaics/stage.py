@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.tiles.mosaics.products import make_products, plan_outputs
-from roadscan.tiles.plan.plan import plan_of
 from roadscan.tiles.product import SurveyProduct, products
 from roadscan.tiles.tasks.cell_size import density_notes
 

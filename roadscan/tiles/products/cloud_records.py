@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.grid import TileGrid
+from roadscan.georeference.cloud import TilePoints
 from roadscan.store.codecs.las import Layout
-from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.products.las import fill_record
 from roadscan.tiles.products.las_axes import axis, set_coordinates
 

@@ -16,8 +16,8 @@ from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.gpstime import ADJUSTED_OFFSET_S, NS_PER_S
 from roadscan.core.grid import TileGrid
 from roadscan.core.strict import Strict
+from roadscan.georeference.cloud import TilePoints
 from roadscan.store.codecs.las import ONE_OF_ONE, Layout, check_points, write_points
-from roadscan.tiles.georeferencing.cloud import TilePoints
 from roadscan.tiles.product import Cells, ProductContext, Tile, TileProduct
 from roadscan.tiles.products.las_axes import Axes, axis, rounding_errors, set_coordinates
 

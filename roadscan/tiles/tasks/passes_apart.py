@@ -12,8 +12,8 @@ from roadscan.compute.robust import scatter_about
 from roadscan.core.grid import QUANTUM_M, TileGrid
 from roadscan.core.ids import LanePass
 from roadscan.core.witness import Finding, Witness
+from roadscan.georeference.cloud import TilePoints
 from roadscan.store.records import OutputRecord
-from roadscan.tiles.georeferencing.cloud import TilePoints
 
 PASSES_APART: Final = Witness(
     "passes_apart",

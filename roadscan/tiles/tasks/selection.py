@@ -8,8 +8,8 @@ import numpy as np
 
 from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
+from roadscan.footprints.footprints import FootprintRanges
 from roadscan.run.selection import Selection, SelectionError
-from roadscan.tiles.footprints.footprints import FootprintRanges
 
 
 def chosen_tiles(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.tiles.footprints.row_groups import GroupsByTile
+from roadscan.footprints.row_groups import GroupsByTile
 
 _SQUARE_M = 100.0
 """Edge of the squares whose tiles stay together."""

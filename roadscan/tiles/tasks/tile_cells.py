@@ -17,15 +17,15 @@ import numpy.typing as npt
 
 from roadscan.core.errors import StoreError
 from roadscan.core.ids import LanePass, TileId
+from roadscan.georeference.place import pass_numbers
+from roadscan.georeference.reading_counts import Fates
+from roadscan.georeference.sources import Placer, RawSlice, geometry_of
 from roadscan.store.profiles import ProfileReader
 from roadscan.store.returns import ReturnsReader
 from roadscan.store.schema import table_schema
 from roadscan.tiles.accumulator import Accumulator, Pool, PoolExhaustedError, TileEvidence
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.counting import Counting
-from roadscan.tiles.georeferencing.place import pass_numbers
-from roadscan.tiles.tasks.readings import Placer, RawSlice, geometry_of
-from roadscan.tiles.tasks.tile_fates import Fates
 from roadscan.tiles.tasks.tile_plan import TileTask
 
 _RETURNS_AT_ONCE = 1 << 18

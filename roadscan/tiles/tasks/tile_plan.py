@@ -13,19 +13,19 @@ import numpy.typing as npt
 
 from roadscan.core.ids import LanePass, TileId
 from roadscan.core.survey import CellColumns
+from roadscan.footprints.footprints import FootprintRanges, footprints_of
+from roadscan.footprints.row_groups import GroupsByTile
+from roadscan.georeference.plan.centre_line import CentreLines
+from roadscan.georeference.plan.plan import SurveyPlan, plan_of
+from roadscan.georeference.plan.road import road_key
+from roadscan.georeference.sources import Ground, RawSlice
 from roadscan.run.engine.compute import Made
 from roadscan.run.engine.fingerprint import key_of, keys_of
 from roadscan.run.session import Session, found_once
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.tiles.blocks import Block, cut_blocks
-from roadscan.tiles.footprints.footprints import FootprintRanges, footprints_of
-from roadscan.tiles.footprints.row_groups import GroupsByTile
-from roadscan.tiles.plan.centre_line import CentreLines
-from roadscan.tiles.plan.plan import SurveyPlan, plan_of
-from roadscan.tiles.plan.road import road_key
 from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.readings import Ground, RawSlice
 from roadscan.tiles.tasks.stretches import DrivenTiles, cut_stretches
 from roadscan.tiles.tasks.tile_files import WantedProduct
 

@@ -11,16 +11,16 @@ import numpy.typing as npt
 
 from roadscan.core.grid import QUANTUM_M
 from roadscan.core.ids import TileId
+from roadscan.georeference.centre_line import CentreLineBuffer
+from roadscan.georeference.classes import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
+from roadscan.georeference.cloud import TilePoints, fill_of
+from roadscan.georeference.order import canonical_order
+from roadscan.georeference.place import EXTRA_COLUMNS, Placed, Window, passes_of
+from roadscan.georeference.plan.centre_line import load_buffer
+from roadscan.georeference.reading_counts import Fates
+from roadscan.georeference.sources import Ground, Placer, RawSlice, ReadingSource
 from roadscan.navigation.trajectory import Trajectory
 from roadscan.tiles.accumulator import TileEvidence
-from roadscan.tiles.georeferencing.centre_line import CentreLineBuffer
-from roadscan.tiles.georeferencing.classes import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
-from roadscan.tiles.georeferencing.cloud import TilePoints, fill_of
-from roadscan.tiles.georeferencing.order import canonical_order
-from roadscan.tiles.georeferencing.place import EXTRA_COLUMNS, Placed, Window, passes_of
-from roadscan.tiles.plan.centre_line import load_buffer
-from roadscan.tiles.tasks.readings import Ground, Placer, RawSlice, ReadingSource
-from roadscan.tiles.tasks.tile_fates import Fates
 from roadscan.tiles.tasks.tile_plan import TileTask
 
 

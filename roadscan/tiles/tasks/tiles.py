@@ -13,6 +13,7 @@ import numpy as np
 
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.core.ids import TileId
+from roadscan.georeference.reading_counts import Fates
 from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.records import OutputRecord, Packed, Row, table_of
@@ -27,7 +28,6 @@ from roadscan.tiles.tasks.cell_files import write_cells, write_overviews
 from roadscan.tiles.tasks.passes_apart import FIGURE as PASSES_APART
 from roadscan.tiles.tasks.passes_apart import apart_in_tile
 from roadscan.tiles.tasks.tile_cells import count_tiles
-from roadscan.tiles.tasks.tile_fates import Fates
 from roadscan.tiles.tasks.tile_files import publish_file, write_product
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.tiles.tasks.tile_points import load_tiles

@@ -17,8 +17,8 @@ from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.settings.assets import AssetsConfig
+from roadscan.georeference.sensor_places import sensor_places
 from roadscan.navigation.trajectory import Trajectory
-from roadscan.tiles.georeferencing.sensor_places import sensor_places
 
 
 def test_squares_are_whole_tiles() -> None:

@@ -1,0 +1,73 @@
+"""Stage `footprints`: which raw block touches which tile."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.calibrate.tasks.calibrate import outdated_calibrations
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding
+from roadscan.footprints.footprints import (
+    PRODUCT,
+    footprints_of,
+    index_footprints,
+    stale_footprints,
+    unplaced_logs,
+)
+from roadscan.georeference.plan.plan import empty_passes, plan_of
+from roadscan.georeference.tick_clocks import check_tick_clocks, tick_findings
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, StageState
+from roadscan.store.logs import LogRecord
+from roadscan.store.manifest import Manifest
+from roadscan.strips.findings import strip_findings
+from roadscan.strips.work import compare_strips
+
+
+def faults_of_plan(session: Session) -> list[tuple[str, str]]:
+    """Logs that give nothing, and passes without a reading."""
+    plan = plan_of(session)
+    return [*(fault.told for fault in plan.apart), *empty_passes(plan), *unplaced_logs(plan, session.manifest)]
+
+
+class Footprints(Stage):
+    """One record a data file, from bounds; readings are placed only where there are none."""
+
+    name = "footprints"
+    title = "which raw block touches which tile"
+    after = ("navigate",)
+
+    def run(self, session: Session) -> None:
+        """Index the data files whose footprints are missing or stale."""
+        plan, manifest = plan_of(session), session.manifest
+        session.failed(self.name, [*(fault.told for fault in plan.apart), *empty_passes(plan)])
+        for note in outdated_calibrations(plan):
+            session.note(note)
+        found = index_footprints(plan, manifest, session.compute, session.bar(self.name))
+        session.forget(footprints_of)
+        found += check_tick_clocks(plan, manifest, session.compute, session.bar("clocks by ticks"))
+        found += compare_strips(session, manifest)
+        session.failed(self.name, [*found, *unplaced_logs(plan, manifest)])
+
+    def state(self, session: Session) -> StageState:
+        """Data files of which it is not known, or not known any more, which tiles they touch."""
+        stale, current = len(stale_footprints(plan_of(session), session.manifest)), len(session.manifest.of(PRODUCT))
+        state = StageState(current - stale, stale, next_run={"footprints": stale})
+        state.notes = outdated_calibrations(plan_of(session))
+        state.faults = faults_of_plan(session)
+        if not current:
+            state.next_run["raw_bytes"] = plan_of(session).raw_bytes
+            state.hides_rest = True
+        elif stale:
+            state.notes.append(
+                f"{stale:,} data files have no footprints, or old ones: more tiles than these may be due"
+            )
+        return state
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """Clocks that wheel ticks and poses contradict, and sensors that the others contradict."""
+        return [*tick_findings(records, manifest), *strip_findings(records, manifest)]
+
+    def folders(self) -> Sequence[str]:
+        """One file a data file."""
+        return ("tables/footprints",)

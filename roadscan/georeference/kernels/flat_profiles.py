@@ -1,0 +1,162 @@
+"""Planes and points of profiles that are measured at once, near the sensor.
+
+All readings of such a profile have one pose and lie in one plane, a few metres across. There the map is linear to a
+few µm (``points.flat_profiles`` holds the reach to that), so each map coordinate is
+
+    value = anchor + p + q · y + r · z
+
+with the sensor's y and z counted from the middle of the profile. The anchor is a whole number of cells (or quanta);
+what is left fits 32-bit floats with a resolution below a tenth of a quantum, and sixteen readings fit a register.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.compute.kernel_options import bare, bare_inlined
+from roadscan.georeference.kernels.profile_forms import form_value, profile_forms
+from roadscan.georeference.kernels.readings import (
+    CLASS_NO_POSE,
+    CLASS_NO_RETURN,
+    CLASS_TOO_FAR,
+    CLASS_TOO_HIGH,
+    CLASS_TOO_LOW,
+    CLASS_TOO_NEAR,
+    HEIGHT,
+    KEPT,
+    NO_POSE,
+    NO_RETURN,
+    OUTSIDE,
+    RANGE,
+    is_wanted,
+    tile_and_rest,
+    write_point,
+)
+from roadscan.navigation.kernels.poses import find_interval
+
+HALF = np.float32(0.5)
+
+
+class FlatProfiles(NamedTuple):
+    """Rays of a profile about its middle."""
+
+    rays: npt.NDArray[np.float32]
+    """(4, m) y and z of the rays' origins from the middle (m), y and z of their directions."""
+    middle: tuple[float, float]
+    """y and z in the sensor's frame (m)."""
+    scale: tuple[np.float32, np.float32]
+    """Range of a raw 0 and step between raw ranges (m)."""
+    raw_limits: tuple[np.uint16, np.uint16]
+    """Lowest and highest raw range that is kept."""
+
+
+@bare_inlined
+def anchored(form, middle, quanta_per_m):
+    """A form of ``profile_forms`` about the profile's middle (y, z): anchor in whole quanta, and (p, q, r)."""
+    y, z = middle
+    value = form_value(form, y, z) * quanta_per_m
+    anchor = np.int64(math.floor(value))
+    return anchor, (
+        np.float32(value - anchor),
+        np.float32((form[1] + 2.0 * form[3] * y + form[4] * z) * quanta_per_m),
+        np.float32((form[2] + form[4] * y + 2.0 * form[5] * z) * quanta_per_m),
+    )
+
+
+@bare_inlined
+def on_plane(plane, y, z):
+    """Value of a plane (p, q, r)."""
+    return plane[0] + plane[1] * y + plane[2] * z
+
+
+@bare_inlined
+def planes_of(epoch, k, middle, georeference):
+    """Planes of a profile's easting, northing and height, with the lowest and highest height kept above the anchor.
+
+    Returns
+    -------
+    placed : bool; anchors : (3,) tuple of int64, easting, northing and height (quanta); planes : three (p, q, r);
+    heights : (2,) tuple of float32.
+    """
+    limits, quanta_per_m = georeference.limits, georeference.quanta_per_m
+    placed, forms = profile_forms(epoch, k, georeference)
+    east_anchor, east = anchored(forms[0], middle, quanta_per_m)
+    north_anchor, north = anchored(forms[1], middle, quanta_per_m)
+    up_anchor, up = anchored(forms[2], middle, quanta_per_m)
+    body = forms[3][0]
+    lowest = max(limits.height_min_m, body + limits.above_body_min_m) * quanta_per_m - up_anchor
+    highest = min(limits.height_max_m, body + limits.above_body_max_m) * quanta_per_m - up_anchor
+    return (
+        placed,
+        (east_anchor, north_anchor, up_anchor),
+        (east, north, up),
+        (np.float32(lowest), np.float32(highest)),
+    )
+
+
+@bare_inlined
+def class_of(raw, height, raw_limits, heights):
+    """Class of a reading that a filter leaves out; `height` above the anchor."""
+    if raw == 0:
+        return CLASS_NO_RETURN
+    if raw < raw_limits[0]:
+        return CLASS_TOO_NEAR
+    if raw > raw_limits[1]:
+        return CLASS_TOO_FAR
+    return CLASS_TOO_LOW if height < heights[0] else CLASS_TOO_HIGH
+
+
+@bare_inlined
+def fate_of(kind):
+    """Fate of a class other than kept."""
+    if kind == CLASS_NO_RETURN:
+        return NO_RETURN
+    if kind == CLASS_NO_POSE:
+        return NO_POSE
+    return RANGE if kind in (CLASS_TOO_NEAR, CLASS_TOO_FAR) else HEIGHT
+
+
+@bare
+def georeference_flat_profiles(epochs, ranges, flat, georeference, window, out):
+    """Place the readings of profiles and write points of those in the window. Returns how many points were written.
+
+    Parameters
+    ----------
+    epochs : (n,) int64, GPS ns; ranges : (n, m) uint16, raw, 0 no return; flat : FlatProfiles.
+    georeference : Georeference; window : Window; out : Points, with a row for each reading.
+    """
+    made = 0
+    count = ranges.shape[1]
+    rays, middle, scale, raw_limits = flat
+    fates, classes = out.fates, out.classes
+    k = 0
+    for i in range(epochs.size):
+        k = find_interval(epochs[i], georeference.poses.knots, k)
+        placed, anchors, planes, heights = planes_of(epochs[i], k, middle, georeference)
+        for j in range(count):
+            raw = ranges[i, j]
+            distance = scale[0] + scale[1] * np.float32(raw)
+            y = rays[0, j] + distance * rays[2, j]
+            z = rays[1, j] + distance * rays[3, j]
+            h = on_plane(planes[2], y, z)
+            if not (placed and raw_limits[0] <= raw <= raw_limits[1] and heights[0] <= h <= heights[1]):
+                kind = class_of(raw, h, raw_limits, heights) if placed or raw == 0 else CLASS_NO_POSE
+                fates[fate_of(kind)] += 1
+                if classes.size:
+                    classes[i * count + j] = kind
+                continue
+            east = anchors[0] + np.int64(np.floor(on_plane(planes[0], y, z) + HALF))
+            north = anchors[1] + np.int64(np.floor(on_plane(planes[1], y, z) + HALF))
+            across, along = tile_and_rest(east, window.tile_quanta), tile_and_rest(north, window.tile_quanta)
+            if not is_wanted(across[0], along[0], window.tiles):
+                fates[OUTSIDE] += 1
+                continue
+            write_point(made, i, across, along, anchors[2] + np.int64(np.floor(h + HALF)), out)
+            out.readings[made] = j
+            made += 1
+            fates[KEPT] += 1
+    return made

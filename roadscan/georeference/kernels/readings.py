@@ -1,0 +1,151 @@
+"""Structures of georeferencing: readings, what places them on the map, and the points that are written.
+
+    p_world = t + R_world←body · (R_body←sensor · p_sensor + l_body)
+    map     = chart(p_world)
+
+Map coordinates leave as whole quanta (10 µm).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.compute.kernel_options import bare_inlined, inlined
+from roadscan.georeference.kernels.charts import Charts
+from roadscan.navigation.kernels.poses import PoseIntervals
+
+KEPT, NO_POSE, RANGE, HEIGHT, OUTSIDE, NO_RETURN = 0, 1, 2, 3, 4, 5
+"""Fates of a reading, the indices of the kernels' `fates` counters."""
+FATES = 6
+
+CLASS_KEPT, CLASS_NO_RETURN, CLASS_NO_POSE, CLASS_TOO_NEAR, CLASS_TOO_FAR, CLASS_TOO_LOW, CLASS_TOO_HIGH = range(7)
+"""Classes of a reading; the window counts in its fate only."""
+
+
+class Limits(NamedTuple):
+    """What is kept of readings (m); infinite where there is no limit."""
+
+    range_min_m: float
+    range_max_m: float
+    height_min_m: float
+    """Of the map's heights."""
+    height_max_m: float
+    above_body_min_m: float
+    """Of heights above the body's origin."""
+    above_body_max_m: float
+
+
+class Georeference(NamedTuple):
+    """What places the readings of one sensor."""
+
+    mounting: tuple[float, ...]
+    """(12,) body from sensor, row by row, then the lever arm in body axes (m)."""
+    poses: PoseIntervals
+    charts: Charts
+    limits: Limits
+    quanta_per_m: float
+
+
+class Returns(NamedTuple):
+    """Readings with an epoch and a position each."""
+
+    epochs: npt.NDArray[np.int64]
+    """(n,) GPS ns of the pose that places each; ascending is fastest."""
+    x: npt.NDArray[np.floating]
+    """(n,) sensor frame, m; y and z alike."""
+    y: npt.NDArray[np.floating]
+    z: npt.NDArray[np.floating]
+
+
+class MirrorProfiles(NamedTuple):
+    """Profiles of a turning mirror, which measures one reading after another."""
+
+    epochs: npt.NDArray[np.int64]
+    """(n,) GPS ns of each profile's first reading."""
+    ranges: npt.NDArray[np.uint16]
+    """(n, m) raw, 0 no return."""
+    origins: npt.NDArray[np.float64]
+    """(m, 3) of the rays, sensor frame, m; x is 0 (``ScanGeometry.rays``)."""
+    directions: npt.NDArray[np.float64]
+    """(m, 3) unit vectors, sensor frame; x is 0."""
+    scale: tuple[float, float]
+    """Range of a raw 0 and step between raw ranges (m)."""
+    reading_period_ns: float
+    """From one reading of a profile to the next."""
+
+
+class Placed(NamedTuple):
+    """Places of readings on the map, written by kernels."""
+
+    east: npt.NDArray[np.float64]
+    """(n,) whole quanta, floor(metres · quanta_per_m + ½); of no meaning where the class is not CLASS_KEPT."""
+    north: npt.NDArray[np.float64]
+    """(n,) alike."""
+    height: npt.NDArray[np.float64]
+    """(n,) alike."""
+    classes: npt.NDArray[np.uint8]
+    """(n,) CLASS_KEPT, or why the reading is left out."""
+    intervals: npt.NDArray[np.int32]
+    """(n,) interval of the trajectory, −1 outside it."""
+
+
+class Window(NamedTuple):
+    """Tiles whose points are wanted."""
+
+    tile_quanta: int
+    """Edge of a tile."""
+    tiles: tuple[int, int, int, int]
+    """First column, first row, end column, end row; ends exclusive."""
+
+
+class Points(NamedTuple):
+    """Points of the readings that are kept and lie in the window, written by kernels one behind another."""
+
+    rows: npt.NDArray[np.int32]
+    """(n,) index of the return, or of the profile."""
+    readings: npt.NDArray[np.int32]
+    """(n,) index in the profile; not written for returns."""
+    tiles: npt.NDArray[np.int32]
+    """(n, 2) column and row."""
+    quanta: npt.NDArray[np.int32]
+    """(n, 3) x and y from the tile's south-west corner, and height."""
+    fates: npt.NDArray[np.int64]
+    """(≥ FATES,) in/out, counts of all readings by fate."""
+    classes: npt.NDArray[np.uint8]
+    """(n,) class of every reading, kept or not; or (0,) where not wanted."""
+
+
+@inlined
+def tile_and_rest(quanta, tile_quanta):
+    """Tile number of a coordinate (quanta, int64), and its quanta from the tile's edge.
+
+    A floored division without the slow instruction: multiply, then mend the last unit.
+    """
+    tile = np.int64(math.floor(quanta * (1.0 / tile_quanta)))
+    rest = quanta - tile * tile_quanta
+    if rest < 0:
+        tile -= 1
+        rest += tile_quanta
+    elif rest >= tile_quanta:
+        tile += 1
+        rest -= tile_quanta
+    return tile, rest
+
+
+@inlined
+def is_wanted(column, row, tiles):
+    """True for a tile inside a window; tiles : of :class:`Window`."""
+    return tiles[0] <= column < tiles[2] and tiles[1] <= row < tiles[3]
+
+
+@bare_inlined
+def write_point(made, row, column_and_x, row_and_y, height, out):
+    """Write point number `made` of the reading `row`; tile number and rest of either coordinate as tuples (quanta)."""
+    out.rows[made] = row
+    out.tiles[made, 0], out.quanta[made, 0] = column_and_x
+    out.tiles[made, 1], out.quanta[made, 1] = row_and_y
+    out.quanta[made, 2] = height

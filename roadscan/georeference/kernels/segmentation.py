@@ -1,0 +1,349 @@
+"""Which readings of a profile hit the road: histogram threshold, height, second derivative and angle, connection.
+
+The steps and how each is read are described in :mod:`roadscan.georeference.segmentation`. All of it happens in the plane of
+the profile, in the sensor's own axes: y across, *up* = −z.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roadscan.compute.kernel_options import inlined, inner, kernel
+from roadscan.georeference.kernels.carriageway import (
+    BIN,
+    CHORD,
+    CLASS_OFF_ROAD,
+    CLASS_SCATTERED,
+    GATE,
+    GRAZING,
+    NOISE_FACTOR,
+    SCATTER_FACTOR,
+    SCATTER_READINGS,
+    SHARE,
+    mark_off_road,
+)
+from roadscan.georeference.kernels.readings import CLASS_KEPT, CLASS_NO_RETURN, CLASS_TOO_FAR, CLASS_TOO_NEAR
+
+CLASS_ABOVE, CLASS_GRAZING = 9, 11
+"""Classes of readings that did not hit the road; 7 and 8 belong to passes and centre lines."""
+
+HYPOTHESES = 9
+"""Pieces of a profile whose lines are tried as the road's."""
+REFINEMENTS = 4
+SAMPLES = 256
+"""About so many readings of a profile are asked whether they agree with a line."""
+HISTOGRAM_REACH_M = 1.0
+"""Readings farther than this above or below the datum are not in the histogram."""
+FEWEST = 8
+"""Profiles with fewer returns have no road."""
+NOISE_SAMPLES = 100
+LEAST_NOISE_M = 1e-4
+"""Noise is not taken for smaller: ranges are rounded, too."""
+LEAST_DZ = 0.2
+"""Beams nearer to the horizontal have an error of height as if they fell by so much a metre."""
+
+
+@inner
+def profile_points(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up, index):
+    """Returns of one profile within the range limits, in the order of their readings.
+
+    Parameters
+    ----------
+    raw : (m,) uint16; y0, z0, dy, dz : (m,) float64, origins (m) and directions of the rays.
+    scale : (2,) tuple, range_offset_m, range_step_m; raw_limits : (2,) tuple of int64, lowest and highest that count.
+    classes : (m,) uint8, out; y, up : (m,) float64, out, m; index : (m,) int32, out, number of the reading.
+
+    Returns
+    -------
+    int, how many returns there are.
+    """
+    place_readings(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up)
+    n = 0
+    for j in range(raw.size):
+        y[n] = y[j]
+        up[n] = up[j]
+        index[n] = j
+        n += classes[j] == CLASS_KEPT
+    return n
+
+
+@inner
+def place_readings(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up):
+    """Class and place (m,) of every reading; arguments of :func:`profile_points`. Alone, the loop vectorises."""
+    low, high = np.uint16(raw_limits[0]), np.uint16(raw_limits[1])
+    for j in range(raw.size):
+        distance = scale[0] + scale[1] * raw[j]
+        y[j] = y0[j] + distance * dy[j]
+        up[j] = -(z0[j] + distance * dz[j])
+        beyond = np.uint8(CLASS_TOO_NEAR) if raw[j] < low else np.uint8(CLASS_TOO_FAR)
+        kind = np.uint8(CLASS_KEPT) if (raw[j] >= low) & (raw[j] <= high) else beyond
+        classes[j] = kind if raw[j] else np.uint8(CLASS_NO_RETURN)
+
+
+@inlined
+def parabola_at(p, y):
+    """Value of a parabola (1, y, y²)."""
+    return p[0] + y * (p[1] + y * p[2])
+
+
+@kernel
+def fitted(y, up, first, end, stride, near, gate, bent):
+    """Least-squares line, or parabola where `bent`, through readings within `gate` (m) of the parabola `near`.
+
+    `near` is kept where too few readings or too short a piece determine nothing.
+    """
+    origin = near[3]
+    s0, s1, s2, s3, s4, t0, t1, t2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(first, end, stride):
+        x = y[j] - origin
+        w = 1.0 if abs(up[j] - parabola_at(near, x)) <= gate else 0.0
+        v = w * up[j]
+        x2 = x * x
+        s0 += w
+        s1 += w * x
+        s2 += w * x2
+        s3 += w * x2 * x
+        s4 += w * x2 * x2
+        t0 += v
+        t1 += v * x
+        t2 += v * x2
+    if s0 < 5.0:
+        return near
+    m1, m2, height = s1 / s0, s2 / s0, t0 / s0
+    a11 = m2 - m1 * m1
+    b1 = t1 / s0 - m1 * height
+    if a11 < 1e-6:
+        return near
+    if bent:
+        a12 = s3 / s0 - m1 * m2
+        a22 = s4 / s0 - m2 * m2
+        b2 = t2 / s0 - m2 * height
+        determinant = a11 * a22 - a12 * a12
+        if determinant > 1e-6 * a11 * a22:
+            p2 = (a11 * b2 - a12 * b1) / determinant
+            p1 = (b1 - a12 * p2) / a11
+            return (height - p1 * m1 - p2 * m2, p1, p2, origin)
+    p1 = b1 / a11
+    return (height - p1 * m1, p1, 0.0, origin)
+
+
+@inner
+def road_datum(y, up, gate):
+    """The road's own level in a profile: a parabola (1, y, y²; m) and the y that it counts from.
+
+    Lines through pieces of the profile are tried, that with most readings within `gate` (m) wins; a parabola is then
+    fitted to the readings near it, several times. So neither a car's side nor a pavement beside a kerb bends it.
+    """
+    n = y.size
+    stride = max(n // SAMPLES, 1)
+    best = (up[n // 2], 0.0, 0.0, y[n // 2])
+    most = -1.0
+    size = max(2 * n // HYPOTHESES, 5)
+    for piece in range(HYPOTHESES):
+        first = piece * max(n - size, 0) // (HYPOTHESES - 1)
+        end = min(first + size, n)
+        step = max((end - first) // 64, 1)
+        middle = (first + end) // 2
+        line = fitted(y, up, first, end, step, (up[middle], 0.0, 0.0, y[middle]), np.inf, False)
+        line = fitted(y, up, first, end, step, line, 2.0 * gate, False)
+        agree = 0.0
+        for j in range(0, n, stride):
+            off = (up[j] - parabola_at(line, y[j] - line[3])) / gate
+            agree += max(1.0 - off * off, 0.0)
+        if agree > most:
+            most, best = agree, line
+    for _ in range(REFINEMENTS):
+        best = fitted(y, up, 0, n, stride, best, 2.0 * gate, True)
+    return best
+
+
+@kernel
+def height_threshold(height, bin_m, share, counts):
+    """Step 1 of the segmentation: the threshold of the heights.
+
+    Parameters
+    ----------
+    height : (n,) float64, above the datum, m; counts : (b,) int32, scratch.
+
+    Returns
+    -------
+    float64, m.
+    """
+    bins = counts.size
+    for b in range(bins):
+        counts[b] = 0
+    low = -0.5 * bin_m * bins
+    for j in range(height.size):
+        b = np.floor((height[j] - low) / bin_m)
+        if 0.0 <= b < bins:
+            counts[np.int64(b)] += 1
+    # (i) the bin with the highest frequency is N
+    peak = 0
+    for b in range(bins):
+        if counts[b] > counts[peak]:
+            peak = b
+    # (ii) the last bin of the unbroken run above N with at least 40 % of N's count is N1
+    first = peak
+    while first + 1 < bins and counts[first + 1] >= share * counts[peak]:
+        first += 1
+    # (iii) the last bin of the unbroken run above N1 with at least 40 % of N1's count is N2
+    second = first
+    while second + 1 < bins and counts[second + 1] >= share * counts[first] and counts[second + 1] > 0:
+        second += 1
+    # Where in its bin the road's level lies is chance, so the peak may reach a bin's width beyond N2.
+    return low + (second + 2) * bin_m
+
+
+@inner
+def mark_above(height, threshold, kinds):
+    """Step 2: readings higher than the threshold."""
+    for j in range(height.size):
+        kinds[j] = CLASS_ABOVE if height[j] > threshold else CLASS_KEPT
+
+
+@inner
+def curvatures(y, up, bend):
+    """Step 3 (i): how far each reading stands above the line through its two neighbours (n,), m.
+
+    It is the second difference −z″ · (y₊ − y)(y − y₋) / 2: free of the spacing, which makes z″ itself incomparable.
+    """
+    n = y.size
+    bend[0] = 0.0
+    bend[n - 1] = 0.0
+    for j in range(1, n - 1):
+        span = y[j + 1] - y[j - 1]
+        share = (y[j] - y[j - 1]) / (span if span != 0.0 else 1.0)
+        inside = (share > 0.0) & (share < 1.0)
+        over = up[j] - (up[j - 1] + share * (up[j + 1] - up[j - 1]))
+        bend[j] = over if inside else 0.0
+
+
+@inner
+def range_noise(bend, index, dz, kinds, sample):
+    """Standard deviation of the ranges (m) as the profile itself shows it: from the median of :func:`curvatures`.
+
+    A range error e on level ground shifts the height by e · dz, and a second difference has 1.5 times the variance of a
+    height; the median of |x| is 0.6745 σ. Texture counts as noise, and objects of a few readings do not count.
+    sample : (s,) float64, scratch: so many readings, evenly through the profile.
+    """
+    n, most = bend.size, sample.size
+    stride = max(n // most, 1)
+    count = 0
+    for j in range(1, n - 1, stride):
+        if kinds[j] == CLASS_KEPT and bend[j] != 0.0 and count < most:
+            value = abs(bend[j]) / max(abs(dz[index[j]]), LEAST_DZ)
+            at = count
+            while at > 0 and sample[at - 1] > value:
+                sample[at] = sample[at - 1]
+                at -= 1
+            sample[at] = value
+            count += 1
+    if count < FEWEST:
+        return LEAST_NOISE_M
+    return max(sample[count // 2] / (0.6745 * np.sqrt(1.5)), LEAST_NOISE_M)
+
+
+@inner
+def mark_scattered(bend, index, dz, noise, factor, neighbours, sums, kinds):
+    """Step 3 (i): readings that stand out upwards, `factor` times more than the readings around them.
+
+    bend : (n,); sums : (n + 1,) scratch. The two readings beside one share it in their second differences and do
+    not count as neighbours. Large ones count no more than 10 σ, lest one hides another.
+    """
+    n = bend.size
+    sums[0] = 0.0
+    for j in range(n):
+        sums[j + 1] = sums[j] + min(abs(bend[j]), 10.0 * noise)
+    for j in range(1, n - 1):
+        own = noise * max(abs(dz[index[j]]), LEAST_DZ)
+        if kinds[j] == CLASS_KEPT and bend[j] > factor * own and bend[j] >= bend[j - 1] and bend[j] >= bend[j + 1]:
+            low, high = max(j - 1 - neighbours, 0), min(j + 2 + neighbours, n)
+            left, right = max(j - 1, low), min(j + 2, high)
+            count = (left - low) + (high - right)
+            around = (sums[left] - sums[low] + sums[high] - sums[right]) / max(count, 1)
+            if bend[j] > factor * around:
+                kinds[j] = CLASS_SCATTERED
+
+
+@inlined
+def is_grazing(y, up, j, k, beam_y, beam_up, sine):
+    """True where the chord from reading j to k makes a smaller angle with the beam than that of `sine`."""
+    a, b = y[k] - y[j], up[k] - up[j]
+    cross = a * beam_up - b * beam_y
+    return cross * cross < sine * sine * (a * a + b * b)
+
+
+@inlined
+def is_near(y, up, j, k, least):
+    """True where the readings j and k are less than √least (m) apart."""
+    a, b = y[k] - y[j], up[k] - up[j]
+    return a * a + b * b < least
+
+
+@inner
+def mark_grazing(y, up, index, dy, dz, sine, chord, kinds):
+    """Step 3 (ii): readings where beam and surface meet at less than the limit, seen from both sides.
+
+    The surface is the chord to the next reading at least `chord` (m) away on each side; dy, dz : (m,) rays.
+    """
+    n = y.size
+    least = chord * chord
+    after = 0
+    for j in range(n):
+        after = max(after, min(j + 1, n - 1))
+        while after + 1 < n and is_near(y, up, j, after, least):
+            after += 1
+        if kinds[j] != CLASS_KEPT:
+            continue
+        beam_y, beam_up = dy[index[j]], -dz[index[j]]
+        if j < n - 1 and not is_grazing(y, up, j, after, beam_y, beam_up, sine):
+            continue
+        before = max(j - 1, 0)
+        while before > 0 and is_near(y, up, j, before, least):
+            before -= 1
+        if j == 0 or is_grazing(y, up, j, before, beam_y, beam_up, sine):
+            kinds[j] = CLASS_GRAZING
+
+
+@kernel
+def segment_profiles(ranges, y0, z0, dy, dz, scale, raw_limits, settings, classes):
+    """Class of every reading of profiles; each profile is judged alone.
+
+    Parameters
+    ----------
+    ranges : (n, m) uint16, raw, 0 no return.
+    y0, z0, dy, dz : (m,) float64, y and z of the rays' origins (m) and directions, sensor frame.
+    scale : (2,) tuple, range_offset_m, range_step_m; raw_limits : (2,) tuple of int64, lowest and highest raw range.
+    settings : (13,) tuple of float64, see :data:`SETTINGS`.
+    classes : (n, m) uint8, out: CLASS_KEPT for the road, or why not.
+    """
+    m = ranges.shape[1]
+    y, up, height, bend, sums = np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(m + 1)
+    index, trail = np.empty(m, np.int32), np.empty(m, np.int32)
+    kinds, trial, best = np.empty(m, np.uint8), np.empty(m, np.uint8), np.empty(m, np.uint8)
+    counts = np.empty(np.int64(2.0 * HISTOGRAM_REACH_M / settings[BIN]) | 1, np.int32)
+    sample = np.empty(NOISE_SAMPLES)
+    sine = np.sin(settings[GRAZING])
+    for p in range(ranges.shape[0]):
+        n = profile_points(ranges[p], y0, z0, dy, dz, scale, raw_limits, classes[p], y, up, index)
+        if n < FEWEST:
+            for i in range(n):
+                classes[p, index[i]] = CLASS_OFF_ROAD
+            continue
+        datum = road_datum(y[:n], up[:n], settings[GATE])
+        for i in range(n):
+            height[i] = up[i] - parabola_at(datum, y[i] - datum[3])
+        threshold = height_threshold(height[:n], settings[BIN], settings[SHARE], counts)
+        mark_above(height[:n], threshold, kinds[:n])
+        curvatures(y[:n], up[:n], bend[:n])
+        noise = range_noise(bend[:n], index[:n], dz, kinds[:n], sample)
+        mark_scattered(
+            bend[:n], index[:n], dz, noise, settings[SCATTER_FACTOR], np.int64(settings[SCATTER_READINGS]),
+            sums[: n + 1], kinds[:n],
+        )  # fmt: skip
+        mark_grazing(y[:n], up[:n], index[:n], dy, dz, sine, settings[CHORD], kinds[:n])
+        for i in range(n):
+            bend[i] = settings[NOISE_FACTOR] * noise * max(abs(dz[index[i]]), LEAST_DZ)
+        mark_off_road(y[:n], up[:n], height[:n], bend[:n], settings, trail[:n], trial[:n], best[:n], kinds[:n])
+        for i in range(n):
+            classes[p, index[i]] = kinds[i]

@@ -1,0 +1,88 @@
+"""Points of readings with an epoch each: placed chunk by chunk, those wanted written one behind another."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roadscan.compute.kernel_options import bare_inner, kernel
+from roadscan.georeference.kernels.readings import (
+    CLASS_KEPT,
+    KEPT,
+    OUTSIDE,
+    Placed,
+    is_wanted,
+    tile_and_rest,
+    write_point,
+)
+from roadscan.georeference.kernels.timed_readings import CHUNK, place_mirror, place_returns
+
+
+@kernel
+def places(n):
+    """Arrays for the places of n readings."""
+    return Placed(np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.uint8), np.empty(n, np.int32))
+
+
+@bare_inner
+def keep_points(first, n, made, placed, window, out):
+    """Append the readings that are kept and lie in the window; write the classes of all where they are wanted.
+
+    Parameters
+    ----------
+    first : int64, number of the first reading; made : int64, points written before.
+    placed : Placed, of which the first n are the readings; window : Window; out : Points, rows of numbers of readings.
+
+    Returns
+    -------
+    int, how many points are written now.
+    """
+    if out.classes.size:
+        for i in range(n):
+            out.classes[first + i] = placed.classes[i]
+    for i in range(n):
+        if placed.classes[i] != CLASS_KEPT:
+            continue
+        across = tile_and_rest(np.int64(placed.east[i]), window.tile_quanta)
+        along = tile_and_rest(np.int64(placed.north[i]), window.tile_quanta)
+        if not is_wanted(across[0], along[0], window.tiles):
+            out.fates[OUTSIDE] += 1
+            continue
+        write_point(made, first + i, across, along, np.int64(placed.height[i]), out)
+        made += 1
+        out.fates[KEPT] += 1
+    return made
+
+
+@kernel
+def georeference_returns(returns, georeference, window, out):
+    """Place returns and write points of those in the window. Returns how many points were written.
+
+    returns : Returns; georeference : Georeference; window : Window; out : Points of as many rows as there are returns.
+    """
+    placed = places(CHUNK)
+    made = np.int64(0)
+    for start in range(0, returns.epochs.size, CHUNK):
+        end = min(start + CHUNK, returns.epochs.size)
+        place_returns(start, end, returns, georeference, placed, out.fates)
+        made = keep_points(start, end - start, made, placed, window, out)
+    return made
+
+
+@kernel
+def georeference_mirror(profiles, georeference, window, out):
+    """Place the readings of a mirror's profiles and write points of those in the window. Returns how many.
+
+    profiles : MirrorProfiles; others as in :func:`georeference_returns`, with a row of `out` for each reading.
+    """
+    m = profiles.ranges.shape[1]
+    at_once = max(CHUNK // m, 1)
+    placed = places(at_once * m)
+    made = np.int64(0)
+    for start in range(0, profiles.epochs.size, at_once):
+        end = min(start + at_once, profiles.epochs.size)
+        place_mirror(start, end, profiles, georeference, placed, out.fates)
+        made = keep_points(start * m, (end - start) * m, made, placed, window, out)
+    for i in range(made):
+        out.readings[i] = out.rows[i] % m
+        out.rows[i] //= m
+    return made

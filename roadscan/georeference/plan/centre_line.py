@@ -1,0 +1,124 @@
+"""The layer of centre lines that points are cut to: read once a process, widened line by line."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError
+from roadscan.core.survey import Survey
+from roadscan.formats.vectors.road_lines import (
+    LineLayer,
+    Lines,
+    Place,
+    RoadLines,
+    RoadLinesOptions,
+    place_in_map,
+    read_lines,
+    sidecars,
+)
+from roadscan.georeference.centre_line import CentreLineBuffer
+from roadscan.ingest.format import Reject
+from roadscan.store.store import file_digest
+
+BUFFER: Final = "buffer"
+CLASS: Final = "class"
+
+
+@dataclass(frozen=True)
+class CentreLines:
+    """Which layer points are cut to, and how far beside its lines. Sent to workers: it holds no data."""
+
+    path: Path
+    digests: tuple[str, ...]
+    """Content of the layer's files: a changed layer is another one."""
+    crs: str | None
+    width: str
+    """"buffer", "class", or the attribute with the road's width."""
+    buffer_m: float
+    margin_m: float
+    options: str
+    """Settings of the layer (JSON of ``RoadLinesOptions``)."""
+
+    @classmethod
+    def of(cls, survey: Survey) -> CentreLines | None:
+        """What the survey file states, None where points are not cut."""
+        stated = survey.config.filters
+        if stated.centre_line is None:
+            return None
+        path = survey.resolve(stated.centre_line)
+        if not path.is_file():
+            raise ConfigError("the centre-line layer does not exist", change="check filters.centre_line", file=path)
+        options = dict(stated.centre_line_options)
+        if stated.centre_line_width not in {BUFFER, CLASS}:
+            options["width_column"] = stated.centre_line_width
+        return cls(
+            path=path,
+            digests=tuple(file_digest(file) for file in (path, *sidecars(path))),
+            crs=stated.centre_line_crs,
+            width=stated.centre_line_width,
+            buffer_m=stated.centre_line_buffer_m,
+            margin_m=stated.centre_line_margin_m,
+            options=RoadLinesOptions.parse(options, file=path).model_dump_json(),
+        )
+
+    def key(self) -> list[object]:
+        """What shapes tiles; where the file lies does not."""
+        return [RoadLines.version, self.digests, self.crs, self.width, self.buffer_m, self.margin_m, self.options]
+
+
+@functools.lru_cache(maxsize=2)
+def load_buffer(stated: CentreLines, frame: MapFrame) -> CentreLineBuffer:
+    """Read the lines and find how far beside each points are kept.
+
+    Raises
+    ------
+    FormatError, ConfigError, CrsError
+        if the layer cannot be read as stated, if it has no line, or if a feature cannot be used: the road along it
+        would be cut away without a word.
+    """
+    options = RoadLinesOptions.model_validate_json(stated.options)
+    layer = LineLayer.of(stated.path, options, stated.crs)
+    if stated.width == CLASS and not layer.says_widths:
+        raise ConfigError(
+            "the layer of centre lines has no attribute with the road's class, lanes or width",
+            expected='such as MTFCC, for filters.centre_line_width = "class"',
+            change='name it in filters.centre_line_options, or keep "buffer"',
+            file=stated.path,
+        )
+    parts = _all_lines(layer, place_in_map(layer.crs, frame, stated.path), stated)
+    if not parts:
+        raise ConfigError("the layer has no centre lines", expected="at least one line", file=stated.path)
+    return CentreLineBuffer(
+        np.concatenate([part.shapes for part in parts]), np.concatenate([_half_widths_m(p, stated) for p in parts])
+    )
+
+
+def _all_lines(layer: LineLayer, place: Place, stated: CentreLines) -> list[Lines]:
+    """Every line of the layer; attributes that do not matter here are not read, so they cannot be at fault."""
+    needed: set[str] = set() if stated.width == BUFFER else {"class", "lanes", "width"}
+    plain = replace(layer, columns={what: name if what in needed else None for what, name in layer.columns.items()})
+    parts: list[Lines] = []
+    for item in read_lines(plain, place, need_widths=False):
+        if isinstance(item, Reject):
+            raise ConfigError(
+                f"feature {item.record} of the centre lines (counted from 0) cannot be used: {item.reason}",
+                expected="a line that lies in the map; without it, the road along it would be cut away",
+                change="mend the feature, or take it out of the layer",
+                file=stated.path,
+            )
+        parts.append(item)
+    return parts
+
+
+def _half_widths_m(lines: Lines, stated: CentreLines) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Distance (n,) kept beside each line (m)."""
+    if stated.width == BUFFER:
+        return np.full(lines.width_m.size, stated.buffer_m)
+    own = lines.width_m / 2 + stated.margin_m
+    return np.where(np.isnan(own), stated.buffer_m, own)

@@ -1,0 +1,313 @@
+"""The plan of a survey: sources of readings, ground, passes; everything a stage starts from."""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from roadscan.core.errors import ConfigError, RunError
+from roadscan.core.gpstime import iso_from_gps_ns, utc_from_gps_ns
+from roadscan.core.grid import TileGrid
+from roadscan.core.ids import LanePass, RunId, of_run
+from roadscan.core.rig import UNMOUNTED, Mounting, Mountings, Rig, Sensor
+from roadscan.core.survey import Survey
+from roadscan.georeference.place import HeightLimits
+from roadscan.georeference.plan.centre_line import CentreLines
+from roadscan.georeference.plan.corrections import KnownCorrections
+from roadscan.georeference.plan.road import check_road, road_of
+from roadscan.georeference.sources import Ground, RawSlice, ReadingSource, change_of, load_mountings
+from roadscan.ingest.format import log_formats
+from roadscan.ingest.ingest import DATA_TABLES
+from roadscan.ingest.one_stamp import one_stamp_logs
+from roadscan.ingest.overlap import Fault, NothingPlacedError, apart_logs
+from roadscan.ingest.same_content import same_points
+from roadscan.navigation.tasks.clocks import load_clocks
+from roadscan.navigation.tasks.navigate import records_of, records_with_trajectories
+from roadscan.navigation.tasks.trajectories import TrajectorySource
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import grid_key, key_of
+from roadscan.run.session import Session, found_once
+from roadscan.store.logs import NAVIGATION, DataFile, LogRecord
+from roadscan.store.store import Store
+
+DatedMountings: TypeAlias = Mapping[tuple[str, str], Sequence[tuple[int, Mounting]]]
+"""Calibrated mountings by run ('*' for all) and sensor, with the epochs from which they hold, ascending."""
+
+_SAME_MOUNTING = 1e-3
+"""Mountings that differ by less (m, or in the rotation's elements) are one."""
+
+
+@dataclass(frozen=True)
+class SurveyPlan:
+    """What stages after ingest know of a survey."""
+
+    survey: Survey
+    store: Store
+    records: tuple[LogRecord, ...]
+    ground: Ground
+    sources: tuple[tuple[ReadingSource, tuple[DataFile, ...]], ...]
+    """Each sensor's readings in each run, with their data files."""
+    passes: tuple[LanePass, ...]
+    centre_lines: CentreLines | None
+    """Layer that points are cut to."""
+    tile_key: str
+    """Hash of all that shapes any tile, beside its readings."""
+    apart: tuple[Fault, ...] = ()
+    """Logs that do not overlap the poses of their run: none of their readings is a source."""
+    corrections: KnownCorrections = field(default_factory=lambda: KnownCorrections({}))
+    """Corrections of the poses that hold now."""
+
+    @property
+    def raw_bytes(self) -> int:
+        """Compressed bytes of all readings."""
+        return sum(f.bytes for _, files in self.sources for f in files)
+
+    @property
+    def date(self) -> dt.date:
+        """UTC date of the first reading."""
+        return utc_from_gps_ns(min(p.start_gps_ns for p in self.passes)).date()
+
+    def pass_key(self, run: str) -> list[object]:
+        """What makes a run's tiles stale when its passes change: ids, and the spans that the survey file states."""
+        stated = [(p.id, p.start, p.end) for p in self.survey.config.passes if p.run == run]
+        return list(stated) or [p.pass_id for p in self.passes if p.run == run]
+
+    def corrected_anew(self) -> SurveyPlan:
+        """The same with the corrections that the table holds now."""
+        corrections = KnownCorrections.load(self.store)
+        sources = tuple((_with_room(source, corrections), files) for source, files in self.sources)
+        return replace(self, sources=sources, corrections=corrections)
+
+    def slices(self) -> list[RawSlice]:
+        """All data files, whole."""
+        return [RawSlice.whole(source, f) for source, files in self.sources for f in files]
+
+
+def plan_survey(
+    survey: Survey, store: Store, calibrated: DatedMountings | None = None, records: Sequence[LogRecord] | None = None
+) -> SurveyPlan:
+    """Put together what the tables and the survey file say; reads no readings.
+
+    `calibrated` stand in for the table of mountings where they are given, `records` for those of the survey's logs and
+    trajectories.
+
+    Raises
+    ------
+    NothingToPlaceError
+        where no log of the survey is of a format that holds readings.
+    RunError
+        where a log is not ingested, a trajectory not computed, or logs of readings hold none.
+    """
+    records = tuple(records_with_trajectories(survey, store) if records is None else records)
+    survey = Survey(survey.config, _mounted_rig(survey.rig, records), survey.folder)
+    config = survey.config
+    f = config.filters
+    unlimited = float("inf")
+    heights = HeightLimits(
+        -unlimited if f.height_min_m is None else f.height_min_m,
+        unlimited if f.height_max_m is None else f.height_max_m,
+        -unlimited if f.above_body_min_m is None else f.above_body_min_m,
+        unlimited if f.above_body_max_m is None else f.above_body_max_m,
+    )
+    ground = Ground(
+        map=survey.frame(),
+        grid=TileGrid(config.tiles.size_m, config.tiles.cell_m),
+        heights=heights,
+        max_gap_s=config.navigation.max_gap_s,
+        marks=f.keep_marked,
+    )
+    known = load_mountings(store) if calibrated is None else calibrated
+    clocks = load_clocks(store)
+    apart = (*apart_logs(survey, records, clocks, estimated=True), *one_stamp_logs(records))
+    corrections = KnownCorrections.load(store)
+    copies = {later.key for first, later in same_points(records) if first.run == later.run}
+    used = [record for record in _without(records, apart) if record.key not in copies]
+    sources = tuple(_sources(survey, store, used, ground, known, corrections))
+    if not sources and apart and any(r.tables.get(t) for r in records for t in DATA_TABLES):
+        raise NothingPlacedError.of(apart)
+    if not sources:
+        if not any(yields_readings(r.format) for r in records):
+            raise NothingToPlaceError(
+                "nothing to place: the survey has no log of scans, returns or points",
+                change="add one where there should be; logs, trajectories and clocks are in their tables",
+            )
+        raise RunError(
+            "the survey has no readings", expected="at least one log of scans, returns or points with rows in it"
+        )
+    passes = tuple(_passes(survey, sources))
+    centre_lines = CentreLines.of(survey)
+    tile_key = key_of(
+        code_digest("roadscan.tiles.tasks.tiles:compute_tiles"),
+        config.tiles.cell_m,
+        config.tiles.cell_table,
+        None if centre_lines is None else centre_lines.key(),
+    )
+    return SurveyPlan(survey, store, records, ground, sources, passes, centre_lines, tile_key, apart, corrections)
+
+
+def _without(records: Sequence[LogRecord], faults: Sequence[Fault]) -> list[LogRecord]:
+    keys = {key for fault in faults for key in fault.keys}
+    return [record for record in records if record.key not in keys]
+
+
+class NothingToPlaceError(RunError):
+    """A survey without logs of readings, such as one of GNSS and IMU alone: no fault, but no tiles either."""
+
+
+def yields_readings(log_format: str) -> bool:
+    """Whether logs of a format (or computed trajectories, by what computes them) hold readings to place."""
+    known = log_formats().get(log_format)
+    return known is not None and not set(DATA_TABLES).isdisjoint(known.yields)
+
+
+def _mounted_rig(rig: Rig, records: Sequence[LogRecord]) -> Rig:
+    """The rig with what the logs say of the mounting of their sensors, where the rig file states none."""
+    sensors = dict(rig.sensors)
+    for name, sensor in rig.sensors.items():
+        own = [r for r in records if r.sensor == name and (r.tables.get("scans") or r.tables.get("returns"))]
+        mounted = {r.path: sensor.mounted_as(r.attributes.get("mounting", {})) for r in own}
+        first = next(iter(mounted.values()), sensor)
+        other = next((path for path, one in mounted.items() if not _mounted_alike(one, first)), None)
+        if other is not None:
+            raise ConfigError(
+                f"logs of the sensor '{name}' say different mountings: {next(iter(mounted))} and {other}",
+                expected="one mounting of a sensor",
+                change="give each log a sensor of its own, or state axes and lever_arm_body_m in the rig file",
+            )
+        sensors[name] = first
+    return rig.model_copy(update={"sensors": sensors})
+
+
+def _mounted_alike(one: Sensor, other: Sensor) -> bool:
+    pairs = zip(one.mounting().arrays(), other.mounting().arrays(), strict=True)
+    return all(np.allclose(a, b, rtol=0.0, atol=_SAME_MOUNTING) for a, b in pairs)
+
+
+def _sources(
+    survey: Survey,
+    store: Store,
+    records: Sequence[LogRecord],
+    ground: Ground,
+    calibrated: DatedMountings,
+    corrections: KnownCorrections,
+) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
+    clocks = load_clocks(store)
+    found: list[tuple[ReadingSource, tuple[DataFile, ...]]] = []
+    for record in records:
+        for table in DATA_TABLES:
+            files = record.tables.get(table, ())
+            if not files:
+                continue
+            trajectory = None if table == "cloud" else trajectory_source(record.run, records)
+            sensor = survey.rig.sensors.get(record.sensor)
+            nominal = sensor.mounting() if sensor else UNMOUNTED
+            mountings = mountings_of(record.run, record.sensor, nominal, calibrated)
+            clock = of_run(clocks, record.run, record.sensor)
+            geoid = survey.geoid(record.attributes.get("geoid"))
+            limits = (sensor.range_min_m, sensor.range_max_m) if sensor else (0.0, float("inf"))
+            key = key_of(
+                asdict(mountings),
+                None if clock is None else (clock.offset_s, clock.drift, clock.reference_gps_ns),
+                limits,
+                None if trajectory is None else [trajectory.world, [f.digest for f in trajectory.files]],
+                record.attributes,
+                survey.config.map.model_dump(mode="json"),
+                [grid_key(survey.geoid(survey.config.map.geoid)), grid_key(geoid)],
+                asdict(ground.heights),
+                ground.max_gap_s,
+                ground.grid.size_m,
+                ground.marks,
+                record.run,
+                record.sensor,
+            )
+            source = ReadingSource(
+                record.run, record.sensor, table, tuple(sorted(record.attributes.items())), trajectory, mountings,
+                *limits, key, clock, road_of(survey.config.segmentation, record.sensor, table, nominal), geoid=geoid,
+            )  # fmt: skip
+            found.append((_with_room(source, corrections), files))
+    check_road(survey.config.segmentation, [source for source, _ in found])
+    return found
+
+
+def _with_room(source: ReadingSource, corrections: KnownCorrections) -> ReadingSource:
+    """A source with the correction of its mounting, whose footprints leave room for corrections."""
+    if source.trajectory is None:
+        return source
+    change = change_of(corrections.mountings, source.run, source.sensor)
+    return replace(source, allowance=corrections.allowance(source.run, source.sensor), mounting_change=change)
+
+
+def mountings_of(run: str, sensor: str, nominal: Mounting, calibrated: DatedMountings) -> Mountings:
+    """The rig file's mounting of a sensor, until the first calibrated one of its run (or of all), and so on."""
+    dated = list(of_run(calibrated, run, sensor) or [])
+    if not dated or dated[0][0] > 0:
+        dated = [(0, nominal), *dated]
+    return Mountings(tuple(since for since, _ in dated), tuple(mounting for _, mounting in dated))
+
+
+def trajectory_source(run: str, records: Sequence[LogRecord]) -> TrajectorySource:
+    """Where the poses of a run lie, or :class:`ConfigError` where that is not one trajectory."""
+    own = [r for r in records if r.run == run and r.tables.get("trajectory")]
+    own = [r for r in own if r.sensor == NAVIGATION] or own  # what was computed stands in for what was logged
+    worlds = {r.attributes["world_frame"] for r in own}
+    if len(worlds) != 1:
+        raise ConfigError(
+            f"run '{run}' has " + ("no trajectory" if not worlds else "trajectories in different world frames"),
+            expected="one trajectory log, or several in one datum; or logs of GNSS and IMU with navigation.solve",
+        )
+    files = tuple(f for r in own for f in r.tables["trajectory"])
+    return TrajectorySource(run, worlds.pop(), files)
+
+
+def empty_passes(plan: SurveyPlan) -> list[tuple[str, str]]:
+    """Passes during which no log has readings, and why that is so."""
+    spans = _run_spans(plan.sources)
+    found: list[tuple[str, str]] = []
+    for one in plan.passes:
+        own, run = (one.start_gps_ns, one.end_gps_ns), spans[one.run]
+        if own[1] <= run[0] or own[0] > run[1]:
+            (start, end), (first, last) = (map(iso_from_gps_ns, span) for span in (own, run))
+            reason = (
+                f"it lasts from {start} to {end}, the readings of run '{one.run}' from {first} to {last}: "
+                "none is of the pass; correct its start and end (their zone, too)"
+            )
+            found.append((f"pass {one.pass_id}", reason))
+    return found
+
+
+def _passes(
+    survey: Survey, sources: Sequence[tuple[ReadingSource, tuple[DataFile, ...]]]
+) -> list[LanePass]:  # fmt: skip
+    return survey.passes(_run_spans(sources))
+
+
+def _run_spans(
+    sources: Sequence[tuple[ReadingSource, tuple[DataFile, ...]]]
+) -> dict[RunId, tuple[int, int]]:  # fmt: skip
+    """First and last epoch (GPS ns) of the readings of each run."""
+    spans: dict[RunId, tuple[int, int]] = {}
+    for source, files in sources:
+        run = RunId(source.run)
+        for span in (f.span for f in files):
+            if span is not None:
+                ((first, last),) = source.spans([span])
+                before = spans.get(run, (first, last))
+                spans[run] = (min(before[0], first), max(before[1], last + _profile_ns(source)))
+    return spans
+
+
+def _profile_ns(source: ReadingSource) -> int:
+    """Time from a profile's epoch to that of its last reading (ns)."""
+    geometry = source.attribute.get("scan_geometry", {})
+    return math.ceil(float(geometry.get("reading_period_ns", 0.0)) * int(geometry.get("readings", 1)))
+
+
+@found_once
+def plan_of(session: Session) -> SurveyPlan:
+    """What places the readings: sources, ground, passes."""
+    return plan_survey(session.survey, session.store, records=records_of(session))

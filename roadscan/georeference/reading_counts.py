@@ -1,0 +1,124 @@
+"""What became of readings, told with the tiles: each row group's readings with one of the tiles that it touches."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.ids import TileId
+from roadscan.core.witness import Finding, Witness
+from roadscan.georeference.kernels.readings import KEPT, OUTSIDE
+from roadscan.georeference.place import COUNTED_FATES, FATE_NAMES
+from roadscan.store.logs import LogRecord, log_of
+from roadscan.store.manifest import OutputRecord
+
+_MOST_NOTED: Final = 10
+"""Logs that are named."""
+
+
+class Fates:
+    """Readings by fate of the row groups of a task, by the tile that tells them and by log."""
+
+    def __init__(self) -> None:
+        self._counts: dict[TileId, dict[str, npt.NDArray[np.int64]]] = defaultdict(
+            lambda: defaultdict(lambda: np.zeros(COUNTED_FATES, np.int64))
+        )
+
+    def add(self, tile: TileId, file: str, fates: npt.NDArray[np.int64]) -> None:
+        """Count (11,) readings of a log's file by fate; those placed outside the task's tiles are kept ones, too."""
+        self._counts[tile][log_of(file)] += fates
+
+    def of(self, tile: TileId) -> dict[str, dict[str, int]]:
+        """Figures for the tile's record: by the key of the log."""
+        return {log: _counts(fates) for log, fates in sorted(self._counts.get(tile, {}).items())}
+
+
+def _counts(fates: npt.NDArray[np.int64]) -> dict[str, int]:
+    counts = fates.copy()
+    counts[KEPT] += counts[OUTSIDE]
+    counts[OUTSIDE] = 0
+    return {name: int(n) for name, n in zip(FATE_NAMES[:COUNTED_FATES], counts, strict=True) if n}
+
+
+def told_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
+    """Readings by fate over the records of tiles and footprints, by the key of their log.
+
+    Footprints tell of clouds, which are placed for these, and of row groups that touch no tile. Tiles of older versions
+    do not say which log it was; theirs stand under "".
+    """
+    logs: dict[str, dict[str, int]] = defaultdict(lambda: dict.fromkeys(FATE_NAMES, 0))
+    for record in records:
+        figures: dict[str, Any] = record.figures().get("fates", {})
+        is_by_log = all(isinstance(own, dict) for own in figures.values())
+        for log, fates in figures.items() if is_by_log else ((log_of(record.unit), figures),):
+            for name, count in fates.items():
+                logs[log][name] += count
+    return {log: {name: count for name, count in fates.items() if count} for log, fates in sorted(logs.items())}
+
+
+def told(records: Iterable[OutputRecord]) -> dict[str, int]:
+    """The same of all logs together."""
+    return of_all(told_by_log(records))
+
+
+def of_all(logs: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
+    """Readings by fate, of all logs together."""
+    totals = dict.fromkeys(FATE_NAMES, 0)
+    for fates in logs.values():
+        for name, count in fates.items():
+            totals[name] += count
+    return {name: count for name, count in totals.items() if count}
+
+
+FATE_WORDS: Final = {
+    "no_pose": "have no pose (the trajectory has a gap there, or navigation.max_gap_s is too short)",
+    "range": "lie outside range_min_m and range_max_m of their sensor",
+    "height": "lie outside the heights of [filters]",
+    "no_return": "have no return",
+    "outside_pass": "lie outside all passes",
+    "centre_line": "lie off the centre lines of filters.centre_line",
+}
+"""What became of readings that were not kept, in words."""
+
+
+def fate_words(fates: Mapping[str, int]) -> str:
+    """What became of readings that were not kept, the largest number first."""
+    lost = sorted(((n, c) for n, c in fates.items() if c and n not in {"kept", "outside"}), key=lambda one: -one[1])
+    return "; ".join(f"{count:,} {FATE_WORDS.get(name, f'are {name}')}" for name, count in lost)
+
+
+NO_POSE: Final = Witness(
+    "no_pose",
+    input="lidar, profiler",
+    fault="Readings were taken when the run has no pose: a gap, or a clock that is off.",
+    asks="the trajectory at each reading's epoch",
+    does="such a reading is left out and counted; where they are more than checks.lost_share, the log is named",
+    told=("findings",),
+)
+
+
+def lost_findings(
+    logs: Mapping[str, Mapping[str, int]], records: Iterable[LogRecord], share: float
+) -> list[Finding]:  # fmt: skip
+    """Logs of which more than a share of the readings has no pose.
+
+    Parameters
+    ----------
+    logs : readings by fate, by the key of their log.
+    records : of the logs.
+    """
+    found: list[Finding] = []
+    for record in records:
+        fates = logs.get(record.key, {})
+        readings, lost = sum(fates.values()), fates.get("no_pose", 0)
+        if readings and lost > share * readings:
+            words = f"{lost:,} of {readings:,} readings ({lost / readings:.0%}) {FATE_WORDS['no_pose']}"
+            found.append(NO_POSE.finds(record.path, words, lost))
+    if more := found[_MOST_NOTED:]:
+        words = "as many readings of each of these, too, have no pose"
+        found[_MOST_NOTED:] = [NO_POSE.finds(f"{len(more):,} more logs", words, sum(one.left_out for one in more))]
+    return found

@@ -19,7 +19,7 @@ from roadscan.core.gpstime import NS_PER_S, WEEK_S
 from roadscan.core.imu import IMU_GRADES
 from roadscan.core.rig import Mounting, Rig
 from roadscan.navigation.inertial.readings import ImuReadings
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.simulate import Scene, simulate
 
 HEADINGS_DEG = (0.0, 90.0, 180.0, 270.0)

@@ -17,7 +17,7 @@ from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.place import HeightLimits, Placement
 from roadscan.georeference.reach import RangeSpans, Reach
-from roadscan.navigation.trajectory import Trajectory, world_from_ned
+from roadscan.poses.trajectory import Trajectory, world_from_ned
 
 SECONDS = 10.0
 TILE_QUANTA = 1_000_000

@@ -23,7 +23,7 @@ from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.kernels.readings import FATES, Placed, Returns
 from roadscan.georeference.kernels.timed_readings import CHUNK, place_returns
 from roadscan.georeference.place import EVERYWHERE, HeightLimits, Placement
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.tiles.statistics import cells_of
 
 N = 4_000_000

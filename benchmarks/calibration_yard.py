@@ -18,7 +18,7 @@ from roadscan.calibrate.surfaces.readings import Pieces, Readings
 from roadscan.calibrate.unknowns import Prior, mounting_of
 from roadscan.core.imu import IMU_GRADES
 from roadscan.core.rig import Mounting, Rig
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.simulate import Scene, simulate
 from roadscan.simulate.caster import World, ray_key
 from roadscan.simulate.drive import Drive, drives_of

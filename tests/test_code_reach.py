@@ -158,10 +158,10 @@ def test_the_tiles_reach_what_shapes_them_and_no_settings_of_other_stages() -> N
     reached = reached_code(["roadscan.tiles.tasks.tiles:compute_tiles"])
     modules = {place.partition(":")[0] for place in reached}
     assert {
-        "roadscan.navigation.trajectory:Corrections",
+        "roadscan.poses.trajectory:Corrections",
         "roadscan.georeference.charts:Charts",
     } <= reached.keys()
-    assert {"roadscan.navigation.clocks.correction", "roadscan.tiles.cells", "roadscan.core.crs"} <= modules
+    assert {"roadscan.ingest.clocks.correction", "roadscan.tiles.cells", "roadscan.core.crs"} <= modules
     rooms = ("inspect", "simulate", "surfaces", "condition", "assets", "adjust", "cli", "products.hillshade")
     assert not [m for m in modules if m.startswith(tuple(f"roadscan.{room}" for room in rooms))]
     assert not [

@@ -16,7 +16,7 @@ import pytest
 SCRIPT = """
 import sys
 import numpy as np
-from roadscan.navigation.kernels.poses import slope_weights
+from roadscan.poses.kernels.poses import slope_weights
 print("ready", flush=True)
 sys.stdin.readline()
 times, weights = np.array([0.0, 1.0, 2.0]), np.zeros(3)

@@ -97,7 +97,7 @@ def test_a_poisoned_cache_is_not_run(tmp_path: Path) -> None:
     """What another user put there would be executed: it is, where the folder is trusted, so the test bites."""
     base = tmp_path / "shared"
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(base)}
-    ask = "import numpy as np; from roadscan.navigation.kernels.poses import slope_weights; "
+    ask = "import numpy as np; from roadscan.poses.kernels.poses import slope_weights; "
     ask += "slope_weights(np.array([0.0, 1.0, 2.0]), 1.0, np.zeros(3))"
 
     def computed() -> subprocess.CompletedProcess[str]:

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import survey_records
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.store.store import Store
 
 SURVEY_FILE = Path("two_pass.toml")

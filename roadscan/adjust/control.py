@@ -19,8 +19,8 @@ from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Shape, SurveyedLine
 from roadscan.adjust.targets.values import ExpectedTarget, HeightFind, TargetFind, TargetReadings
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.navigation.mounting_change import MountingChange, Seat
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.mounting_change import MountingChange, Seat
+from roadscan.poses.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -19,7 +19,7 @@ from roadscan.adjust.control import Sighting
 from roadscan.adjust.control_test import quantile
 from roadscan.adjust.patches import level_from_map
 from roadscan.core.errors import ConfigError
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -24,7 +24,7 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.navigation.mounting_change import Seat
+from roadscan.poses.mounting_change import Seat
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.observations import Observations
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

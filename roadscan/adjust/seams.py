@@ -11,8 +11,8 @@ import numpy.typing as npt
 from roadscan.adjust.patches import PassReadings, Patch, map_from_level, patch_of
 from roadscan.adjust.places import Place
 from roadscan.core.settings.tie_settings import TieSettings
-from roadscan.navigation.mounting_change import MountingChange, Seat
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.mounting_change import MountingChange, Seat
+from roadscan.poses.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
 

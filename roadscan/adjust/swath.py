@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.level import LevelPoses
+from roadscan.poses.level import LevelPoses
 
 Float64 = npt.NDArray[np.float64]
 

@@ -36,7 +36,7 @@ from roadscan.core.imu import ImuErrors
 from roadscan.core.rig import Mounting
 from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, gravity_ecef
 from roadscan.navigation.inertial.readings import ImuReadings
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -20,8 +20,6 @@ from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
-from roadscan.strips.findings import strip_findings
-from roadscan.strips.work import compare_strips
 
 
 def faults_of_plan(session: Session) -> list[tuple[str, str]]:
@@ -46,7 +44,6 @@ class Footprints(Stage):
         found = index_footprints(plan, manifest, session.compute, session.bar(self.name))
         session.forget(footprints_of)
         found += check_tick_clocks(plan, manifest, session.compute, session.bar("clocks by ticks"))
-        found += compare_strips(session, manifest)
         session.failed(self.name, [*found, *unplaced_logs(plan, manifest)])
 
     def state(self, session: Session) -> StageState:
@@ -65,8 +62,8 @@ class Footprints(Stage):
         return state
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """Clocks that wheel ticks and poses contradict, and sensors that the others contradict."""
-        return [*tick_findings(records, manifest), *strip_findings(records, manifest)]
+        """Clocks that wheel ticks and poses contradict."""
+        return tick_findings(records, manifest)
 
     def folders(self) -> Sequence[str]:
         """One file a data file."""

@@ -7,7 +7,7 @@ from roadscan.core.rig import Mounting
 from roadscan.georeference.charts import Charts
 from roadscan.georeference.kernels import charts as kernels
 from roadscan.georeference.kernels.readings import Georeference, Limits
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 
 def georeference_of(mounting: Mounting, trajectory: Trajectory, charts: Charts, limits: Limits) -> Georeference:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import MapFrame
-from roadscan.navigation.trajectory import world_from_ned
+from roadscan.poses.trajectory import world_from_ned
 
 Float64 = npt.NDArray[np.float64]
 

@@ -35,7 +35,7 @@ from roadscan.georeference.kernels.flat_profiles import georeference_flat_profil
 from roadscan.georeference.kernels.readings import FATES, Georeference, Limits, MirrorProfiles, Points, Returns
 from roadscan.georeference.kernels.timed_points import georeference_mirror, georeference_returns
 from roadscan.georeference.road_profiles import RoadFinder, RoadProfiles
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]

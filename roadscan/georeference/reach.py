@@ -18,8 +18,8 @@ from roadscan.georeference.georeference import georeference_of
 from roadscan.georeference.kernels.block_ranges import block_ranges
 from roadscan.georeference.kernels.reach import SpannedProfiles, reach_of_profiles, reach_of_returns
 from roadscan.georeference.kernels.readings import Georeference, Limits
-from roadscan.navigation.movement import NO_CORRECTION, Allowance
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.movement import NO_CORRECTION, Allowance
+from roadscan.poses.trajectory import Trajectory
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -17,7 +17,7 @@ from roadscan.georeference.kernels.road_ranges import keep_road
 from roadscan.georeference.range_filter import kept_in_turns
 from roadscan.georeference.segmentation import segmented
 from roadscan.georeference.turns import turn_limits
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 Int64 = npt.NDArray[np.int64]
 UInt8 = npt.NDArray[np.uint8]

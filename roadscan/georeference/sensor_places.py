@@ -11,7 +11,7 @@ from roadscan.compute.kernel_options import read_only
 from roadscan.core.crs import MapFrame
 from roadscan.core.rig import Mountings
 from roadscan.georeference.kernels.tick_places import between_ticks
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -33,11 +33,11 @@ from roadscan.georeference.place import (
 )
 from roadscan.georeference.road_profiles import RoadFinder
 from roadscan.georeference.turns import TICK_NS, WINDOW_NS
-from roadscan.navigation.clocks import ClockCorrection
-from roadscan.navigation.mounting_change import MountingChange
-from roadscan.navigation.movement import NO_CORRECTION, Allowance
+from roadscan.ingest.clocks.correction import ClockCorrection
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, load_trajectory
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.mounting_change import MountingChange
+from roadscan.poses.movement import NO_CORRECTION, Allowance
+from roadscan.poses.trajectory import Trajectory
 from roadscan.store.group_reader import read_groups
 from roadscan.store.held import read_held
 from roadscan.store.logs import DataFile

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from roadscan.core.settings.segmentation import RangeFilter
 from roadscan.georeference.range_filter import limits_of_turns
-from roadscan.navigation.trajectory import Poses, Trajectory
+from roadscan.poses.trajectory import Poses, Trajectory
 
 TICK_NS: Final = 10_000_000
 WINDOW_NS: Final = 200 * TICK_NS

@@ -18,7 +18,7 @@ from roadscan.ingest.log_check import LogCheck, Refuses
 from roadscan.ingest.motion_checks import MotionCheck
 from roadscan.ingest.overlap import reject_words
 from roadscan.ingest.place_checks import PLACED, place_faults
-from roadscan.ingest.planned_logs import Logs, PlannedLog, plan_logs
+from roadscan.ingest.planned_logs import Logs, PlannedLog, logs_of, plan_logs
 from roadscan.ingest.pose_checks import PoseRecords
 from roadscan.ingest.reading.future_times import FutureTimes
 from roadscan.ingest.repeated_profiles import RepeatedProfiles
@@ -26,6 +26,7 @@ from roadscan.ingest.resolution import resolution_findings
 from roadscan.ingest.sources import stamp_of
 from roadscan.ingest.stray_points import CloudPoints
 from roadscan.run.engine.compute import Compute, Done, Inline
+from roadscan.run.session import Session, found_once
 from roadscan.store.logs import (
     DataFile,
     LogRecord,
@@ -198,6 +199,12 @@ def survey_records(survey: Survey, store: Store, logs: Logs | None = None) -> li
             change="run `roadscan ingest` (or `roadscan run`) first",
         )
     return read_log_records(store, [p.key for p in planned])
+
+
+@found_once
+def ingested_of(session: Session) -> list[LogRecord]:
+    """Records of the survey file's logs (:func:`survey_records`)."""
+    return survey_records(session.survey, session.store, logs_of(session))
 
 
 def _tasks(store: Store, logs: Sequence[PlannedLog], listed: frozenset[str], held: frozenset[str]) -> list[IngestTask]:

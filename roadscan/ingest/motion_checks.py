@@ -16,7 +16,7 @@ from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.format import LogHeader
 from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.pose_checks import POSES, PoseRecords, pose_track
-from roadscan.navigation.pose_motion import PoseMotion, Same
+from roadscan.poses.motion import PoseMotion, Same
 from roadscan.store.writer import LogWriter
 
 Int64 = npt.NDArray[np.int64]

@@ -30,7 +30,7 @@ from roadscan.core.gpstime import (
 from roadscan.core.ids import of_run
 from roadscan.core.survey import ClockConfig, Survey
 from roadscan.core.witness import Finding, Witness
-from roadscan.navigation.clocks import ClockCorrection
+from roadscan.ingest.clocks.correction import ClockCorrection
 from roadscan.store.logs import NAVIGATION, LogRecord
 
 Span = tuple[int, int]

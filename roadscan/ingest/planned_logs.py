@@ -12,7 +12,7 @@ from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
 from roadscan.core.strict import Strict
 from roadscan.core.survey import ControlConfig, LogConfig, Survey
-from roadscan.ingest.clock_pairs import log_clock
+from roadscan.ingest.clocks.stated_pairs import log_clock
 from roadscan.ingest.format import LogFormat, LogSource, SourceDefaults
 from roadscan.ingest.place_checks import PLACED
 from roadscan.ingest.place_checks import VERSION as PLACE_CHECKS

@@ -24,8 +24,8 @@ from roadscan.ingest.format import LogHeader, Rows
 from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.place_checks import NO_FIX, without_fix
 from roadscan.ingest.reading.gnss import ned_from_ecef
-from roadscan.navigation.leaps import Leaps, PoseTrack, Stall, Step, find_leaps
-from roadscan.navigation.pose_motion import frozen
+from roadscan.poses.leaps import Leaps, PoseTrack, Stall, Step, find_leaps
+from roadscan.poses.motion import frozen
 from roadscan.store.writer import LogWriter
 
 Float64 = npt.NDArray[np.float64]

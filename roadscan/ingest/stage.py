@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
-from roadscan.ingest.ingest import DATA_TABLES, ingest, survey_records
+from roadscan.ingest.ingest import DATA_TABLES, ingest, ingested_of
 from roadscan.ingest.one_stamp import one_stamp_findings, one_stamp_logs
 from roadscan.ingest.overlap import (
     Fault,
@@ -18,15 +18,12 @@ from roadscan.ingest.overlap import (
 )
 from roadscan.ingest.planned_logs import logs_of
 from roadscan.ingest.same_content import same_content_findings
-from roadscan.navigation.tasks.navigate import records_of
+from roadscan.run.memory import BYTES_PER_READING, WORKER_BASE_BYTES
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord, has_log
 from roadscan.store.manifest import Manifest
 from roadscan.store.salvage import read_lost
-from roadscan.surface.tasks.surface_colours import check_cameras
-from roadscan.tiles.mosaics.products import wanted_products
-from roadscan.tiles.tasks.tile_work import BYTES_PER_READING, WORKER_BASE_BYTES
 
 
 class Ingest(Stage):
@@ -37,13 +34,11 @@ class Ingest(Stage):
 
     def run(self, session: Session) -> None:
         """Read the logs that the store does not hold."""
-        wanted_products(session.survey)  # a wrong name or option is told before a log is read
-        check_cameras(session.survey)
         try:
             ingest(session.survey, session.store, session.reporter.line, session.compute, logs_of(session))
         finally:
-            session.forget(records_of)
-        records = survey_records(session.survey, session.store, logs_of(session))
+            session.forget(ingested_of)
+        records = ingested_of(session)
         faults = [*_empty(session, records), *apart_logs(session.survey, records, {}, estimated=False)]
         faults += one_stamp_logs(records)
         has_readings = any(r.tables.get(table) for r in records for table in DATA_TABLES)
@@ -56,7 +51,7 @@ class Ingest(Stage):
         planned, unplanned = logs_of(session)
         waiting = [log for log in planned if not has_log(session.store, log.key)]
         if not waiting and not unplanned:
-            records = survey_records(session.survey, session.store, logs_of(session))
+            records = ingested_of(session)
             return StageState(len(planned), faults=[fault.told for fault in _empty(session, records)])
         most = session.survey.config.tiles.max_block_readings
         doing = {

@@ -33,7 +33,7 @@ from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.settings.smoothing import SplineConfig
 from roadscan.navigation.inertial.motion import ned_from_world
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

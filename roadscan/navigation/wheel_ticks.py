@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from roadscan.compute.robust import scatter_about
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.navigation.leaps import rotation_vectors
+from roadscan.poses.leaps import rotation_vectors
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.level import level_poses
 from roadscan.adjust.tasks.near import PlacedReadings, placed_readings
 from roadscan.compute.robust import scatter_about
 from roadscan.compute.ways import way_along
@@ -25,6 +24,7 @@ from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import Ground, Placer, RawSlice, geometry_of, read_rows
 from roadscan.navigation.tasks.pose_sigma import median_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
+from roadscan.poses.level import level_poses
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.fingerprint import key_of

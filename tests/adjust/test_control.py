@@ -14,7 +14,7 @@ from roadscan.adjust.places import Track
 from roadscan.adjust.publish import left_after
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.core.frames import rotation_from_rph
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections
 
 TARGETS = TargetSettings()
 SLOPE = (0.02, -0.03)

@@ -10,7 +10,7 @@ from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.helmert import helmert, rigid_fit
 from roadscan.core.errors import ConfigError
 from roadscan.core.frames import ENU_FROM_NED
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 TURN, SHIFT = Rotation.from_euler("ZYX", [40.0, -8.0, 170.0], degrees=True), np.array([310.0, -20.0, 4.0])
 POINTS = np.array([[0.0, 0.0, 0.0], [400.0, 0.0, 3.0], [0.0, 300.0, 1.0], [90.0, 40.0, 25.0], [400.0, 300.0, 9.0]])

@@ -7,10 +7,10 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from roadscan.adjust.level import LevelPoses, level_poses
 from roadscan.adjust.swath import swath_of
 from roadscan.core.crs import MapFrame, grid_convergence_rad
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.level import LevelPoses, level_poses
+from roadscan.poses.trajectory import Trajectory
 
 LON, LAT = 11.4, 48.2
 HEADING = np.radians([37.0, 37.5, 38.0, 38.5, 39.0])

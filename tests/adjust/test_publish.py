@@ -6,7 +6,7 @@ import numpy as np
 
 from roadscan.adjust.observations import FIXED, Observations
 from roadscan.adjust.publish import left_after, published
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections
 
 KNOTS = np.arange(5, dtype=np.int64) * 10**9
 

@@ -13,7 +13,7 @@ import pytest
 from roadscan.core.errors import RoadscanError
 from roadscan.core.frames import rotation_from_quaternion
 from roadscan.core.survey import Survey
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.run.session import Session
 from roadscan.simulate import Scene, simulate
 from roadscan.store.logs import NAVIGATION, read_log_records

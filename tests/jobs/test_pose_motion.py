@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 
 from docs.mistakes import FIRST_GPS_S
 from roadscan.cli import app
-from roadscan.navigation.leaps import PoseTrack
-from roadscan.navigation.pose_motion import PoseMotion
+from roadscan.poses.leaps import PoseTrack
+from roadscan.poses.motion import PoseMotion
 from tests.jobs.test_mistakes import changed, said
 from tests.jobs.test_tick_clocks import write_drive, write_ticks
 

@@ -29,7 +29,7 @@ from typer.testing import CliRunner
 import roadscan as rs
 from roadscan.cli import app
 from roadscan.ingest.pose_checks import pose_track
-from roadscan.navigation.leaps import find_leaps
+from roadscan.poses.leaps import find_leaps
 from tests.jobs.conftest import Simulated
 
 Float64 = npt.NDArray[np.float64]

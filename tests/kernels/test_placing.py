@@ -27,7 +27,7 @@ from roadscan.georeference.kernels.readings import (
     Returns,
 )
 from roadscan.georeference.kernels.timed_readings import STEP_NS, place_mirror, place_returns
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 START = 10**18
 WIDE = (0.0, 1e4, -1e5, 1e5, -1e5, 1e5)

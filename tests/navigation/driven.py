@@ -11,9 +11,9 @@ import pyarrow.csv as pa_csv
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.gpstime import TimeSystem
-from roadscan.navigation.clocks import ClockCorrection
+from roadscan.ingest.clocks.correction import ClockCorrection
 from roadscan.navigation.inertial.readings import ImuReadings, OdometerReadings
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.simulate import Scene
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth

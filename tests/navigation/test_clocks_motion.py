@@ -12,7 +12,7 @@ from roadscan.core.errors import NavigationError
 from roadscan.navigation.clocks.motion import MotionFit, clock_from_motion
 from roadscan.navigation.clocks.signals import driving, felt_by_encoder, felt_by_imu, turning, turning_of_imu
 from roadscan.navigation.inertial.readings import ImuReadings, OdometerReadings
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from tests.navigation.driven import Driven, scene_of
 
 CLOCK = {"offset_s": -1.2345, "drift_ppm": 37.0}

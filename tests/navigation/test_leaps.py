@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.navigation.leaps import PoseTrack, find_leaps, rotation_vectors
+from roadscan.poses.leaps import PoseTrack, find_leaps, rotation_vectors
 
 Float64 = npt.NDArray[np.float64]
 RATES_HZ = [1.0, 5.0, 10.0, 50.0, 100.0, 200.0]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.navigation.movement import NO_CORRECTION, Allowance, allowance_for
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.movement import NO_CORRECTION, Allowance, allowance_for
+from roadscan.poses.trajectory import Corrections
 
 
 def corrections(north_m: float, down_m: float, roll_rad: float) -> Corrections:

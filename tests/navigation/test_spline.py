@@ -17,7 +17,7 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.settings.smoothing import SmootherConfig, SplineConfig
 from roadscan.navigation.inertial.smoother import solve
 from roadscan.navigation.spline import Smoothed, smoothed
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.simulate import Scene
 from roadscan.simulate.drive import drives_of
 from roadscan.simulate.earth import Earth

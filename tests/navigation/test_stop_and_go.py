@@ -24,7 +24,7 @@ from roadscan.core.imu import IMU_GRADES
 from roadscan.core.rig import Mounting, Rig
 from roadscan.core.settings.calibration import CalibrationSettings
 from roadscan.navigation.inertial.readings import ImuReadings
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.simulate import Scene, simulate
 
 pytestmark = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="thousands of poses")

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.navigation.trajectory import Corrections, Trajectory
+from roadscan.poses.trajectory import Corrections, Trajectory
 
 
 def drive(times_s: np.ndarray) -> tuple[np.ndarray, Rotation]:

@@ -16,7 +16,7 @@ from roadscan.core.rig import Mountings, Sensor
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.place import EVERYWHERE, HeightLimits, Placement, Window, pass_numbers, passes_of
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 TILE_QUANTA = 1_000_000
 

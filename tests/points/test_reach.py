@@ -17,8 +17,8 @@ from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.place import HeightLimits, Placement
 from roadscan.georeference.reach import RangeSpans, Reach, Touched
-from roadscan.navigation.movement import Allowance
-from roadscan.navigation.trajectory import Corrections, Trajectory
+from roadscan.poses.movement import Allowance
+from roadscan.poses.trajectory import Corrections, Trajectory
 
 TILE_QUANTA = 100_000
 """Tiles of 1 m: many edges to get wrong."""

@@ -13,7 +13,7 @@ from roadscan.core.settings.segmentation import RangeFilter, RoadSegmentation
 from roadscan.georeference.classes import OVERLAPPING
 from roadscan.georeference.road_profiles import RoadFinder
 from roadscan.georeference.turns import WINDOW_NS, turn_limits
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 RADIUS_M, SPEED_M_PER_S, KNOT_NS = 6.0, 4.0, 5_000_000
 START = 1_400_000_000 * 10**9

@@ -61,7 +61,7 @@ from roadscan.core.settings.tie_settings import PlaceSettings
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.plan.road import road_key
-from roadscan.navigation.movement import largest
+from roadscan.poses.movement import largest
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.fingerprint import key_of

@@ -25,8 +25,8 @@ from roadscan.adjust.quality import (
 )
 from roadscan.adjust.tasks.solution import Evidence, Solution
 from roadscan.compute.ways import way_along
-from roadscan.navigation.mounting_change import MountingChange
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.mounting_change import MountingChange
+from roadscan.poses.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -23,7 +23,7 @@ from roadscan.core.settings.adjust import AdjustConfig
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import MOUNTING_COLUMNS, MountingChanges, key_of_row, mounting_change_of
-from roadscan.navigation.mounting_change import MountingChange, Seat
+from roadscan.poses.mounting_change import MountingChange, Seat
 from roadscan.store.held import held_path, read_held, write_held
 from roadscan.store.store import Store
 

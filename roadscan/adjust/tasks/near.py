@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.adjust.level import LevelPoses, level_poses
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Traverse
 from roadscan.core.grid import QUANTA_PER_M
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, EVERYWHERE, Placement
 from roadscan.georeference.sources import Ground, Placer, RawSlice, ReadingSource, geometry_of, read_rows
+from roadscan.poses.level import LevelPoses, level_poses
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
 

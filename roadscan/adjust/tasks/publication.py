@@ -12,7 +12,7 @@ from roadscan.adjust.observations import COMPONENTS
 from roadscan.adjust.publish import published
 from roadscan.core.settings.adjust import AdjustConfig
 from roadscan.navigation.tasks.trajectories import CORRECTION_SIGMAS, load_all_corrections
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections
 from roadscan.store.held import held_path, read_held, write_held
 from roadscan.store.store import Store
 

@@ -19,8 +19,8 @@ from roadscan.adjust.tasks.solution import Evidence, Solution
 from roadscan.adjust.tasks.tie_work import DIAGONAL, TieTask
 from roadscan.adjust.ties.tie import HEIGHT
 from roadscan.georeference.sources import MountingChanges, change_of
-from roadscan.navigation.mounting_change import MountingChange, Seat
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.mounting_change import MountingChange, Seat
+from roadscan.poses.trajectory import Corrections
 from roadscan.run.engine.compute import Compute, reason_of
 
 Float64 = npt.NDArray[np.float64]

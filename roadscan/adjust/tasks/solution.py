@@ -15,7 +15,6 @@ from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_heigh
 from roadscan.adjust.control_test import COMPONENTS as _AXES
 from roadscan.adjust.control_test import HEIGHT, PLACE
 from roadscan.adjust.helmert import RigidFit, rigid_fit
-from roadscan.adjust.level import level_poses
 from roadscan.adjust.observations import FIXED, MOUNTED, Observations
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of
@@ -50,10 +49,11 @@ from roadscan.core.settings.adjust import AdjustConfig, PosePriors
 from roadscan.core.settings.adjustment import AdjustmentSettings, ControlRules
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.navigation.mounting_change import NO_SEAT
 from roadscan.navigation.tasks.pose_sigma import stated_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.level import level_poses
+from roadscan.poses.mounting_change import NO_SEAT
+from roadscan.poses.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]

@@ -22,7 +22,7 @@ from roadscan.core.settings.tie_settings import TieSettings
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import Ground
-from roadscan.navigation.mounting_change import Seat
+from roadscan.poses.mounting_change import Seat
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded

@@ -28,7 +28,7 @@ from roadscan.core.settings.adjust import AdjustConfig
 from roadscan.core.settings.tie_settings import TieSettings
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections
 
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]

@@ -8,13 +8,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.level import LevelPoses, level_poses
 from roadscan.adjust.places import Track
 from roadscan.adjust.swath import Swath, swath_of
 from roadscan.adjust.tasks.near import PlacedReadings, Sources, placed_readings
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import Placer, RawSlice, ReadingSource, read_rows
 from roadscan.navigation.tasks.trajectories import load_recorded
+from roadscan.poses.level import LevelPoses, level_poses
 from roadscan.store.logs import DataFile
 
 Float64 = npt.NDArray[np.float64]

@@ -24,7 +24,7 @@ from roadscan.georeference.plan.centre_line import load_buffer
 from roadscan.georeference.sensor_places import sensor_places
 from roadscan.georeference.sources import Placer, RawSlice, ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.tiles.tasks.tile_plan import TileTask
 
 Float64 = npt.NDArray[np.float64]

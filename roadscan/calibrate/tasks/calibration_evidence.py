@@ -39,7 +39,7 @@ from roadscan.ingest.inspect.provisional import Stated, open_log
 from roadscan.navigation.tasks.navigation_logs import imu_readings
 from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
 from roadscan.navigation.tasks.trajectories import load_trajectory
-from roadscan.navigation.trajectory import world_from_ned
+from roadscan.poses.trajectory import world_from_ned
 
 Float64 = npt.NDArray[np.float64]
 

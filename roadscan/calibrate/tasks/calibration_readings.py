@@ -17,7 +17,7 @@ from roadscan.core.settings.calibration import Area
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import ReadingSource, geometry_of, read_rows
 from roadscan.navigation.tasks.trajectories import load_trajectory
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.store.logs import DataFile
 
 Float64 = npt.NDArray[np.float64]

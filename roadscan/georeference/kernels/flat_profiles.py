@@ -36,7 +36,7 @@ from roadscan.georeference.kernels.readings import (
     tile_and_rest,
     write_point,
 )
-from roadscan.navigation.kernels.poses import find_interval
+from roadscan.poses.kernels.poses import find_interval
 
 HALF = np.float32(0.5)
 

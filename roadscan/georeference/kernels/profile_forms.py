@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from roadscan.compute.kernel_options import inlined, kernel
 from roadscan.georeference.kernels.charts import box_of, chart_index, expansion, map_value
-from roadscan.navigation.kernels.poses import attitude_at, interval, position_at
+from roadscan.poses.kernels.poses import attitude_at, interval, position_at
 
 NO_FORMS = ((0.0,) * 6,) * 4
 """Forms of a reading without a pose."""

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from roadscan.compute.kernel_options import bare_inlined, inlined
 from roadscan.georeference.kernels.charts import Charts
-from roadscan.navigation.kernels.poses import PoseIntervals
+from roadscan.poses.kernels.poses import PoseIntervals
 
 KEPT, NO_POSE, RANGE, HEIGHT, OUTSIDE, NO_RETURN = 0, 1, 2, 3, 4, 5
 """Fates of a reading, the indices of the kernels' `fates` counters."""

@@ -35,7 +35,7 @@ from roadscan.georeference.kernels.readings import (
     Placed,
     Returns,
 )
-from roadscan.navigation.kernels.poses import attitude_at, find_interval, interval, position_at
+from roadscan.poses.kernels.poses import attitude_at, find_interval, interval, position_at
 
 STEP_NS = 5_000_000
 """Longest pose step: one an interval of a trajectory at 200 Hz."""

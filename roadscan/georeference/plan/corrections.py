@@ -15,9 +15,9 @@ from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.sources import MountingChanges, ReadingSource, change_of, load_mounting_changes
 from roadscan.georeference.turns import TICK_NS, WINDOW_NS
-from roadscan.navigation.movement import Allowance, allowance_for, largest
 from roadscan.navigation.tasks.trajectories import load_all_corrections
-from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections
+from roadscan.poses.movement import Allowance, allowance_for, largest
+from roadscan.poses.trajectory import STENCIL_KNOTS, Corrections
 from roadscan.store.store import Store
 
 Int64 = npt.NDArray[np.int64]

@@ -22,7 +22,7 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding
 from roadscan.ingest.format import Item, LogHeader, Reject, Rows
 from roadscan.ingest.reading.future_times import FutureTimes
-from roadscan.navigation.leaps import FASTEST_M_PER_S
+from roadscan.poses.leaps import FASTEST_M_PER_S
 from roadscan.store.schema import TableSchema, table_schema
 
 Float64 = npt.NDArray[np.float64]

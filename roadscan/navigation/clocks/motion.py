@@ -11,9 +11,9 @@ import numpy.typing as npt
 from roadscan.core.clock_evidence import Drift
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.navigation.clocks.correction import ClockCorrection, Residuals
+from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
+from roadscan.ingest.clocks.lines import Line, robust_line
 from roadscan.navigation.clocks.lag import STEP_S, Lag, coarse_lag
-from roadscan.navigation.clocks.lines import Line, robust_line
 from roadscan.navigation.clocks.signals import Felt, Motion
 from roadscan.navigation.clocks.windows import LEAST_SAMPLES, LEAST_WINDOWS, Lags, Windows
 

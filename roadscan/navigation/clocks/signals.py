@@ -16,7 +16,7 @@ from roadscan.core.errors import NavigationError
 from roadscan.core.frames import rotation_from_quaternion
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.inertial.readings import ImuReadings, OdometerReadings
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]

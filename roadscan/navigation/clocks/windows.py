@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from roadscan.navigation.clocks.lines import Line
+from roadscan.ingest.clocks.lines import Line
 from roadscan.navigation.clocks.signals import Felt, Motion
 
 Bool = npt.NDArray[np.bool_]

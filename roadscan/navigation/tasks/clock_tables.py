@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from roadscan.core.errors import DamagedError
-from roadscan.navigation.clocks import ClockCorrection, Residuals
+from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
 from roadscan.store.held import held_path, read_held, write_held
 from roadscan.store.store import Store
 

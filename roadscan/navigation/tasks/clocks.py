@@ -14,10 +14,10 @@ import pyarrow as pa
 from roadscan.core.clock_evidence import MotionEvidence
 from roadscan.core.errors import ConfigError, RoadscanError, RunError, nearest
 from roadscan.core.survey import LogConfig, Survey
-from roadscan.ingest.clock_pairs import log_pairs
+from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
+from roadscan.ingest.clocks.stated_pairs import log_pairs
 from roadscan.ingest.ingest import survey_records
 from roadscan.ingest.planned_logs import Logs
-from roadscan.navigation.clocks import ClockCorrection, Residuals
 from roadscan.navigation.clocks.motion import MotionFit, clock_from_motion
 from roadscan.navigation.clocks.picture import ClockPicture, draw_clock
 from roadscan.navigation.clocks.signals import (
@@ -40,7 +40,7 @@ from roadscan.navigation.tasks.clock_tables import (
 )
 from roadscan.navigation.tasks.navigation_logs import imu_readings, odometer_readings
 from roadscan.navigation.tasks.recorded_pictures import CLOCK_PICTURE, keep_file, picture_key, remove_others
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.group_reader import read_groups

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 
 from roadscan.core.errors import ConfigError, DamagedError, RoadscanError, RunError
 from roadscan.core.survey import Survey
-from roadscan.ingest.ingest import survey_records
-from roadscan.ingest.planned_logs import Logs, logs_of, plan_logs
+from roadscan.ingest.ingest import ingested_of, survey_records
+from roadscan.ingest.planned_logs import Logs, plan_logs
 from roadscan.navigation.tasks.computed_trajectory import PlannedTrajectory
 from roadscan.navigation.tasks.navigation_pictures import draw_trajectories
 from roadscan.navigation.tasks.solve_trajectory import plan_solutions
@@ -74,15 +74,17 @@ def navigate(
     return done
 
 
-def records_with_trajectories(survey: Survey, store: Store, logs: Logs | None = None) -> list[LogRecord]:
-    """Records of the survey file's logs and of the trajectories computed from them.
+def records_with_trajectories(
+    survey: Survey, store: Store, ingested: Sequence[LogRecord] | None = None
+) -> list[LogRecord]:
+    """Records of the survey file's logs (`ingested`, where they are known) and of the trajectories computed from them.
 
     Raises
     ------
     RunError
         where a log is not ingested, or a trajectory not computed from the logs as they are.
     """
-    records = survey_records(survey, store, logs)
+    records = survey_records(survey, store) if ingested is None else ingested
     planned = plan_trajectories(survey, store, records)
     missing = [p.run for p in planned if not has_log(store, p.key)]
     if missing:
@@ -154,4 +156,4 @@ def records_of(session: Session) -> tuple[LogRecord, ...]:
     RunError
         where one is missing.
     """
-    return tuple(records_with_trajectories(session.survey, session.store, logs_of(session)))
+    return tuple(records_with_trajectories(session.survey, session.store, ingested_of(session)))

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from roadscan.core.ids import of_run
 from roadscan.core.survey import Survey
-from roadscan.navigation.clocks import ClockCorrection
+from roadscan.ingest.clocks.correction import ClockCorrection
 from roadscan.navigation.inertial.adaptive import solve_adaptively
 from roadscan.navigation.inertial.checks import prepared
 from roadscan.navigation.inertial.outcome import check_outcome, warnings_of

@@ -13,7 +13,7 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
 from roadscan.navigation.spline import smoothed
 from roadscan.navigation.tasks.computed_trajectory import Computed, sigma_figures, trajectory_rows
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.group_reader import read_groups

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.navigation.trajectory import STENCIL_KNOTS, Corrections, Trajectory
+from roadscan.poses.trajectory import STENCIL_KNOTS, Corrections, Trajectory
 from roadscan.store.group_reader import read_groups
 from roadscan.store.held import read_held
 from roadscan.store.logs import DataFile

@@ -10,7 +10,7 @@ import numpy as np
 from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner
 from roadscan.georeference.kernels.flat_profiles import HALF, on_plane, planes_of
 from roadscan.georeference.kernels.readings import HEIGHT, KEPT, NO_POSE, NO_RETURN, OUTSIDE, RANGE
-from roadscan.navigation.kernels.poses import find_interval
+from roadscan.poses.kernels.poses import find_interval
 from roadscan.tiles.kernels.accumulate import NOWHERE, PIECE, Heights, accumulate
 
 

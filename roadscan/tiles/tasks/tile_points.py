@@ -19,7 +19,7 @@ from roadscan.georeference.place import EXTRA_COLUMNS, Placed, Window, passes_of
 from roadscan.georeference.plan.centre_line import load_buffer
 from roadscan.georeference.reading_counts import Fates
 from roadscan.georeference.sources import Ground, Placer, RawSlice, ReadingSource
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 from roadscan.tiles.accumulator import TileEvidence
 from roadscan.tiles.tasks.tile_plan import TileTask
 

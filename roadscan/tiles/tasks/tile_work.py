@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 from roadscan.core.ids import TileId
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of
+from roadscan.run.memory import BYTES_PER_READING, WORKER_BASE_BYTES
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
 from roadscan.surface.tasks.found_regions import searched_sources
@@ -19,11 +19,6 @@ from roadscan.tiles.mosaics.products import product_context, wanted_tile_product
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import tile_file_names
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, stale_tiles, tiles_of
-
-BYTES_PER_READING: Final = 100
-"""Memory of a worker per reading of its block, measured: points, sorting and one tile's products."""
-WORKER_BASE_BYTES: Final = 400 << 20
-"""Memory of a worker before its first block: Python and its libraries."""
 
 
 @dataclass(frozen=True)

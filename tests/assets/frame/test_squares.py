@@ -18,7 +18,7 @@ from roadscan.core.ids import TileId
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.settings.assets import AssetsConfig
 from roadscan.georeference.sensor_places import sensor_places
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 
 def test_squares_are_whole_tiles() -> None:

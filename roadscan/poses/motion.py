@@ -19,8 +19,8 @@ from roadscan.compute.robust import scatter_about
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.frames import rotation_from_quaternion, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.navigation.leaps import PoseTrack
-from roadscan.navigation.trajectory import Trajectory, world_from_ned
+from roadscan.poses.leaps import PoseTrack
+from roadscan.poses.trajectory import Trajectory, world_from_ned
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rph_from_rotation
-from roadscan.navigation.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

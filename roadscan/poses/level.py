@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import MapFrame
-from roadscan.navigation.trajectory import Poses, Trajectory, world_from_ned
+from roadscan.poses.trajectory import Poses, Trajectory, world_from_ned
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.navigation.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections
 
 _LEAST_SHIFT_M: Final = 0.05
 _LEAST_TURN_RAD: Final = 0.0005

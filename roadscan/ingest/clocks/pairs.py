@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from roadscan.core.clock_evidence import USUAL_DRIFT, Drift
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.navigation.clocks.correction import ClockCorrection, Residuals
-from roadscan.navigation.clocks.lines import Line, robust_line
+from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
+from roadscan.ingest.clocks.lines import Line, robust_line
 
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]

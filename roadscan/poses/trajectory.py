@@ -12,7 +12,7 @@ from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
-from roadscan.navigation.kernels.poses import COEFFICIENTS, PoseIntervals, interpolate, interval_coefficients
+from roadscan.poses.kernels.poses import COEFFICIENTS, PoseIntervals, interpolate, interval_coefficients
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

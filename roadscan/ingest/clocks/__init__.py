@@ -1,0 +1,1 @@
+"""Clocks of logs from pairs of stamps: lines through them, and corrections."""

@@ -1,0 +1,1 @@
+"""Poses at any epoch: trajectories, corrections of them, and what poses say of themselves."""

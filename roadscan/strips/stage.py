@@ -1,0 +1,30 @@
+"""Stage `strips`: strips of road as each sensor of each run saw them, held against one another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage
+from roadscan.store.logs import LogRecord
+from roadscan.store.manifest import Manifest
+from roadscan.strips.findings import strip_findings
+from roadscan.strips.work import compare_strips
+
+
+class Strips(Stage):
+    """It makes no product: what it finds is a doubt about a sensor, or nothing."""
+
+    name = "strips"
+    title = "what sensors saw of the same strips of road, held against one another"
+    after = ("footprints",)
+
+    def run(self, session: Session) -> None:
+        """Compare the strips that are not compared yet."""
+        session.failed(self.name, compare_strips(session, session.manifest))
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """Sensors that the others contradict, and those that see no road."""
+        return strip_findings(records, manifest)

@@ -41,8 +41,8 @@ from roadscan.formats.motion.nmea_writer import Fix, sentences
 from roadscan.formats.motion.ubx import HEADER, SOLUTION
 from roadscan.formats.scanners.psi_container import PsiContainer, PsiHeader, write_psi
 from roadscan.formats.scanners.sick_telegrams import encode_scans
-from roadscan.ingest.format import LogSource, Reject, format_named, log_formats
 from roadscan.ingest.ingest import ingest
+from roadscan.ingest.reading.format import LogSource, Reject, format_named, log_formats
 from roadscan.store.store import Store
 
 SBET_BAR = 5.0

@@ -30,9 +30,10 @@ from roadscan.run.engine.on_dask import OnDask
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.records import Packed, Row
 from roadscan.store.store import Store
-from roadscan.tiles.mosaics.products import OutputTask, make_products, product_context, wanted_tile_products
+from roadscan.tiles.mosaics.products import OutputTask, make_products
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, plan_tiles, stale_tiles
 from roadscan.tiles.tasks.tiles import TaskResult, compute_tiles, run_tasks
+from roadscan.tiles.tasks.wanted_products import product_context, wanted_tile_products
 
 _BAR_S = 120.0
 _Work: TypeAlias = Callable[[Any], Any]

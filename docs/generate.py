@@ -30,7 +30,7 @@ from pydantic.fields import FieldInfo
 from roadscan.assets.kind import AssetKind, asset_kinds
 from roadscan.core.strict import meanings
 from roadscan.core.witness import Witness, witnesses
-from roadscan.ingest.format import LogFormat, log_formats
+from roadscan.ingest.reading.format import LogFormat, log_formats
 from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.store.schema import TableSchema, schema_folder, schema_names, table_schema
 from roadscan.tiles.product import Product, SurfaceProduct, TileFiles, products

@@ -21,7 +21,7 @@ from benchmarks.same_grid import difference_m, pdal_pipeline, with_numpy, with_r
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.strict import load_toml
 from roadscan.core.survey import Survey
-from roadscan.ingest.format import LogSource, format_named, log_formats
+from roadscan.ingest.reading.format import LogSource, format_named, log_formats
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.store.manifest import Manifest

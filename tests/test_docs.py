@@ -31,7 +31,7 @@ from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
-from roadscan.ingest.format import LogSource, Reject, Rows, format_of, log_formats
+from roadscan.ingest.reading.format import LogSource, Reject, Rows, format_of, log_formats
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.asset_schema import _files, asset_schema, asset_tables

@@ -80,7 +80,7 @@ def surveys_for(incomplete: str) -> list[str]:
 
 def formats_for(incomplete: str) -> list[tuple[str, str]]:
     """Names of formats, with what they are."""
-    from roadscan.ingest.format import log_formats
+    from roadscan.ingest.reading.format import log_formats
 
     return [
         (name, textwrap.shorten(one.title, _HELP_WIDTH, placeholder="…"))

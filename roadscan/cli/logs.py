@@ -20,7 +20,7 @@ def list_formats(
 ) -> None:
     """Raw formats that can be read, and what they yield."""
     from roadscan.core.strict import meanings
-    from roadscan.ingest.format import format_named, log_formats
+    from roadscan.ingest.reading.format import format_named, log_formats
 
     if name is None:
         rows = [(n, ", ".join(f.yields), f.title) for n, f in log_formats().items()]

@@ -28,8 +28,8 @@ from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
-from roadscan.tiles.mosaics.products import product_context
 from roadscan.tiles.tasks.tiles import TaskResult
+from roadscan.tiles.tasks.wanted_products import product_context
 
 _PICTURES = 20
 """Pictures that a task draws."""

@@ -6,7 +6,6 @@ from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 from pydantic import Field, model_validator
 
 from roadscan.core.strict import Strict
@@ -70,14 +69,3 @@ class ScanGeometry(Strict):
             return epochs_gps_ns
         later_ns: Int64 = np.floor(reading * self.reading_period_ns + 0.5).astype(np.int64)
         return epochs_gps_ns + later_ns
-
-
-def farthest_m(batch: pa.RecordBatch, geometry: ScanGeometry | None) -> float:
-    """Farthest that a reading of rows of ``scans``, or without `geometry` of ``returns``, lies from its sensor (m)."""
-    if geometry is None:
-        xyz = [batch.column(f"{axis}_sensor_m").to_numpy(zero_copy_only=False).astype(np.float64) for axis in "xyz"]
-        return float(np.sqrt(sum(x * x for x in xyz)).max(initial=0.0))
-    raw = int(batch.column("range").flatten().to_numpy(zero_copy_only=False).max(initial=0))
-    across = max(abs(geometry.first), abs(geometry.first + geometry.step * (geometry.readings - 1)))
-    along = geometry.range_offset_m + geometry.range_step_m * raw
-    return float(np.hypot(along, across if geometry.kind == "cartesian" else 0.0))

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from roadscan.core.grid import Bounds
     from roadscan.core.survey import Survey
     from roadscan.core.witness import Finding
-    from roadscan.ingest.format import Reject
+    from roadscan.ingest.reading.format import Reject
     from roadscan.inventory.inventory import Inventory
     from roadscan.run.selection import Selection
     from roadscan.store.store import Store
@@ -446,7 +446,7 @@ def read_log(
     """
     from roadscan.core.crs import Geoid
     from roadscan.door.extracts import read_tables
-    from roadscan.ingest.format import LogSource, format_named, format_of
+    from roadscan.ingest.reading.format import LogSource, format_named, format_of
 
     file = Path(path)
     found = format_of(file) if format is None else format_named(format)

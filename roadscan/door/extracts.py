@@ -16,16 +16,16 @@ from roadscan.core.ids import TileId
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of, trajectory_source
-from roadscan.ingest.format import LogFormat, LogSource, Reject
+from roadscan.ingest.reading.format import LogFormat, LogSource, Reject
 from roadscan.navigation.tasks.navigate import records_of
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.run.session import Session
 from roadscan.store.schema import table_schema
 from roadscan.tiles.blocks import Block
-from roadscan.tiles.mosaics.products import product_context
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE, TilePlan, tiles_of
 from roadscan.tiles.tasks.tile_points import load_points
+from roadscan.tiles.tasks.wanted_products import product_context
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,7 +17,7 @@ from roadscan.core.errors import ConfigError, NavigationError
 from roadscan.core.frames import rotation_from_quaternion
 from roadscan.core.grid import TileGrid
 from roadscan.core.rig import Mounting, Mountings
-from roadscan.core.scan_geometry import ScanGeometry, farthest_m
+from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.settings.segmentation import RoadSegmentation
 from roadscan.georeference.charts import Charts, charts_along
 from roadscan.georeference.place import (
@@ -330,3 +330,14 @@ def _chunks(one: RawSlice) -> Iterator[list[int]]:
     step = max(_CHUNK_READINGS // readings, 1)
     for start in range(0, len(one.groups), step):
         yield list(one.groups[start : start + step])
+
+
+def farthest_m(batch: pa.RecordBatch, geometry: ScanGeometry | None) -> float:
+    """Farthest that a reading of rows of ``scans``, or without `geometry` of ``returns``, lies from its sensor (m)."""
+    if geometry is None:
+        xyz = [batch.column(f"{axis}_sensor_m").to_numpy(zero_copy_only=False).astype(np.float64) for axis in "xyz"]
+        return float(np.sqrt(sum(x * x for x in xyz)).max(initial=0.0))
+    raw = int(batch.column("range").flatten().to_numpy(zero_copy_only=False).max(initial=0))
+    across = max(abs(geometry.first), abs(geometry.first + geometry.step * (geometry.readings - 1)))
+    along = geometry.range_offset_m + geometry.range_step_m * raw
+    return float(np.hypot(along, across if geometry.kind == "cartesian" else 0.0))

@@ -16,8 +16,8 @@ import pyarrow.compute as pc
 
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.witness import Finding, Witness
-from roadscan.ingest.format import LogHeader, Rows
 from roadscan.ingest.log_check import LogCheck
+from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.ingest.reading.records import LEAP_NS
 from roadscan.store.writer import LogWriter
 

@@ -16,8 +16,8 @@ import pyarrow.compute as pc
 from roadscan.core.errors import RoadscanError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.survey import Survey
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Rows
 from roadscan.ingest.overlap import DRIVEN, Fault, apart_logs
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Rows
 from roadscan.store.logs import DataFile, LogRecord
 
 _WHOLE_BYTES: Final = 4 << 20

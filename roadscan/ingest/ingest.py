@@ -12,7 +12,6 @@ from roadscan.core.gpstime import TimeSystem
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.ingest.epoch_order import EpochOrder
-from roadscan.ingest.format import Item, LogHeader, LogSource, Reject
 from roadscan.ingest.laser_ranges import LaserRanges
 from roadscan.ingest.log_check import LogCheck, Refuses
 from roadscan.ingest.motion_checks import MotionCheck
@@ -20,6 +19,7 @@ from roadscan.ingest.overlap import reject_words
 from roadscan.ingest.place_checks import PLACED, place_faults
 from roadscan.ingest.planned_logs import Logs, PlannedLog, logs_of, plan_logs
 from roadscan.ingest.pose_checks import PoseRecords
+from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.future_times import FutureTimes
 from roadscan.ingest.repeated_profiles import RepeatedProfiles
 from roadscan.ingest.resolution import resolution_findings

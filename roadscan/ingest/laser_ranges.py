@@ -13,8 +13,8 @@ import pyarrow as pa
 
 from roadscan.compute.robust import scatter_about
 from roadscan.core.witness import Finding, Witness
-from roadscan.ingest.format import LogHeader, Rows
 from roadscan.ingest.log_check import LogCheck
+from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.store.writer import LogWriter
 
 Float64 = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.ingest.format import LogHeader, Rows
+from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.store.writer import LogWriter
 
 Int64 = npt.NDArray[np.int64]

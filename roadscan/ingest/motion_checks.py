@@ -13,9 +13,9 @@ import pyarrow as pa
 from roadscan.core.counted import counted
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.witness import Finding, Witness
-from roadscan.ingest.format import LogHeader
 from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.pose_checks import POSES, PoseRecords, pose_track
+from roadscan.ingest.reading.format import LogHeader
 from roadscan.poses.motion import PoseMotion, Same
 from roadscan.store.writer import LogWriter
 

@@ -16,7 +16,7 @@ from pyproj.exceptions import ProjError
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import RoadscanError
 from roadscan.core.witness import Witness
-from roadscan.ingest.format import LogHeader
+from roadscan.ingest.reading.format import LogHeader
 from roadscan.ingest.reading.poses import GRID_MAX_M
 
 Float64 = npt.NDArray[np.float64]

@@ -13,11 +13,11 @@ from roadscan.core.rig import Sensor
 from roadscan.core.strict import Strict
 from roadscan.core.survey import ControlConfig, LogConfig, Survey
 from roadscan.ingest.clocks.stated_pairs import log_clock
-from roadscan.ingest.format import LogFormat, LogSource, SourceDefaults
 from roadscan.ingest.place_checks import PLACED
 from roadscan.ingest.place_checks import VERSION as PLACE_CHECKS
 from roadscan.ingest.pose_checks import FIXES, POSES
 from roadscan.ingest.pose_checks import VERSION as POSE_CHECKS
+from roadscan.ingest.reading.format import LogFormat, LogSource, SourceDefaults
 from roadscan.ingest.sources import Known, Sources, open_sources
 from roadscan.run.engine.fingerprint import grid_key, key_of
 from roadscan.run.session import Session, found_once

@@ -20,9 +20,9 @@ from roadscan.core.counted import counted
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.witness import Finding, Witness
-from roadscan.ingest.format import LogHeader, Rows
 from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.place_checks import NO_FIX, without_fix
+from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.ingest.reading.gnss import ned_from_ecef
 from roadscan.poses.leaps import Leaps, PoseTrack, Stall, Step, find_leaps
 from roadscan.poses.motion import frozen

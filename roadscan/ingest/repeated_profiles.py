@@ -12,8 +12,8 @@ import pyarrow as pa
 from roadscan.core.counted import counted
 from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.core.witness import Witness
-from roadscan.ingest.format import LogHeader, Rows
 from roadscan.ingest.log_check import LogCheck
+from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.store.writer import LogWriter
 
 REPEATED_PROFILES: Final = Witness(

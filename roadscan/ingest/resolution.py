@@ -18,7 +18,7 @@ from roadscan.core.crs import LOCAL_WORLD, crs_from_text, geodetic_from_world, g
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
-from roadscan.ingest.format import LogHeader, LogSource
+from roadscan.ingest.reading.format import LogHeader, LogSource
 from roadscan.store.writer import LogWriter
 
 Float64 = npt.NDArray[np.float64]

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from roadscan.core.errors import FormatError, StoreError
-from roadscan.ingest.format import LogFormat, format_named
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
+from roadscan.ingest.reading.format import LogFormat, format_named
 from roadscan.store.sealed import seal, unseal
 from roadscan.store.store import Store, digest_holds, file_digest
 

@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.core.witness import Witness
-from roadscan.ingest.format import LogHeader, Rows
 from roadscan.ingest.log_check import LogCheck
+from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.store.writer import LogWriter
 
 Int64 = npt.NDArray[np.int64]

@@ -27,12 +27,13 @@ from roadscan.inventory.visibility import Visibility
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.store.manifest import OutputRecord, read_recorded
-from roadscan.tiles.mosaics.products import StoredTiles, product_context
+from roadscan.tiles.mosaics.products import StoredTiles
 from roadscan.tiles.product import ProductContext, TileSummary
 from roadscan.tiles.products.geo_table import in_crs_unit, read_geo_table
 from roadscan.tiles.pyramid import Level, overview_factors
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 from roadscan.tiles.tasks.tiles import summary_of
+from roadscan.tiles.tasks.wanted_products import product_context
 
 _PIXEL_M: Final = 0.04
 """Edge of the pixels that heights are taken from, about."""

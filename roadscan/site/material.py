@@ -24,11 +24,12 @@ from roadscan.store.asset_schema import asset_schema
 from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
-from roadscan.tiles.mosaics.products import StoredTiles, product_context
+from roadscan.tiles.mosaics.products import StoredTiles
 from roadscan.tiles.product import ProductContext, TileSummary
 from roadscan.tiles.products.geo_table import read_geo_table
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 from roadscan.tiles.tasks.tiles import summary_of
+from roadscan.tiles.tasks.wanted_products import product_context
 
 SHEET_M: Final = 1000.0
 """Edge of a kilometre sheet."""

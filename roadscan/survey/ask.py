@@ -8,14 +8,14 @@ import pyarrow as pa
 
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.survey import Survey
-from roadscan.ingest.format import log_formats
+from roadscan.ingest.reading.format import log_formats
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.store.asset_schema import asset_tables
 from roadscan.store.schema import schema_names
 from roadscan.store.sql import missing_table, query
 from roadscan.store.store import Store
-from roadscan.tiles.mosaics.products import wanted_products
 from roadscan.tiles.product import SurveyProduct, products
+from roadscan.tiles.tasks.wanted_products import wanted_products
 
 _MADE_BY: Final = {
     "cells": "`roadscan run` makes it",

@@ -37,12 +37,12 @@ from roadscan.georeference.place import CloudFrame
 from roadscan.georeference.plan.centre_line import CentreLines, load_buffer
 from roadscan.georeference.plan.road import looks_across
 from roadscan.ingest.first_look import LookedAt, key_of_look, look_at, named, never_meeting
-from roadscan.ingest.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
 from roadscan.ingest.one_stamp import one_stamp_logs
 from roadscan.ingest.overlap import Fault, NothingPlacedError, no_row
 from roadscan.ingest.place_checks import without_fix
 from roadscan.ingest.planned_logs import CONTROL_RUN, log_source
+from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
 from roadscan.ingest.sources import listed_name, remembered_formats
 from roadscan.navigation.tasks.clocks import check_clocks
 from roadscan.run.selection import Selection
@@ -51,8 +51,8 @@ from roadscan.store.logs import read_log_records
 from roadscan.store.store import Store
 from roadscan.surface.tasks.surface_colours import check_cameras
 from roadscan.surface.tasks.surface_plan import checked_surface
-from roadscan.tiles.mosaics.products import check_product, wanted_tile_products
 from roadscan.tiles.product import ProductContext
+from roadscan.tiles.tasks.wanted_products import check_product, wanted_tile_products
 
 FARTHEST_DEG: Final = 10.0
 """Positions farther than this outside the area of the map's CRS are refused (degrees): a metre of such a map is no

@@ -13,7 +13,7 @@ from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.store.group_reader import read_groups
 from roadscan.store.store import Store
-from roadscan.tiles.products.lane_direction import STEP_M, LaneDirections
+from roadscan.tiles.lane_direction import STEP_M, LaneDirections
 
 _POSITION = [f"{a}_world_m" for a in "xyz"]
 

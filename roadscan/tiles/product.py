@@ -26,7 +26,7 @@ from roadscan.georeference.cloud import TilePoints
 from roadscan.surface.tile import SurfaceTile
 from roadscan.surface.views import PictureRule
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.products.lane_direction import LaneDirections
+from roadscan.tiles.lane_direction import LaneDirections
 from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
 
 ENTRY_POINT_GROUP: Final = "roadscan.tiles.products"

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from roadscan.ingest.format import log_formats
+from roadscan.ingest.reading.format import log_formats
 from tests.fuzz.harness import SLOWEST_S, Fuzzer, Outcome, Summary
 from tests.fuzz.samples import Sample, all_samples
 

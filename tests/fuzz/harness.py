@@ -22,7 +22,7 @@ import pyarrow as pa
 
 from roadscan.core.errors import RoadscanError
 from roadscan.core.witness import Finding
-from roadscan.ingest.format import LogFormat, LogSource, Reject, Rows, format_named, log_formats
+from roadscan.ingest.reading.format import LogFormat, LogSource, Reject, Rows, format_named, log_formats
 from roadscan.store.schema import table_schema
 from tests.fuzz.mutations import changed
 from tests.fuzz.samples import Sample

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from roadscan.core.errors import RoadscanError
-from roadscan.ingest.format import LogSource, format_of, log_formats
+from roadscan.ingest.reading.format import LogSource, format_of, log_formats
 from tests.fuzz.harness import Broken, Fuzzer, bounded, damaged_record, others_differ, read
 from tests.fuzz.mutations import changed
 from tests.fuzz.samples import Sample, all_samples

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from roadscan.ingest.format import log_formats
+from roadscan.ingest.reading.format import log_formats
 from tests.conftest import REPOSITORY
 
 A_NIGHT = 400

@@ -15,7 +15,7 @@ import time
 import psutil
 
 from roadscan.cli import main
-from roadscan.ingest.format import log_formats
+from roadscan.ingest.reading.format import log_formats
 from roadscan.run.stage import stages
 from roadscan.tiles.product import products
 

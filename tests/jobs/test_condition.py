@@ -39,10 +39,10 @@ from roadscan.store.schema import table_schema
 from roadscan.store.sql import query
 from roadscan.store.store import bytes_digest
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.mosaics.products import product_context
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
+from roadscan.tiles.tasks.wanted_products import product_context
 
 STEP_MM = 5.0
 LINES = [{"offset_m": 0.1, "dash_m": 3.0, "gap_m": 6.0}, {"offset_m": 3.4}]

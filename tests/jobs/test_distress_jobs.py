@@ -23,8 +23,9 @@ from roadscan.store.store import Store, bytes_digest
 from roadscan.survey.run import run_stages
 from roadscan.tiles.drives import Drives
 from roadscan.tiles.mosaics import products
-from roadscan.tiles.mosaics.products import StoredTiles, wanted_products
+from roadscan.tiles.mosaics.products import StoredTiles
 from roadscan.tiles.product import ProductContext, product_named
+from roadscan.tiles.tasks.wanted_products import wanted_products
 from tests.jobs.conftest import changed
 
 DAY = dt.date(2026, 4, 24)

@@ -23,8 +23,8 @@ from roadscan.export.export_psi import PsiSettings, export_psi
 from roadscan.formats.clouds.opencrg_file import read_crg
 from roadscan.formats.scanners.psi_container import read_psi
 from roadscan.georeference.plan.plan import plan_survey
-from roadscan.ingest.format import format_of
 from roadscan.ingest.ingest import ingest
+from roadscan.ingest.reading.format import format_of
 from roadscan.simulate import simulate, truth
 from roadscan.store.group_reader import read_groups
 from roadscan.store.store import Store

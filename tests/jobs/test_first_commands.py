@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import roadscan
 from roadscan.cli import app
 from roadscan.core.errors import ConfigError
-from roadscan.ingest.format import log_formats
+from roadscan.ingest.reading.format import log_formats
 from roadscan.simulate.scene import shipped_scenes
 from roadscan.store.logs import read_log_records
 from tests.conftest import REPOSITORY

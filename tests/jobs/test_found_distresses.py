@@ -23,8 +23,8 @@ from roadscan.site.parts.vectors import site_layers
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import bytes_digest
-from roadscan.tiles.mosaics.products import product_context
 from roadscan.tiles.products.geo_table import write_geo_table
+from roadscan.tiles.tasks.wanted_products import product_context
 from tests.jobs.conftest import Simulated
 
 

@@ -25,13 +25,13 @@ from typer.testing import CliRunner
 from roadscan.cli import app
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Provisional, log_formats
 from roadscan.ingest.inspect import diagnosis as diagnosis_module
 from roadscan.ingest.inspect import inspect as inspect_module
 from roadscan.ingest.inspect.inspect import Inspection, inspect
 from roadscan.ingest.inspect.inspect_text import print_inspection
 from roadscan.ingest.inspect.log_figures import Fault
 from roadscan.ingest.inspect.provisional import Stated, open_log, parse_clock, parse_option
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, log_formats
 from roadscan.store.schema import table_schema
 
 RECORD = 136

@@ -30,7 +30,7 @@ class Another(TileProduct):
     default = False
 '''
 FORMAT = '''
-from roadscan.ingest.format import LogFormat
+from roadscan.ingest.reading.format import LogFormat
 
 
 class Another(LogFormat):

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.ingest.format import log_formats
+from roadscan.ingest.reading.format import log_formats
 from roadscan.run.session import Session
 from roadscan.store.sql import query
 from roadscan.survey.status import survey_status, verify_store

@@ -22,7 +22,7 @@ from roadscan.calibrate.surfels import Surfels
 from roadscan.core.errors import ConfigError
 from roadscan.core.rig import Mounting, Rig
 from roadscan.core.survey import ClockConfig
-from roadscan.ingest.format import Rows, format_named
+from roadscan.ingest.reading.format import Rows, format_named
 from roadscan.poses.trajectory import Trajectory
 from roadscan.simulate import Scene, simulate, truth
 from tests.sensors.log_reading import source_of

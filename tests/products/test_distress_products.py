@@ -21,8 +21,8 @@ from roadscan.distress.products.potholes import Potholes
 from roadscan.store.schema import table_schema
 from roadscan.surface.tile import MEASURED, SurfaceTile
 from roadscan.surface.window import GridWindow
+from roadscan.tiles.lane_direction import LaneDirections
 from roadscan.tiles.product import product_named
-from roadscan.tiles.products.lane_direction import LaneDirections
 
 CELL_M = 0.005
 HALO = 210

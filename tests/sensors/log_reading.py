@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.witness import Finding
-from roadscan.ingest.format import LogSource, Reject, Rows, format_named
+from roadscan.ingest.reading.format import LogSource, Reject, Rows, format_named
 from roadscan.store.schema import table_schema
 
 GPS_SECONDS = Clock(TimeSystem.GPS)

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from roadscan.core.witness import Finding
-from roadscan.ingest.format import LogSource, Reject, Rows, format_named
+from roadscan.ingest.reading.format import LogSource, Reject, Rows, format_named
 from roadscan.store.schema import table_schema
 
 LARGEST_CHUNK_BYTES = 12 << 20

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from roadscan.core.errors import FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
-from roadscan.ingest.format import LogSource, NoOptions, format_named, format_of
+from roadscan.ingest.reading.format import LogSource, NoOptions, format_named, format_of
 from tests.sensors.readings import read
 
 CLOCK = Clock(TimeSystem.UNIX_GPS, unit="ns")

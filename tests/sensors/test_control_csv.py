@@ -11,7 +11,7 @@ import pytest
 
 from roadscan.core.crs import Anchor, Geoid, MapFrame
 from roadscan.core.errors import ConfigError, CrsError, FormatError
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.log_reading import read_ellipsoidal as read_log
 
 UTM32 = MapFrame(crs="EPSG:25832")

@@ -14,7 +14,7 @@ import shapely
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError, CrsError, FormatError
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.log_reading import Log
 from tests.sensors.log_reading import read_ellipsoidal as read_log
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.formats.clouds.e57_file import page_checksums, unpacked
-from roadscan.ingest.format import format_of
+from roadscan.ingest.reading.format import format_of
 from tests.sensors.e57_files import (
     PAGE,
     Column,

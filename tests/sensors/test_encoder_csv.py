@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from roadscan.core.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Rig, Sensor
-from roadscan.ingest.format import format_of
+from roadscan.ingest.reading.format import format_of
 from tests.sensors.log_reading import GPS_SECONDS, Log, read_log
 
 ENCODER = Sensor(kind="encoder")

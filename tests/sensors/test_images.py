@@ -19,7 +19,7 @@ from roadscan.core.errors import ConfigError, FormatError, RoadscanError, TimeSy
 from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
 from roadscan.core.rig import Sensor
 from roadscan.formats.cameras import video
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from roadscan.store.codecs import child
 from roadscan.store.codecs.image_files import ImageError, image_size
 from tests.sensors.log_reading import GPS_SECONDS, Log, read_log

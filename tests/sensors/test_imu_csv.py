@@ -13,7 +13,7 @@ import pytest
 from roadscan.core.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
-from roadscan.ingest.format import format_of
+from roadscan.ingest.reading.format import format_of
 from tests.sensors.log_reading import GPS_SECONDS, Log, read_log
 
 NAMES = "time_s,gyro_x_deg_s,gyro_y_deg_s,gyro_z_deg_s,acc_x_g,acc_y_g,acc_z_g,temperature_deg_c"

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.readings import Readings, read
 
 UTC_S = Clock(TimeSystem.UNIX_UTC)

@@ -16,7 +16,7 @@ import pytest
 from roadscan.core.crs import Geoid
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.format import SourceDefaults, format_named, format_of
+from roadscan.ingest.reading.format import SourceDefaults, format_named, format_of
 from tests.sensors.readings import read_ellipsoidal as read
 
 ADJUSTED = Clock(TimeSystem.GPS_ADJUSTED)

@@ -22,8 +22,8 @@ from roadscan.core.crs import Geoid
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
 from roadscan.formats.motion.nmea_writer import Fix, NmeaForm, sentences, write_nmea
-from roadscan.ingest.format import SourceDefaults, format_named, format_of
 from roadscan.ingest.reading import text_table
+from roadscan.ingest.reading.format import SourceDefaults, format_named, format_of
 from tests.sensors.log_reading import Log, read_log, source_of
 from tests.sensors.test_rtklib_pos import ecef, flat_geoid
 

@@ -13,7 +13,7 @@ import pytest
 
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.format import format_of
+from roadscan.ingest.reading.format import format_of
 from tests.sensors.readings import read_ellipsoidal as read
 
 plyfile = pytest.importorskip("plyfile")

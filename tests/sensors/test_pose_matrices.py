@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.format import format_of
+from roadscan.ingest.reading.format import format_of
 from tests.sensors.log_reading import read_log
 
 NAMES = "frame,unix_utc_s,r11,r12,r13,t1,r21,r22,r23,t2,r31,r32,r33,t3"

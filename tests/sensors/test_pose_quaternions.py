@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.log_reading import read_log
 
 NANOSECONDS = Clock(TimeSystem.GPS, unit="ns")

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.crs import Geoid
 from roadscan.core.errors import ConfigError, CrsError
-from roadscan.ingest.format import LogSource, NoOptions
+from roadscan.ingest.reading.format import LogSource, NoOptions
 from roadscan.ingest.reading.poses import (
     GeodeticPlacement,
     WorldPlacement,

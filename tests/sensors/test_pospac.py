@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.format import format_of
+from roadscan.ingest.reading.format import format_of
 from tests.sensors.log_reading import Log
 from tests.sensors.log_reading import read_ellipsoidal as read_log
 

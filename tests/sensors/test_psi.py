@@ -23,7 +23,7 @@ from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.formats.scanners.psi import Psi, PsiStatement, statement_text
 from roadscan.formats.scanners.psi_container import PsiContainer, PsiHeader, read_psi, write_psi
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.readings import read
 
 ROWS, COLUMNS = 6, 10

@@ -16,7 +16,7 @@ import shapely
 from roadscan.core.crs import Anchor, MapFrame
 from roadscan.core.errors import ConfigError, CrsError, FormatError
 from roadscan.formats.vectors.road_lines import TIGER_ROADS
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.log_reading import Log, read_log
 
 UTM17 = MapFrame(crs="EPSG:26917")

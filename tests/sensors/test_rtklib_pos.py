@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from roadscan.core.crs import Geoid
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.log_reading import Log, read_log, source_of
 
 ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)

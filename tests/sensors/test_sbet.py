@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import WEEK_S, Clock, TimeSystem
 from roadscan.formats.trajectories import sbet
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.log_reading import read_log, source_of
 
 WEEK = 2405

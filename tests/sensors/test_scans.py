@@ -14,7 +14,7 @@ import pytest
 
 from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.format import LogSource, NoOptions, Rows, format_named, format_of
+from roadscan.ingest.reading.format import LogSource, NoOptions, Rows, format_named, format_of
 from tests.sensors.readings import read
 
 READINGS = 12

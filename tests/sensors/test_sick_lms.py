@@ -22,7 +22,7 @@ from roadscan.formats.scanners.sick_telegrams import (
     read_pieces,
     write_telegrams,
 )
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.readings import Readings, read
 
 GPS = Clock(TimeSystem.GPS)

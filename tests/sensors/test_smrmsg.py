@@ -12,8 +12,8 @@ import pytest
 
 from roadscan.core.errors import FormatError, TimeSystemError
 from roadscan.core.gpstime import WEEK_S, Clock, TimeSystem
-from roadscan.ingest.format import format_named, format_of
 from roadscan.ingest.reading import text_table
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.log_reading import Log, read_log, source_of
 
 WEEK = 2405

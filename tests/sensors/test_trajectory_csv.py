@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.log_reading import GPS_SECONDS, read_log
 
 NAMES = "time_s,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,heading_deg"

@@ -9,7 +9,7 @@ import pyproj
 import pytest
 
 from roadscan.formats.motion.ubx import HEADER, SOLUTION
-from roadscan.ingest.format import format_of
+from roadscan.ingest.reading.format import format_of
 from tests.sensors.log_reading import Log, read_log
 
 FLAGS_AT = 6 + 21

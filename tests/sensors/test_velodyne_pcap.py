@@ -16,7 +16,7 @@ import velodyne_decoder
 from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
-from roadscan.ingest.format import format_named, format_of
+from roadscan.ingest.reading.format import format_named, format_of
 from tests.sensors.readings import Readings, read
 
 DATE = dt.date(2026, 5, 4)

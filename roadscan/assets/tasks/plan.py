@@ -26,9 +26,9 @@ from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.store import bytes_digest
 from roadscan.surface.tasks.pictures import rule_cameras
 from roadscan.tiles.blocks import Block, cut_blocks
-from roadscan.tiles.mosaics.products import product_context
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.tile_plan import TilePlan, plan_tiles
+from roadscan.tiles.tasks.wanted_products import product_context
 
 _BLOCK_SQUARES: Final = 16
 """Edge of the largest block of squares that one task searches: a lidar sees 100 m to both sides, and row groups that

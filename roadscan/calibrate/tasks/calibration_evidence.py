@@ -33,9 +33,9 @@ from roadscan.core.settings.calibration import (
 )
 from roadscan.georeference.place import CloudFrame
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
-from roadscan.ingest.format import Rows, format_named
 from roadscan.ingest.inspect.diagnosis import claimed_format
 from roadscan.ingest.inspect.provisional import Stated, open_log
+from roadscan.ingest.reading.format import Rows, format_named
 from roadscan.navigation.tasks.navigation_logs import imu_readings
 from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
 from roadscan.navigation.tasks.trajectories import load_trajectory

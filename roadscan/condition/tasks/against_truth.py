@@ -15,7 +15,7 @@ from roadscan.condition.tasks.values import Group, GroupTask, load_lane
 from roadscan.condition.tasks.work import plan_condition
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
-from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.tasks.wanted_products import product_context
 
 Float64 = npt.NDArray[np.float64]
 HeightAt: TypeAlias = Callable[[Float64, Float64], Float64]

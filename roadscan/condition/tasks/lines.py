@@ -24,7 +24,7 @@ from roadscan.core.settings.condition import ConditionConfig
 from roadscan.core.survey import Survey
 from roadscan.formats.vectors.road_lines import LineLayer, RoadLinesOptions, place_in_map, read_lines, sidecars
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
-from roadscan.ingest.format import Reject
+from roadscan.ingest.reading.format import Reject
 from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.run.code_reach import code_digest
@@ -33,9 +33,9 @@ from roadscan.store.group_reader import read_groups
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, file_digest
-from roadscan.tiles.mosaics.products import product_context
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
+from roadscan.tiles.tasks.wanted_products import product_context
 
 LINES: Final = "reference_lines"
 LANES: Final = "lanes"

@@ -32,8 +32,8 @@ from roadscan.core.settings.condition import ConditionConfig
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
-from roadscan.tiles.mosaics.products import product_context
 from roadscan.tiles.tasks.tile_plan import TILE
+from roadscan.tiles.tasks.wanted_products import product_context
 
 MADE = (
     LINES, LANES, *OF_STRETCHES, EDGES, SURFACES, VALUES, SECTIONS, TILES, PICTURES, RAVELLING, RAVELLING_PICTURES,

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import Clock
-from roadscan.ingest.format import LogSource
+from roadscan.ingest.reading.format import LogSource
 from roadscan.ingest.reading.records import Sieve
 from roadscan.ingest.reading.stamps import calendar_clock, calendar_ns, likely_unit
 

@@ -23,8 +23,8 @@ from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem, 
 from roadscan.core.strict import Strict
 from roadscan.formats.cameras.image_names import NamePattern
 from roadscan.formats.cameras.video import FrameTimes, Video, frame_times, look_into
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.columns import ColumnOption, Found, Quantity, check_keys, find_columns
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.stamps import CALENDAR_SCALES, TIME, StampColumn, calendar_clock, parse_calendar
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, TextOptions, text_blocks, text_layout

@@ -36,7 +36,7 @@ from roadscan.formats.clouds.reference_scan import (
     reference_height,
     stated_epoch_gps_ns,
 )
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject
 from roadscan.ingest.reading.records import Sieve, options_of
 
 Float64 = npt.NDArray[np.float64]

@@ -35,7 +35,7 @@ from roadscan.core.strict import Strict
 from roadscan.core.witness import Witness
 from roadscan.formats.clouds.las_crs import CloudUnits, LengthUnit
 from roadscan.formats.clouds.las_file import Cloud, Head
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve, UnorderedStamps, few_rejects, options_of
 
 Float64 = npt.NDArray[np.float64]

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from roadscan.core.errors import FormatError
-from roadscan.ingest.format import Reject
+from roadscan.ingest.reading.format import Reject
 from roadscan.store.codecs.laz import Laz, LazChunks, LazError
 
 Int64 = npt.NDArray[np.int64]

@@ -23,7 +23,7 @@ from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.strict import Strict
 from roadscan.formats.clouds.opencrg_file import CrgBlock, CrgFile, CurvedRegularGrid, is_crg
 from roadscan.formats.clouds.reference_scan import reference_height
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import options_of
 
 Float64 = npt.NDArray[np.float64]

@@ -36,7 +36,7 @@ from roadscan.formats.clouds.reference_scan import (
     stated_epoch_gps_ns,
     whole_numbers,
 )
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject
 from roadscan.ingest.reading.records import Sieve, UnorderedStamps, options_of
 
 _SPELLINGS: Final = {

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError, FormatError
 from roadscan.formats.clouds.reference_scan import CHUNK_POINTS
-from roadscan.ingest.format import Reject
+from roadscan.ingest.reading.format import Reject
 from roadscan.ingest.reading.text_table import LINE_BYTES_MAX, TextBlock, TextLayout, text_blocks
 
 Int64 = npt.NDArray[np.int64]

@@ -25,8 +25,8 @@ import pyarrow as pa
 
 from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.toml_text import toml
-from roadscan.ingest.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.arrow_batches import unlisted_batches, unlisted_reason
+from roadscan.ingest.reading.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve
 
 _COLUMNS: Final = ("x", "y", "z", "intensity", "laser_number", "offset_ns")

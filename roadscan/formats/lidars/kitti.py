@@ -36,7 +36,7 @@ from pydantic import Field
 from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
 from roadscan.core.strict import Strict
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import Sieve, options_of
 
 RECORD_BYTES: Final = 16

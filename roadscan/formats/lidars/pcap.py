@@ -14,7 +14,7 @@ from typing import BinaryIO, Final, NamedTuple, TypeAlias
 
 from roadscan.core.errors import FormatError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.ingest.format import Reject
+from roadscan.ingest.reading.format import Reject
 
 PCAPNG: Final = b"\x0a\x0d\x0d\x0a"
 MAGICS: Final = {

@@ -31,9 +31,9 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.core.errors import ConfigError, FormatError
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.column_table import UNREADABLE, Lost, brief, is_number, open_table
 from roadscan.ingest.reading.columns import Found
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve
 from roadscan.ingest.reading.table_stamps import EPOCH, TableStamps, column_stamps, need_type
 

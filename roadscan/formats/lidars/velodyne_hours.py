@@ -20,7 +20,7 @@ from roadscan.core.errors import ConfigError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem, leap_seconds_at_unix
 from roadscan.formats.lidars.pcap import Datagram
 from roadscan.formats.lidars.velodyne_packets import LATEST_STAMP_US
-from roadscan.ingest.format import LogSource
+from roadscan.ingest.reading.format import LogSource
 
 Bool = npt.NDArray[np.bool_]
 Int64 = npt.NDArray[np.int64]

@@ -57,7 +57,7 @@ from roadscan.formats.lidars.velodyne_segments import (
     reference,
 )
 from roadscan.formats.lidars.velodyne_sentences import SENTENCES, Sentences
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve, options_of
 
 _CHUNK_PACKETS: Final = 640  # 245,760 slots

@@ -14,7 +14,6 @@ import pyarrow as pa
 
 from roadscan.core.errors import ConfigError, FormatError, Missing, nearest
 from roadscan.core.strict import Strict
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.columns import (
     UNITS,
     ColumnOption,
@@ -25,6 +24,7 @@ from roadscan.ingest.reading.columns import (
     fits,
     named_column,
 )
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.stamps import TIME, StampColumn
 from roadscan.ingest.reading.text_table import (

@@ -13,7 +13,6 @@ import pyarrow as pa
 from pydantic import Field
 
 from roadscan.core.errors import ConfigError, Missing, nearest
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.columns import (
     UNITS,
     ColumnOption,
@@ -25,6 +24,7 @@ from roadscan.ingest.reading.columns import (
     fits,
     unit_in_name,
 )
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.stamps import TIME, StampColumn
 from roadscan.ingest.reading.text_table import (

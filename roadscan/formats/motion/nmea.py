@@ -29,7 +29,7 @@ from roadscan.formats.motion.nmea_sentences import (
     kinds_of,
     parse_sentences,
 )
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.gnss import NO_POSITION, GnssReader, RawSolutions, utc_clock
 from roadscan.ingest.reading.poses import GeodeticPlacement, check_geographic
 from roadscan.ingest.reading.records import EpochReader, Sieve, drop_failing, few_rejects, options_of

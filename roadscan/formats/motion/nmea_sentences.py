@@ -17,7 +17,7 @@ import numpy.typing as npt
 import pyarrow.compute as pc
 
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.ingest.format import Reject
+from roadscan.ingest.reading.format import Reject
 from roadscan.ingest.reading.gnss import NO_POSITION, QUALITIES, UNKNOWN_QUALITY
 from roadscan.ingest.reading.records import Sieve, few_rejects
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, parse_lines

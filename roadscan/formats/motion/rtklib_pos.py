@@ -16,7 +16,7 @@ from roadscan.core.crs import LOCAL_WORLD, crs_from_text, world_from_geodetic
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError, TimeSystemError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S, Clock, TimeSystem
 from roadscan.core.strict import Strict
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.gnss import (
     QUALITIES,
     UNKNOWN_QUALITY,

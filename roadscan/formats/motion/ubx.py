@@ -15,7 +15,7 @@ import numpy.typing as npt
 from roadscan.core.errors import FormatError
 from roadscan.core.gpstime import Clock
 from roadscan.formats.motion.nmea import Nmea
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource
 from roadscan.ingest.reading.gnss import NO_POSITION, QUALITIES, GnssReader, RawSolutions, utc_clock
 from roadscan.ingest.reading.poses import GeodeticPlacement
 from roadscan.ingest.reading.records import EpochReader, Sieve

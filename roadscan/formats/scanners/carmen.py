@@ -54,7 +54,16 @@ from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.strict import Strict, pattern_in_words
-from roadscan.ingest.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Provisional, Reject, Rows
+from roadscan.ingest.reading.format import (
+    NO_LEVER_ARM,
+    Item,
+    LogFormat,
+    LogHeader,
+    LogSource,
+    Provisional,
+    Reject,
+    Rows,
+)
 from roadscan.ingest.reading.poses import LevelPlacement, PoseReader, RawPoses, ned_from_rph
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.text_table import SEARCHED_BYTES, head_of, line_blocks

@@ -41,8 +41,8 @@ from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.strict import Strict
 from roadscan.core.toml_text import toml
 from roadscan.formats.scanners.psi_container import PsiFile, PsiSection, is_psi
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.columns import UNITS
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 
 UInt8 = npt.NDArray[np.uint8]

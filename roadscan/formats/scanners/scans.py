@@ -39,8 +39,8 @@ from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.strict import Strict
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.column_table import UNREADABLE, Lost, brief, open_table
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.table_stamps import EPOCH, column_stamps, refuse_clock
 

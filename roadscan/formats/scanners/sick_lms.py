@@ -67,7 +67,7 @@ from roadscan.formats.scanners.sick_telegrams import (
     find_telegrams,
     read_pieces,
 )
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject, Rows, beside
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 
 UInt8 = npt.NDArray[np.uint8]

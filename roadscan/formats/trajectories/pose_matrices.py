@@ -13,8 +13,8 @@ import numpy.typing as npt
 from roadscan.core.errors import FormatError, nearest
 from roadscan.core.frames import quaternion_from_rotation
 from roadscan.core.gpstime import Clock
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.columns import need_stamp_unit, stamp_column
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import (
     PoseReader,
     RawPoses,

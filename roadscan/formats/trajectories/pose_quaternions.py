@@ -14,9 +14,9 @@ import pyarrow as pa
 
 from roadscan.core.errors import FormatError
 from roadscan.core.gpstime import UNIT_NS, Clock
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.column_table import Lost, is_number, need_table
 from roadscan.ingest.reading.columns import Found, check_keys, named_column, need_stamp_unit, stamp_column
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import (
     PoseReader,
     RawPoses,

@@ -14,7 +14,7 @@ from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import ConfigError, FormatError, Missing, nearest
 from roadscan.core.frames import ENU_FROM_NED, quaternion_from_rotation
 from roadscan.core.gpstime import Clock
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import (
     North,
     Placement,

@@ -17,7 +17,7 @@ from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock
 from roadscan.core.strict import Strict
 from roadscan.formats.trajectories.smrmsg import CLOCK_EXAMPLE, CarriedAccuracy, Smrmsg
 from roadscan.formats.trajectories.smrmsg import RECORD_BYTES as ACCURACY_BYTES
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, beside
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, beside
 from roadscan.ingest.reading.poses import (
     HEIGHT_MAX_M,
     HEIGHT_MIN_M,

@@ -14,7 +14,7 @@ import pyarrow as pa
 from roadscan.core.errors import FormatError
 from roadscan.core.gpstime import WEEK_S, Clock
 from roadscan.core.toml_text import toml
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import SIGMA_MAX_DEG, SIGMA_MAX_M, block_rows, check_sigmas
 from roadscan.ingest.reading.records import LEAP_NS, EpochReader, Sieve
 from roadscan.ingest.reading.text_table import byte_pieces, head_of

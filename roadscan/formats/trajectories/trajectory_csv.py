@@ -16,8 +16,8 @@ from roadscan.formats.trajectories.level_poses import (
     level_poses,
     pose_quantities,
 )
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.columns import ColumnOption, Found, Quantity, find_columns, fits
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import North, Placement, PoseReader, level_placement
 from roadscan.ingest.reading.records import Sieve, options_of
 from roadscan.ingest.reading.stamps import TIME, StampColumn

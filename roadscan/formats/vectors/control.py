@@ -26,7 +26,7 @@ from roadscan.core.crs import (
 )
 from roadscan.core.errors import ConfigError, CrsError, Missing
 from roadscan.core.witness import Finding, Witness
-from roadscan.ingest.format import Item, LogSource, Rows
+from roadscan.ingest.reading.format import Item, LogSource, Rows
 from roadscan.ingest.reading.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M, height_in
 from roadscan.ingest.reading.records import Sieve, drop_failing
 

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from roadscan.core.crs import crs_from_text
 from roadscan.core.errors import FormatError, Missing
 from roadscan.formats.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.columns import ColumnOption, Found, Quantity, find_columns, fits
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M
 from roadscan.ingest.reading.records import options_of
 from roadscan.ingest.reading.text_table import (

@@ -29,8 +29,8 @@ from roadscan.formats.vectors.vector_layer import (
     unread_features,
     word_of,
 )
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.columns import ColumnOption, Quantity, find_columns
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve, options_of
 from roadscan.ingest.reading.text_table import Kind, TextOptions, sniff_layout, text_blocks, text_layout
 

@@ -32,8 +32,8 @@ from roadscan.formats.vectors.vector_layer import (
     unread_features,
     word_of,
 )
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource
 from roadscan.ingest.reading.columns import UNITS
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource
 from roadscan.ingest.reading.records import options_of
 
 Float64 = npt.NDArray[np.float64]

@@ -50,8 +50,8 @@ from roadscan.formats.vectors.vector_layer import (
     unread_features,
     word_of,
 )
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject, Rows
 from roadscan.ingest.reading.columns import UNITS
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject, Rows
 from roadscan.ingest.reading.poses import GRID_MAX_M
 from roadscan.ingest.reading.records import Sieve, options_of
 

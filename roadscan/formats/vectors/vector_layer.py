@@ -19,7 +19,7 @@ import pyproj
 import shapely
 
 from roadscan.core.errors import ConfigError, FormatError, Missing, RoadscanError, nearest
-from roadscan.ingest.format import Reject
+from roadscan.ingest.reading.format import Reject
 
 BATCH_FEATURES: Final = 4_096
 _LARGEST_JSON: Final = 16 << 20

@@ -23,7 +23,7 @@ from roadscan.formats.vectors.road_lines import (
     sidecars,
 )
 from roadscan.georeference.centre_line import CentreLineBuffer
-from roadscan.ingest.format import Reject
+from roadscan.ingest.reading.format import Reject
 from roadscan.store.store import file_digest
 
 BUFFER: Final = "buffer"

@@ -21,10 +21,10 @@ from roadscan.georeference.plan.centre_line import CentreLines
 from roadscan.georeference.plan.corrections import KnownCorrections
 from roadscan.georeference.plan.road import check_road, road_of
 from roadscan.georeference.sources import Ground, RawSlice, ReadingSource, change_of, load_mountings
-from roadscan.ingest.format import log_formats
 from roadscan.ingest.ingest import DATA_TABLES
 from roadscan.ingest.one_stamp import one_stamp_logs
 from roadscan.ingest.overlap import Fault, NothingPlacedError, apart_logs
+from roadscan.ingest.reading.format import log_formats
 from roadscan.ingest.same_content import same_points
 from roadscan.navigation.tasks.clocks import load_clocks
 from roadscan.navigation.tasks.navigate import records_of, records_with_trajectories

@@ -16,11 +16,11 @@ from typing import Final
 
 from roadscan.core.errors import FormatError, Missing, RoadscanError
 from roadscan.core.toml_text import toml
-from roadscan.ingest.format import LogFormat, log_formats
 from roadscan.ingest.inspect.file_kinds import UNPACKING_ERRORS, is_cut_off, kind_of, open_wrapped, wrapper_of
 from roadscan.ingest.inspect.log_figures import LogFigures
 from roadscan.ingest.inspect.provisional import OpenedLog, Stated, open_log
 from roadscan.ingest.reading.columns import Likeness, likeness
+from roadscan.ingest.reading.format import LogFormat, log_formats
 from roadscan.ingest.reading.text_table import TextOptions, first_words, text_layout
 
 UNPACKED_BYTES: Final = 16 << 20

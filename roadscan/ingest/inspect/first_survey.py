@@ -20,11 +20,11 @@ import numpy.typing as npt
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S, WEEK_S, TimeSystem
 from roadscan.core.rig import SensorKind
-from roadscan.ingest.format import LogFormat
 from roadscan.ingest.inspect.diagnosis import formats_of, specific_fault
 from roadscan.ingest.inspect.file_kinds import FileKind, kind_of
 from roadscan.ingest.inspect.inspect import Inspection, LogReport, Progress, inspect
 from roadscan.ingest.inspect.provisional import Need, raw_stamps_ns, sensor_kind
+from roadscan.ingest.reading.format import LogFormat
 
 Int64 = npt.NDArray[np.int64]
 

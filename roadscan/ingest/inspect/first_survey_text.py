@@ -25,12 +25,12 @@ from roadscan.core.frames import DIRECTIONS
 from roadscan.core.gpstime import NS_PER_S, WEEK_S, iso_from_gps_ns
 from roadscan.core.strict import OPEN_QUESTION
 from roadscan.core.toml_text import toml, toml_key
-from roadscan.ingest.format import LogFormat
 from roadscan.ingest.inspect.first_cell_size import cell_lines
 from roadscan.ingest.inspect.first_survey import FoundFolder, FoundLog, FoundRun, overlaps
 from roadscan.ingest.inspect.inspect import LogReport
 from roadscan.ingest.inspect.log_figures import Extent
 from roadscan.ingest.inspect.provisional import Need
+from roadscan.ingest.reading.format import LogFormat
 
 Float64 = npt.NDArray[np.float64]
 

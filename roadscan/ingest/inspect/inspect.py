@@ -22,11 +22,11 @@ from roadscan.core.counted import counted
 from roadscan.core.errors import RoadscanError
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem, iso_from_gps_ns
 from roadscan.core.witness import Finding
-from roadscan.ingest.format import Item, LogFormat, Rows, format_named
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, diagnose, formats_of, is_there, try_open, unpack
 from roadscan.ingest.inspect.file_kinds import FileKind, is_cut_off, kind_of, wrapper_of
 from roadscan.ingest.inspect.log_figures import Fault, LogFigures, TableFigures
 from roadscan.ingest.inspect.provisional import OpenedLog, Stated, raw_stamps_ns
+from roadscan.ingest.reading.format import Item, LogFormat, Rows, format_named
 from roadscan.ingest.reading.future_times import FutureTimes
 
 QUICK_VALUES: Final = 1_000_000

@@ -20,7 +20,7 @@ from roadscan.core.crs import LOCAL_WORLD, MapFrame, crs_from_text, geodetic_fro
 from roadscan.core.errors import RoadscanError, SchemaError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding
-from roadscan.ingest.format import Item, LogHeader, Reject, Rows
+from roadscan.ingest.reading.format import Item, LogHeader, Reject, Rows
 from roadscan.ingest.reading.future_times import FutureTimes
 from roadscan.poses.leaps import FASTEST_M_PER_S
 from roadscan.store.schema import TableSchema, table_schema

@@ -36,7 +36,7 @@ from roadscan.core.gpstime import (
 from roadscan.core.rig import Sensor, SensorKind
 from roadscan.core.survey import ClockConfig
 from roadscan.core.toml_text import UNKNOWN, UNKNOWN_DATE, toml
-from roadscan.ingest.format import Item, LogFormat, LogHeader, LogSource, Rows
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Rows
 
 Int64 = npt.NDArray[np.int64]
 Dimension = Literal["clock", "crs", "height", "options", "proposal", "sensor"]

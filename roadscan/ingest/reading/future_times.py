@@ -21,7 +21,7 @@ from roadscan.core.gpstime import (
     iso_from_gps_ns,
 )
 from roadscan.core.witness import Witness
-from roadscan.ingest.format import LogHeader, LogSource, Rows
+from roadscan.ingest.reading.format import LogHeader, LogSource, Rows
 
 TIME_IN_FUTURE: Final = Witness(
     "time_in_future",

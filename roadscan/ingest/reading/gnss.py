@@ -17,7 +17,7 @@ import pyarrow as pa
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text, geodetic_from_world, world_frame_of
 from roadscan.core.errors import ConfigError, CrsError, Missing, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.format import Item, LogSource
+from roadscan.ingest.reading.format import Item, LogSource
 from roadscan.ingest.reading.poses import BlockPlacer, Placement, WorldPlacement, block_rows, check_sigmas
 from roadscan.ingest.reading.records import Sieve
 

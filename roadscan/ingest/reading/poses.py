@@ -37,7 +37,7 @@ from roadscan.core.crs import (
 from roadscan.core.errors import ConfigError, CrsError, Missing, RoadscanError
 from roadscan.core.frames import BODY_FROM_AXES, ENU_FROM_NED, body_from_axes, quaternion_from_rotation
 from roadscan.core.gpstime import Clock
-from roadscan.ingest.format import Item, LogSource, Rows
+from roadscan.ingest.reading.format import Item, LogSource, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, drop_failing
 
 Float64 = npt.NDArray[np.float64]

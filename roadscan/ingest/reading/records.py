@@ -26,7 +26,7 @@ from roadscan.core.gpstime import (
     unroll_week,
 )
 from roadscan.core.strict import Strict
-from roadscan.ingest.format import LogSource, Reject
+from roadscan.ingest.reading.format import LogSource, Reject
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

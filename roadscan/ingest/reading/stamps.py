@@ -20,8 +20,8 @@ import pyarrow.compute as pc
 from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEKS_A_ROLLOVER, Clock, TimeSystem, leap_seconds_at_unix
 from roadscan.core.witness import Witness
-from roadscan.ingest.format import LogSource
 from roadscan.ingest.reading.columns import Found, Quantity, need_stamp_unit
+from roadscan.ingest.reading.format import LogSource
 from roadscan.ingest.reading.records import Sieve
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, first_fields, is_number, stamp_kind
 

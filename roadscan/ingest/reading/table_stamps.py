@@ -11,9 +11,9 @@ import pyarrow as pa
 
 from roadscan.core.errors import ConfigError, FormatError
 from roadscan.core.gpstime import EARLIEST_GPS_NS, LATEST_GPS_NS, Clock, TimeSystem
-from roadscan.ingest.format import LogSource
 from roadscan.ingest.reading.column_table import is_number
 from roadscan.ingest.reading.columns import Found, need_stamp_unit
+from roadscan.ingest.reading.format import LogSource
 from roadscan.ingest.reading.records import Sieve
 from roadscan.ingest.reading.stamps import calendar_clock
 

@@ -30,7 +30,7 @@ import pyarrow.csv as pa_csv
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Witness
-from roadscan.ingest.format import Reject
+from roadscan.ingest.reading.format import Reject
 from roadscan.ingest.reading.later_headers import AGAIN, Headers, NameLines
 
 Int64 = npt.NDArray[np.int64]

@@ -19,7 +19,7 @@ from roadscan.report.blocks import Block, Drawing, Line, Picture, Table
 from roadscan.report.map_page import COLOURS, WIDTH, MapPage
 from roadscan.report.section import Material, Section
 from roadscan.store.asset_schema import AssetSchema, asset_schema, asset_tables
-from roadscan.tiles.mosaics.products import product_context
+from roadscan.tiles.tasks.wanted_products import product_context
 
 _CROSS: Final = 3.0
 _MOST_LINES: Final = 6000

@@ -29,7 +29,7 @@ from roadscan.site.layer import (
 )
 from roadscan.site.material import Material
 from roadscan.store.group_reader import read_groups
-from roadscan.tiles.products.lane_direction import STEP_M
+from roadscan.tiles.lane_direction import STEP_M
 
 RUN_COLOURS = (BLUE, RED, GREEN, PURPLE, SKY, ORANGE)
 _FAITHFUL_M = 0.02

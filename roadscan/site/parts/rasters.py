@@ -29,8 +29,8 @@ from roadscan.site.site_rasters import (
     coarser_picture,
     write_picture,
 )
-from roadscan.tiles.mosaics.products import wanted_products
 from roadscan.tiles.products.pavement import IntensityOptions
+from roadscan.tiles.tasks.wanted_products import wanted_products
 
 _CODE: Final = ("roadscan.site.site_rasters", "roadscan.tiles.mosaics.products:StoredTiles")
 _PATH: Final = re.compile(r"rasters/(\w+)/(\d+)/(-?\d+)_(-?\d+)\.png")

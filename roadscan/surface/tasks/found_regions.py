@@ -35,9 +35,9 @@ from roadscan.store.store import Store, file_digest
 from roadscan.surface.coarse import CoarseSettings, Stretch, coarse_model
 from roadscan.surface.regions import Region, find_regions
 from roadscan.surface.tasks.surface_regions import Regions
-from roadscan.tiles.mosaics.products import product_context
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
+from roadscan.tiles.tasks.wanted_products import product_context
 
 REGIONS: Final = "regions"
 

@@ -17,9 +17,9 @@ from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.tasks.picture_colours import ColourSource
 from roadscan.surface.tasks.pictures import Pictures, check_folders, check_pictures, plan_pictures, rule_cameras
 from roadscan.surface.tile import NodeColours, SurfaceTile
-from roadscan.tiles.mosaics.products import product_context, wanted_products, wanted_surface_products
 from roadscan.tiles.product import SurfaceProduct
 from roadscan.tiles.tasks.tile_files import WantedSurface
+from roadscan.tiles.tasks.wanted_products import product_context, wanted_products, wanted_surface_products
 
 COLOURS: Final = "colours"
 """Where a tile's record keeps the figures of its colours."""

@@ -13,10 +13,10 @@ from roadscan.store.manifest import OutputRecord
 from roadscan.surface.tasks.found_regions import REGIONS, FoundRegions, load_found_regions
 from roadscan.surface.tasks.surface_colours import plan_colours
 from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, plan_surfaces
-from roadscan.tiles.mosaics.products import product_context, wanted_surface_products
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import surface_file_names
 from roadscan.tiles.tasks.tile_plan import TilePlan, tiles_of
+from roadscan.tiles.tasks.wanted_products import product_context, wanted_surface_products
 
 
 @dataclass(frozen=True)

@@ -3,48 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from roadscan.core.errors import ConfigError
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
-from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.compute import Compute
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.store import Store, file_digest
-from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.drives import Drives
+from roadscan.tiles.lane_direction import LaneDirections
 from roadscan.tiles.product import (
     Output,
-    Product,
     ProductContext,
-    SurfaceProduct,
     SurveyProduct,
-    TileProduct,
     TileSummary,
-    is_default,
-    product_named,
     products,
 )
-from roadscan.tiles.products.lane_direction import LaneDirections
 from roadscan.tiles.pyramid import Level, pyramid_of
 from roadscan.tiles.tasks.cell_files import read_cells, read_overview
-from roadscan.tiles.tasks.tile_files import WantedProduct, WantedSurface
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 from roadscan.tiles.tasks.tiles import summary_of
+from roadscan.tiles.tasks.wanted_products import _product_key, product_context, wanted_products
 
 _TILES_DRAWN = 2000
 """Tiles that one task draws, each as often as it draws it: `kilometre`, with its six rasters, over two kilometres."""
 _NOWHERE = TileId(0, 0)
-_OF_SURVEY = ("roadscan.tiles.drives:Drives", "roadscan.tiles.mosaics.products:StoredTiles")
-"""Code by which survey products get what they draw."""
 
 
 @dataclass(frozen=True)
@@ -71,90 +59,6 @@ class OutputTask:
     def target(self) -> str:
         """Where the file goes, relative to the survey's root."""
         return f"products/{self.product.name}/{self.output.name}"
-
-
-def wanted_products(survey: Survey) -> list[tuple[Product, Strict]]:
-    """Products that the survey file asks for, with their checked settings."""
-    config = survey.config.products
-    cell_m = survey.config.tiles.cell_m
-    with_surface = survey.config.surface is not None
-    names = config.make if config.make is not None else _default_names(cell_m, with_surface)
-    for name in config.options:
-        product_named(name)
-    wanted = [product_named(n) for n in names]
-    read = (n for p in wanted if isinstance(p, SurveyProduct) for n in p.reads if n not in names)
-    wanted += [product_named(n) for n in dict.fromkeys(read)]
-    for product in wanted:
-        _check_surface(survey, product)
-    stated = [(p, _stated_options(p, config.options.get(p.name, {}))) for p in wanted]
-    by_name = {p.name: options for p, options in stated}
-    for product, options in stated:
-        if isinstance(product, SurveyProduct):
-            product.check_reads(options, {name: by_name[name] for name in product.reads})
-    return stated
-
-
-def check_product(survey: Survey, name: str) -> None:
-    """Raise :class:`ConfigError` where a product that the survey file names does not exist, has other settings than
-    those stated, or needs a surface that is not made; reads nothing.
-    """
-    product, config = product_named(name), survey.config.products
-    if name in (config.make or ()):
-        _check_surface(survey, product)
-    _stated_options(product, config.options.get(name, {}))
-
-
-def _check_surface(survey: Survey, product: Product) -> None:
-    of_surface = isinstance(product, SurfaceProduct) or (isinstance(product, SurveyProduct) and product.reads)
-    if of_surface and survey.config.surface is None:
-        raise ConfigError(
-            f"the product '{product.name}' is made of the reconstructed surface, and the survey has none",
-            change="add the section [surface] to the survey file, or leave the product out",
-        )
-
-
-def _stated_options(product: Product, values: dict[str, Any]) -> Strict:
-    try:
-        return product.options.parse(values)
-    except ConfigError as error:
-        raise ConfigError(
-            f"[products.options.{product.name}] {error.arrived}", expected=error.expected, change=error.change
-        ) from error
-
-
-def _default_names(cell_m: float, with_surface: bool) -> list[str]:
-    made = [(n, p) for n, p in products().items() if is_default(p, cell_m)]
-    return [n for n, p in made if with_surface or not isinstance(p, SurfaceProduct)]
-
-
-def product_context(plan: SurveyPlan) -> ProductContext:
-    """What products know of the survey."""
-    config, grid = plan.survey.config, plan.ground.grid
-    cell_m = None if config.surface is None else SurfaceGrid(grid, config.surface).cell_m
-    return ProductContext(config.id, config.title, plan.ground.map, grid, plan.passes, plan.date, cell_m)
-
-
-def wanted_tile_products(survey: Survey, context: ProductContext) -> list[WantedProduct]:
-    """Tile products of the survey, their settings checked, with the keys of what shapes them beside the tile."""
-    wanted: list[WantedProduct] = []
-    for product, options in wanted_products(survey):
-        if isinstance(product, TileProduct):
-            product.check_options(options, context)
-            wanted.append(WantedProduct(product, options, _product_key(product, options, context)))
-    return wanted
-
-
-def wanted_surface_products(survey: Survey, context: ProductContext) -> list[WantedSurface]:
-    """The same, of products of the reconstructed surface."""
-    config = survey.config.surface
-    grid = None if config is None else SurfaceGrid(context.grid, config)
-    wanted: list[WantedSurface] = []
-    for product, options in wanted_products(survey):
-        if isinstance(product, SurfaceProduct) and grid is not None:
-            product.check_options(options, context)
-            product.check_cells(options, grid.cell_m, grid.shown)
-            wanted.append(WantedSurface(product, options, _product_key(product, options, context)))
-    return wanted
 
 
 def plan_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask], list[OutputRecord]]:
@@ -299,12 +203,3 @@ def _read(product: SurveyProduct, files: Sequence[OutputRecord], output: Output)
     """Files of surface products that an output is made from, in the order of tiles."""
     units = {str(t) for t in output.tiles} if product.reads else set()
     return tuple(sorted((r for r in files if r.unit in units), key=lambda r: (r.product, TileId.parse(r.unit))))
-
-
-def _product_key(product: Product, options: Strict, context: ProductContext) -> str:
-    stated = [asdict(p) for p in context.passes] if isinstance(product, SurveyProduct) else []
-    around = _OF_SURVEY if isinstance(product, SurveyProduct) else ()
-    return key_of(
-        product.name, product.version, options.model_dump(mode="json"), code_digest(name_of(type(product)), *around),
-        context.survey_id, context.title, context.map, context.grid, stated,
-    )  # fmt: skip

@@ -15,10 +15,10 @@ from roadscan.surface.tasks.found_regions import searched_sources
 from roadscan.surface.tasks.surface_colours import check_colours
 from roadscan.surface.tasks.surface_plan import checked_surface
 from roadscan.tiles.accumulator import MOST_BYTES
-from roadscan.tiles.mosaics.products import product_context, wanted_tile_products
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import tile_file_names
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, stale_tiles, tiles_of
+from roadscan.tiles.tasks.wanted_products import product_context, wanted_tile_products
 
 
 @dataclass(frozen=True)

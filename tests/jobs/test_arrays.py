@@ -1,4 +1,4 @@
-"""Surveys from arrays: what the writers of `roadscan.door.arrays` wrote lies, after a run, where plain NumPy puts it."""
+"""Surveys from arrays: what the writers of `roadscan.door.arrays` wrote lies, after a run, where NumPy puts it."""
 
 from __future__ import annotations
 

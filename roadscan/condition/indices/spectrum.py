@@ -1,7 +1,7 @@
 """Power spectral density of the wheel paths over a section, and its class of ISO 8608.
 
-Formulas and sources: :mod:`roadscan.condition.profiles.spectrum`. A section of 100 m is one window, so that its density at 0.1
-cycles a metre is known to a third or so; the standard deviation is that of the fitted line.
+Formulas and sources: :mod:`roadscan.condition.profiles.spectrum`. A section of 100 m is one window, so that its density
+at 0.1 cycles a metre is known to a third or so; the standard deviation is that of the fitted line.
 """
 
 from __future__ import annotations

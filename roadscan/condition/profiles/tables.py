@@ -59,12 +59,12 @@ def iri(
     -------
     A row a segment: from_m, to_m, iri_m_per_km (of several profiles one column each, `iri_NAME_m_per_km`; of two also
     mri_m_per_km, their mean, and hri_m_per_km, the half car), ride_number, measured_share (the least of the profiles),
-    accuracy_class (:meth:`roadscan.condition.profiles.ride.Ride.accuracy_class`; 3 where heights are too coarse) and note.
-    Values are NaN where less than half of a segment was measured. Repeated heights and spikes are left out
+    accuracy_class (:meth:`roadscan.condition.profiles.ride.Ride.accuracy_class`; 3 where heights are too coarse) and
+    note. Values are NaN where less than half of a segment was measured. Repeated heights and spikes are left out
     (:mod:`roadscan.condition.profiles.profile_faults`). Notes: `start`, `gap`, `jump`, `step`, `uneven`, `short` (see
-    :meth:`roadscan.condition.profiles.ride.Ride.notes`); `stuck` and `spikes`, of which samples are left out; `coarse`, an IRI
-    that is too high by over 5 % for the rounding of its heights; and `flat` or `wild`, an IRI so low or high that no
-    road has it. `attrs["findings"]` says the same in sentences (:class:`roadscan.core.witness.Finding`).
+    :meth:`roadscan.condition.profiles.ride.Ride.notes`); `stuck` and `spikes`, of which samples are left out; `coarse`,
+    an IRI that is too high by over 5 % for the rounding of its heights; and `flat` or `wild`, an IRI so low or high
+    that no road has it. `attrs["findings"]` says the same in sentences (:class:`roadscan.core.witness.Finding`).
 
     Raises
     ------

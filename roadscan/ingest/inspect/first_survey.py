@@ -1,7 +1,8 @@
 """A first survey from a folder of logs: which logs there are, which belong to one drive, which sensors wrote them.
 
 Every file is told by its content and looked into as `roadscan inspect` does. What the logs say is filled in; what
-they do not say becomes a question of the written file (:mod:`roadscan.ingest.inspect.first_survey_text`), never a guess.
+they do not say becomes a question of the written file (:mod:`roadscan.ingest.inspect.first_survey_text`), never a
+guess.
 """
 
 from __future__ import annotations

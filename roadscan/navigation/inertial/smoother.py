@@ -1,7 +1,7 @@
 """The smoother: a trajectory from IMU, GNSS and odometer.
 
-A loosely coupled error-state Kalman filter (:mod:`roadscan.navigation.inertial.kernels.kalman`) runs forwards over a run, a
-smoother (:mod:`roadscan.navigation.inertial.kernels.kalman_smoother`) back. The order of things is
+A loosely coupled error-state Kalman filter (:mod:`roadscan.navigation.inertial.kernels.kalman`) runs forwards over a
+run, a smoother (:mod:`roadscan.navigation.inertial.kernels.kalman_smoother`) back. The order of things is
 :mod:`~roadscan.navigation.inertial.timeline`, the first attitude :mod:`~roadscan.navigation.inertial.alignment`,
 standstill :mod:`~roadscan.navigation.inertial.standing`, the trust in readings
 :mod:`~roadscan.navigation.inertial.noise`.

@@ -1,4 +1,4 @@
-"""Decompresses LAZ points for :mod:`roadscan.store.codecs.laz`: damaged bytes can make lazrs (0.8) read outside its tables.
+"""Decompresses LAZ points for `roadscan.store.codecs.laz`: damaged bytes make lazrs (0.8) read outside its tables.
 
 A request is two little-endian int64, first point and number of points (0: the chunk table).
 """

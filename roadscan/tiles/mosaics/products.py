@@ -28,7 +28,7 @@ from roadscan.tiles.pyramid import Level, pyramid_of
 from roadscan.tiles.tasks.cell_files import read_cells, read_overview
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 from roadscan.tiles.tasks.tiles import summary_of
-from roadscan.tiles.tasks.wanted_products import _product_key, product_context, wanted_products
+from roadscan.tiles.tasks.wanted_products import product_context, product_key, wanted_products
 
 _TILES_DRAWN = 2000
 """Tiles that one task draws, each as often as it draws it: `kilometre`, with its six rasters, over two kilometres."""
@@ -172,7 +172,7 @@ def _tasks(
 ) -> list[OutputTask]:
     tasks: list[OutputTask] = []
     drives = Drives.of(plan) if product.needs_lanes else None
-    own_key = _product_key(product, options, context)
+    own_key = product_key(product, options, context)
     driven = [] if drives is None else [drives.key()]
     bridged = {TileId.parse(r.unit) for r in files} - summaries.keys()  # they have a surface, and no reading
     known = [*summaries.values(), *map(TileSummary.without_readings, sorted(bridged))]

@@ -23,7 +23,6 @@ from roadscan.tiles.product import (
     products,
 )
 from roadscan.tiles.tasks.tile_files import WantedProduct, WantedSurface
-from roadscan.tiles.tasks.wanted_products import _product_key, product_context, wanted_products
 
 _OF_SURVEY = ("roadscan.tiles.drives:Drives", "roadscan.tiles.mosaics.products:StoredTiles")
 """Code by which survey products get what they draw."""
@@ -96,7 +95,7 @@ def wanted_tile_products(survey: Survey, context: ProductContext) -> list[Wanted
     for product, options in wanted_products(survey):
         if isinstance(product, TileProduct):
             product.check_options(options, context)
-            wanted.append(WantedProduct(product, options, _product_key(product, options, context)))
+            wanted.append(WantedProduct(product, options, product_key(product, options, context)))
     return wanted
 
 
@@ -109,11 +108,12 @@ def wanted_surface_products(survey: Survey, context: ProductContext) -> list[Wan
         if isinstance(product, SurfaceProduct) and grid is not None:
             product.check_options(options, context)
             product.check_cells(options, grid.cell_m, grid.shown)
-            wanted.append(WantedSurface(product, options, _product_key(product, options, context)))
+            wanted.append(WantedSurface(product, options, product_key(product, options, context)))
     return wanted
 
 
-def _product_key(product: Product, options: Strict, context: ProductContext) -> str:
+def product_key(product: Product, options: Strict, context: ProductContext) -> str:
+    """Key of a product with its settings and what it is told of the survey."""
     stated = [asdict(p) for p in context.passes] if isinstance(product, SurveyProduct) else []
     around = _OF_SURVEY if isinstance(product, SurveyProduct) else ()
     return key_of(

@@ -1,6 +1,7 @@
 """Measurement updates of the filter: innovation, row and variance of each kind of measurement.
 
-All functions fill an :class:`~roadscan.navigation.inertial.kernels.kalman_states.Offer`: innovation = row · errors + noise.
+All functions fill an :class:`~roadscan.navigation.inertial.kernels.kalman_states.Offer`: innovation = row · errors +
+noise.
 """
 
 from __future__ import annotations

@@ -145,7 +145,7 @@ def test_a_new_file_does_not_count(package: Path) -> None:
 
 
 def test_an_entry_that_is_gone_is_told() -> None:
-    with pytest.raises(LookupError, match=r"roadscan\.jobs\.tiles\.tiles:no_such_thing"):
+    with pytest.raises(LookupError, match=r"roadscan\.tiles\.tasks\.tiles:no_such_thing"):
         code_digest("roadscan.tiles.tasks.tiles:no_such_thing")
 
 

@@ -38,9 +38,9 @@ from roadscan.navigation.tasks.trajectories import TrajectorySource, load_record
 from roadscan.poses.mounting_change import MountingChange
 from roadscan.poses.movement import NO_CORRECTION, Allowance
 from roadscan.poses.trajectory import Trajectory
-from roadscan.store.group_reader import read_groups
 from roadscan.store.held import read_held
 from roadscan.store.logs import DataFile
+from roadscan.store.row_groups import read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 

@@ -43,6 +43,8 @@ Brought: TypeAlias = tuple[str, str, str | None]
 
 CARRIERS: Final = (
     "roadscan.compute.compiler",
+    "roadscan.compute.kernel_options",
+    "roadscan.core.plugins",
     "roadscan.run.engine.compute",
     "roadscan.run.engine.fingerprint",
     "roadscan.core.errors",
@@ -94,17 +96,20 @@ def reached_code(entries: Iterable[str]) -> dict[str, str]:
     """Shape of each definition ("module:name") that `entries` reach, in the order in which they are reached."""
     waiting = deque(_place_of(entry) for entry in entries)
     numbers: dict[Place, int] = {}
+    entered: dict[str, None] = {}
     while waiting:
         place = _origin(waiting.popleft())
-        if place in numbers or _is_carrier(place):
-            continue
-        numbers[place] = len(numbers)
-        shapes = _module(place[0]).shapes
-        if place[1] is None:
-            waiting += [(place[0], own) for own in shapes]
-        else:
-            waiting += [used for shape in shapes.get(place[1], ()) for used in shape.uses.values()]
-            waiting.append((place[0], _EFFECTS))
+        if place not in numbers and not _is_carrier(place):
+            shapes = _module(place[0]).shapes
+            if place[1] is None:
+                waiting += [(place[0], own) for own in shapes if own != _EFFECTS]
+            else:
+                numbers[place] = len(numbers)
+                waiting += [used for shape in shapes.get(place[1], ()) for used in shape.uses.values()]
+            entered[place[0]] = None
+        if not waiting:  # last: in which file a definition stands changes no number
+            effects = [(name, _EFFECTS) for name in entered if _module(name).shapes[_EFFECTS]]
+            waiting += [one for one in effects if one not in numbers]
     return {f"{name}:{own}": _numbered((name, own), numbers) for name, own in numbers if own in _module(name).shapes}
 
 

@@ -26,7 +26,7 @@ from roadscan.georeference.plan.plan import plan_survey
 from roadscan.ingest.ingest import ingest
 from roadscan.ingest.reading.format import format_of
 from roadscan.simulate import simulate, truth
-from roadscan.store.group_reader import read_groups
+from roadscan.store.row_groups import read_groups
 from roadscan.store.store import Store
 from tests.jobs.conftest import small_scene
 from tests.sensors.readings import read

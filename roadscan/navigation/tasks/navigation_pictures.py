@@ -20,9 +20,9 @@ from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.navigation.tasks.navigation_logs import gnss_solutions
 from roadscan.navigation.tasks.recorded_pictures import NAVIGATION_PICTURE, keep_file, picture_key, remove_others
 from roadscan.navigation.tasks.solve_trajectory import SMOOTHER, on_time
-from roadscan.store.group_reader import read_groups
 from roadscan.store.logs import LogRecord, read_log_records
 from roadscan.store.manifest import Manifest
+from roadscan.store.row_groups import read_groups
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]

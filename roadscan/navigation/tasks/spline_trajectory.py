@@ -16,8 +16,8 @@ from roadscan.navigation.tasks.computed_trajectory import Computed, sigma_figure
 from roadscan.poses.trajectory import Trajectory
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.store.group_reader import read_groups
 from roadscan.store.logs import NAVIGATION, LogRecord
+from roadscan.store.row_groups import read_groups
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]

@@ -210,7 +210,8 @@ def test_a_survey_from_arrays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 GROUPS = {
-    "sensors": "roadscan.formats", "jobs/stages": "roadscan.stages", "assets/kinds": "roadscan.asset_kinds"
+    "formats": "roadscan.formats", "levels": "roadscan.stages", "assets/kinds": "roadscan.asset_kinds",
+    "tiles/products": "roadscan.products",
 }  # fmt: skip
 
 
@@ -221,6 +222,7 @@ def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     blocks = re.findall(r"```python\n# roadscan/([\w/]+)/(\w+)\.py\n(.*?)```", CONTRIBUTING.read_text(), re.DOTALL)
     entries: dict[str, list[str]] = {}
     for group, module, code in blocks:
+        module = group if module == "stage" else module
         (folder / f"contributed_{module}.py").write_text(code)
         name = re.findall(
             r"^class (\w+)\((?:LogFormat|TileProduct|SurveyProduct|AssetKind|Stage)\)", code, flags=re.MULTILINE

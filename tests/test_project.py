@@ -54,11 +54,12 @@ def test_hooks_call_make_targets_that_exist() -> None:
 
 
 VIOLATIONS = {
-    "a neighbour": ("roadscan/formats/zz.py", "from roadscan.store import schema", "Layers"),
-    "upward": ("roadscan/navigation/zz.py", "from roadscan.georeference import cloud", "Layers"),
-    "dask below jobs": ("roadscan/tiles/zz.py", "import dask.array", "Only flows and jobs know Dask"),
-    "prefect in jobs": ("roadscan/jobs/zz.py", "import prefect", "Only flows and the command line know Prefect"),
-    "files in kernels": ("roadscan/kernels/zz.py", "import pyarrow as pa", "Kernels see arrays only"),
+    "a feature after it": ("roadscan/formats/zz.py", "from roadscan.tiles import cells", "Order of the features"),
+    "upward": ("roadscan/navigation/zz.py", "from roadscan.georeference import cloud", "Order of the features"),
+    "dask in a feature": ("roadscan/tiles/zz.py", "import dask.array", "Only flows and the engine know Dask"),
+    "prefect in a feature": ("roadscan/survey/zz.py", "import prefect", "Only flows and the command line know Prefect"),
+    "files in kernels": ("roadscan/tiles/kernels/zz.py", "import pyarrow as pa", "Kernels see arrays only"),
+    "bytes in a feature": ("roadscan/site/zz.py", "import zlib", "Codecs alone know the bytes"),
     "shared rotations": (
         "roadscan/simulate/zz.py",
         "from roadscan.core import frames",
@@ -66,8 +67,8 @@ VIOLATIONS = {
     ),
     "shared geometry": (
         "roadscan/simulate/zz.py",
-        "from roadscan.georeference import readings",
-        "The simulator knows the model only",
+        "from roadscan.georeference import place",
+        "The simulator knows values alone",
     ),
 }
 

@@ -29,7 +29,7 @@ from roadscan.tiles.cells import TileCells
 from roadscan.tiles.lane_direction import LaneDirections
 from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
 
-ENTRY_POINT_GROUP: Final = "roadscan.tiles.products"
+ENTRY_POINT_GROUP: Final = "roadscan.products"
 """Entry-point group through which a third party's package adds a product."""
 
 

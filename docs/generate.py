@@ -323,7 +323,7 @@ def _format_section(kind: LogFormat) -> str:
 
 def product_list(_: str) -> str:
     """Overview of the products and a section each."""
-    found = _own(products(), "roadscan.tiles.products")
+    found = _own(products(), "roadscan.products")
     overview = markdown_table(
         ("product", "what it is", "files", "made"),
         [(f"[`{n}`](#{n})", plain(p.title), _files_words(p), _made_words(p)) for n, p in found.items()],

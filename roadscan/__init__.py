@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from roadscan.arrays import write_profiles, write_returns, write_trajectory
     from roadscan.condition.profiles.profile_files import read_profile, write_erd
     from roadscan.condition.profiles.spectrum import road_spectrum
     from roadscan.condition.profiles.straightedge import straightedge_mm
     from roadscan.condition.profiles.tables import iri, localised_roughness, mpd
     from roadscan.core.errors import RoadscanError
     from roadscan.door import LogTables, MadeProduct, OpenSurvey, open_survey, read_log
-    from roadscan.door.arrays import write_profiles, write_returns, write_trajectory
 
 __all__ = [
     "LogTables",
@@ -45,7 +45,7 @@ _ELSEWHERE = {
     **dict.fromkeys(("read_profile", "write_erd"), "roadscan.condition.profiles.profile_files"),
     "road_spectrum": "roadscan.condition.profiles.spectrum",
     "straightedge_mm": "roadscan.condition.profiles.straightedge",
-    **dict.fromkeys(("write_profiles", "write_returns", "write_trajectory"), "roadscan.door.arrays"),
+    **dict.fromkeys(("write_profiles", "write_returns", "write_trajectory"), "roadscan.arrays"),
 }
 
 

@@ -221,8 +221,8 @@ def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("plugin")
     blocks = re.findall(r"```python\n# roadscan/([\w/]+)/(\w+)\.py\n(.*?)```", CONTRIBUTING.read_text(), re.DOTALL)
     entries: dict[str, list[str]] = {}
-    for group, module, code in blocks:
-        module = group if module == "stage" else module
+    for group, file, code in blocks:
+        module = group if file == "stage" else file
         (folder / f"contributed_{module}.py").write_text(code)
         name = re.findall(
             r"^class (\w+)\((?:LogFormat|TileProduct|SurveyProduct|AssetKind|Stage)\)", code, flags=re.MULTILINE

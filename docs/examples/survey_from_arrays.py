@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from roadscan.door.arrays import write_profiles, write_trajectory
+from roadscan.arrays import write_profiles, write_trajectory
 
 folder = Path("array-survey")
 

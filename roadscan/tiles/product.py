@@ -1,8 +1,8 @@
 """The contract of a product, and the registry that finds products by themselves.
 
-A product is one file in this folder (or one entry point of the group ``roadscan.tiles.products``) with one
-subclass of :class:`TileProduct`, :class:`SurfaceProduct` or :class:`SurveyProduct`. It writes whole files to the path
-it is given; keys, temporary names, checks and the manifest are done for it.
+A product is one file of a folder `products` of its feature (or one entry point of the group ``roadscan.products``) with
+one subclass of :class:`TileProduct`, :class:`SurfaceProduct` or :class:`SurveyProduct`. It writes whole files to the
+path it is given; keys, temporary names, checks and the manifest are done for it.
 """
 
 from __future__ import annotations

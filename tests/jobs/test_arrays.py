@@ -1,4 +1,4 @@
-"""Surveys from arrays: what the writers of `roadscan.door.arrays` wrote lies, after a run, where NumPy puts it."""
+"""Surveys from arrays: what the writers of `roadscan.arrays` wrote lies, after a run, where NumPy puts it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from typer.testing import CliRunner
 
+from roadscan.arrays import Quaternions, write_profiles, write_returns, write_trajectory
 from roadscan.cli import app
-from roadscan.door.arrays import Quaternions, write_profiles, write_returns, write_trajectory
 
 CELL_M = 0.05
 QUANTUM_M = 2e-4

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from roadscan.arrays import write_profiles, write_returns, write_trajectory
 from roadscan.cli import app
-from roadscan.door.arrays import write_profiles, write_returns, write_trajectory
 from roadscan.ingest.inspect.first_cell_size import EDGES_M, cell_edge_m
 
 FIRST_NS = 1_461_922_218_000_000_000

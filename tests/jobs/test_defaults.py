@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
+from roadscan.arrays import write_profiles
 from roadscan.cli import app
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
-from roadscan.door.arrays import write_profiles
 from roadscan.ingest.planned_logs import plan_logs
 from roadscan.store.store import Store
 

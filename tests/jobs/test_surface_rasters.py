@@ -10,8 +10,8 @@ import pytest
 import rasterio
 from typer.testing import CliRunner
 
+from roadscan.arrays import write_profiles, write_trajectory
 from roadscan.cli import app
-from roadscan.door.arrays import write_profiles, write_trajectory
 from roadscan.store.codecs.gdal import without_place_warning
 
 SURVEY = """

@@ -11,9 +11,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from roadscan.arrays import Quaternions, write_profiles, write_returns, write_trajectory
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.door.arrays import Quaternions, write_profiles, write_returns, write_trajectory
 from roadscan.ingest.reading.format import format_of
 from tests.sensors.log_reading import read_log
 from tests.sensors.readings import read

@@ -70,7 +70,7 @@ class TrajectoryTable(LogFormat):
     column such as ``time_s`` in the clock that the survey file states; timestamps of Arrow with a zone are UTC.
 
     The file may state crs, height and heading itself, as JSON in its schema metadata under ``roadscan.trajectory``;
-    files that `roadscan.door.arrays.write_trajectory` wrote do. What the survey file states has to agree with it.
+    files that `roadscan.arrays.write_trajectory` wrote do. What the survey file states has to agree with it.
     """
 
     name = "trajectory_table"

@@ -1,7 +1,7 @@
 """Sparse normal equations: their factor, their solution, and the part of their inverse that is needed.
 
 The factor L D Lᵀ with an approximate minimum degree ordering is QDLDL's (Stellato et al. 2020; Davis 2005); the
-selected inverse is in `kernels/adjust/selected_inverse.py`.
+selected inverse is in `adjust/kernels/selected_inverse.py`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Footprints: which raw block touches which tile. One task some data files, about eight kilometres at line rate.
 
-Profiles and returns are not placed for it: bounds (``points/reach.py``) name every tile that a row group may touch.
-Clouds, whose points are placed already, are read.
+Profiles and returns are not placed for it: bounds (``georeference/reach.py``) name every tile that a row group
+may touch. Clouds, whose points are placed already, are read.
 """
 
 from __future__ import annotations

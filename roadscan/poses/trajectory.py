@@ -71,7 +71,7 @@ class Poses:
 class Trajectory:
     """Recorded poses of one run in one world frame.
 
-    Poses between knots are cubic on position and on the rotation group, see ``kernels/georeferencing/poses.py``.
+    Poses between knots are cubic on position and on the rotation group, see ``poses/kernels/poses.py``.
     """
 
     world: str

@@ -13,7 +13,7 @@ where eight directions are tried at each cell. Over 21 rows it stands out by 8 �
 4. *Confirmed* is what gains `_GAIN_ALONE` σ, or `_GAIN_TOGETHER` where another strip that does goes on 11 to 18 cells
    further. In twelve million cells of noise with 2 % wrong readings that is three strips; 5.5 σ alone would be 22.
    Where lines beside a strip vary more than those of independent cells, it counts for less by as much.
-   It is drawn, as one more support that the risk decides about (``surfaces/detail_median.py``).
+   It is drawn, as one more support that the risk decides about (``surface/detail_median.py``).
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ class HeightWindow:
 
         A crack that takes in less than half of a cell is not in its height, but in its lowest reading. A single wrong
         reading decides that: it must not outweigh the cells around. Nor must cells with many times the readings of
-        those around them (``surfaces/lowest.py``): the lowest of 300 readings lies lower than that of 10.
+        those around them (``surface/lowest.py``): the lowest of 300 readings lies lower than that of 10.
         """
         heights = self.cleaned_m()
         if self.lowest is None or most_m <= 0.0:

@@ -1,7 +1,7 @@
 """Holes of a gridded surface, filled up to a stated width.
 
 A hole is a run of empty cells between two known ones, along a row or a column, of at most that width. It is filled as
-the coarse model fills one (``surfaces/coarse.py``): by the straight line between the mean heights of the last three
+the coarse model fills one (``surface/coarse.py``): by the straight line between the mean heights of the last three
 known cells on each side. A cell that lies in such a run both ways gets the line of the shorter one, of two of the same
 length the mean. Heights that were there stay as they are, and nothing goes beyond the border of what was measured.
 """

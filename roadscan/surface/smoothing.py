@@ -7,7 +7,7 @@ The smoothed surface F minimises the paper's energy
 where P are the measured heights, P_M their median and C₁ … C₅ the five high-pass filters of eq. 12. All filters act on
 neighbouring cells, whatever their size: on 1 × 3 cm cells, "two cells" is 2 cm one way and 6 cm the other.
 
-**P_M** is detail-preserving (``surfaces/detail_median.py``): with λ_M = 30 the surface follows it, and a 9 × 9 median
+**P_M** is detail-preserving (``surface/detail_median.py``): with λ_M = 30 the surface follows it, and a 9 × 9 median
 loses every crack.
 
 **Iᵢ**. The paper does not define it; it cites Paik et al. (2001), "Adaptive regularized noise smoothing of dense range

@@ -1,4 +1,4 @@
-"""Settings of the search for regions of interest on the coarse model (``surfaces/regions.py``)."""
+"""Settings of the search for regions of interest on the coarse model (``surface/regions.py``)."""
 
 from __future__ import annotations
 

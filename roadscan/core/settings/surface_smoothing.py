@@ -8,7 +8,7 @@ from roadscan.core.strict import Strict
 
 
 class SmoothingWeights(Strict):
-    """Weights and thresholds of ``surfaces/smoothing.py``; the weights are those of Yu et al. (2007), section 4."""
+    """Weights and thresholds of ``surface/smoothing.py``; the weights are those of Yu et al. (2007), section 4."""
 
     curvature_weight: float = Field(default=50.0, ge=0.0, le=10_000.0)
     """λ_C, weight of the directional high-pass filters against the weight 1 of the measured heights."""

@@ -1,4 +1,4 @@
-"""Looks into a video for `sensors/cameras/video.py`: damaged bytes can crash or stall the libraries that do it.
+"""Looks into a video for `formats/cameras/video.py`: damaged bytes can crash or stall the libraries that do it.
 
 The one request is empty. The reply: frames per second, frames that the header claims, width and height as float64;
 number of packets n, number of decoded frames m (−1 where the video was not decoded) as int64; n and m float64 times in

@@ -15,7 +15,7 @@ def choose_row(surface, measured, i, limit, chosen, own, residual):
     ----------
     surface : (rows + 4, n + 4) float64 (m), 0 where nothing was measured, two cells more at either end; measured : the
         same, 1 where measured, 0 elsewhere; i : the row, of those without margin.
-    chosen, own, residual : (n,) float32, out; see ``kernels/surface/smoothing.py``.
+    chosen, own, residual : (n,) float32, out; see ``surface/kernels/smoothing.py``.
     """
     i0, i1, i2, i3, i4 = i, i + 1, i + 2, i + 3, i + 4
     for j in range(chosen.size):

@@ -51,7 +51,7 @@ docs-check: $(VENV)/.installed-dev  ## Fail where a generated page is out of dat
 	$(BIN)/python docs/generate.py --check
 
 # The last lines of the output are pytest's summary.
-pytest: $(VENV)/.installed-dev  ## Tests only; PYTEST_ARGS="tests/model -n0" narrows them.
+pytest: $(VENV)/.installed-dev  ## Tests only; PYTEST_ARGS="tests/core -n0" narrows them.
 	$(BIN)/python -m pytest $(or $(PYTEST_ARGS),-q -n 2 --dist worksteal)
 
 nightly: $(VENV)/.installed-dev  ## What takes too long for every change: fuzz, power cuts, servers, a second user, benchmarks, no AVX-512.

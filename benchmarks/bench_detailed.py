@@ -23,7 +23,7 @@ from roadscan.surface.normals import slopes_at
 from roadscan.surface.sites import sites
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow
-from tests.surfaces.test_detailed import franke
+from tests.surface.test_detailed import franke
 
 ORIGIN = np.array([431_000.0, 5_400_000.0, 0.0])
 POINTS = 26_310

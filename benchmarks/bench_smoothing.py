@@ -14,7 +14,7 @@ from scipy.sparse.linalg import cg, spsolve
 from benchmarks.timing import Figure, thread_seconds
 from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surface.smoothing import Smoothing, smooth_surface, steps
-from tests.surfaces.patches import (
+from tests.surface.patches import (
     CLASSES_M,
     PROFILER_1,
     PROFILER_2,
@@ -30,7 +30,7 @@ from tests.surfaces.patches import (
     rms_m,
     width_change_cells,
 )
-from tests.surfaces.test_smoothing import PRINTED
+from tests.surface.test_smoothing import PRINTED
 
 EDGE = 1000
 SEEDS = (3, 4, 5)

@@ -1,7 +1,7 @@
 """Mistakes that surveys are made with, and what roadscan prints of each: the table of ``docs/troubleshooting.md``.
 
 Each mistake is made in a survey of a few poses and profiles, and the command is run on it. `docs/generate.py` writes
-what was printed into the page; ``tests/jobs/test_mistakes.py`` holds each to one clear message before any long work.
+what was printed into the page; ``tests/survey/test_mistakes.py`` holds each to one clear message before any long work.
 """
 
 from __future__ import annotations

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from tests.pictures import blank
+from tests.surveys import adjusted, finished, raw_site, simulated
+
+__all__ = ["adjusted", "finished", "raw_site", "simulated"]
+"""Fixtures of surveys."""
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -61,3 +68,10 @@ def faults(recordings: Path) -> Path:
     if not folder.is_dir():
         pytest.skip(f"no wrong inputs at {folder}")
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def blank_pictures() -> Iterator[None]:
+    """Tests that look at drawings ask for them (:func:`tests.pictures.drawn`)."""
+    with blank():
+        yield

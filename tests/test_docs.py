@@ -40,7 +40,7 @@ from roadscan.store.sql import query
 from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import ProductContext, SurveyProduct, Tile, TileProduct, product_named, products
-from tests.jobs.conftest import Simulated, finished, simulated  # noqa: F401  fixtures
+from tests.surveys import Simulated
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
@@ -115,7 +115,7 @@ def test_the_glossary_is_in_order_and_explains_the_terms_that_it_names() -> None
 
 
 def test_files_for_gis_open_as_the_page_says(
-    finished: Simulated,  # noqa: F811
+    finished: Simulated,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -152,7 +152,7 @@ def test_readme_lists_every_format_and_product() -> None:
 
 
 def test_readme_questions_to_the_demo_have_answers(
-    finished: Simulated,  # noqa: F811
+    finished: Simulated,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -386,7 +386,7 @@ def test_contributed_formats_stay_off_the_pages(plugin: Path) -> None:
     assert "flatness" not in generate.product_list("")
 
 
-def test_the_contributed_stage(plugin: Path, finished: Simulated, tmp_path: Path) -> None:  # noqa: F811
+def test_the_contributed_stage(plugin: Path, finished: Simulated, tmp_path: Path) -> None:
     survey = finished.copy_with_store_to(tmp_path / "survey").survey_file
     assert [s.name for s in stages()][-5:] == ["levels", "surfaces", "products", "condition", "assets"]
 

@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 
 import roadscan as rs
 from roadscan.simulate import truth
-from tests.jobs.conftest import Simulated, finished, simulated  # noqa: F401  fixtures
+from tests.surveys import Simulated
 
 
 @pytest.fixture(scope="module")
-def survey(finished: Simulated) -> rs.OpenSurvey:  # noqa: F811
+def survey(finished: Simulated) -> rs.OpenSurvey:
     return rs.open_survey(finished.survey_file)
 
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.jobs.conftest import Simulated, finished, simulated  # noqa: F401  fixtures
+from tests.surveys import Simulated
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "python.md"
 
 
 def test_the_examples_run(
-    finished: Simulated,  # noqa: F811
+    finished: Simulated,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

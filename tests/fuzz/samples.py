@@ -31,16 +31,7 @@ from roadscan.formats.clouds.e57_file import page_checksums
 from roadscan.formats.motion.nmea_writer import Fix, sentences
 from roadscan.formats.scanners.sick_telegrams import encode_scans, encode_telegram, write_telegrams
 from roadscan.ingest.reading.text_table import LINE_BYTES_MAX
-from tests.fuzz.mutations import Change, Inside
-from tests.fuzz.pose_samples import (
-    control_csv,
-    level_feather,
-    level_parquet,
-    pose_feather,
-    pose_parquet,
-    returns_parquet,
-)
-from tests.sensors import (
+from tests.formats import (
     test_argoverse,
     test_carmen,
     test_control_lines,
@@ -62,7 +53,16 @@ from tests.sensors import (
     test_ubx,
     test_velodyne_pcap,
 )
-from tests.sensors.e57_files import PAGE, PAYLOAD, small_e57
+from tests.formats.e57_files import PAGE, PAYLOAD, small_e57
+from tests.fuzz.mutations import Change, Inside
+from tests.fuzz.pose_samples import (
+    control_csv,
+    level_feather,
+    level_parquet,
+    pose_feather,
+    pose_parquet,
+    returns_parquet,
+)
 
 GPS = Clock(TimeSystem.GPS)
 WEEK = Clock(TimeSystem.GPS_WEEK, week=2405)

@@ -49,6 +49,6 @@ def test_a_few_kernels_on_a_plain_processor(tmp_path: Path) -> None:
 def test_core_on_a_plain_processor() -> None:
     """Kernels, cells, georeferencing and packing."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n0", "--timeout=1800"]
-    places = ["tests/kernels", "tests/tiles", "tests/points", "tests/navigation/test_trajectory.py"]
-    places += ["tests/jobs/test_cell_path.py", "--ignore=tests/kernels/test_uncompiled.py"]
+    places = ["tests/kernels", "tests/tiles", "tests/georeference", "tests/poses/test_trajectory.py"]
+    places += ["tests/tiles/test_cell_path.py", "--ignore=tests/kernels/test_uncompiled.py"]
     without_avx512([*command, "--ignore=tests/kernels/test_plain_processor.py", *places])

@@ -22,9 +22,9 @@ FEW = (
 """Those that have a twin of their own in plain Python, and a few more."""
 ALL = (
     *FEW,
-    "tests/tiles/test_grid.py",
-    "tests/navigation/test_trajectory.py",
-    "tests/points/test_place.py",
+    "tests/core/test_grid.py",
+    "tests/poses/test_trajectory.py",
+    "tests/georeference/test_place.py",
     "tests/kernels/test_small_kernels.py",
     "tests/kernels/test_cell_figures.py",
     "tests/kernels/test_profile_kernels.py",

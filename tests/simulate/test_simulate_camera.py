@@ -21,7 +21,7 @@ from roadscan.core.survey import ClockConfig
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.scene import Camera
 from roadscan.simulate.sensors.lens import Lens
-from tests.sensors.log_reading import read_log
+from tests.formats.log_reading import read_log
 
 BARREL = (-0.22, 0.05, 0.002, -0.0015, 0.004)
 BOX = {"station_m": 10.0, "offset_m": 2.1, "length_m": 1.2, "width_m": 0.8, "height_m": 0.6, "shade": 240.0}

@@ -18,7 +18,7 @@ from roadscan.ingest.reading.format import Reject, format_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.run import SimulatedSurvey
 from roadscan.simulate.sensors.sick import telegrams
-from tests.sensors.log_reading import Log, source_of
+from tests.formats.log_reading import Log, source_of
 from tests.simulate.chain import WEEK_NS, Chain
 
 SCENE = (

@@ -21,7 +21,7 @@ from roadscan.simulate import simulate, truth
 from roadscan.simulate.earth import Earth
 from roadscan.site.live import LiveSite, open_survey
 from roadscan.site.server import SiteServer
-from tests.jobs.conftest import Simulated, small_scene
+from tests.surveys import Simulated, small_scene
 from tests.viewer.test_page import _look, _middle, _read
 
 Float64 = npt.NDArray[np.float64]

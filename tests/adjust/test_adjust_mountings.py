@@ -1,0 +1,96 @@
+"""A boresight that the rig file has wrong: passes side by side find it, and say so."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from roadscan.adjust.tasks.outcome import known_findings
+from roadscan.simulate import Scene, simulate
+from roadscan.store.held import held_path, read_held
+from roadscan.store.manifest import Manifest
+from tests.adjust.adjusted_site import cell_errors
+from tests.surveys import Simulated
+
+pytestmark = pytest.mark.nightly
+
+OFF = {"on": False}
+WRONG_DEG = 0.05
+"""The rig file's roll of the right head minus the true one."""
+CHANGES: dict[str, object] = {
+    "adjust__targets": {"shape": "circle", "size_m": 0.30, "centre_m": 0.06},
+    "adjust__ties": {"cell_m": 0.05},
+    "products__make": ["tile_table"],
+}
+COMPONENTS = ("forward_m", "right_m", "down_m", "roll_deg", "pitch_deg", "heading_deg", "range_scale")
+
+
+def site() -> Scene:
+    """Four passes over one lane, one of them the other way, and heads that see 0.4 m of the road together."""
+    places = ((2.0, 3.2), (20.0, 0.6), (40.0, 3.2), (58.0, 0.6))
+    bare: dict[str, Any] = {
+        k: [] for k in ("joints", "cracks", "alligators", "potholes", "patches", "stains", "tyre_marks")
+    }
+    right = {"lever_arm_body_m": (-2.28, 0.99, -1.11), "roll_deg": -0.35, "pitch_deg": 0.25, "heading_deg": -0.5}
+    return Scene.load("reference_site").changed(
+        road={
+            "targets": [{"station_m": s, "offset_m": o, "role": "gcp"} for s, o in places],
+            "alignment": [{"kind": "straight", "length_m": 260.0}], **bare,
+        },
+        length_m=60.0, lidar=OFF, imu=OFF, gnss=OFF, encoder=OFF, camera=OFF,
+        profilers={
+            "spacing_m": 0.05, "readings": 300, "head_imus": None, "width_m": 2.4,
+            "right": {**right, "error": {"roll_deg": WRONG_DEG}},
+        },
+        passes=[
+            {"lane": 2, "offset_m": -0.6}, {"lane": 2}, {"lane": 2, "offset_m": 0.4},
+            {"lane": 2, "direction": "backward"},
+        ],
+        noise={"position_m": 0.015, "attitude_deg": 0.003, "time_constant_s": 60.0, "control_m": 0.001},
+        vehicle={"speed_m_per_s": 10.0, "standstill_s": 0.0}, roadside={"poles": [], "trees": []},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
+    """Run whole, into the store ``store``."""
+    one = Simulated(simulate(site(), tmp_path_factory.mktemp("mounted") / "survey").survey_file)
+    one.run(**CHANGES)
+    return one
+
+
+@pytest.mark.witness("mounting")
+def test_a_wrong_boresight_is_found_named_and_applied(survey: Simulated) -> None:
+    table = read_held(survey.store(), "mounting_corrections")
+    assert table is not None
+    found = {row["sensor"]: row for row in table.to_pylist()}
+    assert set(found) == {"profiler_right"}  # nothing contradicts the other's
+    roll, sigma = (np.degrees(found["profiler_right"][name]) for name in ("roll_rad", "sigma_roll_rad"))
+    assert abs(roll + WRONG_DEG) < 3.0 * sigma
+    assert sigma < 0.008
+    assert roll < -0.04
+    # Nothing tells of what a head that looks straight down does not feel.
+    heading = found["profiler_right"]
+    assert heading["sigma_heading_rad"] > 0.9 * heading["prior_sigma_heading_rad"]
+    said = [one for one in known_findings(Manifest(survey.store())) if one.witness == "mounting"]
+    assert [one.subject for one in said] == ["profiler_right"]
+    assert f"boresight roll {roll:+.4f}° (σ {sigma:.4f}°" in said[0].text
+    assert np.mean(np.abs(cell_errors(survey, survey.store()))) < 0.003
+
+
+def test_the_mounting_is_applied_once_and_a_second_run_does_nothing(survey: Simulated) -> None:
+    store = survey.store()
+    before = store.read_bytes(held_path("mounting_corrections")), store.read_bytes(held_path("corrections"))
+    run = survey.run(**CHANGES)
+    assert run.raw_bytes_read == 0
+    assert (store.read_bytes(held_path("mounting_corrections")), store.read_bytes(held_path("corrections"))) == before
+
+
+def test_sigmas_of_zero_leave_mountings_as_they_are_stated(survey: Simulated) -> None:
+    survey.run("store-stated", **CHANGES, adjust__mountings={f"sigma_{name}": 0.0 for name in COMPONENTS})
+    store = survey.store("store-stated")
+    assert not store.exists(held_path("mounting_corrections"))
+    stated, estimated = (np.sqrt(np.mean(cell_errors(survey, one) ** 2)) for one in (store, survey.store()))
+    assert estimated < stated

@@ -1,0 +1,190 @@
+"""An outage of one drive, stated in its accuracy log: the good drives beside it stay as good as they were."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from benchmarks.bench_reference_logs import true_corrections
+from roadscan.adjust.observations import Observations
+from roadscan.adjust.tasks import adjustment
+from roadscan.adjust.tasks.solution import Evidence, Solution
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.run.session import Session
+from roadscan.simulate import Scene, simulate
+from roadscan.store.sql import query
+from tests.surveys import Simulated
+
+pytestmark = pytest.mark.nightly
+
+OFF = {"on": False}
+ROLES = {2.0: "gcp", 40.0: "gcp", 80.0: "gcp", 112.0: "gcp"}
+SPEED_M_S = 5.0
+OUTAGE_S = (7.0, 17.0)
+"""Since the beginning of the run: the vehicle is beside the points at 40 m and at 80 m then."""
+HUMP_M = 0.100
+USUAL_M = 0.006
+BAD = "run-4"
+TAU_S = 120.0
+
+
+def hump(since_s: np.ndarray) -> np.ndarray:
+    """0 outside of the outage, 1 in its middle."""
+    share = (since_s - OUTAGE_S[0]) / (OUTAGE_S[1] - OUTAGE_S[0])
+    return np.where((share > 0.0) & (share < 1.0), np.sin(np.pi * share) ** 2, 0.0)
+
+
+def site() -> Scene:
+    targets = [{"station_m": s, "offset_m": 3.2, "role": role} for s, role in ROLES.items()]
+    bare: dict[str, Any] = {
+        k: [] for k in ("joints", "cracks", "alligators", "potholes", "patches", "stains", "tyre_marks")
+    }
+    return Scene.load("reference_site").changed(
+        road={"targets": targets, "alignment": [{"kind": "straight", "length_m": 320.0}], **bare},
+        length_m=120.0, lidar=OFF, imu=OFF, gnss=OFF, encoder=OFF, camera=OFF,
+        profilers={"spacing_m": 0.05, "readings": 300, "head_imus": None},
+        passes=[{"lane": 2, "offset_m": offset} for offset in (-0.2, 0.0, 0.2, 0.1)],
+        noise={"position_m": USUAL_M, "attitude_deg": 0.002, "time_constant_s": TAU_S, "control_m": 0.001},
+        vehicle={"speed_m_per_s": SPEED_M_S, "standstill_s": 0.0}, roadside={"poles": [], "trees": []},
+    )  # fmt: skip
+
+
+def with_outage(folder: Path) -> None:
+    """Heights of one drive leave the truth by a hump, and its SMRMSG says so."""
+    logs = folder / "raw" / BAD
+    poses = np.fromfile(logs / "trajectory.sbet", "<f8").reshape(-1, 17)
+    since = poses[:, 0] - poses[0, 0]
+    poses[:, 3] += HUMP_M * hump(since)
+    poses.tofile(logs / "trajectory.sbet")
+    accuracy = np.fromfile(logs / "trajectory.smrmsg", "<f8").reshape(-1, 10)
+    accuracy[:, 3] += HUMP_M * hump(accuracy[:, 0] - poses[0, 0])
+    accuracy.tofile(logs / "trajectory.smrmsg")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A survey that was run, with what its adjustment was given and found."""
+
+    session: Session
+    evidence: Evidence
+    solution: Solution
+
+    def errors_mm(self, run: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Errors of the heights of a run's poses each 0.25 s as recorded and as corrected, their σ, and the epochs."""
+        prior = next(one for one in self.evidence.priors if one.run == run)
+        epochs = np.arange(prior.first_gps_ns, prior.last_gps_ns, NS_PER_S // 4)
+        true = true_corrections(self.session, run, epochs)[:, 2]
+        own = self.solution.corrections[run]
+        sigma = own.sigma_ned_m(epochs)
+        assert sigma is not None
+        return 1e3 * true, 1e3 * (true - own.at(epochs)[0][:, 2]), 1e3 * sigma[:, 2], epochs
+
+
+@pytest.fixture(scope="module")
+def outage(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("outage") / "survey"
+    raw = Simulated(simulate(site(), folder).survey_file)
+    with_outage(folder)
+    kept: list[tuple[Evidence, Solution]] = []
+    solve = adjustment.solve
+
+    def noted(plan: Any, evidence: Evidence) -> Solution:
+        kept.append((evidence, solve(plan, evidence)))
+        return kept[-1][1]
+
+    circles = {"shape": "circle", "size_m": 0.30, "centre_m": 0.06}
+    with mock.patch.object(adjustment, "solve", noted):
+        session = raw.run(
+            adjust__targets=circles, adjust__ties={"cell_m": 0.05}, products__make=["tile_table"],
+        )  # fmt: skip
+    return Run(session, *kept[-1])
+
+
+def test_an_outage_that_the_logs_state_costs_the_good_drives_nothing(outage: Run) -> None:
+    for run in outage.evidence.runs:
+        before, after, sigma, _ = outage.errors_mm(run)
+        rms = [float(np.sqrt(np.mean(np.square(values)))) for values in (before, after)]
+        honest = float(np.sqrt(np.mean((after / sigma) ** 2)))
+        if run != BAD:
+            assert rms[1] <= rms[0]
+        assert rms[1] <= 2.5
+        assert 0.5 <= honest <= 1.5
+    weights = query(
+        outage.session.store, "SELECT name, run, weight_height FROM control_residuals WHERE role = 'gcp'"
+    ).to_pylist()
+    assert len(weights) == 4 * len(ROLES)
+    assert min(row["weight_height"] for row in weights) > 0.9
+
+
+def test_its_sigma_is_that_of_the_dense_estimate(outage: Run) -> None:
+    """The best linear unbiased estimate from the covariance of the poses' errors at the observations themselves."""
+    evidence, solution = outage.evidence, outage.solution
+    gcp = np.array([one.point.role == "gcp" for one in evidence.sightings for _ in range(one.observed)])
+    every = Observations.joined([evidence.ties.observations, solution.control.chosen(gcp)])
+    counts = np.append(solution.tie_weight, np.ones(int(gcp.sum())))
+    used = every.chosen(counts > 0.0)
+    ends = _ends(used)
+    shared = (
+        (used.survey_sigma_m[:, None] > 0.0) & (used.place[:, None] == used.place) & (used.kind[:, None] == used.kind)
+    )
+    shared &= (used.run[:, None, 1] < 0) & (used.run[:, 1] < 0)
+    direction = used.partials[:, 0, :3]
+    survey = np.where(shared, used.survey_sigma_m[:, None] * used.survey_sigma_m * (direction @ direction.T), 0.0)
+    own = _covariance(outage, ends, ends) + survey + np.diag(used.sigma_m**2 / counts[counts > 0.0])
+    for number, run in enumerate(evidence.runs):
+        found = solution.corrections[run]
+        knots = found.epochs_gps_ns[::12]
+        wanted = [[(number, int(epoch), np.eye(6)[2])] for epoch in knots]
+        across = _covariance(outage, wanted, ends)
+        prior = np.diag(_covariance(outage, wanted, wanted))
+        best = across @ np.linalg.solve(own, used.observed_m)
+        sigma = np.sqrt(prior - np.einsum("ij,ji->i", across, np.linalg.solve(own, across.T)))
+        assert found.sigma is not None
+        ratio = found.sigma[::12, 2] / sigma
+        away = 1e3 * (found.north_east_down_m[::12, 2] - best)
+        assert np.abs(ratio - 1.0).max() < 0.05
+        assert np.abs(away).max() < 0.3
+
+
+def _ends(observations: Observations) -> list[list[tuple[int, int, np.ndarray]]]:
+    """Run, epoch and derivatives of each end of each observation that poses move."""
+    o = observations
+    return [
+        [(int(o.run[k, end]), int(o.epoch_gps_ns[k, end]), o.partials[k, end]) for end in (0, 1) if o.run[k, end] >= 0]
+        for k in range(o.size)
+    ]
+
+
+def _covariance(
+    outage: Run, one: list[list[tuple[int, int, np.ndarray]]], two: list[list[tuple[int, int, np.ndarray]]]
+) -> np.ndarray:
+    """Of what the errors of the poses make of two lists: in an outage a part of the error is of that outage alone."""
+    flat = [[(k, *end) for k, ends in enumerate(each) for end in ends] for each in (one, two)]
+    total = np.zeros((len(one), len(two)))
+    row, column = (np.array([entry[0] for entry in entries]) for entries in flat)
+    run = [np.array([entry[1] for entry in entries]) for entries in flat]
+    at = [np.array([entry[2] for entry in entries], np.int64) for entries in flat]
+    slope = [np.array([entry[3] for entry in entries]) for entries in flat]
+    parts = [_usual_and_extra(outage, r, t) for r, t in zip(run, at, strict=True)]
+    alike = run[0][:, None] == run[1]
+    for c in range(6):
+        tau = outage.evidence.priors[0].processes[c].tau_s
+        own = np.exp(-np.abs(at[0][:, None] - at[1]) / NS_PER_S / tau) * alike
+        own *= sum(np.outer(a[:, c], b[:, c]) for a, b in zip(*parts, strict=True))
+        np.add.at(total, (row[:, None], column), own * np.outer(slope[0][:, c], slope[1][:, c]))
+    return total
+
+
+def _usual_and_extra(outage: Run, run: np.ndarray, epochs_gps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Parts of the stated σ of poses: the usual one, up to √2 of its median, and what the outage adds (one a drive)."""
+    sigma, usual = np.empty((run.size, 6)), np.empty((run.size, 6))
+    for number, prior in enumerate(outage.evidence.priors):
+        here = run == number
+        sigma[here], usual[here] = prior.sigma_at(epochs_gps_ns[here]), np.sqrt(2.0) * prior.sigmas
+    low = np.minimum(sigma, usual)
+    return low, np.sqrt(np.maximum(sigma**2 - low**2, 0.0))

@@ -1,0 +1,105 @@
+"""A store without folders, locks and renames: the same bytes, nothing twice, every command."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+from typing import Any
+
+import fsspec
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+
+from roadscan.core.errors import StoreError
+from roadscan.core.ids import TileId
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.selection import Selection
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.store.manifest import Manifest
+from roadscan.store.sql import query
+from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
+from roadscan.survey.status import survey_status, verify_store
+from tests.surveys import Lines, Simulated, outputs
+
+
+class Remembering(MemoryFileSystem):
+    """Objects that all clients share; each keeps the lists that it has seen, as those of S3 do."""
+
+    protocol = "remembering"
+    cachable = False  # a client a process
+    store: dict[str, Any] = {}
+    pseudo_dirs = [""]
+
+    @classmethod
+    def _strip_protocol(cls, path: str) -> str:
+        return str(super()._strip_protocol(path.removeprefix("remembering:/")))
+
+    def find(self, path: str, *_: object, **__: object) -> list[str]:
+        try:
+            return list(self.dircache[path])
+        except KeyError:
+            found = sorted(super().find(path))
+            self.dircache[path] = found
+            return found
+
+
+@pytest.fixture
+def objects() -> Iterator[str]:
+    """URL of an empty store."""
+    fsspec.register_implementation("remembering", Remembering, clobber=True)
+    yield "remembering://bucket/roads"
+    Remembering.store.clear()
+
+
+def run(survey: Survey, store: Store, *chosen: TileId) -> Session:
+    run = Session(survey, store, Inline(), Selection(named=chosen) if chosen else None, Lines())
+    run_stages(run, stages())
+    return run
+
+
+def test_a_whole_run(finished: Simulated, objects: str) -> None:
+    survey, folder = Survey.load(finished.survey_file), finished.store()
+    store = Store(objects, survey.config.id)
+    assert not store.is_folder
+    assert run(survey, store).raw_bytes_read > 0
+    assert outputs(store) == outputs(folder)
+    assert run(survey, store).raw_bytes_read == 0
+    assert survey_status(Session(survey, store)).is_complete
+    tile, damaged = [r for r in Manifest(store).of("tile").values() if r.path][:2]
+    assert run(survey, store, TileId.parse(tile.unit)).raw_bytes_read > 0
+    for table in ("scans", "returns", "trajectory", "cells", "tiles", "footprints", "outputs", "rejects"):
+        asked = f"SELECT count(*) AS n FROM {table}"
+        assert query(store, asked) == query(folder, asked), table
+    store.write_bytes(damaged.path, b"cut")
+    (part,) = store.files("manifest/outputs")
+    assert [damaged.path in fault for fault in verify_store(store)] == [True]
+    store.write_bytes(part, b"cut")
+    run(survey, store)
+    assert verify_store(store) == []
+    assert outputs(store) == outputs(folder)
+    assert store.files("damaged") == [f"damaged/{part}"]
+
+
+def test_what_a_worker_wrote_is_seen(objects: str) -> None:
+    store = Store(objects, "s")
+    store.write_bytes("manifest/logs/a.json", b"{}")
+    assert store.files("manifest/logs") == ["manifest/logs/a.json"]
+    pickle.loads(pickle.dumps(store)).write_bytes("manifest/logs/b.json", b"{}")
+    assert store.files("manifest/logs") == ["manifest/logs/a.json", "manifest/logs/b.json"]
+
+
+def test_a_store_that_does_not_answer_is_told(objects: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class NoCredentialsError(Exception):
+        """As libraries of object stores have them."""
+
+    def refuse(*_: object) -> None:
+        raise NoCredentialsError("Unable to locate credentials")
+
+    monkeypatch.setattr(Remembering, "exists", refuse)
+    with pytest.raises(StoreError, match=rf"{objects} cannot be reached: Unable to locate credentials; .*your keys"):
+        verify_store(Store(objects, "s"))
+    with pytest.raises(StoreError, match="the store odd://x cannot be opened: Protocol not known"):
+        Store("odd://x", "s")

@@ -1,0 +1,66 @@
+"""A session finds what it needs once; a stage that changes something makes it look again."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from roadscan.footprints.footprints import footprints_of
+from roadscan.run import session as session_module
+from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.survey.run import run_stages
+from roadscan.survey.status import survey_status
+from roadscan.tiles.tasks.tile_plan import tiles_of
+from tests.surveys import Simulated
+
+PLANS = ("plan_logs", "plan_survey", "load_ranges", "plan_tiles")
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often a session plans."""
+    counts: Counter[str] = Counter()
+
+    def watch(name: str) -> None:
+        plan = getattr(session_module, name)
+
+        def planned(*arguments: object, **named: object) -> object:
+            counts[name] += 1
+            return plan(*arguments, **named)
+
+        monkeypatch.setattr(session_module, name, planned)
+
+    for name in PLANS:
+        watch(name)
+    return counts
+
+
+def test_a_whole_run_plans_once(simulated: Simulated, tmp_path: Path, counted: Counter[str]) -> None:
+    copy = simulated.copy_to(tmp_path / "survey")
+    run_stages(Session.open(copy.survey_file))
+    assert dict(counted) == dict.fromkeys(PLANS, 1)
+
+
+def test_status_plans_once(finished: Simulated, counted: Counter[str]) -> None:
+    assert survey_status(Session.open(finished.survey_file)).is_complete
+    assert dict(counted) == dict.fromkeys(PLANS, 1)
+
+
+def test_renewing_forgets_what_follows_and_nothing_before(finished: Simulated, counted: Counter[str]) -> None:
+    session = Session.open(finished.survey_file)
+    assert tiles_of(session) is tiles_of(session)
+    session.forget(footprints_of)
+    assert len(tiles_of(session)) > 0
+    assert dict(counted) == {"plan_logs": 1, "plan_survey": 1, "load_ranges": 2, "plan_tiles": 2}
+
+
+def test_stages_come_after_those_that_they_need() -> None:
+    names = [stage.name for stage in stages()]
+    assert [n for n in names if n != "levels"] == [
+        "ingest", "navigate", "footprints", "adjust", "tiles", "surfaces", "products", "condition", "assets",
+    ]  # fmt: skip
+    for stage in stages():
+        assert all(names.index(before) < names.index(stage.name) for before in stage.after)

@@ -15,6 +15,7 @@ from roadscan.ingest.epoch_order import EpochOrder
 from roadscan.ingest.laser_ranges import LaserRanges
 from roadscan.ingest.log_check import LogCheck, Refuses
 from roadscan.ingest.motion_checks import MotionCheck
+from roadscan.ingest.one_stamp import StandingClock
 from roadscan.ingest.overlap import reject_words
 from roadscan.ingest.place_checks import PLACED, place_faults
 from roadscan.ingest.planned_logs import Logs, PlannedLog, logs_of, plan_logs
@@ -278,6 +279,7 @@ def _checks(source: LogSource, header: LogHeader) -> list[LogCheck]:
     return [
         Refuses(lambda rows: place_faults(rows.table, rows.batch, header) if rows.table in PLACED else ()),
         Refuses(FutureTimes.of(source, header).refused),
+        StandingClock(),
         EpochOrder(free=free),
         RepeatedProfiles(),
         poses,

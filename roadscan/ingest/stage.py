@@ -66,7 +66,7 @@ class Ingest(Stage):
         share = survey.config.checks.lost_share
         own = [one for record in records for one in record.findings]
         own += same_content_findings(survey, records)
-        return [*own, *reject_findings(records, share), *one_stamp_findings(records, share)]
+        return [*own, *reject_findings(records, share), *one_stamp_findings(records)]
 
 
 def _empty(session: Session, records: Sequence[LogRecord]) -> list[Fault]:

@@ -316,6 +316,21 @@ def test_a_log_of_one_stamp_fails_beside_others(tmp_path: Path) -> None:
     assert said(tmp_path, "status")[0] == 1
 
 
+@pytest.mark.witness("one_stamp")
+def test_rows_of_a_clock_that_stands_for_a_while_are_left_out(tmp_path: Path) -> None:
+    changed(tmp_path)
+    rows = pq.read_table(tmp_path / "scans.parquet")
+    epochs = rows.column(0).to_numpy().copy()
+    epochs[8:22] = epochs[8]
+    ranges = pa.FixedSizeListArray.from_arrays((20_000 + np.arange(30 * 40) // 40).astype(np.uint16), 40)
+    stopped = rows.set_column(0, rows.schema.field(0), pa.array(epochs)).set_column(1, rows.schema.field(1), ranges)
+    pq.write_table(stopped, tmp_path / "scans.parquet")
+    code, text = said(tmp_path, "run", "--workers", "0")
+    assert code == 0, text
+    assert "13 rows of 30 carry the stamp of the rows before them" in text
+    assert "680, of which kept 680" in text
+
+
 def test_a_longer_vehicle_is_stated(tmp_path: Path) -> None:
     arm = ("lever_arm_body_m = [0.0, 0.0, 0.0]", "lever_arm_body_m = [-12.5, 0.0, 0.0]")
     changed(tmp_path, arm)

@@ -37,13 +37,13 @@ from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
 from roadscan.core.survey import Survey
 from roadscan.formats.clouds.opencrg_file import CurvedRegularGrid, write_crg
-from roadscan.formats.motion.nmea_writer import Fix, sentences
 from roadscan.formats.motion.ubx import HEADER, SOLUTION
 from roadscan.formats.scanners.psi_container import PsiContainer, PsiHeader, write_psi
 from roadscan.formats.scanners.sick_telegrams import encode_scans
 from roadscan.ingest.ingest import ingest
 from roadscan.ingest.reading.format import LogSource, Reject, format_named, log_formats
 from roadscan.store.store import Store
+from tests.formats.nmea_files import Fix, sentences
 
 SBET_BAR = 5.0
 """Million records a second."""

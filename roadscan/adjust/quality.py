@@ -131,11 +131,6 @@ def horizontal_accuracy(
     )  # fmt: skip
 
 
-def asprs_three_dimensional(horizontal: HorizontalAccuracy, vertical: VerticalAccuracy) -> float:
-    """RMSE_3D of ASPRS (2023): √(RMSE_H² + RMSE_V²) (m)."""
-    return float(np.hypot(horizontal.asprs_rmse, vertical.asprs_rmse))
-
-
 @dataclass(frozen=True)
 class LeaveOneOut:
     """What each control point's survey says against the adjustment without it; accuracy None where not observed."""

@@ -46,7 +46,6 @@ pavement or verge flush with the road is road, and a dropped kerb of 2 cm stays 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -89,11 +88,6 @@ def segmented(
         _numbers(settings), classes,
     )  # fmt: skip
     return classes
-
-
-def road_only(ranges: npt.NDArray[np.uint16], classes: UInt8) -> npt.NDArray[Any]:
-    """Raw ranges (n, m) with 0, no return, in place of readings that did not hit the road."""
-    return np.where(classes == 0, ranges, np.uint16(0))
 
 
 def _numbers(s: SegmentationConfig) -> tuple[float, ...]:

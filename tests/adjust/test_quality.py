@@ -8,7 +8,6 @@ import pytest
 from roadscan.adjust.adjustment import ControlErrors
 from roadscan.adjust.quality import (
     accuracy_by_distance,
-    asprs_three_dimensional,
     horizontal_accuracy,
     leave_one_out,
     nearest_m,
@@ -46,8 +45,6 @@ def test_horizontal_figures_by_hand() -> None:
     assert (found.rmse_north, found.rmse_east, found.rmse_r) == pytest.approx((0.03, 0.04, 0.05))
     assert found.mean_absolute == pytest.approx(0.05)
     assert found.asprs_rmse == pytest.approx(np.sqrt(0.05**2 + 2 * 0.002**2))
-    vertical = vertical_accuracy(np.array([0.01, -0.01]))
-    assert asprs_three_dimensional(found, vertical) == pytest.approx(np.sqrt(0.0025 + 8e-6 + 1e-4))
 
 
 def test_no_check_point_is_no_figure() -> None:

@@ -26,7 +26,7 @@ from roadscan.adjust.targets.find import find_target
 from roadscan.adjust.targets.heights import height_at
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc
-from roadscan.adjust.targets.values import PickedTarget, TargetReadings
+from roadscan.adjust.targets.values import TargetReadings
 from roadscan.core.errors import ConfigError
 
 SETTINGS = TargetSettings()
@@ -238,4 +238,3 @@ def test_sizes_that_cannot_be_are_refused_and_picked_targets_carry_their_sigma()
         Disc(0.3, 0.29)
     with pytest.raises(ConfigError, match="chequered"):
         Chequered(-1.0)
-    assert PickedTarget("run_1", "A", 1.0, 2.0, 3.0, 0.002).covariance_m2[0, 0] == pytest.approx(4e-6)

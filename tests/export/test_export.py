@@ -20,14 +20,14 @@ from roadscan.core.survey import Survey
 from roadscan.export.curved_grid import CurvedHeights, fill_holes, inner_holes
 from roadscan.export.export_opencrg import CrgSettings, export_opencrg
 from roadscan.export.export_psi import PsiSettings, export_psi
-from roadscan.formats.clouds.opencrg_file import read_crg
-from roadscan.formats.scanners.psi_container import read_psi
 from roadscan.georeference.plan.plan import plan_survey
 from roadscan.ingest.ingest import ingest
 from roadscan.ingest.reading.format import format_of
 from roadscan.simulate import simulate, truth
 from roadscan.store.row_groups import read_groups
 from roadscan.store.store import Store
+from tests.formats.crg_files import read_crg
+from tests.formats.psi_files import read_psi
 from tests.formats.readings import read
 from tests.surveys import small_scene
 

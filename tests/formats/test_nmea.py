@@ -21,10 +21,10 @@ from hypothesis import strategies as st
 from roadscan.core.crs import Geoid
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
-from roadscan.formats.motion.nmea_writer import Fix, NmeaForm, sentences, write_nmea
 from roadscan.ingest.reading import text_table
 from roadscan.ingest.reading.format import SourceDefaults, format_named, format_of
 from tests.formats.log_reading import Log, read_log, source_of
+from tests.formats.nmea_files import Fix, NmeaForm, sentences, write_nmea
 from tests.formats.test_rtklib_pos import ecef, flat_geoid
 
 GEODETIC = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)

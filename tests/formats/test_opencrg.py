@@ -16,8 +16,9 @@ from hypothesis.extra import numpy as hnp
 
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.formats.clouds.opencrg_file import CurvedRegularGrid, MapOffset, read_crg, write_crg
+from roadscan.formats.clouds.opencrg_file import CurvedRegularGrid, MapOffset, write_crg
 from roadscan.ingest.reading.format import format_named, format_of
+from tests.formats.crg_files import read_crg
 from tests.formats.readings import read
 
 EPOCH = dt.datetime(2026, 5, 4, 9, 30, tzinfo=dt.UTC)

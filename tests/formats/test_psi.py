@@ -22,8 +22,9 @@ from hypothesis import strategies as st
 from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.formats.scanners.psi import Psi, PsiStatement, statement_text
-from roadscan.formats.scanners.psi_container import PsiContainer, PsiHeader, read_psi, write_psi
+from roadscan.formats.scanners.psi_container import PsiContainer, PsiHeader, write_psi
 from roadscan.ingest.reading.format import format_named, format_of
+from tests.formats.psi_files import read_psi
 from tests.formats.readings import read
 
 ROWS, COLUMNS = 6, 10

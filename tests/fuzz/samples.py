@@ -28,8 +28,7 @@ import pyarrow.parquet as pq
 from roadscan.core.crs import MapFrame
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.formats.clouds.e57_file import page_checksums
-from roadscan.formats.motion.nmea_writer import Fix, sentences
-from roadscan.formats.scanners.sick_telegrams import encode_scans, encode_telegram, write_telegrams
+from roadscan.formats.scanners.sick_telegrams import encode_scans
 from roadscan.ingest.reading.text_table import LINE_BYTES_MAX
 from tests.formats import (
     test_argoverse,
@@ -54,6 +53,8 @@ from tests.formats import (
     test_velodyne_pcap,
 )
 from tests.formats.e57_files import PAGE, PAYLOAD, small_e57
+from tests.formats.nmea_files import Fix, sentences
+from tests.formats.sick_files import encode_telegram, write_telegrams
 from tests.fuzz.mutations import Change, Inside
 from tests.fuzz.pose_samples import (
     control_csv,

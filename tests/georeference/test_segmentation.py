@@ -9,7 +9,8 @@ from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.settings.segmentation import SegmentationConfig
 from roadscan.georeference.classes import LAS_CLASSES, READING_CLASSES
 from roadscan.georeference.kernels.segmentation import height_threshold
-from roadscan.georeference.segmentation import road_only, segmented
+from roadscan.georeference.segmentation import segmented
+from tests.georeference.road_profiles import road_only
 
 CODES = {name: code for code, name in READING_CLASSES.items()}
 SICK = ScanGeometry(kind="polar", readings=361, first=np.pi / 2, step=-np.radians(0.5), range_step_m=0.001)

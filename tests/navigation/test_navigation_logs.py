@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from roadscan.core.survey import Survey
-from roadscan.formats.motion.nmea_writer import Fix, write_nmea
 from roadscan.ingest.ingest import ingest
 from roadscan.ingest.planned_logs import plan_logs
 from roadscan.run.session import Session
@@ -18,6 +17,7 @@ from roadscan.store.logs import read_log_records
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.status import survey_status, verify_store
+from tests.formats.nmea_files import Fix, write_nmea
 from tests.surveys import Simulated, outputs
 
 POS = (

@@ -105,25 +105,6 @@ class TargetFind:
 
 
 @dataclass(frozen=True)
-class PickedTarget:
-    """A target whose place in a pass the user picked; axes of the map."""
-
-    run: str
-    """Run, or pass, that it was picked in."""
-    name: str
-    easting_m: float
-    northing_m: float
-    height_m: float
-    sigma_m: float
-    """1 σ on each axis (m)."""
-
-    @property
-    def covariance_m2(self) -> Float64:
-        """(2, 2) of easting and northing."""
-        return self.sigma_m**2 * np.eye(2)
-
-
-@dataclass(frozen=True)
 class HeightFind:
     """Height of the road's surface at a place, from the readings around it."""
 

@@ -366,31 +366,6 @@ def is_crg(path: Path) -> bool:
     return re.search(rb"^\$(ROAD_CRG|ROAD_CRG_FILE|KD_DEFINITION)\b", start, re.MULTILINE) is not None
 
 
-def read_crg(path: Path) -> CurvedRegularGrid:
-    """Read an OpenCRG file.
-
-    Raises
-    ------
-    FormatError
-        if it is none, is of a kind that is not read, or is damaged (`OpenCrg` leaves
-        out damaged rows in its place).
-    """
-    file = CrgFile.open(path)
-    reference, heights = [np.empty((0, 3))], [np.empty((0, file.header.columns.size))]
-    for block in file.blocks():
-        if block.damaged.any():
-            record = block.first_row + int(np.argmax(block.damaged.any(axis=1)))
-            raise FormatError("a number cannot be read", expected="a finite number or a hole", file=path, record=record)
-        reference.append(file.reference_of(block))
-        heights.append(block.values[:, file.header.columns])
-    if file.left_over():
-        raise FormatError("the last row is cut off", expected="whole rows", file=path)
-    grid = file.grid(np.concatenate(reference), np.concatenate(heights))
-    if file.header.rows_claimed not in {None, grid.rows}:
-        raise FormatError(f"there are {grid.rows:,} rows, the header claims {file.header.rows_claimed:,}", file=path)
-    return grid
-
-
 def write_crg(grid: CurvedRegularGrid, path: Path, encoding: Encoding = "KRBI") -> None:
     """Write an OpenCRG file; KRBI and LRFI keep heights to about 7 digits, KDBI all of them.
 

@@ -302,18 +302,6 @@ def is_psi(path: Path) -> bool:
         return False
 
 
-def read_psi(path: Path) -> PsiContainer:
-    """Read a PSI file.
-
-    Raises
-    ------
-    FormatError
-        if it is no sound PSI file, or a codec is not read.
-    """
-    file = PsiFile.open(path)
-    return PsiContainer(file.header, file.image2d(), file.surface3d(), file.metadata())
-
-
 def write_psi(
     container: PsiContainer,
     path: Path,

@@ -72,7 +72,7 @@ def one_stamp_findings(records: Sequence[LogRecord]) -> list[Finding]:
     return [
         ONE_STAMP.finds(
             r.path,
-            f"{counted(left_out, 'row')} of {r.rows + left_out:,} carry the stamp of the rows before them, and would lie "
+            f"{counted(left_out, 'row')} of {r.rows + left_out:,} carry the stamp of those before, and would lie "
             "on one line; they are left out: see to what stamps them",
             left_out,
         )
@@ -101,8 +101,8 @@ def _share(record: LogRecord, table: str) -> float:
 def _fault(record: LogRecord, table: str) -> Fault:
     (first, _), count = record.span(table) or (0, 0), record.rows + record.reject_reasons.get(STANDS, 0)
     reason = TimeSystemError(
-        f"its {count:,} {table} carry one stamp for many rows ({iso_from_gps_ns(first)} at first), so they would lie on "
-        "one line",
+        f"its {count:,} {table} carry one stamp for many rows ({iso_from_gps_ns(first)} at first), so they would lie "
+        "on one line",
         expected="a time of its own for each",
         change="see to what stamps them: a clock that stands still, or stamps that were rounded",
     )

@@ -327,7 +327,7 @@ def test_rows_of_a_clock_that_stands_for_a_while_are_left_out(tmp_path: Path) ->
     pq.write_table(stopped, tmp_path / "scans.parquet")
     code, text = said(tmp_path, "run", "--workers", "0")
     assert code == 0, text
-    assert "13 rows of 30 carry the stamp of the rows before them" in text
+    assert "13 rows of 30 carry the stamp of those before" in text
     assert "680, of which kept 680" in text
 
 

@@ -18,17 +18,17 @@ import numpy.typing as npt
 import shapely
 
 from benchmarks.timing import Figure, thread_seconds
-from roadscan.core.settings.distress import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
-from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.distress.crack_network import Crack, join_cracks
 from roadscan.distress.cracks import crack_pieces
 from roadscan.distress.potholes import join_potholes, pothole_pieces
+from roadscan.distress.settings import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
 from roadscan.distress.valley_lines import LINE_HALF, flank_cells
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surface.heights import HeightWindow
 from roadscan.surface.lowest import LowestReadings
 from roadscan.surface.smoothing import smooth_surface
+from roadscan.surface.smoothing_settings import SurfaceSmoothing
 
 SEEDS = (1, 2, 3)
 READING_M, SIGMA_M = 0.001, 0.0003

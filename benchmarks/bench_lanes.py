@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.timing import Figure
+from roadscan.condition.settings import ConditionConfig
 from roadscan.condition.tasks.against_truth import Compared, compared_values
 from roadscan.core.strict import load_toml
 from roadscan.core.survey import Survey
@@ -192,7 +193,7 @@ def _two_passes(folder: Path) -> Iterator[Figure]:
 
 def _cost(session: Session) -> Iterator[Figure]:
     """Seconds for a kilometre of lane from the tiles; the second time, when all is compiled."""
-    config = session.survey.config.condition
+    config = ConditionConfig.stated(session.survey)
     lanes_km = 0.0
     for name in ("tables/profiles_longitudinal", "tables/cross_sections", "tables/condition_values"):
         for path in session.store.files(name):

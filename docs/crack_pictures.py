@@ -19,8 +19,8 @@ from matplotlib.colors import LightSource
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.bench_cracks import Seen, cracks_of, seen
-from roadscan.core.settings.distress import PotholeDetection, PotholeJoining
 from roadscan.distress.potholes import join_potholes, pothole_pieces
+from roadscan.distress.settings import PotholeDetection, PotholeJoining
 
 PICTURE: Final = Path(__file__).resolve().parent / "pictures" / "cracks.png"
 WARM, COOL = "#d1495b", "#00a5b5"

@@ -25,10 +25,10 @@ from roadscan.adjust.estimation import SURVEY, Estimate, Problem, Rounds
 from roadscan.adjust.fixed_runs import FixedRun, fixed_runs
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations
 from roadscan.adjust.process import MountingPrior, RunPrior, line_variance
+from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, Unknowns, directions_of
 from roadscan.adjust.weights import Groups
-from roadscan.core.settings.adjustment import AdjustmentSettings
 from roadscan.poses.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
-from roadscan.core.settings.adjustment import AdjustmentSettings, ControlRules
+from roadscan.adjust.solver_settings import AdjustmentSettings, ControlRules
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

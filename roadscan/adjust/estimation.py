@@ -16,10 +16,10 @@ import numpy.typing as npt
 from scipy.special import chdtri
 
 from roadscan.adjust.observations import COMPONENTS, KINDS
+from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.sparse_normal import NormalEquations, Rows, SelectedInverse
 from roadscan.adjust.unknowns import Unknowns
 from roadscan.adjust.weights import Groups, LeftOut, left_out
-from roadscan.core.settings.adjustment import AdjustmentSettings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.kernels.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
+from roadscan.adjust.tie_settings import PlaceSettings
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.settings.tie_settings import PlaceSettings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

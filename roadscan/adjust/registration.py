@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.kernels.correlation import Laid, correlate, lay_upon
 from roadscan.adjust.pictures import BLUR_CELLS, Picture
-from roadscan.core.settings.tie_settings import TieSettings
+from roadscan.adjust.tie_settings import TieSettings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.patches import PassReadings, Patch, map_from_level, patch_of
 from roadscan.adjust.places import Place
-from roadscan.core.settings.tie_settings import TieSettings
+from roadscan.adjust.tie_settings import TieSettings
 from roadscan.poses.mounting_change import MountingChange, Seat
 from roadscan.poses.trajectory import Corrections
 

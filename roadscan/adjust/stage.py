@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.adjustment import adjust_survey, is_current, withdraw
 from roadscan.adjust.tasks.hand_ties import read_hand_ties
 from roadscan.adjust.tasks.outcome import FOLDER, TABLES, known_findings, known_lines
@@ -30,7 +31,7 @@ class Adjust(Stage):
         """Adjust where evidence, settings or code are others than those of the last solution."""
         if is_current(plan_of(session), session.manifest):
             return
-        if session.survey.config.adjust.on:
+        if AdjustConfig.of(session.survey).on:
             adjust_survey(session)
         else:
             withdraw(session)
@@ -42,10 +43,10 @@ class Adjust(Stage):
 
     def check(self, survey: Survey) -> list[RoadscanError]:
         """Whether the file of picked targets is there, and that of ties by hand is one."""
-        if not survey.config.adjust.on:
+        if not AdjustConfig.of(survey).on:
             return []
         found: list[RoadscanError] = []
-        picked = survey.config.adjust.targets.picked
+        picked = AdjustConfig.of(survey).targets.picked
         file = None if picked is None else survey.resolve(picked)
         if file is not None and not file.is_file():
             found.append(
@@ -61,7 +62,7 @@ class Adjust(Stage):
         """Whether the corrections are those of the survey as it is, and what they are worth."""
         due = int(not is_current(plan_of(session), session.manifest))
         notes = []
-        if due and session.survey.config.adjust.on:
+        if due and AdjustConfig.of(session.survey).on:
             notes = ["the adjustment is due: it may make more tiles stale than these"]
         lines = known_lines(session.manifest)
         return StageState(1 - due, due, next_run={self.name: due}, notes=notes, lines=lines)

@@ -11,13 +11,13 @@ from roadscan.assets import classes
 from roadscan.assets.cubes import cubes_of
 from roadscan.assets.ground.bare_earth import bare_earth
 from roadscan.assets.ground.road import road_cells
+from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.ground.surface import Place
 from roadscan.assets.kernels.columns import marked
 from roadscan.assets.moving import road_users
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, GroundModel, Scene, extent_of
 from roadscan.assets.surroundings import surroundings
-from roadscan.core.settings.asset_ground import GroundSettings
 
 _ABOVE_M: Final = 0.1
 """Returns are looked at that do not lie on the ground and stand higher above it."""

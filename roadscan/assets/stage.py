@@ -143,7 +143,7 @@ class Assets(Stage):
         records_of = manifest.of(EVIDENCE)
         found = [one.figures() for unit, one in records_of.items() if unit.startswith(f"{LaneLine.name}/")]
         dense, rough = (sum(one.get(name, 0) for one in found) for name in ("dense_cells", "rough_cells"))
-        if survey.config.assets is None or rough <= _MOST_ROUGH * dense:
+        if not survey.has("assets") or rough <= _MOST_ROUGH * dense:
             return ()
         said = (
             f"Paint was not sought on {rough / dense:.0%} of the ground that is seen densely enough: its returns "
@@ -162,7 +162,7 @@ class Assets(Stage):
 
     def state(self, session: Session) -> StageState:
         """Outputs of squares, objects and files that are there, and those that are due as far as is known by now."""
-        if session.survey.config.assets is None:
+        if not session.survey.has("assets"):
             return StageState()
         work = plan_evidence(session)
         plan, manifest = work.plan, session.manifest

@@ -13,7 +13,7 @@ from roadscan.condition.cracks_on_lane import CrackOnLane
 from roadscan.condition.on_lane.lines import LaneLines
 from roadscan.condition.on_lane.squares import TextureSquares
 from roadscan.condition.road_edges.on_lane import EdgesOnLane
-from roadscan.core.settings.condition import SectionConfig
+from roadscan.condition.settings import SectionConfig
 
 Float64 = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from roadscan.compute.kernels.curved_grid import thin_path
 from roadscan.compute.ways import way_along
 from roadscan.condition.road_line import NODE_M, Lane, RoadLine
-from roadscan.core.settings.condition import ConditionConfig
+from roadscan.condition.settings import ConditionConfig
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]

@@ -7,6 +7,7 @@ from typing import Final
 
 from roadscan.condition.index import condition_indices
 from roadscan.condition.roads import LEAST_M
+from roadscan.condition.settings import ConditionConfig
 from roadscan.condition.tasks.lines import LINES, check_layer, write_lines
 from roadscan.condition.tasks.pictures import draw_picture
 from roadscan.condition.tasks.ravelling import patches_of_group
@@ -55,7 +56,7 @@ class Condition(Stage):
 
     def run(self, session: Session) -> None:
         """Compute what is missing or stale."""
-        config = session.survey.config.condition
+        config = ConditionConfig.stated(session.survey)
         work = plan_condition(session)
         if config is None:
             session.manifest.remove(work.gone)
@@ -116,7 +117,7 @@ class Condition(Stage):
 
     def state(self, session: Session) -> StageState:
         """Stretches and values that are there, and those that are due."""
-        if session.survey.config.condition is None:
+        if not session.survey.has("condition"):
             return StageState()
         work = plan_condition(session)
         stale = self._stale(work)
@@ -140,7 +141,7 @@ class Condition(Stage):
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """Steps of wheel paths that no road has; and figures that no section has, by the limit that they missed."""
-        if survey.config.condition is None or not manifest.of(LINES):
+        if not survey.has("condition") or not manifest.of(LINES):
             return ()
         told = known_sections(manifest)
         if told is None or not told[0]:

@@ -14,7 +14,7 @@ from roadscan.condition.kernels.sampling import CellTable, sample
 from roadscan.condition.on_lane.lines import LINE_REACH_M, LaneLines, lane_lines
 from roadscan.condition.on_lane.squares import TextureSquares, texture_squares
 from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.core.settings.condition import SectionConfig
+from roadscan.condition.settings import SectionConfig
 
 Float64 = npt.NDArray[np.float64]
 

@@ -15,13 +15,15 @@ Kind = TypeVar("Kind")
 _LIBRARY: Final = Path(__file__).parents[1]
 
 
-def found_kinds(place: str, base: type[Kind] | tuple[type[Kind], ...], group: str) -> dict[str, Any]:
-    """Classes derived from `base`, by their `name`: those of roadscan's modules at a place, and installed entry points.
+def found_kinds(
+    place: str, base: type[Kind] | tuple[type[Kind], ...], group: str, name: str = "name"
+) -> dict[str, Any]:
+    """Classes derived from `base`, by their names: those of roadscan's modules at a place, and installed entry points.
 
     Parameters
     ----------
     place : pattern of the files of these modules, below the folder of roadscan (``"*/stage.py"``).
-    group : name of the entry points.
+    group : name of the entry points; name : class variable that holds the name of a kind.
 
     Raises
     ------
@@ -31,13 +33,14 @@ def found_kinds(place: str, base: type[Kind] | tuple[type[Kind], ...], group: st
     found: dict[str, Any] = {}
     origins: dict[str, str] = {}
     for kind, origin in _candidates(place, base, group):
-        if kind.__abstractmethods__:
+        called = getattr(kind, name, None)
+        if kind.__abstractmethods__ or called is None:
             continue
-        if kind.name in found:
+        if called in found:
             raise ConfigError(
-                f"'{kind.name}' is there twice: {origins[kind.name]} and {origin}", expected="a name of its own"
+                f"'{called}' is there twice: {origins[called]} and {origin}", expected="a name of its own"
             )
-        found[kind.name], origins[kind.name] = kind, origin
+        found[called], origins[called] = kind, origin
     return dict(sorted(found.items()))
 
 

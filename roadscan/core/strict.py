@@ -47,6 +47,10 @@ class Strict(BaseModel):
             raise ConfigError("; ".join(faults_in_words(cls, values, error)), file=file) from error
 
 
+MEANINGS: Final[dict[type[BaseModel], dict[str, str]]] = {}
+"""What the fields of models say that are made at run time, and stand in no source."""
+
+
 def meanings(model: type[BaseModel]) -> dict[str, str]:
     """The docstring under each field of a model, "" where there is none, in the order of the fields.
 
@@ -56,7 +60,7 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
     found: dict[str, str] = {}
     for kind in reversed(model.__mro__):
         if issubclass(kind, BaseModel) and kind is not BaseModel:
-            found |= _docstrings_of(kind)
+            found |= MEANINGS[kind] if kind in MEANINGS else _docstrings_of(kind)
     return {name: found.get(name, "") for name in model.model_fields}
 
 

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import datetime as dt
+import functools
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Final, Literal, Self, cast
 
-from pydantic import Field, model_validator
+from pydantic import Field, create_model, model_validator
 
 from roadscan.core.clock_evidence import MotionEvidence, PairEvidence
 from roadscan.core.crs import Anchor, Geoid, MapFrame, check_not_mirrored
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.gpstime import Clock, TimeSystem, check_week, gps_ns_from_utc
 from roadscan.core.ids import LanePass, PassId, RunId
+from roadscan.core.plugins import found_kinds
 from roadscan.core.rig import Rig, Sensor
-from roadscan.core.settings.adjust import AdjustConfig
-from roadscan.core.settings.assets import AssetsConfig
 from roadscan.core.settings.calibration import CalibrationEvidence, CalibrationSettings
-from roadscan.core.settings.condition import ConditionConfig
-from roadscan.core.settings.inventory import InventoryConfig
 from roadscan.core.settings.segmentation import RoadSegmentation
 from roadscan.core.settings.smoothing import SmootherConfig, SplineConfig
-from roadscan.core.settings.surface import SurfaceConfig
-from roadscan.core.strict import NAME_PATTERN, Strict, load_toml
+from roadscan.core.strict import MEANINGS, NAME_PATTERN, Strict, load_toml
+
+ENTRY_POINT_GROUP: Final = "roadscan.survey_sections"
 
 
 class AnchorConfig(Strict):
@@ -385,7 +384,7 @@ class ChecksConfig(Strict):
 
 
 class SurveyConfig(Strict):
-    """Everything a run needs to know."""
+    """What every survey states; the tables of the features join it (:func:`survey_file_model`)."""
 
     id: str = Field(pattern=NAME_PATTERN)
     """Name of the survey; part of the store's path."""
@@ -411,8 +410,6 @@ class SurveyConfig(Strict):
     """What mountings are calibrated from (`roadscan calibrate`)."""
     navigation: NavigationConfig = NavigationConfig()
     """Poses."""
-    adjust: AdjustConfig = AdjustConfig()
-    """Adjustment of the poses where passes overlap, and to ground control."""
     filters: FilterConfig = FilterConfig()
     """Filters of points."""
     checks: ChecksConfig = ChecksConfig()
@@ -421,14 +418,6 @@ class SurveyConfig(Strict):
     """Left out, all readings of profiles count; with it, even as an empty table, only those that hit the road."""
     tiles: TileConfig = TileConfig()
     """Tiles and cells."""
-    surface: SurfaceConfig | None = None
-    """Reconstruction of the road's surface; left out, there is none."""
-    condition: ConditionConfig | None = None
-    """The road's condition along its lanes; left out, none is computed."""
-    assets: AssetsConfig | None = None
-    """Assets on, beside and over the road; left out, none are sought."""
-    inventory: InventoryConfig = InventoryConfig()
-    """The inventory of assets that people edit."""
     products: ProductConfig = ProductConfig()
     """Products."""
 
@@ -442,13 +431,46 @@ class SurveyConfig(Strict):
         for one in self.passes:
             if one.run not in runs:
                 raise ValueError(f"pass {one.id} names the unknown run '{one.run}'{nearest(one.run, runs)}")
-        fixed = self.adjust.fixed if self.adjust.on else []
-        for run in fixed:
-            if run not in runs:
-                raise ValueError(f"adjust.fixed names the unknown run '{run}'{nearest(run, runs)}")
-        if set(fixed) == set(runs):
-            raise ValueError("adjust.fixed names all runs: none is left to adjust; adjust.on = false switches it off")
         return self
+
+
+class SurveySection(Strict):
+    """A table of the survey file that a feature declares: a class in its file ``settings.py``, or of another package by
+    an entry point of the group ``roadscan.survey_sections``.
+    """
+
+    table: ClassVar[str]
+    """Key of the table."""
+    meaning: ClassVar[str]
+    """What it is for, in a line."""
+    may_be_left_out: ClassVar[bool] = False
+    """True where a survey file without the table has none; False where it has one of default values then."""
+
+    def check_survey(self, config: SurveyConfig) -> None:
+        """Raise :class:`ValueError` where the settings do not fit the rest of the survey file."""
+
+    @classmethod
+    def of(cls, survey: Survey) -> Self:
+        """The table of a survey, of default values where its file has none."""
+        return cls.stated(survey) or cls()
+
+    @classmethod
+    def stated(cls, survey: Survey) -> Self | None:
+        """The table of a survey; None where it may be left out, and is."""
+        return cast("Self | None", getattr(survey.config, cls.table))
+
+
+@functools.cache
+def survey_file_model() -> type[SurveyConfig]:
+    """The model of a whole survey file: what every survey states, and a field a table of a feature."""
+    sections: dict[str, type[SurveySection]] = found_kinds("*/settings.py", SurveySection, ENTRY_POINT_GROUP, "table")
+    fields: dict[str, Any] = {
+        name: (kind | None, None) if kind.may_be_left_out else (kind, kind()) for name, kind in sections.items()
+    }
+    model = create_model("SurveyFile", __base__=SurveyConfig, __module__=__name__, **fields)
+    MEANINGS[model] = {name: kind.meaning for name, kind in sections.items()}
+    globals()[model.__name__] = model  # by this name it travels to workers
+    return model
 
 
 def _with_defaults(config: SurveyConfig) -> SurveyConfig:
@@ -458,6 +480,13 @@ def _with_defaults(config: SurveyConfig) -> SurveyConfig:
         return config
     runs = [run.model_copy(update={"logs": [log.completed(defaults) for log in run.logs]}) for run in config.runs]
     return config.model_copy(update={"runs": runs})
+
+
+def _check_section(section: SurveySection, config: SurveyConfig, file: str | Path | None) -> None:
+    try:
+        section.check_survey(config)
+    except ValueError as error:
+        raise ConfigError(str(error), file=file) from error
 
 
 class Survey:
@@ -477,7 +506,10 @@ class Survey:
     @classmethod
     def parse(cls, values: dict[str, Any], *, folder: Path, file: str | Path | None = None) -> Self:
         """Check `values` as a survey file in `folder`."""
-        config = _with_defaults(SurveyConfig.parse(values, file=file))
+        config = _with_defaults(survey_file_model().parse(values, file=file))
+        for name in type(config).model_fields.keys() - SurveyConfig.model_fields.keys():
+            if (section := getattr(config, name)) is not None:
+                _check_section(section, config, file)
         rig = config.rig if isinstance(config.rig, Rig) else Rig.load(folder / config.rig)
         for run in config.runs:
             for log in run.logs:
@@ -502,6 +534,10 @@ class Survey:
         """Where tables and products live: an absolute folder, or a URL."""
         store = self.config.store
         return store if "://" in store else str((self.folder / store).resolve())
+
+    def has(self, section: str) -> bool:
+        """Whether the survey file has a table that may be left out."""
+        return getattr(self.config, section) is not None
 
     def resolve(self, path: Path) -> Path:
         """Absolute path of one that the survey file states relative to itself."""

@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from roadscan.core.settings.distress import CrackJoining
 from roadscan.distress.crack_gaps import bridges_of, outwards
 from roadscan.distress.crack_parts import Network, components, grouped, parts_of, united
 from roadscan.distress.cracks import CrackPiece
+from roadscan.distress.settings import CrackJoining
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -25,11 +25,11 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.ways import way_along
-from roadscan.core.settings.distress import CrackDetection
 from roadscan.distress import valleys
 from roadscan.distress.crack_depths import ValleyCells, blended, bottom_depths
 from roadscan.distress.kernels.cross_sections import cross_sections
 from roadscan.distress.kernels.quantiles_along import HALF_ALONG
+from roadscan.distress.settings import CrackDetection
 from roadscan.distress.skeleton_graph import PRUNINGS, SkeletonGraph, pruned, trimmed
 from roadscan.distress.valley_lines import DIRECTIONS, flank_cells
 from roadscan.distress.valleys import Valleys, bridge_cells, find_valleys

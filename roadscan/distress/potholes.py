@@ -26,10 +26,10 @@ import shapely
 from rasterio.features import shapes
 from scipy.ndimage import label
 
-from roadscan.core.settings.distress import PotholeDetection, PotholeJoining
+from roadscan.distress.hole_blocks import Blocks, block_cells, blocks_around
 from roadscan.distress.kernels.crack_response import fill_holes
+from roadscan.distress.settings import PotholeDetection, PotholeJoining
 from roadscan.surface.heights import HEIGHT_STEP_M, HeightWindow
-from roadscan.surface.hole_blocks import Blocks, block_cells, blocks_around
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.settings.distress import CrackDetection
 from roadscan.distress.kernels.crack_response import add_bend, deepen, fill_holes, line_sums
+from roadscan.distress.settings import CrackDetection
 from roadscan.surface.heights import HEIGHT_STEP_M
 from roadscan.surface.lowest import CROWD_CELLS
 

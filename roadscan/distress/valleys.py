@@ -27,8 +27,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.settings.distress import CrackDetection
 from roadscan.distress.kernels.thinning import thin
+from roadscan.distress.settings import CrackDetection
 from roadscan.distress.valley_lines import (
     DIRECTIONS,
     FAR,

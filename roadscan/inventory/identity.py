@@ -16,7 +16,7 @@ import pyarrow as pa
 import scipy.sparse
 import shapely
 
-from roadscan.core.settings.inventory import Matching
+from roadscan.inventory.settings import Matching
 from roadscan.store.asset_schema import asset_schema
 from roadscan.store.inventory_schema import GEOMETRY
 from roadscan.store.store import bytes_digest

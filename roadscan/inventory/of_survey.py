@@ -9,6 +9,7 @@ from typing import Final
 
 import pyarrow as pa
 
+from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.evidence import VISIBILITY
 from roadscan.assets.tasks.plan import asset_grid
 from roadscan.core.crs import crs_from_text
@@ -22,6 +23,7 @@ from roadscan.inventory.homes.page_edits import PageDocument
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.qgis.project import Raster
 from roadscan.inventory.recording import Found, Rules
+from roadscan.inventory.settings import InventoryConfig
 from roadscan.inventory.visibility import Unknown, Visibility, VisibilityOfSquares
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
@@ -53,7 +55,7 @@ def truth_of(session: Session) -> Inventory:
 
 
 def _opened(session: Session, home: Home) -> Inventory:
-    settings, survey = session.survey.config.inventory, session.survey
+    settings, survey = InventoryConfig.of(session.survey), session.survey
     name = settings.name or survey.config.id
     frame = survey.frame()
     rules = Rules(SeenByCells(session, _visibility(session)), settings.matching, frame.horizontal_unit_m)
@@ -65,7 +67,7 @@ def _opened(session: Session, home: Home) -> Inventory:
 
 def _truth(survey: Survey) -> AssetTruth:
     """The commits of the inventory that a survey belongs to."""
-    settings, url = survey.config.inventory, survey.store_url
+    settings, url = InventoryConfig.of(survey), survey.store_url
     if settings.store is not None:
         url = settings.store if "://" in settings.store else str(survey.resolve(Path(settings.store)))
     frame = survey.frame()
@@ -79,7 +81,7 @@ def inventory_faults(survey: Survey) -> list[str]:
 
 def home_of(session: Session, given: str | None = None) -> Home:
     """The home that the survey file states, or another one: a GeoPackage or the address of a PostGIS database."""
-    settings, survey = session.survey.config.inventory, session.survey
+    settings, survey = InventoryConfig.of(session.survey), session.survey
     frame = survey.frame()
     crs = frame.crs
     address = given if given is not None else os.environ.get(ADDRESS) or settings.postgis
@@ -139,12 +141,12 @@ def found_assets(session: Session) -> Found | None:
     key = bytes_digest("\n".join(digests).encode())
     nothing = not any(rows.num_rows for rows in tables.values())
     began = min((p.start_gps_ns for p in plan_of(session).passes), default=0) if nothing else 0
-    return Found(tables, key, f"survey {session.survey.config.id}", session.survey.config.inventory.epoch, began)
+    return Found(tables, key, f"survey {session.survey.config.id}", InventoryConfig.of(session.survey).epoch, began)
 
 
 def _visibility(session: Session) -> Visibility:
     """What the stage `assets` says of the places that passes had in sight, square by square."""
-    config, store = session.survey.config.assets, session.store
+    config, store = AssetsConfig.stated(session.survey), session.store
     records = {} if config is None else session.manifest.of(VISIBILITY)
     if config is None or not records:
         return Unknown()

@@ -14,9 +14,9 @@ import shapely
 
 from roadscan.core.errors import SchemaError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, leap_seconds_at_gps, utc_from_gps_ns
-from roadscan.core.settings.inventory import Matching
 from roadscan.inventory.identity import Known, matched, new_ids
 from roadscan.inventory.parents import Placed, parents_of
+from roadscan.inventory.settings import Matching
 from roadscan.inventory.state import Assets, State, live_commits, state_at
 from roadscan.inventory.values import iso_column
 from roadscan.inventory.visibility import NOT_KNOWN, Visibility

@@ -18,6 +18,7 @@ from roadscan.assets.files.thumbnails import (
     read_cut_out,
     sheet,
 )
+from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.evidence import CLASSIFIED
 from roadscan.assets.tasks.picture_work import CUT_OUTS
 from roadscan.assets.tasks.plan import asset_grid
@@ -36,7 +37,7 @@ class Thumbnails:
     """Draws thumbnails of a survey's assets; points of a square are read once while kinds look at them."""
 
     def __init__(self, session: Session) -> None:
-        config = session.survey.config.assets
+        config = AssetsConfig.stated(session.survey)
         self._session = session
         self._grid = None if config is None else asset_grid(session.survey, config)
         self._cut_outs = {r.path: r for r in session.manifest.of(CUT_OUTS).values()}

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.near import PlacedReadings, placed_readings
 from roadscan.compute.robust import scatter_about
 from roadscan.compute.ways import way_along
@@ -125,7 +126,7 @@ def _tasks(session: Session) -> Iterator[StripTask]:
 
 def _sigma(plan: SurveyPlan, poses: TrajectorySource) -> tuple[float, float]:
     """Usual 1 σ (m) of a run's poses, horizontal and down, as its logs state it, else as the adjustment assumes."""
-    assumed = plan.survey.config.adjust.priors
+    assumed = AdjustConfig.of(plan.survey).priors
     north, east, down, *_ = median_pose_sigma(plan.store, plan.records, poses).tolist()
     horizontal = float(np.hypot(north, east))
     return (

@@ -35,7 +35,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surface.faint_cracks import REACH as STRIP_REACH
 from roadscan.surface.faint_cracks import Chains, no_strips
 from roadscan.surface.kernels.line_medians import (
@@ -48,6 +47,7 @@ from roadscan.surface.kernels.line_medians import (
     window_sums,
 )
 from roadscan.surface.kernels.supports import SUPPORTS, CrackCells, Shapes, heights_by_support, least_risk
+from roadscan.surface.smoothing_settings import SurfaceSmoothing
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from roadscan.core.settings.surface import SlopeKind
 from roadscan.core.strict import Strict
 from roadscan.surface.clough_tocher import CubicSurface, cubic_surface
 from roadscan.surface.normals import RINGS, slopes_at
+from roadscan.surface.settings import SlopeKind
 from roadscan.surface.sites import sites
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow

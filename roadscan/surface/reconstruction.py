@@ -18,16 +18,16 @@ import numpy.typing as npt
 
 from roadscan.core.grid import QUANTUM_M, Bounds, TileGrid
 from roadscan.core.ids import TileId
-from roadscan.core.settings.surface import SurfaceConfig
-from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.georeference.cloud import TilePoints
 from roadscan.surface.clough_tocher import cubic_surface
 from roadscan.surface.detailed import DetailedSettings
 from roadscan.surface.holes import RIM, Holes, cells_across
 from roadscan.surface.lowest import LowestReadings
 from roadscan.surface.normals import slopes_at
+from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.sites import sites
 from roadscan.surface.smoothing import halo_cells, smooth_surface
+from roadscan.surface.smoothing_settings import SurfaceSmoothing
 from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow

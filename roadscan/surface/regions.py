@@ -23,9 +23,9 @@ import numpy.typing as npt
 import shapely
 from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter1d
 
-from roadscan.core.settings.surface_regions import RegionSettings
 from roadscan.surface.coarse import CoarseModel
 from roadscan.surface.kernels.coarse import PATCH_SUMS, sum_patches
+from roadscan.surface.region_settings import RegionSettings
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]

@@ -55,12 +55,12 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import RoadscanError
-from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surface.detail_median import REACH as MEDIAN_REACH
 from roadscan.surface.detail_median import detail_median
 from roadscan.surface.kernels.directional_filters import choose_filters
 from roadscan.surface.kernels.smoothing import REACH as STEP_REACH
 from roadscan.surface.kernels.smoothing import descend
+from roadscan.surface.smoothing_settings import SurfaceSmoothing
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]

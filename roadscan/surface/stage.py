@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
+from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.found_regions import find_due_regions
 from roadscan.surface.tasks.surface_colours import check_colours, colour_notes
 from roadscan.surface.tasks.surface_plan import SURFACE, files_without_surface
@@ -24,7 +25,7 @@ class Surfaces(Stage):
 
     def run(self, session: Session) -> None:
         """Reconstruct what is missing or stale."""
-        manifest, surface = session.manifest, session.survey.config.surface
+        manifest, surface = session.manifest, SurfaceConfig.stated(session.survey)
         if surface is not None and surface.regions == "found":
             bar = session.bar("regions of interest")
             session.failed(self.name, find_due_regions(plan_of(session), manifest, session.compute, bar))

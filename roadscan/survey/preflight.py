@@ -49,6 +49,7 @@ from roadscan.run.selection import Selection
 from roadscan.run.stage import stages
 from roadscan.store.logs import read_log_records
 from roadscan.store.store import Store
+from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.surface_colours import check_cameras
 from roadscan.surface.tasks.surface_plan import checked_surface
 from roadscan.tiles.product import ProductContext
@@ -391,7 +392,7 @@ def check_products(asked: Asked) -> Iterator[RoadscanError]:
 
 def check_surface(asked: Asked) -> Iterator[RoadscanError]:
     """Settings of the surface fit the tiles, and its polygons lie on the map."""
-    surface = asked.survey.config.surface
+    surface = SurfaceConfig.stated(asked.survey)
     if surface is not None and asked.frame is not None:
         yield from _faults(lambda: checked_surface(asked.survey, surface))
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from roadscan.adjust.places import Place, Track, places_of_overlap
+from roadscan.adjust.tie_settings import PlaceSettings
 from roadscan.core.errors import NavigationError
-from roadscan.core.settings.tie_settings import PlaceSettings
 
 SPEED = 25.0
 

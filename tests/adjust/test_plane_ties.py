@@ -7,8 +7,8 @@ import pytest
 
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.at_place import Ties, ties_at
-from roadscan.core.settings.tie_settings import TieSettings
 
 PLACE = Place(0, 1000.0, 2000.0, 0.0, 8.0, (Traverse(0, "lidar", 0, 10**10),))
 NOISE_M = 0.01

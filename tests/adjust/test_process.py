@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of, line_variance, precision_of
+from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.core.errors import ConfigError
-from roadscan.core.settings.adjustment import AdjustmentSettings
 
 PROCESS = GaussMarkov(0.015, 120.0)
 S = 10**9

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from roadscan.adjust.seams import moved, seam_view
-from roadscan.core.settings.tie_settings import TieSettings
+from roadscan.adjust.tie_settings import TieSettings
 from roadscan.poses.trajectory import Corrections
 from tests.adjust.drawn_patches import PLACE, Seen, edge_line, readings
 from tests.adjust.test_ties import moved as moved_in_full

@@ -13,12 +13,12 @@ from roadscan.assets.ground.bare_earth import ground_returns
 from roadscan.assets.ground.filling import filled
 from roadscan.assets.ground.grid import Grid
 from roadscan.assets.ground.morphological import opened
+from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.ground.surface import Place, is_dense
 from roadscan.assets.ground.undersides import undersides
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
-from roadscan.core.settings.asset_ground import GroundSettings
 from roadscan.simulate import Scene as Street
 from tests.assets.edges.streets import returns_of
 from tests.assets.isprs import SAMPLES, isprs_sample

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from roadscan.assets.pictures.reader import CutOut
+from roadscan.assets.pictures.settings import AssetPicturesSettings
 from roadscan.assets.tasks.recognition import OnnxModel, SignRecognition, check_recognition, recognition_of, upright
 from roadscan.core.errors import ConfigError
-from roadscan.core.settings.asset_pictures import AssetPicturesSettings
 
 
 def face(text: str = "", colour: tuple[int, int, int] = (255, 255, 255)) -> CutOut:

@@ -22,6 +22,7 @@ from roadscan.condition.index import ConditionIndex, Quantity, Value, condition_
 from roadscan.condition.indices.faulting import Faulting
 from roadscan.condition.indices.iri import Iri
 from roadscan.condition.lane_data import LaneData
+from roadscan.condition.settings import ConditionConfig
 from roadscan.condition.survey_lane import survey_lane
 from roadscan.condition.tasks import stretches
 from roadscan.condition.tasks.against_truth import compared_values, true_lane
@@ -110,7 +111,7 @@ def test_values_are_those_of_the_truth(surveyed: RoughSurvey) -> None:
 
 def test_steps_are_as_high_as_those_of_the_truth(surveyed: RoughSurvey) -> None:
     session = surveyed.session("store", section_m=50.0)
-    config = session.survey.config.condition
+    config = ConditionConfig.stated(session.survey)
     assert config is not None
     group = next(g for g in plan_condition(session).groups if g.lane.name == "2")
     lane = load_lane(GroupTask(session.store, config.sections(), 0.05, product_context(plan_of(session)), group))
@@ -130,7 +131,7 @@ def test_steps_are_as_high_as_those_of_the_truth(surveyed: RoughSurvey) -> None:
 def test_sections_of_ten_metres_have_a_roughness(surveyed: RoughSurvey) -> None:
     """Their mean is that of the section which they part."""
     session = surveyed.session("store", section_m=50.0)
-    config = session.survey.config.condition
+    config = ConditionConfig.stated(session.survey)
     assert config is not None
     group = next(g for g in plan_condition(session).groups if g.lane.name == "2")
     lane = load_lane(GroupTask(session.store, config.sections(), 0.05, product_context(plan_of(session)), group))
@@ -244,7 +245,7 @@ def test_a_second_run_does_nothing_and_stretches_change_no_bit(
 
 def test_heights_do_not_depend_on_the_stretch(surveyed: RoughSurvey) -> None:
     session = surveyed.session("store", section_m=50.0)
-    config = session.survey.config.condition
+    config = ConditionConfig.stated(session.survey)
     assert config is not None
     one = next(s for s in plan_condition(session).stretches if s.unit.startswith("A1/2/") and s.from_m == 50.0)
     edge = plan_of(session).ground.grid.cells_per_edge

@@ -11,6 +11,7 @@ import pytest
 import shapely
 
 from benchmarks.bench_lanes import RoughSurvey, rough_scene, run
+from roadscan.condition.settings import ConditionConfig
 from roadscan.condition.tasks import road_edges
 from roadscan.condition.tasks.values import GroupTask, load_lane
 from roadscan.condition.tasks.work import plan_condition
@@ -89,7 +90,7 @@ def test_heights_beyond_an_edge_are_no_part_of_a_cross_section(surveyed: RoughSu
     values = {"lanes": [{"name": "2", "offset_m": 1.95, "width_m": 3.9}], "road_edges": {"reach_m": 1.5}}
     with_edges = surveyed.session("wide", section_m=10.0, **values)
     run(with_edges)
-    config = with_edges.survey.config.condition
+    config = ConditionConfig.stated(with_edges.survey)
     assert config is not None
     (group,) = plan_condition(with_edges).groups
     lane = load_lane(GroupTask(with_edges.store, config.sections(), 0.05, product_context(with_edges.plan), group))
@@ -133,7 +134,7 @@ def test_polygons_of_the_survey_file_are_the_edges(surveyed: RoughSurvey, tmp_pa
     work = plan_condition(session)
     assert work.due_edges
     grid = plan_of(session).ground.grid
-    config = session.survey.config.condition
+    config = ConditionConfig.stated(session.survey)
     assert config is not None and config.road_edges is not None
     task = road_edges.EdgeTask(
         session.store, grid, product_context(plan_of(session)), config.road_edges, tuple(work.due_edges)

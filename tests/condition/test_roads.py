@@ -10,7 +10,7 @@ from roadscan.condition import road_line
 from roadscan.condition.cracks_on_lane import located
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roads import Drive, StatedLine, find_roads
-from roadscan.core.settings.condition import ConditionConfig
+from roadscan.condition.settings import ConditionConfig
 
 Float64 = npt.NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from roadscan.condition.roughness_regions.intensity import normalised_intensity,
 from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rotated_back
 from roadscan.condition.roughness_regions.raster import closed
 from roadscan.condition.roughness_regions.regions import SectionRegions, find_regions
+from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
 from roadscan.condition.roughness_regions.surface import fit, road_below
 from roadscan.core.errors import ProfileError
-from roadscan.core.settings.roughness_regions import RoughnessRegionsConfig
 from tests.condition.road_section import ALL, ORIGIN, PATCH, SLANTED, SQUARE, TRENCH, Section
 
 SETTINGS = RoughnessRegionsConfig()

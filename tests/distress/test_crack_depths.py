@@ -11,11 +11,11 @@ import pytest
 import shapely
 from numpy.lib.stride_tricks import sliding_window_view
 
-from roadscan.core.settings.distress import CrackDetection, CrackJoining
 from roadscan.distress.crack_depths import NARROW_CELLS, WIDE_CELLS, blended
 from roadscan.distress.crack_network import join_cracks
 from roadscan.distress.cracks import crack_pieces
 from roadscan.distress.kernels.quantiles_along import quantiles_along
+from roadscan.distress.settings import CrackDetection, CrackJoining
 from roadscan.distress.valley_lines import LINE_HALF, flank_cells
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface

@@ -13,11 +13,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from roadscan.core.errors import ConfigError, RoadscanError
-from roadscan.core.settings.distress import CrackDetection, CrackJoining
 from roadscan.distress.crack_network import join_cracks
 from roadscan.distress.crack_parts import bridges
 from roadscan.distress.cracks import CrackPiece, crack_pieces, halo_cells, needed_part, sharpened
 from roadscan.distress.kernels.cross_sections import cross_sections
+from roadscan.distress.settings import CrackDetection, CrackJoining
 from roadscan.distress.skeleton_graph import SkeletonGraph, pruned
 from roadscan.distress.valleys import _boxes, _thinned, find_valleys
 from roadscan.simulate.scene import Scene

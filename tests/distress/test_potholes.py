@@ -7,8 +7,8 @@ import pytest
 import shapely
 
 from roadscan.core.errors import ConfigError
-from roadscan.core.settings.distress import PotholeDetection, PotholeJoining
 from roadscan.distress.potholes import around_cells, join_potholes, pothole_pieces
+from roadscan.distress.settings import PotholeDetection, PotholeJoining
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surface.heights import HeightWindow

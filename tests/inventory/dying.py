@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 
 import psutil
 
-from roadscan.core.settings.inventory import Matching
 from roadscan.inventory.home import Content, Home, Mark
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.recording import Found, Rules
+from roadscan.inventory.settings import Matching
 from roadscan.store.asset_truth import AssetTruth
 from roadscan.store.store import Store
 from tests.inventory.streets import Everywhere

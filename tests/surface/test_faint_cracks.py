@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.core.settings.surface import SurfaceConfig
-from roadscan.core.settings.surface_smoothing import SurfaceSmoothing
 from roadscan.surface.detail_median import REACH, detail_median
 from roadscan.surface.faint_cracks import confirmed_strips
 from roadscan.surface.kernels.faint_cracks import (
@@ -18,7 +16,9 @@ from roadscan.surface.kernels.faint_cracks import (
     line_depths,
     mark_peaks,
 )
+from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.smoothing import Smoothing, smooth_surface
+from roadscan.surface.smoothing_settings import SurfaceSmoothing
 from tests.surface.patches import (
     IMPULSES,
     PROFILER_5,

@@ -16,6 +16,7 @@ from roadscan.adjust.picture import AdjustmentPicture, Residuals
 from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
+from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.control_lines import lines_line
 from roadscan.adjust.tasks.control_work import (
     SIGHTINGS,
@@ -56,8 +57,8 @@ from roadscan.adjust.tasks.solution import Evidence, Solution, priors_of, solve
 from roadscan.adjust.tasks.tie_work import TIES, KnownTies, TieTask, collect_ties, load_ties, tie_tasks
 from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
 from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
+from roadscan.adjust.tie_settings import PlaceSettings
 from roadscan.core.counted import counted as count_of
-from roadscan.core.settings.tie_settings import PlaceSettings
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.plan.road import road_key
@@ -106,7 +107,7 @@ class Seen(NamedTuple):
 
 def solution_key(plan: SurveyPlan) -> str:
     """Hash of all that the solution depends on: settings, code, readings, poses, control. No reading is read for it."""
-    config = plan.survey.config.adjust
+    config = AdjustConfig.of(plan.survey)
     picked = None if config.targets.picked is None else plan.survey.resolve(config.targets.picked)
     by_hand = [None if f is None or not f.is_file() else file_digest(f) for f in (picked, hand_file(plan.survey))]
     sources = [
@@ -133,7 +134,7 @@ def solution_key(plan: SurveyPlan) -> str:
 def is_current(plan: SurveyPlan, manifest: Manifest) -> bool:
     """True where nothing has changed since the last solution, and what it made is there."""
     record = manifest.get(ADJUSTMENT, SOLUTION)
-    if not plan.survey.config.adjust.on:
+    if not AdjustConfig.of(plan.survey).on:
         return record is None
     if record is None or record.key != solution_key(plan):
         return False
@@ -146,8 +147,8 @@ def withdraw(session: Session) -> None:
     """Take away what the stage made: the poses hold as they were recorded."""
     manifest, plan = session.manifest, plan_of(session)
     manifest.remove([r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()])
-    publish(session.store, {}, plan.survey.config.adjust)
-    publish_mountings(session.store, None, plan.survey.config.adjust)
+    publish(session.store, {}, AdjustConfig.of(plan.survey))
+    publish_mountings(session.store, None, AdjustConfig.of(plan.survey))
     manifest.forget(ADJUSTMENT, [SOLUTION])
 
 
@@ -182,7 +183,7 @@ class _Collector:
         A run in which heads meet otherwise than in the others gets mountings of its own.
         """
         self.observe(self.work.ties)
-        steps = steps_of(self._loaded(self.work.ties), plan_of(self.session).survey.config.adjust.ties.return_s)
+        steps = steps_of(self._loaded(self.work.ties), AdjustConfig.of(plan_of(self.session).survey).ties.return_s)
         swapped = exchanged(plan_of(self.session), self.sources, steps)
         useless = {one.run for one, _ in swapped}
         odd = odd_steps([one for one in steps if one.run not in useless])
@@ -209,7 +210,7 @@ class _Collector:
 
 def adjust_survey(session: Session) -> None:
     """Collect what evidence is missing, solve, and publish the corrections, tables and pictures."""
-    plan, manifest, config = plan_of(session), session.manifest, plan_of(session).survey.config.adjust
+    plan, manifest, config = plan_of(session), session.manifest, AdjustConfig.of(plan_of(session).survey)
     key = solution_key(plan)
     foreign = foreign_runs(session.store)
     sources = [pair for pair in adjusted_sources(plan) if pair[0].run not in foreign]
@@ -268,7 +269,7 @@ def _tables(
 def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) -> Work:
     """Where passes overlap and where they come by control points: tasks for both."""
     tracks = tracks_of(plan, sources)
-    config = plan.survey.config.adjust
+    config = AdjustConfig.of(plan.survey)
     places = _places(tracks, config.places)
     points = control_points(plan)
     ties = tie_tasks(plan, sources, places, runs_of(plan), config.ties)

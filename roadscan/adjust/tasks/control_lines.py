@@ -12,9 +12,9 @@ import shapely
 
 from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.control_faults import WrongPoint
+from roadscan.adjust.settings import AdjustConfig, LineUse
 from roadscan.adjust.targets.shapes import SurveyedLine
 from roadscan.compute.ways import way_along
-from roadscan.core.settings.adjust import LineUse
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.store.row_groups import read_groups
@@ -35,7 +35,7 @@ _LEAST: Final = 3
 
 def line_points(plan: SurveyPlan, first: int) -> list[ControlPoint]:
     """Points along all surveyed lines, each `adjust.lines.each_m`; first : number of the first of them."""
-    settings, found = plan.survey.config.adjust.lines, list[ControlPoint]()
+    settings, found = AdjustConfig.of(plan.survey).lines, list[ControlPoint]()
     for record in plan.records:
         for file in record.tables.get(TABLE, ()):
             for row in read_groups(plan.store, file.path, range(len(file.group_rows))).to_pylist():

@@ -14,6 +14,7 @@ from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, passes_
 from roadscan.adjust.patches import Shift, shifted
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.process import RunPrior
+from roadscan.adjust.settings import AdjustConfig, TargetConfig
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc, Shape
 from roadscan.adjust.tasks.control_lines import line_points
@@ -22,7 +23,6 @@ from roadscan.adjust.tasks.tracks import runs_of
 from roadscan.core.errors import ConfigError
 from roadscan.core.frames import rotation_from_rph, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.settings.adjust import AdjustConfig, TargetConfig
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import Ground
@@ -83,7 +83,7 @@ def control_points(plan: SurveyPlan) -> list[ControlPoint]:
     """Surveyed points of all control logs, in the order of the survey file and of their names, then those that stand
     for surveyed lines.
     """
-    config = plan.survey.config.adjust
+    config = AdjustConfig.of(plan.survey)
     found: list[ControlPoint] = []
     for record in plan.records:
         for file in record.tables.get("control_points", ()):
@@ -119,7 +119,7 @@ def picked_places(plan: SurveyPlan, points: Sequence[ControlPoint]) -> dict[tupl
     ConfigError
         where the file is not there or a row of it is none.
     """
-    targets = plan.survey.config.adjust.targets
+    targets = AdjustConfig.of(plan.survey).targets
     if targets.picked is None:
         return {}
     path = plan.survey.resolve(targets.picked)
@@ -167,7 +167,7 @@ def control_tasks(
 
 def _settings(plan: SurveyPlan) -> TargetSettings:
     """How targets are looked for."""
-    config = plan.survey.config.adjust
+    config = AdjustConfig.of(plan.survey)
     return TargetSettings(search_radius_m=config.targets.search_m, height_radius_m=config.control.radius_m)
 
 
@@ -218,7 +218,7 @@ def _radius_m(point: ControlPoint, settings: TargetSettings) -> float:
 
 def passes_of(plan: SurveyPlan, tracks: Sequence[Track], point: ControlPoint) -> list[tuple[Traverse, ...]]:
     """Traverses by a point, those of one run at one time together."""
-    radius_m, apart_s = _radius_m(point, _settings(plan)), plan.survey.config.adjust.places.return_s
+    radius_m, apart_s = _radius_m(point, _settings(plan)), AdjustConfig.of(plan.survey).places.return_s
     every = sorted(
         (t for track in tracks for t in passes_by(track, point.easting_m, point.northing_m, radius_m, apart_s)),
         key=lambda t: (t.run, t.first_gps_ns, t.sensor),

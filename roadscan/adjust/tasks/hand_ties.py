@@ -24,6 +24,7 @@ from roadscan.adjust.observations import KINDS, MOUNTED, Observations, mount_par
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.process import RunPrior
+from roadscan.adjust.settings import AdjustConfig, HandTies
 from roadscan.adjust.tasks.control_work import HAND, ControlTask, passes_of, sighting_tasks
 from roadscan.adjust.tasks.mountings import Mounted
 from roadscan.adjust.tasks.near import Sources
@@ -31,7 +32,6 @@ from roadscan.adjust.tasks.tie_work import KnownTies
 from roadscan.adjust.tasks.tracks import runs_of
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.gpstime import NS_PER_S, gps_ns_from_utc
-from roadscan.core.settings.adjust import HandTies
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
@@ -86,7 +86,7 @@ def subject(name: str) -> str:
 
 def hand_file(survey: Survey) -> Path | None:
     """The file of ties by hand; None where the survey file names none."""
-    stated = survey.config.adjust.hand_ties.path
+    stated = AdjustConfig.of(survey).hand_ties.path
     return None if stated is None else survey.resolve(stated)
 
 
@@ -110,7 +110,7 @@ def read_hand_ties(survey: Survey) -> list[HandTie]:
         odd += [f"a column '{name}'{nearest(name, _KNOWN)}" for name in names if name not in _KNOWN]
         if odd:
             raise ConfigError(f"the ties by hand have {odd[0]}", expected=", ".join(_KNOWN), file=path)
-        runs, stated = [run.id for run in survey.config.runs], survey.config.adjust.hand_ties
+        runs, stated = [run.id for run in survey.config.runs], AdjustConfig.of(survey).hand_ties
         found = [_tie(row, number, runs, stated, path) for number, row in enumerate(rows, 2)]
     for number, tie in enumerate(found):
         if tie.name in [other.name for other in found[:number]]:
@@ -198,7 +198,7 @@ def _passes(plan: SurveyPlan, tracks: Sequence[Track], end: HandEnd) -> list[tup
     found = passes_of(plan, [t for t in tracks if t.run == number], probe)
     if end.near_gps_ns is None:
         return found
-    reach = 0.5 * plan.survey.config.adjust.places.return_s * NS_PER_S
+    reach = 0.5 * AdjustConfig.of(plan.survey).places.return_s * NS_PER_S
     return [
         one for one in found
         if min(t.first_gps_ns for t in one) - reach <= end.near_gps_ns <= max(t.last_gps_ns for t in one) + reach

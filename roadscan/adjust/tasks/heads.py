@@ -16,15 +16,16 @@ import numpy.typing as npt
 
 from roadscan.adjust.observations import KINDS
 from roadscan.adjust.places import Place, Track, places_of_overlap
+from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.swath import WHOLE
 from roadscan.adjust.tasks.near import NearReader, Sources, near_files
 from roadscan.adjust.tasks.tie_work import KnownTies, ties_of
 from roadscan.adjust.tasks.tracks import runs_of, tracks_of
+from roadscan.adjust.tie_settings import PlaceSettings
 from roadscan.adjust.ties.at_place import Ties
 from roadscan.adjust.ties.tie import HEIGHT
 from roadscan.compute.robust import scatter_about
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.settings.tie_settings import PlaceSettings
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.run.engine.fingerprint import key_of
@@ -135,7 +136,7 @@ def exchanged(plan: SurveyPlan, sources: Sources, steps: Sequence[Step]) -> list
 
 def _tried(plan: SurveyPlan, sources: Sources, step: Step) -> Step | None:
     """The step with the mountings exchanged; None where it is no smaller."""
-    config, runs = plan.survey.config.adjust, runs_of(plan)
+    config, runs = AdjustConfig.of(plan.survey), runs_of(plan)
     (first, of_first), (second, of_second) = (
         next((s, files) for s, files in sources if (s.run, s.sensor) == (step.run, head)) for head in step.heads
     )

@@ -16,10 +16,10 @@ from roadscan.adjust.adjustment import MountingErrors
 from roadscan.adjust.control_test import APART
 from roadscan.adjust.observations import MOUNTED
 from roadscan.adjust.process import MountingPrior
+from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.unknowns import sharing
 from roadscan.core.rig import Mountings
-from roadscan.core.settings.adjust import AdjustConfig
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import MOUNTING_COLUMNS, MountingChanges, key_of_row, mounting_change_of
@@ -102,7 +102,7 @@ def mounted_of(plan: SurveyPlan, sources: Sources, *, foreign: bool) -> Mounted:
 
     foreign : another program corrected the poses of a run, with the mountings as they are stated.
     """
-    config = plan.survey.config.adjust
+    config = AdjustConfig.of(plan.survey)
     stated = {(source.run, source.sensor): source.mountings for source, _ in sources}
     parallel = frozenset((source.run, source.sensor) for source, _ in sources if source.has_parallel_beams)
     if foreign or config.mode != "joint":

@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 
 from roadscan.adjust.observations import COMPONENTS
 from roadscan.adjust.publish import published
-from roadscan.core.settings.adjust import AdjustConfig
+from roadscan.adjust.settings import AdjustConfig
 from roadscan.navigation.tasks.trajectories import CORRECTION_SIGMAS, load_all_corrections
 from roadscan.poses.trajectory import Corrections
 from roadscan.store.held import held_path, read_held, write_held

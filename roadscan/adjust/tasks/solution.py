@@ -19,6 +19,8 @@ from roadscan.adjust.observations import FIXED, MOUNTED, Observations
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
+from roadscan.adjust.settings import AdjustConfig, PosePriors
+from roadscan.adjust.solver_settings import AdjustmentSettings, ControlRules
 from roadscan.adjust.targets.shapes import SurveyedLine
 from roadscan.adjust.tasks.control_lines import line_findings
 from roadscan.adjust.tasks.doubts import (
@@ -45,8 +47,6 @@ from roadscan.adjust.tasks.mountings import Cause, Mounted, cause_line, causes, 
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.tasks.tie_work import KnownTies
 from roadscan.adjust.tasks.tracks import span_of
-from roadscan.core.settings.adjust import AdjustConfig, PosePriors
-from roadscan.core.settings.adjustment import AdjustmentSettings, ControlRules
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.navigation.tasks.pose_sigma import stated_pose_sigma
@@ -130,7 +130,7 @@ class Solution:
 
 def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[RunPrior, ...]:
     """Errors of the recorded poses of each run; of a run without readings there are none."""
-    config, found = plan.survey.config.adjust.priors, []
+    config, found = AdjustConfig.of(plan.survey).priors, []
     for run in runs:
         own = [(s, files) for s, files in sources if s.run == run]
         trajectory = own[0][0].trajectory if own else None
@@ -140,7 +140,7 @@ def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[
         spans = [span_of(s, files) for s, files in own]
         stated = _stated(plan, trajectory) if config.source == "sigma" else None
         first, last = min(a for a, _ in spans), max(b for _, b in spans)
-        held = run in plan.survey.config.adjust.fixed
+        held = run in AdjustConfig.of(plan.survey).fixed
         found.append(RunPrior(run, first, last, _processes(config, stated), stated, held))
     return tuple(found)
 
@@ -180,7 +180,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     ConfigError
         where a Helmert transformation has too few points.
     """
-    config = plan.survey.config.adjust
+    config = AdjustConfig.of(plan.survey)
     control = observations_of(evidence.sightings, [evidence.seen_by(one) for one in evidence.sightings])
     sightings = _by_observation(evidence.sightings)
     role = np.array([one.point.role == "gcp" for one in sightings], bool)
@@ -375,7 +375,7 @@ def _rigid_solution(
     plan: SurveyPlan, evidence: Evidence, control: Observations, entering: Bool, found: list[Finding]
 ) -> Solution:
     """The survey as a whole, shifted and turned onto its control."""
-    config = plan.survey.config.adjust
+    config = AdjustConfig.of(plan.survey)
     fit = _rigid_fit(evidence, entering, config.control.false_alarm)
     points = _points(fit.control, 0)
     found += wrong_points(_left_out_of(evidence.sightings, points))
@@ -430,7 +430,7 @@ def _rigid_corrections(
 ) -> tuple[dict[str, Corrections], float]:  # fmt: skip
     """A rigid movement as corrections of each run, and the largest σ of a height to the side of the vehicles."""
     corrections: dict[str, Corrections] = {}
-    config, largest = plan.survey.config.adjust, 0.0
+    config, largest = AdjustConfig.of(plan.survey), 0.0
     for prior in evidence.priors:
         source = next((s for s, _ in plan.sources if s.run == prior.run and s.trajectory is not None), None)
         if source is None or source.trajectory is None or not _moves(prior):

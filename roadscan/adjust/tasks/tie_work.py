@@ -15,10 +15,10 @@ from roadscan.adjust.patches import PassReadings, Shift, shifted
 from roadscan.adjust.places import Place, Traverse
 from roadscan.adjust.tasks.mountings import Mounted
 from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files
+from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.at_place import Ties, ties_at
 from roadscan.adjust.ties.tie import HEIGHT, SAME_PASS
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.settings.tie_settings import TieSettings
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import Ground

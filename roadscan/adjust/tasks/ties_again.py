@@ -16,16 +16,16 @@ import numpy.typing as npt
 
 from roadscan.adjust.patches import Shift
 from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.control_work import ControlTask, sighting_tasks
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.tasks.solution import Solution, priors_of
 from roadscan.adjust.tasks.tie_work import KnownTies, TieTask, tie_tasks
 from roadscan.adjust.tasks.tracks import runs_of
+from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.far_apart import agreeing, is_matched, misplaced, places_of_pairs
 from roadscan.core.counted import counted
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.settings.adjust import AdjustConfig
-from roadscan.core.settings.tie_settings import TieSettings
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.poses.trajectory import Corrections
@@ -121,7 +121,7 @@ def first_ties(
         return Again(tuple(tasks), ties, control=tuple(control))
     observe(larger)
     far = load(larger)
-    kept, apart = _agreed(far, ties, plan.survey.config.adjust, _sigmas(plan, sources))
+    kept, apart = _agreed(far, ties, AdjustConfig.of(plan.survey), _sigmas(plan, sources))
     misplaced, findings = _contradicted(plan, sources, ties, apart)
     # What was matched where two passes lie apart is not one place of the road.
     joined = ties.refused(_of_pairs(ties, apart)).with_more(far, kept)
@@ -134,7 +134,7 @@ def settled(
     plan: SurveyPlan, sources: Sources, again: Again, tools: tuple[Observe, Load, Solve]
 ) -> tuple[Again, Solution, list[Finding]]:
     """The solution whose ties lie where it says, and what was observed for it."""
-    config, (observe, load, solve) = plan.survey.config.adjust, tools
+    config, (observe, load, solve) = AdjustConfig.of(plan.survey), tools
     solution = solve(again.ties, again.control)
     tied, findings = config.mode in ("joint", "vertical"), list[Finding]()
     while tied and config.again.rounds:
@@ -163,7 +163,7 @@ def settled(
 
 def _larger_patches(plan: SurveyPlan, sources: Sources, tasks: Sequence[TieTask], ties: KnownTies) -> list[TieTask]:
     """Tasks for larger patches of all pairs of runs that share places; their places are numbered on."""
-    config, runs = plan.survey.config.adjust, runs_of(plan)
+    config, runs = AdjustConfig.of(plan.survey), runs_of(plan)
     known = {place.number: place for task in tasks for place in task.places}
     first, found = 1 + max(known, default=-1), list[Place]()
     sought = config.again.rounds and config.mode in ("joint", "vertical")
@@ -213,7 +213,7 @@ def _contradicted(
     plan: SurveyPlan, sources: Sources, ties: KnownTies, apart: Mapping[tuple[str, str], Float64]
 ) -> tuple[dict[str, Float64], list[Finding]]:
     """Runs that lie farther from others than their σ allow, by how much (3,), and findings on them."""
-    runs, config = runs_of(plan), plan.survey.config.adjust
+    runs, config = runs_of(plan), AdjustConfig.of(plan.survey)
     sigma = _sigmas(plan, sources)
     found = misplaced(runs, places_of_pairs(ties.tried).keys() - apart.keys(), apart, config.fixed)
     wrong, said = dict[str, Float64](), dict[tuple[str, ...], list[str]]()
@@ -248,7 +248,7 @@ def _sigmas(plan: SurveyPlan, sources: Sources) -> dict[str, Float64]:
 
 def _still_needed(plan: SurveyPlan, sources: Sources, ties: KnownTies, larger: KnownTies) -> KnownTies:
     """The ties, and those of larger patches of pairs of runs that still do not match."""
-    kept, apart = _agreed(larger, ties, plan.survey.config.adjust, _sigmas(plan, sources))
+    kept, apart = _agreed(larger, ties, AdjustConfig.of(plan.survey), _sigmas(plan, sources))
     return ties.with_more(larger, kept & _of_pairs(larger, [p for p in apart if not is_matched(ties.tried, p)]))
 
 
@@ -285,7 +285,7 @@ def _places_again(
     """Tasks for the places that a solution moves by too much since they were observed, their shifts, and by how much
     most (m).
     """
-    config, runs = plan.survey.config.adjust, runs_of(plan)
+    config, runs = AdjustConfig.of(plan.survey), runs_of(plan)
     chosen, shifts, largest_m = list[Place](), dict[int, tuple[Shift, ...]](), 0.0
     for place in again.places():
         own = tuple(_shift(corrections.get(runs[t.run]), t) for t in place.traverses)
@@ -308,7 +308,7 @@ def _points_again(
     plan: SurveyPlan, sources: Sources, again: Again, corrections: Mapping[str, Corrections]
 ) -> tuple[ControlTask, ...]:
     """Tasks that look at control points, with those of points whose passes a solution moves by too much."""
-    config, runs = plan.survey.config.adjust, runs_of(plan)
+    config, runs = AdjustConfig.of(plan.survey), runs_of(plan)
     least_m, seen, moves = config.again.share * 2.0 * config.places.radius_m, [], []
     last = {task.point.number: task for task in again.control}
     for task in (one for one in again.control if one.round == 0):

@@ -13,8 +13,8 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from roadscan.adjust.tie_settings import AgainSettings, TieSettings
 from roadscan.adjust.ties.tie import HEIGHT, SHIFT
-from roadscan.core.settings.tie_settings import AgainSettings, TieSettings
 
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]

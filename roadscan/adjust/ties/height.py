@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.patches import Patch, level_from_map, map_from_axes
+from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.tie import COUNTS, FEW_CELLS, HEIGHT, SCATTERED, STEEP, TOO_FAR, TWO_SURFACES, End, Tie
 from roadscan.compute.robust import scatter_about
-from roadscan.core.settings.tie_settings import TieSettings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

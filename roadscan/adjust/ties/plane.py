@@ -18,9 +18,9 @@ import numpy.typing as npt
 from roadscan.adjust.kernels.plane_moments import add_moments, leave_out_far
 from roadscan.adjust.patches import PassReadings, level_from_map
 from roadscan.adjust.places import Place
+from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.tie import COUNTS, PLANE, TOO_FAR, End, Tie
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.settings.tie_settings import TieSettings
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -11,8 +11,8 @@ import numpy as np
 from roadscan.adjust.patches import Patch, level_from_map, map_from_axes
 from roadscan.adjust.pictures import Picture, pictures_of
 from roadscan.adjust.registration import Shift, disagree, shift_of
+from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.tie import SHIFT, End, Tie
-from roadscan.core.settings.tie_settings import TieSettings
 
 DISAGREE: Final = "relief and paint disagree"
 _DISAGREE_SIGMA: Final = 5.0

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.ground.filling import filled
+from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.kernels.ground_cells import least_over_disk
-from roadscan.core.settings.asset_ground import GroundSettings
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.ground.grid import Grid, grid_over
+from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.kernels.lowest import counts
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
-from roadscan.core.settings.asset_ground import GroundSettings
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 
 from roadscan.assets.files.bare_earth import within, write_bare_earth
 from roadscan.assets.files.classified_points import classified_points, write_classified
+from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.intensity import calibrated_scene
 from roadscan.assets.kind import AssetKind, Evidence, Marked, asset_kinds
 from roadscan.assets.make_scene import make_scene
@@ -25,7 +26,6 @@ from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.assets.visibility import CELL_M, passes_in_sight
 from roadscan.core.errors import SchemaError
 from roadscan.core.ids import TileId
-from roadscan.core.settings.asset_ground import GroundSettings
 from roadscan.core.strict import Strict
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of

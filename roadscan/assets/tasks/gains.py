@@ -11,12 +11,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.intensity import IntensitySample, gains_of, intensity_sample
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_squares
 from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.core.ids import TileId
-from roadscan.core.settings.asset_ground import GroundSettings
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of
 from roadscan.run.engine.fingerprint import key_of

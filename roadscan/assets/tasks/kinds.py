@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from roadscan.assets.kind import AssetKind, asset_kinds
+from roadscan.assets.settings import AssetsConfig
 from roadscan.core.errors import ConfigError, nearest
-from roadscan.core.settings.assets import AssetsConfig
 from roadscan.core.strict import Strict
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from roadscan.core.settings.asset_pictures import AssetPicturesSettings
+from roadscan.assets.pictures.settings import AssetPicturesSettings
 from roadscan.surface.views import PictureRule
 
 _ANY_ANGLE_DEG: Final = -90.0

@@ -13,6 +13,7 @@ import pyarrow as pa
 import shapely
 
 from roadscan.assets.pictures.reader import ColourReader, picture_readers
+from roadscan.assets.pictures.settings import AssetPicturesSettings
 from roadscan.assets.tasks.evidence import SCREENS
 from roadscan.assets.tasks.objects import OBJECTS
 from roadscan.assets.tasks.picture_rule import picture_rule
@@ -21,7 +22,6 @@ from roadscan.assets.tiling import AssetGrid
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
-from roadscan.core.settings.asset_pictures import AssetPicturesSettings
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded

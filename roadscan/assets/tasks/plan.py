@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.kinds import WantedKind, wanted_kinds
 from roadscan.assets.tasks.load_returns import ReturnsTask
 from roadscan.assets.tasks.picture_rule import picture_rule
@@ -16,7 +17,6 @@ from roadscan.assets.tiling import AssetGrid
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
-from roadscan.core.settings.assets import AssetsConfig
 from roadscan.core.survey import Survey
 from roadscan.footprints.footprints import FootprintRanges
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
@@ -95,7 +95,7 @@ def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
     ConfigError
         where the survey's settings of assets do not fit it.
     """
-    config = plan.survey.config.assets
+    config = AssetsConfig.stated(plan.survey)
     if config is None:
         raise ConfigError("the survey file has no section [assets]")
     grid = asset_grid(plan.survey, config)
@@ -135,7 +135,7 @@ def is_looked_at(source: ReadingSource, config: AssetsConfig) -> bool:
 
 def check_assets(survey: Survey) -> None:
     """Raise :class:`ConfigError` where the section [assets] names what there is not; reads nothing."""
-    config = survey.config.assets
+    config = AssetsConfig.stated(survey)
     if config is None:
         return
     wanted_kinds(config)

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.pictures.reader import CutOut, Recognition
+from roadscan.assets.pictures.settings import AssetPicturesSettings
 from roadscan.core.errors import ConfigError
-from roadscan.core.settings.asset_pictures import AssetPicturesSettings
 from roadscan.store.store import file_digest
 
 Float32 = npt.NDArray[np.float32]

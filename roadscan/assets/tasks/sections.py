@@ -15,12 +15,12 @@ import shapely
 from roadscan.assets.files.bare_earth import read_bare_earth
 from roadscan.assets.files.layers import Layer, write_dxf
 from roadscan.assets.ground.cross_sections import CrossSections, cross_sections
+from roadscan.assets.settings import GroundSectionsConfig
 from roadscan.assets.tasks.evidence import BARE_EARTH
 from roadscan.assets.tiling import AssetGrid
 from roadscan.condition.road_line import RoadLine
 from roadscan.condition.tasks.lines import Roads
 from roadscan.core.ids import TileId
-from roadscan.core.settings.assets import GroundSectionsConfig
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded

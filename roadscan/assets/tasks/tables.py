@@ -13,13 +13,13 @@ import pyarrow as pa
 import shapely
 
 from roadscan.assets.files.layers import GEOMETRIES, Layer, write_dxf, write_geojson, write_geopackage
+from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.along_roads import along_roads
 from roadscan.assets.tasks.drives import Drives, with_pose_sigma
 from roadscan.assets.tasks.kinds import WantedKind
 from roadscan.assets.tasks.objects import OBJECTS
 from roadscan.assets.tasks.picture_work import PicturePlan
 from roadscan.condition.tasks.lines import Roads
-from roadscan.core.settings.assets import AssetsConfig
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.asset_schema import ASSET_FOLDER, AssetSchema

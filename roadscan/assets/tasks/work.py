@@ -59,7 +59,7 @@ class AssetsWork:
 def plan_evidence(session: Session) -> AssetsWork:
     """Compare the evidence there is with what there should be; with a selection of tiles, of their squares."""
     manifest = session.manifest
-    if session.survey.config.assets is None:
+    if not session.survey.has("assets"):
         return AssetsWork(gone=manifest.beside(set(MADE), ()))
     plan = plan_assets(plan_of(session), footprints_of(session))
     gains = plan_gains(plan)

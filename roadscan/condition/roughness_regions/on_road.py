@@ -13,7 +13,7 @@ from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roughness_regions.intensity import normalised_intensity
 from roadscan.condition.roughness_regions.points import RoadPoints
 from roadscan.condition.roughness_regions.regions import SectionRegions, find_regions
-from roadscan.core.settings.roughness_regions import RoughnessRegionsConfig
+from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
 from roadscan.tiles.cells import TileCells
 
 Float64 = npt.NDArray[np.float64]

@@ -26,9 +26,9 @@ from roadscan.condition.roughness_regions.clusters import Cluster, clusters_of
 from roadscan.condition.roughness_regions.intensity import three_classes
 from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rotated_back
 from roadscan.condition.roughness_regions.raster import IntensityRaster, closed, intensity_raster
+from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
 from roadscan.condition.roughness_regions.severity import UNKNOWN, Severity, severity
 from roadscan.condition.roughness_regions.surface import RoadSurface, road_below
-from roadscan.core.settings.roughness_regions import RoughnessRegionsConfig
 
 Float64 = npt.NDArray[np.float64]
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from roadscan.condition.index import Value, condition_indices
 from roadscan.condition.lane_data import LaneData, Profile
+from roadscan.condition.settings import ConditionConfig
 from roadscan.condition.tasks.values import Group, GroupTask, load_lane
 from roadscan.condition.tasks.work import plan_condition
 from roadscan.georeference.plan.plan import plan_of
@@ -34,7 +35,7 @@ class Compared:
 
 def compared_values(session: Session, height_at: HeightAt) -> Iterator[Compared]:
     """All values of the store beside those of the truth; the profiles and cross-sections have to be made."""
-    config = session.survey.config.condition
+    config = ConditionConfig.stated(session.survey)
     if config is None:
         return
     context = product_context(plan_of(session))

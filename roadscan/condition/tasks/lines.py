@@ -17,10 +17,10 @@ import shapely
 from roadscan.condition.pose_wander import height_wander
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roads import Drive, StatedLine, find_roads
+from roadscan.condition.settings import ConditionConfig
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError
 from roadscan.core.ids import LanePass, PassId
-from roadscan.core.settings.condition import ConditionConfig
 from roadscan.core.survey import Survey
 from roadscan.formats.vectors.road_lines import LineLayer, RoadLinesOptions, place_in_map, read_lines, sidecars
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
@@ -95,7 +95,7 @@ def find_lines(plan: SurveyPlan, config: ConditionConfig) -> Roads:
 
 def roads_key(plan: SurveyPlan) -> str:
     """Key of the lines and lanes of :func:`survey_roads`."""
-    return lines_key(plan, plan.survey.config.condition or ConditionConfig())
+    return lines_key(plan, ConditionConfig.stated(plan.survey) or ConditionConfig())
 
 
 def survey_roads(plan: SurveyPlan, manifest: Manifest) -> tuple[Roads, str]:
@@ -103,7 +103,7 @@ def survey_roads(plan: SurveyPlan, manifest: Manifest) -> tuple[Roads, str]:
 
     A survey without a section `[condition]` has those of its drives.
     """
-    config, key = plan.survey.config.condition or ConditionConfig(), roads_key(plan)
+    config, key = ConditionConfig.stated(plan.survey) or ConditionConfig(), roads_key(plan)
     if current_lines(manifest, key):
         return load_roads(plan.store, manifest, product_context(plan)), key
     return find_lines(plan, config), key
@@ -156,7 +156,7 @@ def check_layer(survey: Survey) -> None:
     FormatError, ConfigError, CrsError
         if it does not exist, cannot be read as stated, or cannot be brought into the map.
     """
-    config = survey.config.condition
+    config = ConditionConfig.stated(survey)
     if config is not None and config.layer is not None:
         path = survey.resolve(config.layer)
         layer = LineLayer.of(path, RoadLinesOptions.parse(config.layer_options, file=path), config.layer_crs)

@@ -23,12 +23,13 @@ from roadscan.condition.road_edges.on_road import (
     road_surfaces,
 )
 from roadscan.condition.road_edges.raster import tile_points
+from roadscan.condition.road_edges.settings import RoadEdgesConfig
+from roadscan.condition.settings import ConditionConfig
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.tasks import PieceTask
 from roadscan.condition.tasks.tiles_beside import tiles_beside
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
-from roadscan.core.settings.road_edges import RoadEdgesConfig
 from roadscan.core.survey import Survey
 from roadscan.formats.vectors.polygons import check_polygons, read_polygons
 from roadscan.formats.vectors.road_lines import sidecars
@@ -84,7 +85,7 @@ def check_edge_polygons(survey: Survey) -> None:
     FormatError, ConfigError, CrsError
         if it does not exist, cannot be read as stated, or cannot be brought into the map.
     """
-    config = survey.config.condition
+    config = ConditionConfig.stated(survey)
     if config is not None and config.road_edges is not None and config.road_edges.polygons is not None:
         settings, frame = config.road_edges, survey.frame()
         check_polygons(survey.resolve(config.road_edges.polygons), settings.polygons_crs, frame)

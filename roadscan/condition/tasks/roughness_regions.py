@@ -15,12 +15,12 @@ from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roughness_regions.on_road import Stretch, points_of, section_regions, station_and_offset
 from roadscan.condition.roughness_regions.picture import DrawnSection, draw_regions
 from roadscan.condition.roughness_regions.regions import Region, SectionRegions
+from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.tasks import PieceTask
 from roadscan.condition.tasks.tiles_beside import tiles_beside
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
-from roadscan.core.settings.roughness_regions import RoughnessRegionsConfig
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of

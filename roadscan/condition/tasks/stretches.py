@@ -19,12 +19,12 @@ import shapely
 from roadscan.condition.cell_table import cell_table
 from roadscan.condition.on_lane.squares import SQUARE_M
 from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.settings import SectionConfig
 from roadscan.condition.survey_lane import LaneHeights, reach_m, survey_lane
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.surface_cells import read_surface
 from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
-from roadscan.core.settings.condition import SectionConfig
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from roadscan.condition.settings import ConditionConfig
 from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
@@ -11,13 +12,14 @@ from roadscan.core.survey import Survey
 from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.store import Store
 from roadscan.surface.reconstruction import SurfaceGrid
+from roadscan.surface.settings import SurfaceConfig
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import ProductContext
 
 
 def check_surface_cells(survey: Survey) -> None:
     """Raise :class:`ConfigError` where heights of the surface are asked for and there is none on the tiles' cells."""
-    config, surface = survey.config.condition, survey.config.surface
+    config, surface = ConditionConfig.stated(survey), SurfaceConfig.stated(survey)
     if config is None or config.heights == "cells":
         return
     cell_m = survey.config.tiles.cell_m

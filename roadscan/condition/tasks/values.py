@@ -21,6 +21,7 @@ from roadscan.condition.on_lane.lines import LaneLines
 from roadscan.condition.on_lane.squares import TextureSquares, columns_of
 from roadscan.condition.road_edges.on_lane import EdgeRows, EdgesOnLane, edges_on_lane
 from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.settings import SectionConfig
 from roadscan.condition.survey_lane import window_m2
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.road_edges import EDGE_PIECE_M, EDGES, edge_unit
@@ -33,7 +34,6 @@ from roadscan.condition.tasks.stretches import (
     STRETCH_M,
     unit_of,
 )
-from roadscan.core.settings.condition import SectionConfig
 from roadscan.core.witness import Finding
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.compute import damaged_file, reason_of

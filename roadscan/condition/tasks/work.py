@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from roadscan.condition.settings import ConditionConfig
 from roadscan.condition.tasks.lines import LANES, LINES, Roads, current_lines, lines_key, load_roads
 from roadscan.condition.tasks.pictures import PICTURES, PictureTask, due_pictures, plan_pictures
 from roadscan.condition.tasks.ravelling import RAVELLING, RAVELLING_PICTURES, PatchTask, due_patches, plan_patches
@@ -28,7 +29,6 @@ from roadscan.condition.tasks.stretches import (
 from roadscan.condition.tasks.tile_summary import TILES, due_tiles
 from roadscan.condition.tasks.values import VALUES, Group, GroupTask, due_groups, plan_groups
 from roadscan.core.ids import TileId
-from roadscan.core.settings.condition import ConditionConfig
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
@@ -77,7 +77,7 @@ class ConditionWork:
 
 def plan_condition(session: Session) -> ConditionWork:
     """Compare what there is with what there should be; what waits for the lines is not told yet."""
-    config, manifest = session.survey.config.condition, session.manifest
+    config, manifest = ConditionConfig.stated(session.survey), session.manifest
     if config is None:
         return ConditionWork(gone=manifest.beside(set(MADE), ()))
     key = lines_key(plan_of(session), config)

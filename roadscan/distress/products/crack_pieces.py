@@ -10,9 +10,9 @@ import pyarrow as pa
 import shapely
 
 from roadscan.core.errors import ConfigError
-from roadscan.core.settings.distress import CrackDetection
 from roadscan.core.strict import Strict
 from roadscan.distress.cracks import CrackPiece, crack_pieces, halo_cells
+from roadscan.distress.settings import CrackDetection
 from roadscan.surface.heights import HeightWindow
 from roadscan.surface.tile import FILLED, SurfaceTile
 from roadscan.tiles.product import ProductContext, SurfaceProduct

@@ -9,11 +9,11 @@ from typing import Any, ClassVar, Final, cast
 import numpy as np
 import pyarrow as pa
 
-from roadscan.core.settings.distress import CrackJoining
 from roadscan.core.strict import Strict
 from roadscan.distress.crack_network import Crack, join_cracks
 from roadscan.distress.cracks import CrackPiece
 from roadscan.distress.products.crack_pieces import read_pieces
+from roadscan.distress.settings import CrackJoining
 from roadscan.tiles.product import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.geo_table import check_geo_table, write_geo_table
 

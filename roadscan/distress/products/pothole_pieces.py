@@ -9,10 +9,10 @@ import numpy as np
 import pyarrow as pa
 
 from roadscan.core.errors import ConfigError
-from roadscan.core.settings.distress import PotholeDetection
 from roadscan.core.strict import Strict
 from roadscan.distress.potholes import PotholePiece, around_cells, halo_cells, pothole_pieces
 from roadscan.distress.products.crack_pieces import check_cells, height_window
+from roadscan.distress.settings import PotholeDetection
 from roadscan.surface.heights import HeightWindow
 from roadscan.surface.tile import SurfaceTile
 from roadscan.tiles.product import ProductContext, SurfaceProduct

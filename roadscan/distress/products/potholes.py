@@ -9,10 +9,10 @@ from typing import Any, ClassVar, Final, cast
 import numpy as np
 import pyarrow as pa
 
-from roadscan.core.settings.distress import PotholeJoining
 from roadscan.core.strict import Strict
 from roadscan.distress.potholes import Pothole, PotholePiece, join_potholes
 from roadscan.distress.products.pothole_pieces import read_pieces
+from roadscan.distress.settings import PotholeJoining
 from roadscan.tiles.product import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.geo_table import check_geo_table, write_geo_table
 

@@ -61,7 +61,7 @@ class Condition(Section):
         session = material.session
         rows = _sections(session)
         if not rows:
-            if session.survey.config.condition is not None:
+            if session.survey.has("condition"):
                 yield Paragraph("No section of a lane was made.", is_warning=True)
             return
         notes = _Notes()

@@ -18,7 +18,6 @@ import shapely
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.ids import TileId
-from roadscan.core.settings.surface_regions import RegionSettings
 from roadscan.footprints.footprints import FootprintRanges
 from roadscan.georeference.place import Placement, ProfilePoints
 from roadscan.georeference.plan.plan import SurveyPlan
@@ -33,7 +32,9 @@ from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, file_digest
 from roadscan.surface.coarse import CoarseSettings, Stretch, coarse_model
+from roadscan.surface.region_settings import RegionSettings
 from roadscan.surface.regions import Region, find_regions
+from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.surface_regions import Regions
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
@@ -82,7 +83,7 @@ def searched_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFi
     ConfigError
         where there are no profiles across the road.
     """
-    config = plan.survey.config.surface
+    config = SurfaceConfig.stated(plan.survey)
     if config is None or config.regions != "found":
         return []
     sources = [(s, files) for s, files in plan.sources if s.table == "scans" and _sees_the_road(s)]
@@ -98,7 +99,7 @@ def searched_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFi
 
 def region_pieces(plan: SurveyPlan) -> list[RegionPiece]:
     """All pieces of the drives that are searched; errors as of :func:`searched_sources`."""
-    config, sources = plan.survey.config.surface, searched_sources(plan)
+    config, sources = SurfaceConfig.stated(plan.survey), searched_sources(plan)
     if config is None or not sources:
         return []
     context = product_context(plan)

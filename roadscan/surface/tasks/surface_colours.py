@@ -28,7 +28,7 @@ _NAMED: Final = 5
 
 def check_cameras(survey: Survey) -> None:
     """Raise where products of the surface want colours, and the rig has no camera for them; reads no log."""
-    for product, options in wanted_products(survey) if survey.config.surface is not None else ():
+    for product, options in wanted_products(survey) if survey.has("surface") else ():
         rule = product.picture_rule(options) if isinstance(product, SurfaceProduct) else None
         if rule is not None:
             rule_cameras(survey.rig, rule)

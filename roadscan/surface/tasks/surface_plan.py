@@ -12,13 +12,13 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
-from roadscan.core.settings.surface import SurfaceConfig
 from roadscan.core.survey import Survey
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.surface.reconstruction import SurfaceGrid
+from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.found_regions import FoundRegions
 from roadscan.surface.tasks.pictures import Pictures
 from roadscan.surface.tasks.surface_colours import shown_box

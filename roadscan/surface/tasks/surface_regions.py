@@ -23,6 +23,7 @@ from roadscan.formats.vectors.vector_layer import (
     layer_names,
     shapes_of,
 )
+from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.window import GridWindow
 
 _EXPECTED: Final = "a layer of polygons"
@@ -63,7 +64,7 @@ def stated_regions(survey: Survey) -> Regions | None:
     ConfigError, FormatError, CrsError
         if the layer cannot be read as stated, or a feature of it is no polygon that lies in the map.
     """
-    stated = survey.config.surface
+    stated = SurfaceConfig.stated(survey)
     if stated is None or stated.polygons is None:
         return None
     path = survey.resolve(stated.polygons)

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 from roadscan.core.ids import TileId
 from roadscan.footprints.footprints import footprints_of
-from roadscan.georeference.plan.plan import plan_of
+from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
-from roadscan.surface.tasks.found_regions import REGIONS, FoundRegions, load_found_regions
-from roadscan.surface.tasks.surface_colours import plan_colours
-from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, plan_surfaces
+from roadscan.surface.settings import SurfaceConfig
+from roadscan.surface.tasks.found_regions import REGIONS, FoundRegions, load_found_regions, searched_sources
+from roadscan.surface.tasks.surface_colours import check_colours, plan_colours
+from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, checked_surface, plan_surfaces
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import surface_file_names
 from roadscan.tiles.tasks.tile_plan import TilePlan, tiles_of
@@ -39,7 +40,8 @@ def plan_surface_work(session: Session) -> SurfaceWork:
     """
     survey, manifest, selection = session.survey, session.manifest, session.selection
     names = {SURFACE, REGIONS, *surface_file_names()}
-    if survey.config.surface is None:
+    config = SurfaceConfig.stated(survey)
+    if config is None:
         return SurfaceWork(None, [], [r for name in names for r in manifest.of(name).values()])
     plan, footprints = plan_of(session), footprints_of(session)
     context = product_context(plan)
@@ -50,7 +52,7 @@ def plan_surface_work(session: Session) -> SurfaceWork:
     tiles = TilePlan(plan, footprints, tiles_of(session), (), context)
     found = load_found_regions(plan, manifest)
     pictures = plan_colours(plan, wanted)
-    planned = plan_surfaces(tiles, survey.config.surface, wanted, manifest, found, pictures)
+    planned = plan_surfaces(tiles, config, wanted, manifest, found, pictures)
     units = {str(tile) for tile in (*planned.keys, *planned.waiting)}
     names_wanted = {SURFACE, *surface_file_names({w.product.name for w in wanted})}
     gone = [
@@ -75,3 +77,11 @@ def _waiting_note(waiting: int, found: FoundRegions) -> str:
     if found.due:
         return f"surfaces of {waiting:,} tiles wait for regions of interest: run `roadscan surfaces`"
     return f"surfaces of {waiting:,} tiles wait for cells that are missing or out of date: run `roadscan tiles`"
+
+
+def check_surface_ahead(plan: SurveyPlan) -> None:
+    """Raise where the surface that a survey asks for cannot be made: its settings, its regions, its pictures."""
+    if (config := SurfaceConfig.stated(plan.survey)) is not None:
+        checked_surface(plan.survey, config)
+        searched_sources(plan)
+        check_colours(plan)

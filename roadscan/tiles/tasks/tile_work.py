@@ -11,9 +11,7 @@ from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.memory import BYTES_PER_READING, WORKER_BASE_BYTES
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
-from roadscan.surface.tasks.found_regions import searched_sources
-from roadscan.surface.tasks.surface_colours import check_colours
-from roadscan.surface.tasks.surface_plan import checked_surface
+from roadscan.surface.tasks.surface_work import check_surface_ahead
 from roadscan.tiles.accumulator import MOST_BYTES
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import tile_file_names
@@ -36,10 +34,7 @@ def plan_tile_work(session: Session) -> TileWork:
     """Compare what there is with what there should be."""
     plan, manifest, survey = plan_of(session), session.manifest, session.survey
     context = product_context(plan)
-    if survey.config.surface is not None:
-        checked_surface(survey, survey.config.surface)  # before the tiles are computed for it
-        searched_sources(plan)
-        check_colours(plan)
+    check_surface_ahead(plan)  # before the tiles are computed for it
     wanted = tuple(wanted_tile_products(survey, context))
     tiles, footprints = tiles_of(session), footprints_of(session)
     if session.selection is not None:

@@ -12,6 +12,7 @@ from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.surface.reconstruction import SurfaceGrid
+from roadscan.surface.settings import SurfaceConfig
 from roadscan.tiles.product import (
     Product,
     ProductContext,
@@ -32,7 +33,7 @@ def wanted_products(survey: Survey) -> list[tuple[Product, Strict]]:
     """Products that the survey file asks for, with their checked settings."""
     config = survey.config.products
     cell_m = survey.config.tiles.cell_m
-    with_surface = survey.config.surface is not None
+    with_surface = survey.has("surface")
     names = config.make if config.make is not None else _default_names(cell_m, with_surface)
     for name in config.options:
         product_named(name)
@@ -61,7 +62,7 @@ def check_product(survey: Survey, name: str) -> None:
 
 def _check_surface(survey: Survey, product: Product) -> None:
     of_surface = isinstance(product, SurfaceProduct) or (isinstance(product, SurveyProduct) and product.reads)
-    if of_surface and survey.config.surface is None:
+    if of_surface and not survey.has("surface"):
         raise ConfigError(
             f"the product '{product.name}' is made of the reconstructed surface, and the survey has none",
             change="add the section [surface] to the survey file, or leave the product out",
@@ -85,7 +86,8 @@ def _default_names(cell_m: float, with_surface: bool) -> list[str]:
 def product_context(plan: SurveyPlan) -> ProductContext:
     """What products know of the survey."""
     config, grid = plan.survey.config, plan.ground.grid
-    cell_m = None if config.surface is None else SurfaceGrid(grid, config.surface).cell_m
+    surface = SurfaceConfig.stated(plan.survey)
+    cell_m = None if surface is None else SurfaceGrid(grid, surface).cell_m
     return ProductContext(config.id, config.title, plan.ground.map, grid, plan.passes, plan.date, cell_m)
 
 
@@ -101,7 +103,7 @@ def wanted_tile_products(survey: Survey, context: ProductContext) -> list[Wanted
 
 def wanted_surface_products(survey: Survey, context: ProductContext) -> list[WantedSurface]:
     """The same, of products of the reconstructed surface."""
-    config = survey.config.surface
+    config = SurfaceConfig.stated(survey)
     grid = None if config is None else SurfaceGrid(context.grid, config)
     wanted: list[WantedSurface] = []
     for product, options in wanted_products(survey):

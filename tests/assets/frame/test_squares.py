@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.along_roads import along_roads
 from roadscan.assets.tasks.load_returns import _Columns, in_order
 from roadscan.assets.tasks.objects import clustered
@@ -16,7 +17,6 @@ from roadscan.core.crs import MapFrame
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.rig import Mounting, Mountings
-from roadscan.core.settings.assets import AssetsConfig
 from roadscan.georeference.sensor_places import sensor_places
 from roadscan.poses.trajectory import Trajectory
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
 from pydantic import Field
 
 from roadscan.core.strict import NAME_PATTERN, Strict, pattern_in_words
+from roadscan.core.survey import SurveySection
 
 _SCHEMA_NAME: Final = pattern_in_words(
     r"^[a-z_][a-z0-9_]{0,30}$", "1 to 31 small letters (a–z), digits and '_', of which the first is no digit"
@@ -25,8 +26,11 @@ class Matching(Strict):
     seen at its place and was not (m)."""
 
 
-class InventoryConfig(Strict):
+class InventoryConfig(SurveySection):
     """The inventory: which one the survey belongs to, where people edit it, and how assets are known again."""
+
+    table: ClassVar[str] = "inventory"
+    meaning: ClassVar[str] = "The inventory of assets that people edit."
 
     store: str | None = None
     """Folder (relative to the survey file) or object-store URL of the inventory; the survey's store where it is left

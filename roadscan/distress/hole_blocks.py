@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.settings.distress import PotholeDetection
+from roadscan.distress.settings import PotholeDetection
 from roadscan.surface.heights import HEIGHT_STEP_M, HeightWindow
 from roadscan.surface.kernels.ground import depths, grounds, slopes
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.core.settings.adjustment import ControlRules, SolverSettings
-from roadscan.core.settings.tie_settings import AgainSettings, PlaceSettings, TieSettings
+from roadscan.adjust.solver_settings import ControlRules, SolverSettings
+from roadscan.adjust.tie_settings import AgainSettings, PlaceSettings, TieSettings
+from roadscan.core.errors import nearest
 from roadscan.core.strict import Strict
+from roadscan.core.survey import SurveyConfig, SurveySection
 
 AdjustMode = Literal["joint", "each_pass", "vertical", "helmert"]
 """What is adjusted."""
@@ -143,11 +145,14 @@ class HandTies(Strict):
     """1 σ of the difference of two heights, beside that of their measurement, where a tie states none (m)."""
 
 
-class AdjustConfig(Strict):
+class AdjustConfig(SurveySection):
     """The adjustment of the recorded poses: passes are tied to one another where they overlap, and to ground control.
 
     It is on where a survey has either, and does nothing where it has neither.
     """
+
+    table: ClassVar[str] = "adjust"
+    meaning: ClassVar[str] = "Adjustment of the poses where passes overlap, and to ground control."
 
     on: bool = True
     """`false`: the poses hold as they were recorded."""
@@ -193,3 +198,12 @@ class AdjustConfig(Strict):
                 "fixed run"
             )
         return self
+
+    def check_survey(self, config: SurveyConfig) -> None:
+        """Raise :class:`ValueError` where runs are held fixed that the survey has not, or all of them."""
+        fixed, runs = self.fixed if self.on else [], [run.id for run in config.runs]
+        for run in fixed:
+            if run not in runs:
+                raise ValueError(f"adjust.fixed names the unknown run '{run}'{nearest(run, runs)}")
+        if set(fixed) == set(runs):
+            raise ValueError("adjust.fixed names all runs: none is left to adjust; adjust.on = false switches it off")

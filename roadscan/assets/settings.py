@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.core.settings.asset_ground import GroundSettings
-from roadscan.core.settings.asset_pictures import AssetPicturesSettings
+from roadscan.assets.ground.settings import GroundSettings
+from roadscan.assets.pictures.settings import AssetPicturesSettings
 from roadscan.core.strict import Strict
+from roadscan.core.survey import SurveySection
 
 
 class GroundSectionsConfig(Strict):
@@ -23,8 +24,12 @@ class GroundSectionsConfig(Strict):
     """Distance between the heights of a cross-section (m)."""
 
 
-class AssetsConfig(Strict):
+class AssetsConfig(SurveySection):
     """What stands on, beside and over the road. Without this section no asset is sought."""
+
+    table: ClassVar[str] = "assets"
+    meaning: ClassVar[str] = "Assets on, beside and over the road; left out, none are sought."
+    may_be_left_out: ClassVar[bool] = True
 
     kinds: list[str] | None = None
     """Kinds of assets to find; those that they need are found with them. Left out, all kinds."""

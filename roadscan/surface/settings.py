@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.core.settings.surface_regions import RegionSettings
-from roadscan.core.settings.surface_smoothing import SmoothingWeights, SurfaceSmoothing
-from roadscan.core.strict import Strict
+from roadscan.core.survey import SurveySection
+from roadscan.surface.region_settings import RegionSettings
+from roadscan.surface.smoothing_settings import SmoothingWeights, SurfaceSmoothing
 
 SlopeKind = Literal["quadratic", "cubic"]
 """How the slopes of the detailed model are found."""
 
 
-class SurfaceConfig(Strict):
+class SurfaceConfig(SurveySection):
     """How the road's surface is reconstructed, tile by tile. Without this section it is not."""
+
+    table: ClassVar[str] = "surface"
+    meaning: ClassVar[str] = "Reconstruction of the road's surface; left out, there is none."
+    may_be_left_out: ClassVar[bool] = True
 
     method: Literal["cells", "points"]
     """`cells`: the robust heights of the tiles' cells are the grid (profilers: several readings a cell); `points`: a

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.core.settings.road_edges import RoadEdgesConfig
-from roadscan.core.settings.roughness_regions import RoughnessRegionsConfig
+from roadscan.condition.road_edges.settings import RoadEdgesConfig
+from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
 from roadscan.core.strict import NAME_PATTERN, Strict
+from roadscan.core.survey import SurveySection
 
 
 class LaneConfig(Strict):
@@ -60,8 +61,12 @@ class SectionConfig(Strict):
     """Share of a cross-section's heights, or of a section's cross-sections, that have to be measured."""
 
 
-class ConditionConfig(SectionConfig):
+class ConditionConfig(SectionConfig, SurveySection):
     """The road's condition along its lanes. Without this section no condition is computed."""
+
+    table: ClassVar[str] = "condition"
+    meaning: ClassVar[str] = "The road's condition along its lanes; left out, none is computed."
+    may_be_left_out: ClassVar[bool] = True
 
     reference: Literal["drive", "layer"] = "drive"
     """Reference lines: the first drive over each piece of road, smoothed; or the lines of `layer`."""

@@ -78,8 +78,9 @@ def main(arguments: list[str]) -> int:
 
 
 def fields(target: str) -> str:
-    """Table of the settings of a model, named ``module:Class``."""
-    return fields_table(_load(target))
+    """Table of the settings of a model, named ``module:Class``, or ``module:function`` that returns it."""
+    found = _load(target)
+    return fields_table(found if isinstance(found, type) else found())
 
 
 def fields_table(model: type[BaseModel]) -> str:

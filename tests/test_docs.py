@@ -30,10 +30,13 @@ from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
-from roadscan.core.survey import Survey
+from roadscan.core.survey import Survey, survey_file_model
 from roadscan.ingest.reading.format import LogSource, Reject, Rows, format_of, log_formats
+from roadscan.report.section import sections
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
+from roadscan.site.layer import layer_kinds
+from roadscan.site.material import Material
 from roadscan.store.asset_schema import _files, asset_schema, asset_tables
 from roadscan.store.schema import _schema_files, table_schema
 from roadscan.store.sql import query
@@ -209,9 +212,13 @@ def test_a_survey_from_arrays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
+BASES = (
+    "LogFormat", "TileProduct", "SurveyProduct", "AssetKind", "Stage", "SurveySection", "Section", "LayerKind"
+)  # fmt: skip
 GROUPS = {
     "formats": "roadscan.formats", "levels": "roadscan.stages", "assets/kinds": "roadscan.asset_kinds",
-    "tiles/products": "roadscan.products",
+    "tiles/products": "roadscan.products", "levels/settings": "roadscan.survey_sections",
+    "report/sections": "roadscan.report_sections", "site/layers": "roadscan.site_layers",
 }  # fmt: skip
 
 
@@ -222,13 +229,12 @@ def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     blocks = re.findall(r"```python\n# roadscan/([\w/]+)/(\w+)\.py\n(.*?)```", CONTRIBUTING.read_text(), re.DOTALL)
     entries: dict[str, list[str]] = {}
     for group, file, code in blocks:
-        module = group if file == "stage" else file
-        (folder / f"contributed_{module}.py").write_text(code)
-        name = re.findall(
-            r"^class (\w+)\((?:LogFormat|TileProduct|SurveyProduct|AssetKind|Stage)\)", code, flags=re.MULTILINE
-        )[0]
-        entry = f"{module} = contributed_{module}:{name}"
-        entries.setdefault(GROUPS.get(group, f"roadscan.{group}"), []).append(entry)
+        module = f"{group}_{file}".replace("/", "_")
+        text = code.replace("from roadscan.levels.settings", "from contributed_levels_settings")
+        (folder / f"contributed_{module}.py").write_text(text)
+        name = re.findall(rf"^class (\w+)\((?:{'|'.join(BASES)})\)", code, flags=re.MULTILINE)[0]
+        entry = f"{group if file == 'stage' else file} = contributed_{module}:{name}"
+        entries.setdefault(GROUPS.get(f"{group}/{file}") or GROUPS[group], []).append(entry)
     schemas = folder / "contributed_schemas"
     schemas.mkdir()
     (schemas / "__init__.py").touch()
@@ -257,6 +263,9 @@ def _look_again() -> None:
         log_formats,
         products,
         stages,
+        survey_file_model,
+        sections,
+        layer_kinds,
         asset_kinds,
         asset_tables,
         asset_schema,
@@ -409,3 +418,30 @@ def test_the_contributed_stage(plugin: Path, finished: Simulated, tmp_path: Path
     Session.open(survey).store.write_bytes(file, b"damaged")
     assert any(file in fault for fault in verify_store(Session.open(survey).store))
     assert due() == 1
+
+
+def test_the_contributed_settings(plugin: Path, finished: Simulated, tmp_path: Path) -> None:
+    """A section of the survey file of another package: checked, used, and part of the keys."""
+    survey = finished.copy_with_store_to(tmp_path / "survey").survey_file
+    assert CliRunner().invoke(app, ["levels", str(survey), "--workers", "0"]).exit_code == 0
+    stated = survey.read_text(encoding="utf-8")
+    survey.write_text(stated + '\n[levels]\nstatistics = "median"\n', encoding="utf-8")
+    wrong = CliRunner().invoke(app, ["levels", str(survey), "--workers", "0"])
+    assert "'levels.statistics' (did you mean 'statistic'?)" in str(wrong.exception)
+    survey.write_text(stated + '\n[levels]\nstatistic = "median"\n', encoding="utf-8")
+    assert survey_status(Session.open(survey)).of("levels").stale > 0
+    assert CliRunner().invoke(app, ["levels", str(survey), "--workers", "0"]).exit_code == 0
+    assert survey_status(Session.open(survey)).of("levels").stale == 0
+
+
+def test_the_contributed_section_and_layer(plugin: Path, finished: Simulated, tmp_path: Path) -> None:
+    survey = finished.copy_with_store_to(tmp_path / "survey").survey_file
+    assert CliRunner().invoke(app, ["levels", str(survey), "--workers", "0"]).exit_code == 0
+    assert CliRunner().invoke(app, ["report", str(survey)]).exit_code == 0
+    count = len(Session.open(survey).manifest.of("levels"))
+    (report,) = (survey.parent / "store").rglob("report.html")
+    assert f"{count:,} tiles have a level." in report.read_text(encoding="utf-8")
+    (layer,) = (
+        one for kind in layer_kinds() if kind.name == "levels" for one in kind.layers(Material(Session.open(survey)))
+    )
+    assert len(layer.rows) == count and layer.shapes_m[0].area == pytest.approx(100.0)

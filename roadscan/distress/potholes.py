@@ -1,7 +1,7 @@
 """Potholes of a window of surface: where it lies well below all that stands around, in a compact form.
 
 1. *Blocks* (5 cm) of cells have mean heights, depths below what stands around, and ground
-   (``surface/hole_blocks.py``). Where what was measured ends before a hole's rim, the hole is not known.
+   (``distress/hole_blocks.py``). Where what was measured ends before a hole's rim, the hole is not known.
 2. *Outline*: cells that lie `edge_depth_m` or more below the ground, near a block that is `min_depth_m` deep, and not
    in a thin line; cells without a height between others (up to 2 cm) have the mean depth of those. Ground is bilinear
    between blocks.

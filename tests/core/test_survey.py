@@ -16,7 +16,7 @@ from roadscan.core.errors import ConfigError, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, TimeSystem, gps_ns_from_utc
 from roadscan.core.ids import LanePass, PassId, RunId
 from roadscan.core.strict import Strict, meanings
-from roadscan.core.survey import Survey, SurveyConfig
+from roadscan.core.survey import Survey, survey_file_model
 
 MINIMAL: dict[str, Any] = {
     "id": "town",
@@ -69,7 +69,7 @@ def test_an_object_store_stays_a_url(tmp_path: Path) -> None:
 
 
 def test_map_frame_of_the_settings() -> None:
-    config = SurveyConfig.parse(
+    config = survey_file_model().parse(
         changed(
             "map",
             to={
@@ -85,7 +85,9 @@ def test_map_frame_of_the_settings() -> None:
     assert (frame.crs, frame.geoid.grid) == ("EPSG:25832", "g.tif")
     assert frame.anchor is not None
     assert frame.anchor.heading_deg == 30.0
-    ellipsoidal = SurveyConfig.parse(changed("map", to={"crs": "EPSG:25832", "geoid": "g.tif"})).map.frame(Path())
+    ellipsoidal = (
+        survey_file_model().parse(changed("map", to={"crs": "EPSG:25832", "geoid": "g.tif"})).map.frame(Path())
+    )
     assert ellipsoidal.geoid is None
 
 

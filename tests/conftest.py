@@ -12,9 +12,12 @@ from hypothesis import settings
 
 from tests.pictures import blank
 from tests.surveys import adjusted, finished, raw_site, simulated
+from tests.workshop import damage, far_apart_place, place, places, workshop
 
-__all__ = ["adjusted", "finished", "raw_site", "simulated"]
-"""Fixtures of surveys."""
+__all__ = [
+    "adjusted", "damage", "far_apart_place", "finished", "place", "places", "raw_site", "simulated", "workshop"
+]  # fmt: skip
+"""Fixtures of surveys and of products."""
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 

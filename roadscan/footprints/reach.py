@@ -18,7 +18,7 @@ from roadscan.georeference.charts import charts_along
 from roadscan.georeference.reach import RangeSpans, Reach, Touched, joined
 from roadscan.georeference.sources import Ground, RawSlice, ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import load_recorded
-from roadscan.store.profiles import ProfileReader
+from roadscan.store.readings.profiles import ProfileReader
 from roadscan.store.store import Store
 
 _SPAN_COLUMNS = ["range_low", "range_high"]

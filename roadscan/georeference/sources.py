@@ -40,7 +40,7 @@ from roadscan.poses.movement import NO_CORRECTION, Allowance
 from roadscan.poses.trajectory import Trajectory
 from roadscan.store.held import read_held
 from roadscan.store.logs import DataFile
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 

@@ -20,6 +20,8 @@ from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
 from roadscan.store.mend import mend_records
 from roadscan.store.verified import note_written, recorded_files
+from roadscan.surface.tasks.surface_colours import check_cameras
+from roadscan.tiles.tasks.wanted_products import wanted_products
 
 _CLOCK_TICK_NS: Final = 50_000_000
 """A file's time may lie that much before the clock's."""
@@ -34,6 +36,8 @@ def run_stages(session: Session, chosen: Sequence[Stage] | None = None) -> None:
         at the end, if any unit failed; all others are finished and kept.
     """
     wanted = stages() if chosen is None else chosen
+    wanted_products(session.survey)  # a wrong name or option is told before a log is read
+    check_cameras(session.survey)
     with session.store.lock():
         for stage in wanted:
             started = time.perf_counter()

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.core.crs import MapFrame
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.navigation.tasks.trajectories import TrajectorySource
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 from roadscan.tiles.lane_direction import STEP_M, LaneDirections
 

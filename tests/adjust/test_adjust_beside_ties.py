@@ -17,6 +17,7 @@ from roadscan.adjust.tasks.outcome import known_findings
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.navigation.tasks.trajectories import load_recorded, load_trajectory
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.store.held import held_path
@@ -84,7 +85,7 @@ def test_a_run_that_is_held_keeps_its_poses_and_the_others_come_to_it(adjusted: 
     assert [line for line in run.reporter.lines if "held fixed, with poses as they were recorded: run-1" in line]
     assert rows(store, "SELECT DISTINCT run FROM corrections ORDER BY run") == [{"run": "run-2"}, {"run": "run-3"}]
     assert not store.exists(held_path("mounting_corrections"))
-    held, moved = (next(s for s, _ in run.plan.sources if s.run == name) for name in ("run-1", "run-2"))
+    held, moved = (next(s for s, _ in plan_of(run).sources if s.run == name) for name in ("run-1", "run-2"))
     for source, same in ((held, True), (moved, False)):
         assert source.trajectory is not None
         ways = [load(store, source.trajectory, EVER, 1.0) for load in (load_trajectory, load_recorded)]

@@ -29,6 +29,7 @@ from roadscan.assets.tasks.objects import OBJECTS
 from roadscan.assets.tasks.work import MADE, due_joins, plan_evidence
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.ids import TileId
+from roadscan.georeference.plan.plan import plan_of
 from roadscan.inventory.of_survey import truth_of
 from roadscan.report.blocks import Drawing, Picture, Table
 from roadscan.report.page import report_page
@@ -269,7 +270,7 @@ def test_reprocessing_a_tile_redoes_what_it_touches(
     own = again(street, tmp_path)
     before = files(own)
     post = true_posts(street).iloc[0]
-    tile = own.plan.ground.grid.tile_at(post["easting_m"], post["northing_m"])
+    tile = plan_of(own).ground.grid.tile_at(post["easting_m"], post["northing_m"])
     searched: list[tuple[float, float]] = []
     evidence = Posts.evidence
 
@@ -288,7 +289,7 @@ def test_reprocessing_a_tile_redoes_what_it_touches(
 def test_changed_evidence_joins_the_objects_near_it_and_no_other(street: Simulated, tmp_path: Path) -> None:
     own = again(street, tmp_path)
     manifest, post = own.manifest, true_posts(street).iloc[0]
-    tile = own.plan.ground.grid.tile_at(post["easting_m"], post["northing_m"])
+    tile = plan_of(own).ground.grid.tile_at(post["easting_m"], post["northing_m"])
     near = {f"pole/{TileId(tile.column + c, tile.row + r)}" for c in (-1, 0, 1) for r in (-1, 0, 1)}
     held = next(r for unit, r in manifest.of(EVIDENCE).items() if r.path and unit in near)
     assert len(manifest.of(OBJECTS)) == 3

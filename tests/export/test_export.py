@@ -24,7 +24,7 @@ from roadscan.georeference.plan.plan import plan_survey
 from roadscan.ingest.ingest import ingest
 from roadscan.ingest.reading.format import format_of
 from roadscan.simulate import simulate, truth
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 from tests.formats.crg_files import read_crg
 from tests.formats.psi_files import read_psi

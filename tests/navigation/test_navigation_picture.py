@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,15 @@ from roadscan.navigation.picture import (
     _summary,
     draw_navigation,
 )
+from tests.pictures import drawn
+
+
+@pytest.fixture(autouse=True)
+def pictures() -> Iterator[None]:
+    """These tests look at drawings."""
+    with drawn():
+        yield
+
 
 WORLD = "EPSG:4978"
 ARM = np.array([0.5, -0.2, -1.5])

@@ -86,12 +86,12 @@ def edited(tmp_path: Path, finished: Simulated) -> Callable[..., tuple[int, int,
 def test_what_is_added_leaves_every_output_current(edited: Callable[..., tuple[int, int, int, bool]]) -> None:
     kernel = "from roadscan.compute.kernel_options import kernel\n\n\n@kernel\ndef another(x):\n    return x\n"
     assert edited(
-        ("kernels/another.py", "", kernel),
-        ("products/another.py", "", PRODUCT),
-        ("sensors/another.py", "", FORMAT),
-        ("inspect/inspect.py", r"\Z", "\nANOTHER = 1\n"),
-        ("model/errors.py", r"\Z", "\n\nclass AnotherError(RoadscanError):\n    pass\n"),
-        ("products/hillshade.py", r'\A"""', '"""Other words. '),
+        ("tiles/kernels/another.py", "", kernel),
+        ("tiles/products/another.py", "", PRODUCT),
+        ("formats/another.py", "", FORMAT),
+        ("ingest/inspect/inspect.py", r"\Z", "\nANOTHER = 1\n"),
+        ("core/errors.py", r"\Z", "\n\nclass AnotherError(RoadscanError):\n    pass\n"),
+        ("tiles/products/hillshade.py", r'\A"""', '"""Other words. '),
     ) == (0, 0, 0, True)
 
 
@@ -104,15 +104,15 @@ def test_a_change_of_a_cells_statistics_makes_the_tiles_stale(
 
 
 def test_a_change_of_a_product_makes_its_files_stale_alone(edited: Callable[..., tuple[int, int, int, bool]]) -> None:
-    footprints, tiles, products, complete = edited(("products/tile_table.py", r"\Z", "\n"))
+    footprints, tiles, products, complete = edited(("tiles/products/tile_table.py", r"\Z", "\n"))
     assert (footprints, tiles, products, complete) == (0, 0, 0, True)
-    changed = ("products/tile_table.py", r"(    def write\(\n)", r"    another = 1\n\n\1")
+    changed = ("tiles/products/tile_table.py", r"(    def write\(\n)", r"    another = 1\n\n\1")
     assert edited(changed)[:3] == (0, 0, 1)
 
 
 def test_a_change_of_placing_makes_footprints_and_tiles_stale(
     edited: Callable[..., tuple[int, int, int, bool]], finished: Simulated
 ) -> None:
-    footprints, tiles, _, _ = edited(("points/charts.py", r"(class Charts.*\n)", r"\1    another = 1\n"))
+    footprints, tiles, _, _ = edited(("georeference/charts.py", r"(class Charts.*\n)", r"\1    another = 1\n"))
     assert footprints > 0
     assert tiles == tiles_of(finished)

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
+from roadscan.footprints import footprints
 from roadscan.footprints.footprints import footprints_of
-from roadscan.run import session as session_module
+from roadscan.georeference.plan import plan
+from roadscan.ingest import planned_logs
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status
+from roadscan.tiles.tasks import tile_plan
 from roadscan.tiles.tasks.tile_plan import tiles_of
 from tests.surveys import Simulated
 
-PLANS = ("plan_logs", "plan_survey", "load_ranges", "plan_tiles")
+PLANS = {
+    "plan_logs": planned_logs, "plan_survey": plan, "load_ranges": footprints, "plan_tiles": tile_plan
+}  # fmt: skip
+"""What plans, and the module in which a session finds it."""
 
 
 @pytest.fixture
@@ -24,17 +31,17 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """How often a session plans."""
     counts: Counter[str] = Counter()
 
-    def watch(name: str) -> None:
-        plan = getattr(session_module, name)
+    def watch(module: ModuleType, name: str) -> None:
+        wrapped = getattr(module, name)
 
         def planned(*arguments: object, **named: object) -> object:
             counts[name] += 1
-            return plan(*arguments, **named)
+            return wrapped(*arguments, **named)
 
-        monkeypatch.setattr(session_module, name, planned)
+        monkeypatch.setattr(module, name, planned)
 
-    for name in PLANS:
-        watch(name)
+    for name, module in PLANS.items():
+        watch(module, name)
     return counts
 
 
@@ -60,7 +67,8 @@ def test_renewing_forgets_what_follows_and_nothing_before(finished: Simulated, c
 def test_stages_come_after_those_that_they_need() -> None:
     names = [stage.name for stage in stages()]
     assert [n for n in names if n != "levels"] == [
-        "ingest", "navigate", "footprints", "adjust", "tiles", "surfaces", "products", "condition", "assets",
+        "ingest", "navigate", "footprints", "adjust", "strips", "tiles", "surfaces", "products", "condition",
+        "assets",
     ]  # fmt: skip
     for stage in stages():
         assert all(names.index(before) < names.index(stage.name) for before in stage.after)

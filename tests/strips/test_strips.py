@@ -88,7 +88,7 @@ def told(
 
     mounted = SECOND_SENSOR[0], SECOND_SENSOR[1].replace('"profiler",', f'"profiler", axes = "{axes}",')
     changed(folder, SECOND_HEAD, mounted, make=make)
-    for command in ("ingest", "footprints"):
+    for command in ("ingest", "footprints", "strips"):
         code, text = said(folder, command, "--workers", "0")
         assert code == 0, text
     _, status = said(folder, "status")

@@ -23,7 +23,7 @@ from roadscan.surface.tile import EMPTY, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.surface.window import GridWindow
 from roadscan.tiles.product import ProductContext, product_named
 from roadscan.tiles.products.mesh import mesh_of
-from tests.tiles.products.conftest import Place, Workshop
+from tests.workshop import Place, Workshop
 
 GRID = TileGrid(10.0, 0.05)
 NAMES = ("surface", "surface_mesh", "surface_pictures")

@@ -137,6 +137,7 @@ def test_second_run_does_nothing(finished: Simulated) -> None:
         "navigate:",
         "footprints:",
         "adjust:",
+        "strips:",
         "tiles:",
         "surfaces:",
         "products:",

@@ -17,7 +17,7 @@ from roadscan.adjust.targets.shapes import SurveyedLine
 from roadscan.compute.ways import way_along
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 
 TABLE: Final = "control_lines"
 CONTROL_LINE: Final = Witness(

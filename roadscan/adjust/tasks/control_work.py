@@ -29,7 +29,7 @@ from roadscan.georeference.sources import Ground
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, bytes_digest
 from roadscan.store.writer import parquet_bytes

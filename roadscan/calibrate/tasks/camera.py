@@ -37,7 +37,7 @@ from roadscan.navigation.tasks.pose_sigma import pose_sigma
 from roadscan.navigation.tasks.taken_pictures import taken_pictures
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.store.logs import LogRecord
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]

@@ -30,7 +30,7 @@ from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, file_digest
 from roadscan.tiles.product import ProductContext

@@ -45,7 +45,7 @@ from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.logs import NAVIGATION, LogRecord, read_log_records
 from roadscan.store.manifest import Manifest
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
 __all__ = ["ClockEstimate", "estimate_clocks", "load_clocks"]

@@ -14,7 +14,7 @@ from roadscan.core.errors import ConfigError, NavigationError
 from roadscan.core.rig import Rig, Sensor
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.store.logs import LogRecord
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]

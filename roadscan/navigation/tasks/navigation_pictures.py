@@ -22,7 +22,7 @@ from roadscan.navigation.tasks.recorded_pictures import NAVIGATION_PICTURE, keep
 from roadscan.navigation.tasks.solve_trajectory import SMOOTHER, on_time
 from roadscan.store.logs import LogRecord, read_log_records
 from roadscan.store.manifest import Manifest
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]

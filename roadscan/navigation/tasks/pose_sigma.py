@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from roadscan.core.settings.calibration import CalibrationSettings
 from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.store.logs import LogRecord
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]

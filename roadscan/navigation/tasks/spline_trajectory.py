@@ -17,7 +17,7 @@ from roadscan.poses.trajectory import Trajectory
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.logs import NAVIGATION, LogRecord
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.core.ids import of_run
 from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.store.logs import LogRecord
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
 _COLUMNS = ["epoch_gps_ns", "file", "width_px", "height_px"]

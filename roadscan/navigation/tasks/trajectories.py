@@ -15,7 +15,7 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.poses.trajectory import STENCIL_KNOTS, Corrections, Trajectory
 from roadscan.store.held import read_held
 from roadscan.store.logs import DataFile
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
 _SIGMA_COLUMNS = ["sigma_north_m", "sigma_east_m", "sigma_down_m"]

@@ -12,7 +12,7 @@ import shapely
 from roadscan.site import evidence
 from roadscan.site.layer import BLUE, RED, LayerKind, SiteLayer, Style, schema_columns
 from roadscan.site.material import Material
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 
 _STYLE = Style("Role", 9, by="role", values={"gcp": BLUE, "check": RED})
 _RESIDUALS_M = (-0.010, -0.003, 0.003, 0.010)

@@ -28,7 +28,7 @@ from roadscan.site.layer import (
     line_of,
 )
 from roadscan.site.material import Material
-from roadscan.store.row_groups import read_groups
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.tiles.lane_direction import STEP_M
 
 RUN_COLOURS = (BLUE, RED, GREEN, PURPLE, SKY, ORANGE)

@@ -20,8 +20,8 @@ from roadscan.core.ids import LanePass, TileId
 from roadscan.georeference.place import pass_numbers
 from roadscan.georeference.reading_counts import Fates
 from roadscan.georeference.sources import Placer, RawSlice, geometry_of
-from roadscan.store.profiles import ProfileReader
-from roadscan.store.returns import ReturnsReader
+from roadscan.store.readings.profiles import ProfileReader
+from roadscan.store.readings.returns import ReturnsReader
 from roadscan.store.schema import table_schema
 from roadscan.tiles.accumulator import Accumulator, Pool, PoolExhaustedError, TileEvidence
 from roadscan.tiles.cells import TileCells

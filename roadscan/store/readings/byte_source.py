@@ -12,7 +12,7 @@ import os
 import weakref
 from typing import Any
 
-from roadscan.store.read_ahead import ReadAhead
+from roadscan.store.readings.read_ahead import ReadAhead
 from roadscan.store.store import Store
 
 

@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from roadscan.store.codecs.parquet.number_file import NumberFile
 from roadscan.store.codecs.parquet.page_file import DamageError
-from roadscan.store.group_reader import GroupReader
+from roadscan.store.readings.group_reader import GroupReader
 from roadscan.store.store import Store
 
 _EPOCH, _POSE_EPOCH = "epoch_gps_ns", "pose_epoch_gps_ns"

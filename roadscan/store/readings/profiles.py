@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from roadscan.store.codecs.parquet.list_file import ListTableFile
 from roadscan.store.codecs.parquet.page_file import DamageError
-from roadscan.store.group_reader import GroupReader
+from roadscan.store.readings.group_reader import GroupReader
 from roadscan.store.store import Store
 
 _COLUMNS: Final = ["epoch_gps_ns", "range", "intensity"]

@@ -11,9 +11,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import StoreError
-from roadscan.store.byte_source import opened
 from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile, read_footer
+from roadscan.store.readings.byte_source import opened
 from roadscan.store.store import Store
 
 Rows = TypeVar("Rows")

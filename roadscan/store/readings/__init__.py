@@ -1,0 +1,1 @@
+"""Ingested readings out of the store, into arrays that are used again."""

@@ -32,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.bench_reference_site import BARS, REPEATABILITY_MM, SITE, pose_covariance, survey_covariance
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
-from roadscan.adjust.control import Sighting
+from roadscan.adjust.control.control import Sighting
 from roadscan.adjust.observations import KINDS, Observations
 from roadscan.adjust.tasks import adjustment
 from roadscan.adjust.tasks.solution import Evidence, Solution

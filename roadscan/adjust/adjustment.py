@@ -5,7 +5,7 @@ process as prior, whose σ is that of each pose (:mod:`roadscan.adjust.process`)
 solves them is one sparse least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing
 changes (:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the
 point share its error. Surveys are first left aside, and judged by what poses and ties say of them
-(:mod:`roadscan.adjust.control_test`); then those that are right count, wholly. Mountings of sensors, which all runs
+(:mod:`roadscan.adjust.control.control_test`); then those that are right count, wholly. Mountings of sensors, which all runs
 share, are unknowns beside the poses.
 """
 
@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import block_diag
 
-from roadscan.adjust.control_test import COMPONENTS as SURVEYED
-from roadscan.adjust.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
+from roadscan.adjust.control.control_test import COMPONENTS as SURVEYED
+from roadscan.adjust.control.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
 from roadscan.adjust.estimation import SURVEY, Estimate, Problem, Rounds
 from roadscan.adjust.fixed_runs import FixedRun, fixed_runs
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations

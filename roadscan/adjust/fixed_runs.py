@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.control_test import quantile
+from roadscan.adjust.control.control_test import quantile
 from roadscan.adjust.observations import COMPONENTS
 from roadscan.adjust.unknowns import Unknowns
 from roadscan.core.gpstime import NS_PER_S

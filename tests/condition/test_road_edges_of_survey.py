@@ -93,7 +93,7 @@ def test_heights_beyond_an_edge_are_no_part_of_a_cross_section(surveyed: RoughSu
     config = ConditionConfig.stated(with_edges.survey)
     assert config is not None
     (group,) = plan_condition(with_edges).groups
-    lane = load_lane(GroupTask(with_edges.store, config.sections(), 0.05, product_context(with_edges.plan), group))
+    lane = load_lane(GroupTask(with_edges.store, config.sections(), 0.05, product_context(plan_of(with_edges)), group))
     c = lane.cross_sections
     inner = (c.station_m > 12.0) & (c.station_m < 38.0)
     assert np.isnan(c.height_m[inner][:, c.offset_m > 1.62]).all()

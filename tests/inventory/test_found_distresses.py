@@ -32,7 +32,7 @@ from tests.surveys import Simulated
 def session(finished: Simulated, tmp_path: Path) -> Session:
     """A survey of 14 m of road with two cracks and a pothole; it was searched for ravelling in vain."""
     made = Session.open(finished.copy_with_store_to(tmp_path / "survey").survey_file)
-    ground, size = Ground(made), product_context(made.plan).grid.size_m
+    ground, size = Ground(made), product_context(plan_of(made)).grid.size_m
     tiles = [map(int, r.unit.split("_")) for r in made.manifest.of("tile").values() if r.path]
     places = [(c * size + e, r * size + n) for c, r in tiles for e in (2.0, 5.0, 8.0) for n in (2.0, 5.0, 8.0)]
     around = np.array([(0.0, 0.0), (0.5, 0.0), (0.4, 0.8)])

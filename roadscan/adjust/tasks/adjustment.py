@@ -10,8 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.control import ControlPoint, Sighting
-from roadscan.adjust.control_faults import listed
+from roadscan.adjust.control.control import ControlPoint, Sighting
+from roadscan.adjust.control.control_faults import listed
 from roadscan.adjust.picture import AdjustmentPicture, Residuals
 from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import RunPrior

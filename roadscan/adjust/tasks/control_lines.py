@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 import shapely
 
-from roadscan.adjust.control import ControlPoint, Sighting
-from roadscan.adjust.control_faults import WrongPoint
+from roadscan.adjust.control.control import ControlPoint, Sighting
+from roadscan.adjust.control.control_faults import WrongPoint
 from roadscan.adjust.settings import AdjustConfig, LineUse
 from roadscan.adjust.targets.shapes import SurveyedLine
 from roadscan.compute.ways import way_along

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, passes_by, sight_shifted
+from roadscan.adjust.control.control import ControlPoint, PickedPlace, Sighting, passes_by, sight_shifted
 from roadscan.adjust.patches import Shift, shifted
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.process import RunPrior

@@ -10,9 +10,9 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from roadscan.adjust.control import Sighting
-from roadscan.adjust.control_faults import WrongPoint, listed, swapped
-from roadscan.adjust.control_test import COMPONENTS, HEIGHT, PLACE, AppliedOffset, ControlVerdict, PlaneShift
+from roadscan.adjust.control.control import Sighting
+from roadscan.adjust.control.control_faults import WrongPoint, listed, swapped
+from roadscan.adjust.control.control_test import COMPONENTS, HEIGHT, PLACE, AppliedOffset, ControlVerdict, PlaneShift
 from roadscan.adjust.process import RunPrior
 from roadscan.core.witness import Finding, Witness
 

@@ -8,8 +8,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.control import Sighting, moved_m
-from roadscan.adjust.control_test import HEIGHT
+from roadscan.adjust.control.control import Sighting, moved_m
+from roadscan.adjust.control.control_test import HEIGHT
 from roadscan.adjust.observations import KINDS
 from roadscan.adjust.places import Track
 from roadscan.adjust.publish import left_after

@@ -13,7 +13,7 @@ from scipy.linalg import null_space
 from scipy.special import chdtri
 
 from roadscan.adjust.adjustment import MountingErrors
-from roadscan.adjust.control_test import APART
+from roadscan.adjust.control.control_test import APART
 from roadscan.adjust.observations import MOUNTED
 from roadscan.adjust.process import MountingPrior
 from roadscan.adjust.settings import AdjustConfig

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, ControlErrors, MountingErrors, adjust
-from roadscan.adjust.control import ControlPoint, SeenBy, Sighting, observations_of
-from roadscan.adjust.control_faults import WrongPoint, datum_fault, far_in_height
-from roadscan.adjust.control_test import COMPONENTS as _AXES
-from roadscan.adjust.control_test import HEIGHT, PLACE
+from roadscan.adjust.control.control import ControlPoint, SeenBy, Sighting, observations_of
+from roadscan.adjust.control.control_faults import WrongPoint, datum_fault, far_in_height
+from roadscan.adjust.control.control_test import COMPONENTS as _AXES
+from roadscan.adjust.control.control_test import HEIGHT, PLACE
 from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.observations import FIXED, MOUNTED, Observations
 from roadscan.adjust.patches import level_from_map

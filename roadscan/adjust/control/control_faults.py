@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.control import Sighting
+from roadscan.adjust.control.control import Sighting
 from roadscan.compute.robust import scatter_about
 
 Float64 = npt.NDArray[np.float64]

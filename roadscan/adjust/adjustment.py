@@ -5,8 +5,8 @@ process as prior, whose σ is that of each pose (:mod:`roadscan.adjust.process`)
 solves them is one sparse least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing
 changes (:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the
 point share its error. Surveys are first left aside, and judged by what poses and ties say of them
-(:mod:`roadscan.adjust.control.control_test`); then those that are right count, wholly. Mountings of sensors, which all runs
-share, are unknowns beside the poses.
+(:mod:`roadscan.adjust.control.control_test`); then those that are right count, wholly. Mountings of sensors, which all
+runs share, are unknowns beside the poses.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The rounds of an adjustment: solve, judge each observation by the others, weigh anew.
 
-The surveys of control points are judged elsewhere, all of them at once (:mod:`roadscan.adjust.control.control_test`): here
-they count as they are told to, wholly or not at all. A target that one pass alone saw and its survey exclude one
+The surveys of control points are judged elsewhere, all of them at once (:mod:`roadscan.adjust.control.control_test`):
+here they count as they are told to, wholly or not at all. A target that one pass alone saw and its survey exclude one
 another, and no weight that both get round by round tells which of them is wrong.
 """
 

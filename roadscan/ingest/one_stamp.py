@@ -17,7 +17,7 @@ from roadscan.ingest.overlap import Fault
 from roadscan.ingest.reading.format import Rows
 from roadscan.store.logs import LogRecord
 
-_STAMPED: Final = ("scans", "imu", "encoder", "gnss")
+STAMPED: Final = ("scans", "imu", "encoder", "gnss")
 """Tables of which each row has a time of its own. Returns of one sweep may share theirs."""
 
 
@@ -31,6 +31,8 @@ ONE_STAMP: Final = Witness(
     told=("error", "rejects", "findings"),
 )
 
+VERSION: Final = 1
+"""Raised when other rows are left out, so that logs with a stamp a row are read again."""
 LEAST_ROWS: Final = 10
 """So many rows in a row with one stamp are no rounding of stamps that a survey can use."""
 STANDS: Final = "the clock stands: the row has the stamp of the rows before it"
@@ -45,7 +47,7 @@ class StandingClock(LogCheck):
 
     def refused(self, rows: Rows) -> list[Refused]:
         """Rows of a chunk (by index) that are left out."""
-        if rows.table not in _STAMPED or not rows.batch.num_rows or "epoch_gps_ns" not in rows.batch.schema.names:
+        if rows.table not in STAMPED or not rows.batch.num_rows or "epoch_gps_ns" not in rows.batch.schema.names:
             return []
         column = rows.batch.column("epoch_gps_ns")
         if column.null_count or not pa.types.is_int64(column.type):
@@ -64,7 +66,7 @@ class StandingClock(LogCheck):
 
 def one_stamp_logs(records: Sequence[LogRecord]) -> list[Fault]:
     """Logs of which most rows have the stamp of their neighbours."""
-    return [_fault(r, table) for r in records for table in _STAMPED if r.tables.get(table) and _stands(r, table)]
+    return [_fault(r, table) for r in records for table in STAMPED if r.tables.get(table) and _stands(r, table)]
 
 
 def one_stamp_findings(records: Sequence[LogRecord]) -> list[Finding]:

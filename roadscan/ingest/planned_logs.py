@@ -13,6 +13,8 @@ from roadscan.core.rig import Sensor
 from roadscan.core.strict import Strict
 from roadscan.core.survey import ControlConfig, LogConfig, Survey
 from roadscan.ingest.clocks.stated_pairs import log_clock
+from roadscan.ingest.one_stamp import STAMPED
+from roadscan.ingest.one_stamp import VERSION as STAMP_CHECKS
 from roadscan.ingest.place_checks import PLACED
 from roadscan.ingest.place_checks import VERSION as PLACE_CHECKS
 from roadscan.ingest.pose_checks import FIXES, POSES
@@ -184,6 +186,8 @@ def _checks_of(format_: LogFormat) -> list[list[object]]:
         found.append(["poses", POSE_CHECKS])
     if set(PLACED) & set(format_.yields):
         found.append(["places", PLACE_CHECKS])
+    if set(STAMPED) & set(format_.yields):
+        found.append(["stamps", STAMP_CHECKS])
     return found
 
 
@@ -192,7 +196,8 @@ def _earlier_checks(format_: LogFormat) -> list[list[list[object]]]:
     places: list[list[object]] = [["places", 1]] if set(PLACED) & set(format_.yields) else []
     first: list[list[object]] = [["poses", 1]] if POSES in format_.yields else []
     second: list[list[object]] = [["poses", 2]] if {POSES, FIXES} & set(format_.yields) else []
-    return [second + places, first + places, []]
+    before_stamps = [one for one in _checks_of(format_) if one[0] != "stamps"]
+    return [before_stamps, second + places, first + places, []]
 
 
 def log_source(

@@ -59,9 +59,10 @@ def test_an_older_store_is_read_and_made_again(survey_file: Path) -> None:
         faults
     )
     state = survey_status(Session.open(survey_file))
-    # Poses were not checked then: their logs are read again.
+    # Neither poses nor clocks that stand were checked then: logs of these are read again.
     waiting = {log["path"] for log in state.logs if log["state"] == "waiting"}
-    assert waiting == {"raw/run-1/trajectory.sbet", "raw/run-2/trajectory.sbet"}
+    names = ("trajectory.sbet", "profiler_left.parquet", "profiler_right.parquet")
+    assert waiting == {f"raw/{run}/{name}" for run in ("run-1", "run-2") for name in names}
     assert {log["state"] for log in state.logs if log["path"] not in waiting} == {"ingested"}
     done = CliRunner().invoke(app, ["run", str(survey_file), "--workers", "0"])
     assert done.exit_code == 0, done.output

@@ -25,7 +25,7 @@ from benchmarks.settings import Settings
 from benchmarks.timing import Figure
 from roadscan.footprints.footprints import PRODUCT, FootprintTask, index_footprints
 from roadscan.run.engine.bundles import Bundle, Ended
-from roadscan.run.engine.compute import Made, rare_collections
+from roadscan.run.engine.compute import LazyTasks, rare_collections
 from roadscan.run.engine.on_dask import OnDask
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.records import Packed, Row
@@ -194,7 +194,7 @@ class _NoKernels(OnDask):
             self._stage.plan_s += time.perf_counter() - started
             return task
 
-        return super().map(self._work, Made(range(len(tasks)), planned))
+        return super().map(self._work, LazyTasks(range(len(tasks)), planned))
 
     def send(self, function: Callable[..., Any], tasks: Sequence[Any]) -> list[Any]:
         """As the way to Dask, timed."""

@@ -23,7 +23,7 @@ from roadscan.core.survey import Survey
 from roadscan.footprints.footprints import FootprintRanges
 from roadscan.georeference.place import HeightLimits
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.georeference.sources import Ground, ReadingSource
+from roadscan.georeference.sources import MapSettings, ReadingSource
 from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
@@ -93,7 +93,7 @@ class Region:
             survey=survey,
             store=Store(str(folder / "store"), "region"),
             records=(),
-            ground=Ground(survey.frame(), grid, HeightLimits(), survey.config.navigation.max_gap_s),
+            ground=MapSettings(survey.frame(), grid, HeightLimits(), survey.config.navigation.max_gap_s),
             sources=tuple(sources),
             passes=tuple(passes),
             centre_lines=None,

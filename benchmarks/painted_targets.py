@@ -208,7 +208,7 @@ def furnished_road() -> SimulatedRoad:
 def other_places() -> list[tuple[str, float, float]]:
     """What lies where on that road: name, station and offset (m)."""
     return [
-        ("stain", 5.0, 1.0), ("bright stain", 5.0, -1.0), ("tyre mark", 10.0, 1.0), ("dark seal", 15.0, 1.0),
+        ("stain", 5.0, 1.0), ("bright stain", 5.0, -1.0), ("tyre mark", 10.0, 1.0), ("dark checked_json", 15.0, 1.0),
         ("bright seals", 15.0, -1.0), ("line", 12.0, 3.3), ("dashes", 12.3, 0.0), ("square dashes", 12.3, -3.2),
         ("large disc", 20.0, 1.5), ("small disc", 20.0, -1.5), ("larger disc", 25.0, 1.5), ("square", 25.0, -1.5),
         ("stop bar", 30.0, 1.0), ("crossing", 37.0, 1.0), ("bare asphalt", 7.0, 1.8),

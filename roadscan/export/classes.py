@@ -22,7 +22,7 @@ from roadscan.georeference.classes import KEPT, OFF_CENTRE_LINE, OUTSIDE_PASS, R
 from roadscan.georeference.place import Placed, passes_of
 from roadscan.georeference.plan.centre_line import load_buffer
 from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
-from roadscan.georeference.sources import Placer, RawSlice, geometry_of
+from roadscan.georeference.sources import Georeferencer, RawSlice, geometry_of
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.tile_points import near_lines
@@ -125,7 +125,7 @@ def _batches(
     row = 0
     report(0, len(slices))
     for done, one in enumerate(slices, 1):
-        placer = Placer(plan.store, plan.ground, [one])
+        placer = Georeferencer(plan.store, plan.ground, [one])
         geometry = geometry_of(one.source)
         passes = [p for p in plan.passes if p.run == one.source.run]
         for rows, classes, kept in placer.classified(one):

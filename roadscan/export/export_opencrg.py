@@ -23,7 +23,7 @@ from roadscan.formats.clouds.opencrg_file import CurvedRegularGrid, write_crg
 from roadscan.formats.clouds.opencrg_header import encoding_named
 from roadscan.georeference.place import EVERYWHERE
 from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
-from roadscan.georeference.sources import Placer, RawSlice, ReadingSource
+from roadscan.georeference.sources import Georeferencer, RawSlice, ReadingSource
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
@@ -148,7 +148,7 @@ def _placed(
         groups = tuple(k for k, span in enumerate(spans) if span[0] < end and span[1] >= first)
         if groups:
             slices.append(RawSlice(source, file.path, groups, tuple(spans[k] for k in groups), file.bytes))
-    placer = Placer(plan.store, plan.ground, slices)
+    placer = Georeferencer(plan.store, plan.ground, slices)
     tile_quanta = plan.ground.grid.size_quanta
     for one in slices:
         for _, points in placer.place(one, EVERYWHERE):

@@ -21,8 +21,8 @@ from roadscan.footprints.reach import group_spans, opened, touched_tiles
 from roadscan.georeference.place import FATE_NAMES, Window
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.reach import Touched, joined
-from roadscan.georeference.reading_counts import fate_words, told
-from roadscan.georeference.sources import Ground, Placer, RawSlice
+from roadscan.georeference.reading_counts import fate_words, reading_counts
+from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.compute import Compute
@@ -50,7 +50,7 @@ class FootprintTask:
     """One data file to index."""
 
     store: Store
-    ground: Ground
+    ground: MapSettings
     slice: RawSlice
     key: str
 
@@ -124,7 +124,7 @@ def unplaced_logs(plan: SurveyPlan, manifest: Manifest) -> list[tuple[str, str]]
         figures = [record.figures() for record in records if record is not None]
         if len(figures) < len(files) or any("window" in one for one in figures):
             continue
-        fates = told(record for record in records if record is not None)
+        fates = reading_counts(record for record in records if record is not None)
         found.append(
             (
                 paths[files[0].path],
@@ -162,7 +162,7 @@ def footprint_task(task: FootprintTask) -> OutputRecord:
 def _placed(task: FootprintTask, numbers: Sequence[int]) -> tuple[Touched, npt.NDArray[np.int64]]:
     """Tiles of some groups of a slice, by placing their readings, and the fates of these."""
     one = task.slice
-    placer = Placer(task.store, task.ground, [one], recorded=True)
+    placer = Georeferencer(task.store, task.ground, [one], recorded=True)
     parts: list[Touched] = []
     fates = np.zeros(len(FATE_NAMES), np.int64)
     for number in numbers:

@@ -16,7 +16,7 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.reach import RangeSpans, Reach, Touched, joined
-from roadscan.georeference.sources import Ground, RawSlice, ReadingSource, geometry_of
+from roadscan.georeference.sources import MapSettings, RawSlice, ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.store.readings.profiles import ProfileReader
 from roadscan.store.store import Store
@@ -27,7 +27,7 @@ _WINDOW_NS = 120 * NS_PER_S
 _KEPT = threading.local()
 
 
-def touched_tiles(store: Store, ground: Ground, one: RawSlice, file: pq.ParquetFile) -> Touched:
+def touched_tiles(store: Store, ground: MapSettings, one: RawSlice, file: pq.ParquetFile) -> Touched:
     """Tiles that row groups of a slice of scans or returns, open as `file`, may touch; groups by place in the slice."""
     reach = _reach(store, ground, one)
     if reach is None:
@@ -56,7 +56,7 @@ def group_spans(one: RawSlice, file: pq.ParquetFile) -> npt.NDArray[np.int64]:
     return _on_time(one, np.array(spans, dtype=np.int64).ravel()).reshape(-1, 2)
 
 
-def _reach(store: Store, ground: Ground, one: RawSlice) -> Reach | None:
+def _reach(store: Store, ground: MapSettings, one: RawSlice) -> Reach | None:
     """Poses around a slice and how far its readings count; None without any pose.
 
     They are those of the minutes that it lies in, and kept for the next slice: files may hold seconds.
@@ -69,7 +69,7 @@ def _reach(store: Store, ground: Ground, one: RawSlice) -> Reach | None:
     return kept[1]
 
 
-def _loaded(store: Store, ground: Ground, source: ReadingSource, spans: Sequence[tuple[int, int]]) -> Reach | None:
+def _loaded(store: Store, ground: MapSettings, source: ReadingSource, spans: Sequence[tuple[int, int]]) -> Reach | None:
     if source.trajectory is None:
         raise NavigationError(f"run '{source.run}' has no trajectory", expected="a trajectory log in the run")
     trajectory = load_recorded(store, source.trajectory, spans, ground.max_gap_s)

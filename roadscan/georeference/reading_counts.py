@@ -20,7 +20,7 @@ _MOST_NOTED: Final = 10
 """Logs that are named."""
 
 
-class Fates:
+class ReadingCounts:
     """Readings by fate of the row groups of a task, by the tile that tells them and by log."""
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ def _counts(fates: npt.NDArray[np.int64]) -> dict[str, int]:
     return {name: int(n) for name, n in zip(FATE_NAMES[:COUNTED_FATES], counts, strict=True) if n}
 
 
-def told_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
+def counts_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
     """Readings by fate over the records of tiles and footprints, by the key of their log.
 
     Footprints tell of clouds, which are placed for these, and of row groups that touch no tile. Tiles of older versions
@@ -60,9 +60,9 @@ def told_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
     return {log: {name: count for name, count in fates.items() if count} for log, fates in sorted(logs.items())}
 
 
-def told(records: Iterable[OutputRecord]) -> dict[str, int]:
+def reading_counts(records: Iterable[OutputRecord]) -> dict[str, int]:
     """The same of all logs together."""
-    return of_all(told_by_log(records))
+    return of_all(counts_by_log(records))
 
 
 def of_all(logs: Mapping[str, Mapping[str, int]]) -> dict[str, int]:

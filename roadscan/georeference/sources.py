@@ -38,10 +38,10 @@ from roadscan.navigation.tasks.trajectories import TrajectorySource, load_record
 from roadscan.poses.mounting_change import MountingChange
 from roadscan.poses.movement import NO_CORRECTION, Allowance
 from roadscan.poses.trajectory import Trajectory
-from roadscan.store.held import read_held
 from roadscan.store.logs import DataFile
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store
 
 _CHUNK_READINGS = 1 << 20
@@ -110,7 +110,7 @@ class ReadingSource:
 
 
 @dataclass(frozen=True)
-class Ground:
+class MapSettings:
     """Where points go: the map, its grid, and which heights count."""
 
     map: MapFrame
@@ -156,10 +156,12 @@ def read_rows(
     return rows
 
 
-class Placer:
+class Georeferencer:
     """Places the readings of slices: loads the poses they need, once for each source."""
 
-    def __init__(self, store: Store, ground: Ground, slices: Sequence[RawSlice], *, recorded: bool = False) -> None:
+    def __init__(
+        self, store: Store, ground: MapSettings, slices: Sequence[RawSlice], *, recorded: bool = False
+    ) -> None:
         """`recorded`: with poses as they were recorded and mountings as stated, whatever corrections there are."""
         self._store = store
         self._ground = ground
@@ -266,7 +268,7 @@ MountingChanges: TypeAlias = Mapping[tuple[str, str], MountingChange]
 
 def load_mounting_changes(store: Store) -> MountingChanges:
     """What an adjustment adds to the mountings of sensors."""
-    table = read_held(store, "mounting_corrections")
+    table = read_small(store, "mounting_corrections")
     return {key_of_row(row): mounting_change_of(row) for row in ([] if table is None else table.to_pylist())}
 
 
@@ -287,7 +289,7 @@ def mounting_change_of(row: Mapping[str, Any]) -> MountingChange:
 
 def load_mountings(store: Store) -> dict[tuple[str, str], list[tuple[int, Mounting]]]:
     """Calibrated mountings by run ('*' for all) and sensor, with the epochs from which they hold, ascending."""
-    table = read_held(store, "mountings")
+    table = read_small(store, "mountings")
     found: dict[tuple[str, str], list[tuple[int, Mounting]]] = {}
     for row in () if table is None else table.sort_by("valid_from_gps_ns").to_pylist():
         rotation = rotation_from_quaternion(np.array([row["qw"], row["qx"], row["qy"], row["qz"]]))

@@ -14,7 +14,7 @@ from typing import Any, Final
 from roadscan.core.errors import FormatError, StoreError
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
 from roadscan.ingest.reading.format import LogFormat, format_named
-from roadscan.store.sealed import seal, unseal
+from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.store import Store, digest_holds, file_digest
 
 _SOURCES: Final = "manifest/sources.json"
@@ -92,8 +92,8 @@ class Sources:
         known = {**self._before, **self._now}
         if known and (known != self._kept or not self._is_whole):
             with contextlib.suppress(StoreError):
-                self._store.write_bytes(_COPY, seal(known), lasting=False)
-                self._store.write_bytes(_SOURCES, seal(known))
+                self._store.write_bytes(_COPY, checked_json(known), lasting=False)
+                self._store.write_bytes(_SOURCES, checked_json(known))
 
     def _name(self, path: Path) -> str:
         return listed_name(path, self._folder)
@@ -186,7 +186,7 @@ def _remembered(store: Store) -> tuple[dict[str, Any] | None, bool]:
         return {}, True
     for path in (_SOURCES, _COPY):
         try:
-            known = unseal(store.read_bytes(path))
+            known = parse_checked(store.read_bytes(path))
             logs = {log: {"format": of["format"], "files": dict(of["files"])} for log, of in known.items()}
         except (StoreError, ValueError, KeyError, TypeError, AttributeError):
             continue

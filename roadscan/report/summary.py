@@ -21,7 +21,7 @@ from roadscan.core.errors import StoreError
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
-from roadscan.georeference.reading_counts import told
+from roadscan.georeference.reading_counts import reading_counts
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.stage import findings_of
 from roadscan.store.logs import LogRecord, read_log_records
@@ -120,7 +120,7 @@ def survey_summary(survey: Survey, store: Store) -> SurveySummary:
         survey=survey.config.id,
         store=store.root,
         logs=_logs(logs),
-        readings=told([*manifest.of(FOOTPRINTS).values(), *tiles]),
+        readings=reading_counts([*manifest.of(FOOTPRINTS).values(), *tiles]),
         tiles=_tiles(tiles, survey.config.tiles.cell_m) if tiles else None,
         adjustment=known_lines(manifest),
         findings=findings_of(survey, logs, manifest),

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.core.witness import Finding
-from roadscan.store.sealed import seal, unseal
+from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.store import Store
 
 _FOLDER: Final = "manifest/logs"
@@ -99,7 +99,7 @@ def copy_path(key: str) -> str:
 
 def write_log_record(store: Store, record: LogRecord) -> None:
     """Make a log part of the store."""
-    content = seal(dataclasses.asdict(record))
+    content = checked_json(dataclasses.asdict(record))
     store.write_bytes(copy_path(record.key), content, lasting=False)
     store.write_bytes(record_path(record.key), content)
 
@@ -165,7 +165,7 @@ def data_file(raw: Mapping[str, Any]) -> DataFile:
 def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
     """The record of the log `key`, from the content of the file `path`."""
     try:
-        raw = unseal(content)
+        raw = parse_checked(content)
         raw["tables"] = {name: tuple(map(data_file, files)) for name, files in raw["tables"].items()}
         raw["findings"] = tuple(map(Finding.of, raw.get("findings", ())))
         record = LogRecord(**raw)

@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 
 from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import iso_from_gps_ns
+from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.logs import DataFile, data_file
 from roadscan.store.schema import table_schema
-from roadscan.store.sealed import seal, unseal
 from roadscan.store.store import Store
 from roadscan.store.writer import describe, write_parquet
 
@@ -121,7 +121,7 @@ def read_lost(store: Store) -> list[Lost]:
     if not store.exists(_LOST):
         return []
     try:
-        return list(map(_parsed, unseal(store.read_bytes(_LOST))["lost"]))
+        return list(map(_parsed, parse_checked(store.read_bytes(_LOST))["lost"]))
     except (StoreError, ValueError, KeyError, TypeError):
         return []
 
@@ -129,7 +129,7 @@ def read_lost(store: Store) -> list[Lost]:
 def write_lost(store: Store, lost: Sequence[Lost]) -> None:
     """Replace the list."""
     if lost or store.exists(_LOST):
-        store.write_bytes(_LOST, seal({"lost": [dataclasses.asdict(one) for one in lost]}))
+        store.write_bytes(_LOST, checked_json({"lost": [dataclasses.asdict(one) for one in lost]}))
 
 
 def _parsed(raw: dict[str, Any]) -> Lost:

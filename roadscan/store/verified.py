@@ -21,10 +21,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import AnswerError, StoreError
-from roadscan.store.held import WAY_OUT, held_path, held_records, read_held
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
-from roadscan.store.mend import fault_of
+from roadscan.store.repair_records import fault_of
+from roadscan.store.small_tables import REPAIR_HINT, read_small, small_path, small_records
 from roadscan.store.sql_files import Stamp, stamp_of
 from roadscan.store.store import MADE_AGAIN, Store
 
@@ -44,7 +44,7 @@ class Recorded(NamedTuple):
 def recorded_files(store: Store, logs: Iterable[LogRecord], manifest: Manifest) -> pa.Table:
     """Every Parquet file that a record names (columns path, bytes, digest): ingested, made or estimated."""
     data = [(f.path, f.bytes, f.digest) for log in logs for own in log.tables.values() for f in own]
-    data += [(path, *one) for path, one in held_records(store).items()]
+    data += [(path, *one) for path, one in small_records(store).items()]
     ingested = _table(data, _RECORDED)
     made = manifest.table().select(_RECORDED.names)
     return pa.concat_tables([ingested, made.filter(pc.ends_with(made.column("path"), _SUFFIX))])
@@ -111,9 +111,9 @@ def note_written(store: Store, since_ns: int, recorded: pa.Table) -> None:
 
 def held_faults(store: Store) -> list[str]:
     """What is wrong with the small tables that are held whole."""
-    records = held_records(store)
+    records = small_records(store)
     found: list[str | None] = []
-    for path in map(held_path, WAY_OUT):
+    for path in map(small_path, REPAIR_HINT):
         if path in records and store.exists(path):
             found.append(_held_against(store, {path: Recorded(*records[path])})[path])
         if not found or found[-1] is None:
@@ -122,13 +122,13 @@ def held_faults(store: Store) -> list[str]:
 
 
 def _held_of(paths: Iterable[str]) -> list[str]:
-    return [path for path in paths if path in map(held_path, WAY_OUT)]
+    return [path for path in paths if path in map(small_path, REPAIR_HINT)]
 
 
 def _fault_of_held(store: Store, path: str) -> str | None:
     """Of a small table without a record: its pages have checksums."""
     try:
-        read_held(store, path.split("/")[1])
+        read_small(store, path.split("/")[1])
     except StoreError as error:
         return str(error)
     return None
@@ -143,7 +143,7 @@ def _held_against(store: Store, files: Mapping[str, Recorded]) -> dict[str, str 
 
 
 def _with_way_out(path: str, fault: str | None) -> str | None:
-    return f"{fault}; {WAY_OUT[path.split('/')[1]]}" if fault and _held_of([path]) else fault
+    return f"{fault}; {REPAIR_HINT[path.split('/')[1]]}" if fault and _held_of([path]) else fault
 
 
 def _in_answer(path: str, fault: str) -> AnswerError:

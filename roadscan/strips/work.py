@@ -22,7 +22,7 @@ from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import Ground, Placer, RawSlice, geometry_of, read_rows
+from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, geometry_of, read_rows
 from roadscan.navigation.tasks.pose_sigma import median_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.poses.level import level_poses
@@ -67,7 +67,7 @@ class StripTask:
     """One stretch of a run, and the row groups that may have seen it; it holds no data."""
 
     store: Store
-    ground: Ground
+    ground: MapSettings
     run: str
     number: int
     poses: TrajectorySource
@@ -147,7 +147,7 @@ def _stretches(own: Sequence[RawSlice]) -> list[tuple[int, int]]:
     return [(int(begin), int(begin) + length) for begin in begins]
 
 
-def _way(store: Store, ground: Ground, poses: TrajectorySource, span: tuple[int, int]) -> Way | None:
+def _way(store: Store, ground: MapSettings, poses: TrajectorySource, span: tuple[int, int]) -> Way | None:
     """The way within a span of time, or its beginning; None where the vehicle stands or there are no poses."""
     recorded = load_recorded(store, poses, [span], ground.max_gap_s)
     knots = recorded.epochs_gps_ns
@@ -238,7 +238,7 @@ def compare_strip(task: StripTask) -> OutputRecord:
     way = _way(task.store, task.ground, task.poses, (task.first_gps_ns, task.last_gps_ns))
     seen: list[tuple[SeenBy, Strip]] = []
     if way is not None:
-        placer = Placer(task.store, task.ground, task.slices, recorded=True)
+        placer = Georeferencer(task.store, task.ground, task.slices, recorded=True)
         order = sorted(task.slices, key=lambda one: (one.source.run != task.run, one.source.run, one.source.sensor))
         for _, slices in itertools.groupby(order, lambda one: (one.source.run, one.source.sensor)):
             seen.append(_seen_by(task, placer, way, list(slices)))
@@ -257,7 +257,7 @@ def compare_strip(task: StripTask) -> OutputRecord:
     return OutputRecord(PRODUCT, task.unit, task.key, "", 0, "", json.dumps(figures))
 
 
-def _seen_by(task: StripTask, placer: Placer, way: Way, slices: Sequence[RawSlice]) -> tuple[SeenBy, Strip]:
+def _seen_by(task: StripTask, placer: Georeferencer, way: Way, slices: Sequence[RawSlice]) -> tuple[SeenBy, Strip]:
     source = slices[0].source
     given, parts = 0, list[PlacedReadings]()
     for count, part in _placed(task, placer, way, slices):
@@ -280,7 +280,7 @@ def _seen_by(task: StripTask, placer: Placer, way: Way, slices: Sequence[RawSlic
 
 
 def _placed(
-    task: StripTask, placer: Placer, way: Way, slices: Sequence[RawSlice]
+    task: StripTask, placer: Georeferencer, way: Way, slices: Sequence[RawSlice]
 ) -> Iterator[tuple[int, PlacedReadings]]:  # fmt: skip
     """Readings of the row groups, thinned, and how many there were before any was left out."""
     geometry = geometry_of(slices[0].source)

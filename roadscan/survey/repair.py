@@ -17,7 +17,7 @@ from roadscan.ingest.planned_logs import PlannedLog, plan_logs
 from roadscan.ingest.sources import is_unchanged
 from roadscan.navigation.tasks.navigate import keep_trajectory, plan_trajectories
 from roadscan.store.logs import NAVIGATION, DataFile, LogRecord, read_log_records, write_log_record
-from roadscan.store.mend import mend_records
+from roadscan.store.repair_records import repair_records
 from roadscan.store.salvage import Lost, read_lost, salvaged, write_lost
 from roadscan.store.sql_files import stamp_of
 from roadscan.store.store import Store
@@ -56,7 +56,7 @@ def repair_store(survey: Survey, store: Store, report: Callable[[int, int], None
     """Hold every file of a store against its record, and mend the ingested tables."""
     with store.lock():
         done = Repair()
-        mend_records(store, done.lines.append)
+        repair_records(store, done.lines.append)
         found = find_damage(store, report)
         done.faults += found.faults
         done.lost = read_lost(store)

@@ -18,7 +18,7 @@ from roadscan.run.session import Session
 from roadscan.run.stage import Stage, findings_of, stages
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
-from roadscan.store.mend import mend_records
+from roadscan.store.repair_records import repair_records
 from roadscan.store.verified import note_written, recorded_files
 from roadscan.surface.tasks.surface_colours import check_cameras
 from roadscan.tiles.tasks.wanted_products import wanted_products
@@ -50,7 +50,7 @@ def run_stage(session: Session, stage: Stage) -> None:
     """Run one stage; where units of an earlier one failed, its own end joins their list instead of hiding it."""
     session.stage = stage.name
     if session.goes_on is None:
-        mend_records(session.store, session.note)
+        repair_records(session.store, session.note)
         session.goes_on = begin_changes(session.store)
         session.began_ns = time.time_ns() - _CLOCK_TICK_NS
     try:

@@ -14,7 +14,7 @@ from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import PRODUCT
 from roadscan.georeference.plan.plan import NothingToPlaceError
-from roadscan.georeference.reading_counts import told
+from roadscan.georeference.reading_counts import reading_counts
 from roadscan.ingest.overlap import NothingPlacedError
 from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog, logs_of
 from roadscan.ingest.sources import damaged_sources
@@ -23,7 +23,7 @@ from roadscan.run.session import Session
 from roadscan.run.stage import StageState, findings_of, stages
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
-from roadscan.store.mend import fault_of
+from roadscan.store.repair_records import fault_of
 from roadscan.store.salvage import Lost, read_lost
 from roadscan.store.sql_files import Stamp, stamp_of
 from roadscan.store.store import Store
@@ -105,7 +105,7 @@ def survey_status(session: Session) -> Status:
     keys = {*(log.key for log in planned), *known_keys(session.survey, store, logs_of(session))}
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
     status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
-    status.readings = told([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])
+    status.readings = reading_counts([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])
     status.findings = findings_of(session.survey, [r for r in records.values() if r.key in keys], manifest)
     for stage in stages():
         try:

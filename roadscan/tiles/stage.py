@@ -10,8 +10,8 @@ from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.footprints.stage import faults_of_plan
 from roadscan.georeference.plan.plan import plan_of
-from roadscan.georeference.reading_counts import fate_words, lost_findings, of_all, told_by_log
-from roadscan.run.engine.compute import Made
+from roadscan.georeference.reading_counts import counts_by_log, fate_words, lost_findings, of_all
+from roadscan.run.engine.compute import LazyTasks
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
@@ -43,7 +43,7 @@ class Tiles(Stage):
             session.raw_bytes_read += task.raw_bytes
             return task
 
-        tasks = Made(work.planned.tasks(work.chosen, session.compute.workers), counted)
+        tasks = LazyTasks(work.planned.tasks(work.chosen, session.compute.workers), counted)
         failures = run_tasks(
             compute_tiles, tasks, len(work.chosen), work.planned.singly, manifest, session.compute,
             session.bar(self.name),
@@ -65,7 +65,9 @@ class Tiles(Stage):
         manifest = session.manifest
         session.failed(self.name, faults_of_plan(session))
         computed = [manifest.get(TILE, str(tile)) for tile in chosen]
-        logs = told_by_log([*manifest.of(FOOTPRINTS).values(), *(record for record in computed if record is not None)])
+        logs = counts_by_log(
+            [*manifest.of(FOOTPRINTS).values(), *(record for record in computed if record is not None)]
+        )
         if manifest.without_file(TILE) and not manifest.files().get(TILE):
             why = (
                 fate_words(of_all(logs)) or "all lie off the centre lines of filters.centre_line, or outside all passes"
@@ -91,7 +93,7 @@ class Tiles(Stage):
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """Logs of which many readings have no pose, and passes that lie at different heights."""
         tiles = list(manifest.of(TILE).values())
-        logs = told_by_log([*manifest.of(FOOTPRINTS).values(), *tiles])
+        logs = counts_by_log([*manifest.of(FOOTPRINTS).values(), *tiles])
         return [*lost_findings(logs, records, survey.config.checks.lost_share), *apart_findings(tiles)]
 
     def folders(self) -> Sequence[str]:

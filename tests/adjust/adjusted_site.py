@@ -13,8 +13,8 @@ from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, truth
-from roadscan.store.held import held_path
 from roadscan.store.manifest import Manifest
+from roadscan.store.small_tables import small_path
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
@@ -55,7 +55,7 @@ def rows(store: Store, statement: str) -> list[dict[str, Any]]:
 
 
 def corrections(store: Store) -> bytes:
-    return store.read_bytes(held_path("corrections"))
+    return store.read_bytes(small_path("corrections"))
 
 
 def cell_errors(one: Simulated, store: Store) -> np.ndarray:

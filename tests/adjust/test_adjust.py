@@ -21,8 +21,8 @@ from roadscan.run.engine.compute import Done, Inline
 from roadscan.run.engine.embedded import embedded
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
-from roadscan.store.held import held_path, read_held, write_held
 from roadscan.store.manifest import Manifest
+from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status
@@ -92,9 +92,9 @@ def test_a_raster_states_the_sigma_of_its_tile_and_a_change_of_sigma_alone_makes
         assert float(tags["ROADSCAN_SIGMA_HORIZONTAL_M"]) == pytest.approx(row["sigma_horizontal_m"], abs=5e-7)
     manifest = Manifest(store)
     before = plan_tiles(load_ranges(plan_survey(survey, store), manifest), plan_survey(survey, store))
-    table = read_held(store, "corrections")
+    table = read_small(store, "corrections")
     assert table is not None
-    write_held(store, "corrections", [{**row, "sigma_down_m": 2 * row["sigma_down_m"]} for row in table.to_pylist()])
+    write_small(store, "corrections", [{**row, "sigma_down_m": 2 * row["sigma_down_m"]} for row in table.to_pylist()])
     after = plan_tiles(load_ranges(plan_survey(survey, store), manifest), plan_survey(survey, store))
     assert list(after.keys) == list(before.keys)
 
@@ -132,12 +132,12 @@ def test_workers_order_and_a_killed_run_change_no_bit(adjusted: Simulated, tmp_p
     copy = adjusted.copy_with_store_to(tmp_path / "survey")
     store = copy.store()
     before = corrections(store)
-    store.remove(held_path("corrections"))
+    store.remove(small_path("corrections"))
     manifest = Manifest(store)
     manifest.remove([r for name in ("ties", "control_sightings") for r in manifest.of(name).values()])
     with pytest.raises(KeyboardInterrupt):
         adjust(copy, Shuffled(2))
-    assert not store.exists(held_path("corrections"))
+    assert not store.exists(small_path("corrections"))
     adjust(copy, Shuffled())
     assert corrections(store) == before
 
@@ -149,7 +149,7 @@ def test_a_cluster_of_workers_gives_the_same_bits(adjusted: Simulated, tmp_path:
     copy = adjusted.copy_with_store_to(tmp_path / "survey")
     store, manifest = copy.store(), Manifest(copy.store())
     before = adjustment_files(store)
-    store.remove(held_path("corrections"))
+    store.remove(small_path("corrections"))
     made = ("ties", "control_sightings", "adjustment_picture", "tie_residuals", "control_residuals")
     manifest.remove([r for name in made for r in manifest.of(name).values()])
     with embedded(workers) as cluster:
@@ -163,7 +163,7 @@ def adjustment_files(store: Store) -> dict[str, bytes]:
     folders = ["products/adjustment", *(f"tables/{name}" for name in tables)]
     paths = [path for folder in folders for path in store.files(folder)]
     assert len(paths) > len(folders)
-    return {path: store.read_bytes(path) for path in [*paths, held_path("corrections")]}
+    return {path: store.read_bytes(path) for path in [*paths, small_path("corrections")]}
 
 
 def test_corrections_leave_footprints_current_and_switching_off_takes_them_away(
@@ -171,7 +171,7 @@ def test_corrections_leave_footprints_current_and_switching_off_takes_them_away(
 ) -> None:
     copy = adjusted.copy_with_store_to(tmp_path / "survey")
     session = adjust(copy, adjust__on=False)
-    assert not copy.store().exists(held_path("corrections"))
+    assert not copy.store().exists(small_path("corrections"))
     assert not rows(copy.store(), "SELECT * FROM outputs WHERE product = 'ties'")
     assert stale_footprints(plan_of(session), session.manifest) == []
     survey = changed(Survey.load(copy.survey_file), {**CIRCLES, **NO_FILES})
@@ -183,19 +183,19 @@ def test_corrections_leave_footprints_current_and_switching_off_takes_them_away(
 def test_only_tiles_near_a_changed_knot_become_stale(adjusted: Simulated) -> None:
     survey = changed(Survey.load(adjusted.survey_file), {**CIRCLES, "navigation__max_gap_s": 0.02})
     store = adjusted.store()
-    whole = store.read_bytes(held_path("corrections"))
+    whole = store.read_bytes(small_path("corrections"))
     manifest, plan = Manifest(store), plan_survey(survey, store)
     footprints = load_ranges(plan, manifest)
-    table = read_held(store, "corrections")
+    table = read_small(store, "corrections")
     assert table is not None
     moved = table.to_pylist()
     last = [k for k, row in enumerate(moved) if row["run"] == "run-2"][-1]
     moved[last]["down_m"] += 0.001
     try:
-        write_held(store, "corrections", moved)
+        write_small(store, "corrections", moved)
         after = plan_survey(survey, store)
     finally:
-        store.write_bytes(held_path("corrections"), whole)
+        store.write_bytes(small_path("corrections"), whole)
     assert stale_footprints(after, manifest) == stale_footprints(plan, manifest)
     ends = moved[last - 1]["epoch_gps_ns"] - 70_000_000
     run_2 = np.array([s.source.run == "run-2" for s in footprints.slices])[footprints.slice_index]
@@ -322,17 +322,17 @@ def test_a_survey_without_overlap_and_control_is_told_so(raw_site: Simulated, tm
     session = Session(Survey(alone, survey.rig, survey.folder), copy.store(), Inline(), None, Lines())
     run_stages(session, [stage_named(name) for name in ("ingest", "navigate", "footprints", "adjust")])
     assert [line for line in session.reporter.lines if line.startswith("adjust: nothing to adjust")]
-    assert not copy.store().exists(held_path("corrections"))
+    assert not copy.store().exists(small_path("corrections"))
 
 
 @pytest.mark.witness("corrected_elsewhere")
 def test_corrections_of_another_program_stay(adjusted: Simulated, tmp_path: Path) -> None:
     copy = adjusted.copy_with_store_to(tmp_path / "survey")
     store = copy.store()
-    table = read_held(store, "corrections")
+    table = read_small(store, "corrections")
     assert table is not None
     own = [{**row, "written_by": None, "down_m": 0.01} for row in table.to_pylist() if row["run"] == "run-1"]
-    write_held(store, "corrections", own)
+    write_small(store, "corrections", own)
     run = adjust(copy)
     assert [line for line in run.reporter.lines if "run 'run-1': its poses were corrected by another program" in line]
     kept = rows(store, "SELECT DISTINCT down_m FROM corrections WHERE run = 'run-1'")

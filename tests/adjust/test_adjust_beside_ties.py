@@ -20,8 +20,8 @@ from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.navigation.tasks.trajectories import load_recorded, load_trajectory
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.store.held import held_path
 from roadscan.store.manifest import Manifest
+from roadscan.store.small_tables import small_path
 from roadscan.store.store import Store
 from tests.adjust.adjusted_site import CIRCLES, NO_FILES, OFF, adjust, cell_errors, corrections, rows
 from tests.surveys import Simulated, changed
@@ -84,7 +84,7 @@ def test_a_run_that_is_held_keeps_its_poses_and_the_others_come_to_it(adjusted: 
     store = copy.store()
     assert [line for line in run.reporter.lines if "held fixed, with poses as they were recorded: run-1" in line]
     assert rows(store, "SELECT DISTINCT run FROM corrections ORDER BY run") == [{"run": "run-2"}, {"run": "run-3"}]
-    assert not store.exists(held_path("mounting_corrections"))
+    assert not store.exists(small_path("mounting_corrections"))
     held, moved = (next(s for s, _ in plan_of(run).sources if s.run == name) for name in ("run-1", "run-2"))
     for source, same in ((held, True), (moved, False)):
         assert source.trajectory is not None

@@ -22,7 +22,7 @@ from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import findings_of, stage_named
 from roadscan.simulate import Scene, simulate
-from roadscan.store.held import held_path, read_held
+from roadscan.store.small_tables import read_small, small_path
 from roadscan.store.sql import query
 from roadscan.survey.run import run_stages
 from tests.pictures import drawn
@@ -87,7 +87,7 @@ class Outcome:
 
     def sigma_m(self) -> float:
         """Published 1 σ of heights; that of the logs where nothing is corrected."""
-        table = read_held(self.store, "corrections")
+        table = read_small(self.store, "corrections")
         return 0.015 if table is None else float(np.median(table.column("sigma_down_m").to_numpy()))
 
 
@@ -210,7 +210,7 @@ def test_the_order_of_runs_in_the_survey_file_changes_no_bit(three_drives: Simul
             run_stages(session, [stage_named(stage) for stage in (*STAGES, "tiles")])
         folders = ("products/adjustment", "tables/control_residuals", "tables/tie_residuals", "tiles")
         paths = [path for folder in folders for path in copy.store().files(folder)]
-        made.append({path: copy.store().read_bytes(path) for path in [*paths, held_path("corrections")]})
+        made.append({path: copy.store().read_bytes(path) for path in [*paths, small_path("corrections")]})
     assert made[0].keys() == made[1].keys()
     assert [path for path in made[0] if made[0][path] != made[1][path]] == []
 

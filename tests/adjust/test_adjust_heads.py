@@ -15,8 +15,8 @@ import pytest
 from roadscan.adjust.tasks.outcome import known_findings
 from roadscan.core.witness import Finding
 from roadscan.simulate import Scene, simulate
-from roadscan.store.held import read_held
 from roadscan.store.manifest import Manifest
+from roadscan.store.small_tables import read_small
 from tests.answers import roadscan
 from tests.drawn_faults.kinds import _ranges, _with
 from tests.surveys import Simulated
@@ -57,7 +57,7 @@ def adjusted(folder: Path, workers: int = 0) -> tuple[list[Finding], str]:
 
 def mountings(folder: Path) -> dict[tuple[str, str], dict[str, float]]:
     """Rows of the table by run and sensor; none where there is none."""
-    table = read_held(Simulated(folder / "SURVEY.toml").store(), "mounting_corrections")
+    table = read_small(Simulated(folder / "SURVEY.toml").store(), "mounting_corrections")
     return {(row["run"], row["sensor"]): row for row in ([] if table is None else table.to_pylist())}
 
 

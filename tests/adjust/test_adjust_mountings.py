@@ -9,8 +9,8 @@ import pytest
 
 from roadscan.adjust.tasks.outcome import known_findings
 from roadscan.simulate import Scene, simulate
-from roadscan.store.held import held_path, read_held
 from roadscan.store.manifest import Manifest
+from roadscan.store.small_tables import read_small, small_path
 from tests.adjust.adjusted_site import cell_errors
 from tests.surveys import Simulated
 
@@ -63,7 +63,7 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
 
 @pytest.mark.witness("mounting")
 def test_a_wrong_boresight_is_found_named_and_applied(survey: Simulated) -> None:
-    table = read_held(survey.store(), "mounting_corrections")
+    table = read_small(survey.store(), "mounting_corrections")
     assert table is not None
     found = {row["sensor"]: row for row in table.to_pylist()}
     assert set(found) == {"profiler_right"}  # nothing contradicts the other's
@@ -82,15 +82,21 @@ def test_a_wrong_boresight_is_found_named_and_applied(survey: Simulated) -> None
 
 def test_the_mounting_is_applied_once_and_a_second_run_does_nothing(survey: Simulated) -> None:
     store = survey.store()
-    before = store.read_bytes(held_path("mounting_corrections")), store.read_bytes(held_path("corrections"))
+    before = (
+        store.read_bytes(small_path("mounting_corrections")),
+        store.read_bytes(small_path("corrections")),
+    )
     run = survey.run(**CHANGES)
     assert run.raw_bytes_read == 0
-    assert (store.read_bytes(held_path("mounting_corrections")), store.read_bytes(held_path("corrections"))) == before
+    assert (
+        store.read_bytes(small_path("mounting_corrections")),
+        store.read_bytes(small_path("corrections")),
+    ) == before
 
 
 def test_sigmas_of_zero_leave_mountings_as_they_are_stated(survey: Simulated) -> None:
     survey.run("store-stated", **CHANGES, adjust__mountings={f"sigma_{name}": 0.0 for name in COMPONENTS})
     store = survey.store("store-stated")
-    assert not store.exists(held_path("mounting_corrections"))
+    assert not store.exists(small_path("mounting_corrections"))
     stated, estimated = (np.sqrt(np.mean(cell_errors(survey, one) ** 2)) for one in (store, survey.store()))
     assert estimated < stated

@@ -19,8 +19,8 @@ from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.simulate import simulate
-from roadscan.store.held import held_path, read_held, write_held
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
@@ -62,7 +62,7 @@ def test_an_estimated_clock_puts_readings_where_a_right_one_does(right: Simulate
     drift = -40.0 / (1.0 + 40e-6)
     reference = start + 500_000_000
     table = [clock_row(s, -0.5, drift, reference) for s in ("profiler_left", "profiler_right")]
-    write_held(wrong.store(), "clocks", table)
+    write_small(wrong.store(), "clocks", table)
     # The stage `navigate` would take the rows away: the survey file names no evidence for them.
     survey = changed(Survey.load(wrong.survey_file), PRODUCTS)
     run_stages(Session(survey, wrong.store(), Inline()), [s for s in stages() if s.name != "navigate"])
@@ -89,12 +89,12 @@ def test_a_calibrated_mounting_holds_from_its_epoch_on(right: Simulated) -> None
         **dict(zip(("qw", "qx", "qy", "qz"), q, strict=True)),
     }  # fmt: skip
     before = heights(right)
-    write_held(store, "mountings", [row])
+    write_small(store, "mountings", [row])
     try:
         run = right.run(**PRODUCTS)
         after = heights(right)
     finally:
-        store.remove(held_path("mountings"))
+        store.remove(small_path("mountings"))
     assert run.raw_bytes_read > 0
     times, low = np.concatenate(list(before.values())).T
     high = np.concatenate(list(after.values()))[:, 1]
@@ -137,12 +137,12 @@ MENDED_BY = {
 @pytest.mark.parametrize("damage", ["cut", "empty", "flipped", "other"])
 @pytest.mark.parametrize("name", sorted(MENDED_BY))
 def test_a_damaged_table_says_what_mends_it(tmp_path: Path, name: str, damage: str) -> None:
-    store, path = Store(str(tmp_path), "s"), held_path(name)
+    store, path = Store(str(tmp_path), "s"), small_path(name)
     values = {"string": "run-1", "int64": 0, "float64": 0.5, "uint8": 1, "int32": 1}
-    write_held(store, name, [{c.name: values.get(c.type) for c in table_schema(name).columns}])
+    write_small(store, name, [{c.name: values.get(c.type) for c in table_schema(name).columns}])
     store.write_bytes(path, damaged(store.read_bytes(path), damage))
     with pytest.raises(DamagedError) as raised:
-        read_held(store, name)
+        read_small(store, name)
     assert MENDED_BY[name] in raised.value.change and "`roadscan verify`" not in str(raised.value)
     assert raised.value.file == store.path(path)
 
@@ -152,22 +152,22 @@ def test_a_run_does_not_go_on_without_a_damaged_table(right: Simulated, name: st
     """Without it, readings would be placed elsewhere."""
     store = right.run(**PRODUCTS).store
     before = outputs(store)
-    store.write_bytes(held_path(name), b"PAR1 and no more")
+    store.write_bytes(small_path(name), b"PAR1 and no more")
     try:
         for _ in range(2):
             with pytest.raises(DamagedError, match=f"{name}/part-00000.parquet: the file is damaged"):
                 right.run(**PRODUCTS)
         assert outputs(store) == before
     finally:
-        store.remove(held_path(name))
+        store.remove(small_path(name))
     assert right.run(**PRODUCTS).raw_bytes_read == 0
 
 
 def test_damaged_clocks_are_estimated_anew(right: Simulated) -> None:
     store = right.store()
-    store.write_bytes(held_path("clocks"), b"PAR1 and no more")
+    store.write_bytes(small_path("clocks"), b"PAR1 and no more")
     with pytest.raises(DamagedError, match="`roadscan clocks`"):
         plan_survey(Survey.load(right.survey_file), store)
     said = right.run(**PRODUCTS).reporter.lines
     assert [line for line in said if line.startswith("note: the table `clocks` is damaged")]
-    assert store.read_bytes("damaged/" + held_path("clocks")) == b"PAR1 and no more"
+    assert store.read_bytes("damaged/" + small_path("clocks")) == b"PAR1 and no more"

@@ -21,7 +21,7 @@ from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.simulate import Scene, simulate
-from roadscan.store.held import held_path
+from roadscan.store.small_tables import small_path
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status, verify_store
@@ -182,14 +182,14 @@ def test_evidence_that_finds_nothing_is_refused_and_what_was_known_stays(
     yard: Path, calibrated: tuple[Survey, Calibrated]
 ) -> None:
     store = store_of(calibrated[0])
-    before = store.read_bytes(held_path("mountings"))
+    before = store.read_bytes(small_path("mountings"))
     west, south = 566002.0, 5933047.0
     beside = {"easting_min_m": west, "northing_min_m": south, "easting_max_m": west + 1, "northing_max_m": south + 1}
     entry = {"kind": "overlap", "sensors": ["profiler_left", "profiler_right"], "area": beside}
     survey = changed(Survey.load(yard), {"calibration": [entry, stop_and_go("profiler_left")]})
     with pytest.raises(RoadscanError):
         calibrate_survey(survey, store)
-    assert store.read_bytes(held_path("mountings")) == before
+    assert store.read_bytes(small_path("mountings")) == before
 
 
 def test_an_overlap_of_whole_runs_is_refused_before_their_readings_are_loaded(yard: Path) -> None:
@@ -212,12 +212,12 @@ def test_status_says_when_the_rig_is_another_than_the_calibrated_one(calibrated:
 def test_a_damaged_table_is_calibrated_anew(calibrated: tuple[Survey, Calibrated]) -> None:
     survey, done = calibrated
     store, said, name = store_of(survey), [], "profiler_left"
-    before = store.read_bytes(held_path("mountings"))
-    store.write_bytes(held_path("mountings"), b"PAR1 and no more")
+    before = store.read_bytes(small_path("mountings"))
+    store.write_bytes(small_path("mountings"), b"PAR1 and no more")
     calibrate_survey(changed(survey, {"calibration": [stop_and_go(name)]}), store, said.append)
     assert [line for line in said if line.startswith("the damaged table was set aside (damaged/tables/mountings/")]
     ((key, ((_, mounting),)),) = load_mountings(store).items()
     assert key == ("*", name)
     turn = mounting.arrays()[0] @ done.calibration.sensors[name].mounting.arrays()[0].T
     assert Rotation.from_matrix(turn).magnitude() < 1e-3
-    store.write_bytes(held_path("mountings"), before)
+    store.write_bytes(small_path("mountings"), before)

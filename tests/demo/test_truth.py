@@ -12,7 +12,7 @@ from roadscan.core.survey import Survey
 from roadscan.demo.demo import summarise
 from roadscan.georeference.place import EVERYWHERE
 from roadscan.georeference.plan.plan import plan_survey
-from roadscan.georeference.sources import Placer
+from roadscan.georeference.sources import Georeferencer
 from roadscan.ingest.ingest import ingest
 from roadscan.simulate import simulate, truth
 from roadscan.store.store import Store
@@ -35,7 +35,7 @@ def test_every_reading_lies_where_its_beam_hit(noiseless: Path) -> None:
     for source, files in plan.sources:
         slices = [s for s in plan.slices() if s.source is source]
         assert len(files) == len(slices)
-        placer = Placer(store, plan.ground, slices)
+        placer = Georeferencer(store, plan.ground, slices)
         placed = [p for one in slices for _, p in placer.place(one, EVERYWHERE)]
         tiles = np.concatenate([p.tiles for p in placed]).astype(np.int64)
         own = np.concatenate([p.quanta for p in placed])

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from roadscan.core.survey import Survey
 from roadscan.georeference.place import EVERYWHERE
 from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
-from roadscan.georeference.sources import Placer
+from roadscan.georeference.sources import Georeferencer
 from roadscan.ingest.ingest import ingest
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.store.store import Store
@@ -114,7 +114,7 @@ def placed(survey: Survey, plan: SurveyPlan, source: object, sensor: str) -> tup
     """Points (n, 3) of a source in the order of its log, in metres of the map, and the step of its ranges."""
     quanta = plan.ground.grid.size_quanta
     slices = [s for s in plan.slices() if s.source is source]
-    placer = Placer(Store(survey.store_url, survey.config.id), plan.ground, slices)
+    placer = Georeferencer(Store(survey.store_url, survey.config.id), plan.ground, slices)
     parts = [p for one in slices for _, p in placer.place(one, EVERYWHERE)]
     tiles = np.concatenate([p.tiles for p in parts]).astype(np.int64)
     own = np.concatenate([p.quanta for p in parts])

@@ -14,7 +14,7 @@ from roadscan.footprints.footprints import FootprintRanges, load_ranges
 from roadscan.footprints.reach import opened, touched_tiles
 from roadscan.georeference.place import Window
 from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
-from roadscan.georeference.sources import Placer
+from roadscan.georeference.sources import Georeferencer
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from tests.surveys import Simulated
@@ -42,7 +42,7 @@ def test_footprints_hold_every_reading(indexed) -> None:
     assert len(known) == len(pairs) > found.readings.size
     placed = set()
     for number, one in enumerate(found.slices):
-        placer = Placer(plan.store, plan.ground, [one])
+        placer = Georeferencer(plan.store, plan.ground, [one])
         for group in one.groups:
             tiles, _ = placer.touched(one, group)
             placed |= {(number, group, c, r) for c, r in np.unique(tiles, axis=0).tolist()}
@@ -100,7 +100,7 @@ def test_files_without_spans_of_ranges_or_statistics_are_bounded_too(indexed, ta
         bare = touched_tiles(store, plan.ground, one, file)
     assert not bare.unbounded.any()
     pairs = set(zip(bare.group.tolist(), bare.column.tolist(), bare.row.tolist(), strict=True))
-    placer = Placer(plan.store, plan.ground, [one])
+    placer = Georeferencer(plan.store, plan.ground, [one])
     for group in one.groups:
         tiles, _ = placer.touched(one, group)
         assert {(group, c, r) for c, r in np.unique(tiles, axis=0).tolist()} <= pairs

@@ -19,7 +19,7 @@ from docs.mistakes import FIRST_GPS_S, MISTAKES, Mistake, heard, write_scans, wr
 from roadscan.cli import app
 from roadscan.core.errors import RoadscanError
 from roadscan.core.gpstime import gps_ns_from_utc
-from roadscan.store.sealed import seal, unseal
+from roadscan.store.checked_json import checked_json, parse_checked
 from tests.surveys import Simulated
 
 SOUND = Mistake("none", "")
@@ -289,9 +289,9 @@ def test_an_older_list_of_logs_is_read(tmp_path: Path) -> None:
     assert run(tmp_path)[0] == 0
     for name in ("sources", "sources_copy"):
         file = tmp_path / "store" / "survey=street" / "manifest" / f"{name}.json"
-        known = unseal(file.read_bytes())
+        known = parse_checked(file.read_bytes())
         assert set(known) == {"poses.csv", "scans.parquet"}
-        file.write_bytes(seal({str((tmp_path / path).resolve()): of for path, of in known.items()}))
+        file.write_bytes(checked_json({str((tmp_path / path).resolve()): of for path, of in known.items()}))
     (tmp_path / "scans.parquet").unlink()
     assert said(tmp_path, "status")[0] == 0
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from roadscan.core.errors import RoadscanError, StoreError
-from roadscan.store.held import held_path, write_held
 from roadscan.store.logs import copy_path, read_log_records, record_path
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import small_path, write_small
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.store.verified import Stamp
@@ -40,7 +40,7 @@ def whole(finished: Simulated, tmp_path_factory: pytest.TempPathFactory) -> Simu
     copy = finished.copy_with_store_to(tmp_path_factory.mktemp("whole") / "survey")
     copy.run(**MAKE)
     values = {"string": "run-1", "int64": 0, "float64": 0.5}
-    write_held(copy.store(), "corrections", [{c.name: values[c.type] for c in table_schema("corrections").columns}])
+    write_small(copy.store(), "corrections", [{c.name: values[c.type] for c in table_schema("corrections").columns}])
     return copy
 
 
@@ -309,7 +309,7 @@ def test_a_small_table_that_was_put_there_is_believed(tmp_path: Path) -> None:
     """One that is not of roadscan's writing has no record."""
     store, other = Store(str(tmp_path / "a"), "s"), Store(str(tmp_path / "b"), "s")
     values = {"string": "run-1", "int64": 0, "float64": 0.5}
-    write_held(other, "corrections", [{c.name: values[c.type] for c in table_schema("corrections").columns}])
-    store.write_bytes(held_path("corrections"), other.read_bytes(held_path("corrections")))
+    write_small(other, "corrections", [{c.name: values[c.type] for c in table_schema("corrections").columns}])
+    store.write_bytes(small_path("corrections"), other.read_bytes(small_path("corrections")))
     assert query(store, "SELECT count(*) AS n FROM corrections").to_pylist() == [{"n": 1}]
     assert verify_store(store) == []

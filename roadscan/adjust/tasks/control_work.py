@@ -25,7 +25,7 @@ from roadscan.core.frames import rotation_from_rph, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import Ground
+from roadscan.georeference.sources import MapSettings
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
@@ -50,7 +50,7 @@ class ControlTask:
     """A point, and the row groups that saw it; it holds no data."""
 
     store: Store
-    ground: Ground
+    ground: MapSettings
     settings: TargetSettings
     runs: tuple[str, ...]
     sigma_pose_m: tuple[float, ...]

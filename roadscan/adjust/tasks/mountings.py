@@ -24,7 +24,7 @@ from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import MOUNTING_COLUMNS, MountingChanges, key_of_row, mounting_change_of
 from roadscan.poses.mounting_change import MountingChange, Seat
-from roadscan.store.held import held_path, read_held, write_held
+from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
@@ -144,7 +144,7 @@ def _sigma(plan: SurveyPlan, config: AdjustConfig, sensor: str, calibrated: Floa
 
 def calibrated_sigma(store: Store) -> dict[str, Float64]:
     """1 σ (7,) of calibrated mountings by sensor, the largest of all runs and times; NaN where not stated."""
-    table = read_held(store, "mountings")
+    table = read_small(store, "mountings")
     found: dict[str, Float64] = {}
     for row in [] if table is None else table.to_pylist():
         values = [np.nan if row.get(name) is None else float(row[name]) for name in _CALIBRATED_SIGMAS]
@@ -161,7 +161,7 @@ def held_values(mounted: Mounted, changes: MountingChanges) -> Float64:
 
 def publish_mountings(store: Store, found: MountingErrors | None, config: AdjustConfig) -> MountingChanges:
     """Bring the table up to date; what moves a point by no more than `adjust.moved_m` stays as it was, to the bit."""
-    table = read_held(store, TABLE)
+    table = read_small(store, TABLE)
     before = {key_of_row(row): row for row in ([] if table is None else table.to_pylist())}
     after: dict[tuple[str, str], dict[str, Any]] = {}
     if found is not None:
@@ -170,9 +170,9 @@ def publish_mountings(store: Store, found: MountingErrors | None, config: Adjust
                 known = before.get(sensor)
                 after[sensor] = known if known and _stays(known, found.error[k], config) else _row(found, k)
     if after != before:
-        write_held(store, TABLE, [after[sensor] for sensor in sorted(after)])
-    if not after and store.exists(held_path(TABLE)):
-        store.remove(held_path(TABLE))
+        write_small(store, TABLE, [after[sensor] for sensor in sorted(after)])
+    if not after and store.exists(small_path(TABLE)):
+        store.remove(small_path(TABLE))
     return {sensor: MountingChange.of(_values(row)) for sensor, row in after.items()}
 
 

@@ -14,7 +14,7 @@ from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Traverse
 from roadscan.core.grid import QUANTA_PER_M
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, EVERYWHERE, Placement
-from roadscan.georeference.sources import Ground, Placer, RawSlice, ReadingSource, geometry_of, read_rows
+from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource, geometry_of, read_rows
 from roadscan.poses.level import LevelPoses, level_poses
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
@@ -97,14 +97,14 @@ class NearReader:
     """Places readings near places; keeps the row groups that the next place may need as well."""
 
     def __init__(
-        self, store: Store, ground: Ground, files: Sequence[NearFile], runs: Sequence[str], apart_m: float = 0.0
+        self, store: Store, ground: MapSettings, files: Sequence[NearFile], runs: Sequence[str], apart_m: float = 0.0
     ) -> None:
         """`runs` : all runs of the survey, in the order that traverses count them.
 
         apart_m : of profiles that lie closer than this, as many are left out as still keeps them closer.
         """
         self._store, self._frame, self._runs = store, ground.map, runs
-        self._placer = Placer(store, ground, [one.slice for one in files], recorded=True)
+        self._placer = Georeferencer(store, ground, [one.slice for one in files], recorded=True)
         self._files: dict[tuple[str, str], list[NearFile]] = {}
         for one in files:
             self._files.setdefault((one.source.run, one.source.sensor), []).append(one)

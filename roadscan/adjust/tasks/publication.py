@@ -13,7 +13,7 @@ from roadscan.adjust.publish import published
 from roadscan.adjust.settings import AdjustConfig
 from roadscan.navigation.tasks.trajectories import CORRECTION_SIGMAS, load_all_corrections
 from roadscan.poses.trajectory import Corrections
-from roadscan.store.held import held_path, read_held, write_held
+from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 
 _WRITER: Final = "adjust"
@@ -21,7 +21,7 @@ _WRITER: Final = "adjust"
 
 def foreign_runs(store: Store) -> set[str]:
     """Runs whose corrections another program wrote."""
-    table = read_held(store, "corrections")
+    table = read_small(store, "corrections")
     if table is None:
         return set()
     if "written_by" not in table.column_names:
@@ -43,20 +43,20 @@ def publish(store: Store, solved: Mapping[str, Corrections], config: AdjustConfi
     }
     kept = {run: own for run, own in before.items() if run in foreign}
     if not (after or kept):
-        if store.exists(held_path("corrections")):
-            store.remove(held_path("corrections"))
+        if store.exists(small_path("corrections")):
+            store.remove(small_path("corrections"))
         return after
     same = after.keys() | kept.keys() == before.keys() and all(own is before.get(run) for run, own in after.items())
     if not same:
         rows = [row for run, own in sorted(after.items()) for row in _rows(run, own, _WRITER)]
         rows += [row for run, own in sorted(kept.items()) for row in _rows(run, own, None)]
-        write_held(store, "corrections", rows)
+        write_small(store, "corrections", rows)
     return after
 
 
 def digests_of(store: Store) -> list[str]:
     """Digests of the tables `corrections` and `mounting_corrections` as they are; "" without one."""
-    paths = [held_path(name) for name in ("corrections", "mounting_corrections")]
+    paths = [small_path(name) for name in ("corrections", "mounting_corrections")]
     return [hashlib.blake2b(store.read_bytes(p), digest_size=8).hexdigest() if store.exists(p) else "" for p in paths]
 
 

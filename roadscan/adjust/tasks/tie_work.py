@@ -21,7 +21,7 @@ from roadscan.adjust.ties.tie import HEIGHT, SAME_PASS
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import Ground
+from roadscan.georeference.sources import MapSettings
 from roadscan.poses.mounting_change import Seat
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
@@ -57,7 +57,7 @@ class TieTask:
     """Some places, and the row groups that saw them; it holds no data."""
 
     store: Store
-    ground: Ground
+    ground: MapSettings
     settings: TieSettings
     runs: tuple[str, ...]
     places: tuple[Place, ...]

@@ -12,7 +12,7 @@ from roadscan.adjust.places import Track
 from roadscan.adjust.swath import Swath, swath_of
 from roadscan.adjust.tasks.near import PlacedReadings, Sources, placed_readings
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.georeference.sources import Placer, RawSlice, ReadingSource, read_rows
+from roadscan.georeference.sources import Georeferencer, RawSlice, ReadingSource, read_rows
 from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.poses.level import LevelPoses, level_poses
 from roadscan.store.logs import DataFile
@@ -103,7 +103,7 @@ def _swath(plan: SurveyPlan, source: ReadingSource, files: Sequence[DataFile]) -
         RawSlice(source, file.path, [group], source.spans([file.group_spans[group]]), 0)
         for file, group in (groups[k] for k in chosen)
     ]
-    placement = Placer(plan.store, plan.ground, slices, recorded=True).placement(source)
+    placement = Georeferencer(plan.store, plan.ground, slices, recorded=True).placement(source)
     parts: list[PlacedReadings] = []
     for own in slices:
         batch = read_rows(plan.store, source, own.file, own.groups).combine_chunks().to_batches()[0]

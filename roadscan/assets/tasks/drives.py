@@ -17,7 +17,7 @@ from roadscan.georeference.sensor_places import sensor_places
 from roadscan.navigation.tasks.pose_sigma import pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.store.held import held_path
+from roadscan.store.small_tables import small_path
 from roadscan.store.store import bytes_digest
 
 Float64 = npt.NDArray[np.float64]
@@ -74,7 +74,7 @@ def drives_key(plan: AssetPlan) -> str:
         for r in survey.records
         if r.run in runs
     ]
-    path = held_path("corrections")
+    path = small_path("corrections")
     corrections = bytes_digest(survey.store.read_bytes(path)) if survey.store.exists(path) else ""
     return key_of(files, corrections, settings.traverse_sigma_m, settings.traverse_sigma_deg)
 

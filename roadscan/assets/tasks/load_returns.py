@@ -22,7 +22,7 @@ from roadscan.georeference.centre_line import CentreLineBuffer
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, Located, Window, passes_of
 from roadscan.georeference.plan.centre_line import load_buffer
 from roadscan.georeference.sensor_places import sensor_places
-from roadscan.georeference.sources import Placer, RawSlice, ReadingSource, geometry_of
+from roadscan.georeference.sources import Georeferencer, RawSlice, ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.poses.trajectory import Trajectory
 from roadscan.tiles.tasks.tile_plan import TileTask
@@ -99,7 +99,7 @@ class _Block:
         self._centre: CentreLineBuffer | None = None
         if readings.centre_lines is not None:
             self._centre = load_buffer(readings.centre_lines, self._ground.map)
-        self._placer = Placer(self._store, self._ground, readings.slices)
+        self._placer = Georeferencer(self._store, self._ground, readings.slices)
         self._sources = _numbered([one.source for one in readings.slices])
         box = readings.block.box() if readings.block.tiles else (0, 0, 1, 1)
         self._corner, self._window = (box[0], box[1]), Window(*box)

@@ -25,9 +25,9 @@ from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.recorded_pictures import CALIBRATION, keep_file, picture_key
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.store.held import held_path, read_held, write_held
 from roadscan.store.manifest import Manifest
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 
 Report = Callable[[str], None]
@@ -129,7 +129,7 @@ def _write_report(store: Store, manifest: Manifest, unit: str, values: dict[str,
 
 def renew_reports(store: Store, say: Report = lambda _: None) -> None:
     """Write again what is missing or damaged of the last calibration's report and picture."""
-    if not store.exists(held_path("mountings")):
+    if not store.exists(small_path("mountings")):
         return
     manifest = Manifest(store)
     for unit, record in manifest.of(CALIBRATION).items():
@@ -217,7 +217,7 @@ def _prior(survey: Survey, name: str) -> Prior:
 def outdated_calibrations(plan: SurveyPlan) -> list[str]:
     """In words, the calibrations of the table that were made from other logs, rig, settings or code than there are."""
     by_key: dict[str, dict[str, str]] = {}
-    table = read_held(plan.store, "mountings")
+    table = read_small(plan.store, "mountings")
     for row in () if table is None else table.to_pylist():
         if row["calibration"]:
             by_key.setdefault(row["calibration"], {})[row["sensor"]] = row["estimated_at"] or ""
@@ -262,11 +262,11 @@ def _keep(store: Store, rows: list[dict[str, Any]], say: Report) -> None:
     """Put rows into the table; those of the same run, sensor and instant are replaced, all others stay."""
     sort = table_schema("mountings").sort
     try:
-        table = read_held(store, "mountings")
+        table = read_small(store, "mountings")
     except DamagedError:
         table = None
-        aside = store.set_aside(held_path("mountings"))
+        aside = store.set_aside(small_path("mountings"))
         say(f"the damaged table was set aside ({aside}): mountings that only it held have to be calibrated again")
     known = [] if table is None else table.to_pylist()
     places = {tuple(row[c] for c in sort) for row in rows}
-    write_held(store, "mountings", [*(row for row in known if tuple(row[c] for c in sort) not in places), *rows])
+    write_small(store, "mountings", [*(row for row in known if tuple(row[c] for c in sort) not in places), *rows])

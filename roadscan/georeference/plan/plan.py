@@ -20,7 +20,7 @@ from roadscan.georeference.place import HeightLimits
 from roadscan.georeference.plan.centre_line import CentreLines
 from roadscan.georeference.plan.corrections import KnownCorrections
 from roadscan.georeference.plan.road import check_road, road_of
-from roadscan.georeference.sources import Ground, RawSlice, ReadingSource, change_of, load_mountings
+from roadscan.georeference.sources import MapSettings, RawSlice, ReadingSource, change_of, load_mountings
 from roadscan.ingest.ingest import DATA_TABLES
 from roadscan.ingest.one_stamp import one_stamp_logs
 from roadscan.ingest.overlap import Fault, NothingPlacedError, apart_logs
@@ -49,7 +49,7 @@ class SurveyPlan:
     survey: Survey
     store: Store
     records: tuple[LogRecord, ...]
-    ground: Ground
+    ground: MapSettings
     sources: tuple[tuple[ReadingSource, tuple[DataFile, ...]], ...]
     """Each sensor's readings in each run, with their data files."""
     passes: tuple[LanePass, ...]
@@ -114,7 +114,7 @@ def plan_survey(
         -unlimited if f.above_body_min_m is None else f.above_body_min_m,
         unlimited if f.above_body_max_m is None else f.above_body_max_m,
     )
-    ground = Ground(
+    ground = MapSettings(
         map=survey.frame(),
         grid=TileGrid(config.tiles.size_m, config.tiles.cell_m),
         heights=heights,
@@ -192,7 +192,7 @@ def _sources(
     survey: Survey,
     store: Store,
     records: Sequence[LogRecord],
-    ground: Ground,
+    ground: MapSettings,
     calibrated: DatedMountings,
     corrections: KnownCorrections,
 ) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from roadscan.core.errors import DamagedError
 from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
-from roadscan.store.held import held_path, read_held, write_held
+from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 
 
@@ -99,7 +99,7 @@ def _residuals(rows: list[dict[str, Any]]) -> Residuals | None:
 
 
 def _read(store: Store, name: str) -> list[dict[str, Any]]:
-    table = read_held(store, name)
+    table = read_small(store, name)
     return [] if table is None else list(table.to_pylist())
 
 
@@ -110,7 +110,7 @@ def set_damaged_clocks_aside(store: Store) -> list[str]:
         try:
             _read(store, name)
         except DamagedError as error:
-            aside = store.set_aside(held_path(name))
+            aside = store.set_aside(small_path(name))
             done.append(f"the table `{name}` is damaged ({error.arrived}) and was set aside ({aside}): it is made anew")
     return done
 
@@ -154,5 +154,5 @@ def keep_estimates(store: Store, estimates: Sequence[ClockEstimate]) -> None:
         }
         for e in estimates
     ]
-    write_held(store, "clock_residuals", residuals)
-    write_held(store, "clocks", clocks)
+    write_small(store, "clock_residuals", residuals)
+    write_small(store, "clocks", clocks)

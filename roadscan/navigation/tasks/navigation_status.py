@@ -15,8 +15,8 @@ from roadscan.navigation.tasks.clock_tables import clock_picture_path, clock_uni
 from roadscan.navigation.tasks.computed_trajectory import PlannedTrajectory
 from roadscan.navigation.tasks.navigate import plan_trajectories
 from roadscan.navigation.tasks.navigation_pictures import picture_path
-from roadscan.store.held import read_held
 from roadscan.store.logs import NAVIGATION, LogRecord, has_log
+from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store
 
 
@@ -159,7 +159,7 @@ def _clocks(store: Store) -> Iterator[dict[str, Any]]:
 
 
 def _mountings(store: Store) -> Iterator[dict[str, Any]]:
-    table = read_held(store, "mountings")
+    table = read_small(store, "mountings")
     picture = CALIBRATION_PICTURE if store.exists(CALIBRATION_PICTURE) else ""
     for row in [] if table is None else table.to_pylist():
         lever = [row[f"sigma_lever_{a}_m"] for a in ("forward", "right", "down")]

@@ -13,9 +13,9 @@ import pyarrow.compute as pc
 
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.poses.trajectory import STENCIL_KNOTS, Corrections, Trajectory
-from roadscan.store.held import read_held
 from roadscan.store.logs import DataFile
 from roadscan.store.readings.row_groups import read_groups
+from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store
 
 _SIGMA_COLUMNS = ["sigma_north_m", "sigma_east_m", "sigma_down_m"]
@@ -79,13 +79,13 @@ def load_recorded(
 
 def load_corrections(store: Store, run: str) -> Corrections | None:
     """Corrections of a run's trajectory, None where no adjustment wrote any."""
-    rows = read_held(store, "corrections")
+    rows = read_small(store, "corrections")
     return None if rows is None else _corrections(rows, run)
 
 
 def load_all_corrections(store: Store) -> dict[str, Corrections]:
     """Corrections of the trajectories of all runs that have any."""
-    rows = read_held(store, "corrections")
+    rows = read_small(store, "corrections")
     runs = [] if rows is None else sorted(pc.unique(rows.column("run")).to_pylist())
     return {run: found for run in runs if (found := _corrections(rows, run)) is not None}
 

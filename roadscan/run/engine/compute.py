@@ -46,7 +46,7 @@ def damaged_file(error: Exception | None) -> str:
     return (error.file or "") if isinstance(error, DamagedError) else ""
 
 
-class Made(Sequence[T]):
+class LazyTasks(Sequence[T]):
     """Tasks that are made when they are handed out: while workers are at the first, and not all in memory."""
 
     def __init__(self, pieces: Sequence[Any], make: Callable[[Any], T]) -> None:

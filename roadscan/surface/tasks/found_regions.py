@@ -22,7 +22,7 @@ from roadscan.footprints.footprints import FootprintRanges
 from roadscan.georeference.place import Placement, ProfilePoints
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import looks_across, road_key
-from roadscan.georeference.sources import Ground, Placer, RawSlice, ReadingSource, geometry_of, read_rows
+from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource, geometry_of, read_rows
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.compute import Compute
@@ -57,7 +57,7 @@ class RegionPiece:
     """A span of a sensor's profiles in one run; it holds no data."""
 
     store: Store
-    ground: Ground
+    ground: MapSettings
     context: ProductContext
     settings: RegionSettings
     source: ReadingSource
@@ -203,7 +203,7 @@ def regions_of_piece(piece: RegionPiece) -> OutputRecord:
 
 def _found(piece: RegionPiece) -> list[Region]:
     """Regions of a piece, from its coarse model: those that reach into its span, so that margins are told of once."""
-    placer = Placer(piece.store, piece.ground, piece.slices)
+    placer = Georeferencer(piece.store, piece.ground, piece.slices)
     placement = placer.placement(piece.source)
     points = _profiles(piece, placement)
     poses = placement.trajectory.poses(points.epoch_gps_ns)

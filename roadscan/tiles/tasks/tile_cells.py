@@ -18,8 +18,8 @@ import numpy.typing as npt
 from roadscan.core.errors import StoreError
 from roadscan.core.ids import LanePass, TileId
 from roadscan.georeference.place import pass_numbers
-from roadscan.georeference.reading_counts import Fates
-from roadscan.georeference.sources import Placer, RawSlice, geometry_of
+from roadscan.georeference.reading_counts import ReadingCounts
+from roadscan.georeference.sources import Georeferencer, RawSlice, geometry_of
 from roadscan.store.readings.profiles import ProfileReader
 from roadscan.store.readings.returns import ReturnsReader
 from roadscan.store.schema import table_schema
@@ -46,7 +46,7 @@ class CountedTile:
     failure: str = ""
 
 
-def count_tiles(task: TileTask, fates: Fates) -> Iterator[CountedTile]:
+def count_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[CountedTile]:
     """Cells of all tiles of a task that needs no points, in the task's order."""
     yield from _Stretch(task, fates).tiles(range(len(task.block.tiles)))
 
@@ -54,9 +54,9 @@ def count_tiles(task: TileTask, fates: Fates) -> Iterator[CountedTile]:
 class _Stretch:
     """A task at work."""
 
-    def __init__(self, task: TileTask, fates: Fates) -> None:
+    def __init__(self, task: TileTask, fates: ReadingCounts) -> None:
         self._task, self._fates = task, fates
-        self._placer = Placer(task.store, task.ground, task.slices)
+        self._placer = Georeferencer(task.store, task.ground, task.slices)
         self._sources = [_Source.of(task, number) for number in range(len(task.slices))]
         self._accumulator = Accumulator(task.ground.grid, task.block.tiles, [p.pass_id for p in task.passes], _pool())
         self._counting = [self._counting_of(one) for one in task.slices]

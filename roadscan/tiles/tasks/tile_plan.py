@@ -18,8 +18,8 @@ from roadscan.footprints.row_groups import GroupsByTile
 from roadscan.georeference.plan.centre_line import CentreLines
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import Ground, RawSlice
-from roadscan.run.engine.compute import Made
+from roadscan.georeference.sources import MapSettings, RawSlice
+from roadscan.run.engine.compute import LazyTasks
 from roadscan.run.engine.fingerprint import key_of, keys_of
 from roadscan.run.session import Session, found_once
 from roadscan.store.manifest import Manifest
@@ -95,7 +95,7 @@ class TileTask:
     """Everything a worker needs to compute some tiles; it holds no data, and no epoch of single row groups."""
 
     store: Store
-    ground: Ground
+    ground: MapSettings
     block: Block
     """The tiles, and the halo whose points are loaded as well."""
     keys: tuple[str, ...]
@@ -216,7 +216,7 @@ class TilePlan:
         if self._points_of(self.task(Block(()))):
             readings = dict(zip(chosen, self.tiles.readings[numbers].tolist(), strict=True))
             return [self.task(b) for b in cut_blocks(readings, config.block_tiles, config.max_block_readings)]
-        return Made(cut_stretches(self.tiles, numbers, config.size_m, workers), self._stretch)
+        return LazyTasks(cut_stretches(self.tiles, numbers, config.size_m, workers), self._stretch)
 
     def _stretch(self, own: npt.NDArray[np.int64]) -> TileTask:
         """A task over tiles by their numbers, without halo."""

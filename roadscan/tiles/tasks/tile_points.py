@@ -17,8 +17,8 @@ from roadscan.georeference.cloud import TilePoints, fill_of
 from roadscan.georeference.order import canonical_order
 from roadscan.georeference.place import EXTRA_COLUMNS, Placed, Window, passes_of
 from roadscan.georeference.plan.centre_line import load_buffer
-from roadscan.georeference.reading_counts import Fates
-from roadscan.georeference.sources import Ground, Placer, RawSlice, ReadingSource
+from roadscan.georeference.reading_counts import ReadingCounts
+from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource
 from roadscan.poses.trajectory import Trajectory
 from roadscan.tiles.accumulator import TileEvidence
 from roadscan.tiles.tasks.tile_plan import TileTask
@@ -39,17 +39,17 @@ class LoadedTile:
 
 def load_points(task: TileTask) -> Iterator[tuple[TileId, TilePoints]]:
     """Points of every tile of the block and its halo that holds any: filtered, in canonical order, tile by tile."""
-    for loaded in load_tiles(task, Fates()):
+    for loaded in load_tiles(task, ReadingCounts()):
         if loaded.points is not None:
             yield loaded.tile, loaded.points
 
 
-def load_tiles(task: TileTask, fates: Fates) -> Iterator[LoadedTile]:
+def load_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[LoadedTile]:
     """As :func:`load_points`, with the points that filters leave out, where the survey keeps them marked."""
     box = task.block.box()
     buffer = None if task.centre_lines is None else load_buffer(task.centre_lines, task.ground.map)
     parts = _Parts()
-    placer = Placer(task.store, task.ground, task.slices)
+    placer = Georeferencer(task.store, task.ground, task.slices)
     owners = {(s, k): tile for s, k, tile in task.owned}
     for number, one in enumerate(task.slices):
         own = [p for p in task.passes if p.run == one.source.run]
@@ -92,7 +92,7 @@ def _loaded(
     rows: npt.NDArray[np.int32],
     joined: _Joined,
     buffer: CentreLineBuffer | None,
-    ground: Ground,
+    ground: MapSettings,
 ) -> LoadedTile:
     """Points of a tile at `rows` of the block, those that filters leave out apart."""
     near = None if buffer is None else near_lines(tile, joined.quanta[rows], buffer, ground)
@@ -242,7 +242,7 @@ def _lacks(parts: list[Placed], column: str) -> npt.NDArray[np.bool_]:
 
 
 def near_lines(
-    tile: TileId, quanta: npt.NDArray[np.int32], buffer: CentreLineBuffer, ground: Ground
+    tile: TileId, quanta: npt.NDArray[np.int32], buffer: CentreLineBuffer, ground: MapSettings
 ) -> npt.NDArray[np.bool_]:
     """Which points (n, …) of a tile lie in the buffer about the centre lines; `quanta` from the tile's corner."""
     b = ground.grid.bounds(tile)

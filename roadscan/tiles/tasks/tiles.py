@@ -13,7 +13,7 @@ import numpy as np
 
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.core.ids import TileId
-from roadscan.georeference.reading_counts import Fates
+from roadscan.georeference.reading_counts import ReadingCounts
 from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.records import OutputRecord, Packed, Row, table_of
@@ -119,7 +119,7 @@ def compute_tiles(task: TileTask) -> TaskResult:
     """Compute the tiles of a task and write their files (runs on a worker)."""
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
-    fates = Fates()
+    fates = ReadingCounts()
     waiting = dict(zip(task.block.tiles, task.keys, strict=True))
     empty: list[tuple[TileId, str]] = []
     with task.store.scratch() as folder:
@@ -143,7 +143,7 @@ def compute_tiles(task: TileTask) -> TaskResult:
     return TaskResult.of([_with_fates(r, fates) for r in records], failures)
 
 
-def computed_tiles(task: TileTask, fates: Fates) -> Iterator[ComputedTile]:
+def computed_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[ComputedTile]:
     """Tiles of a task: counted from the readings, or from points where these are needed."""
     if not task.needs_points:
         for counted in count_tiles(task, fates):
@@ -215,7 +215,7 @@ def _known(sigma_m: float) -> float | None:
     return sigma_m if np.isfinite(sigma_m) else None
 
 
-def _with_fates(record: OutputRecord, fates: Fates) -> OutputRecord:
+def _with_fates(record: OutputRecord, fates: ReadingCounts) -> OutputRecord:
     """A tile's record, with what became of the readings that it tells of."""
     told = fates.of(TileId.parse(record.unit)) if record.product == TILE else {}
     if not told:

@@ -210,7 +210,11 @@ def test_any_damaged_byte_is_told_or_changes_nothing(folder: Store) -> None:
     footer = len(whole) - int.from_bytes(whole[-8:-4], "little") - 8
     unread = metadata.column(3).data_page_offset  # from here on, pages of columns that are not wanted
     seal = range(whole.index(b"roadscan.footer_crc32") - 1, len(whole))  # without its name, another writer's file
-    looked_at = [*range(4, unread), *range(footer, seal.start, 5), *range(seal.start, seal.stop)]
+    looked_at = [
+        *range(4, unread),
+        *range(footer, seal.start, 5),
+        *range(seal.start, seal.stop),
+    ]
     path, rng, told = Path(folder.path(FILE)), np.random.default_rng(0), 0
     path.parent.mkdir(parents=True)
     for at in looked_at:

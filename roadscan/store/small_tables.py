@@ -14,13 +14,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, StoreError
+from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.schema import table_schema
-from roadscan.store.sealed import seal, unseal
 from roadscan.store.store import Store, bytes_digest
 
 _DIGESTS: Final = "manifest/held.json"
 
-WAY_OUT: Final = {
+REPAIR_HINT: Final = {
     "clocks": "`roadscan clocks` (or `roadscan run`) estimates the clocks anew",
     "clock_residuals": "`roadscan clocks` (or `roadscan run`) estimates the clocks anew",
     "mountings": "`roadscan calibrate` makes it anew of the survey file's evidence; if it is removed, the rig file's "
@@ -31,12 +31,12 @@ WAY_OUT: Final = {
 """What mends each of the tables where it is damaged."""
 
 
-def held_path(name: str) -> str:
+def small_path(name: str) -> str:
     """File of such a table, relative to the survey's root."""
     return f"tables/{name}/part-00000.parquet"
 
 
-def read_held(store: Store, name: str) -> pa.Table | None:
+def read_small(store: Store, name: str) -> pa.Table | None:
     """The table, None where there is none.
 
     Raises
@@ -46,10 +46,10 @@ def read_held(store: Store, name: str) -> pa.Table | None:
     StoreError
         It cannot be read.
     """
-    path = held_path(name)
+    path = small_path(name)
     if not store.exists(path):
         return None
-    change = WAY_OUT[name]
+    change = REPAIR_HINT[name]
     table = store.read_table(path, change=change)
     missing = [c.name for c in table_schema(name).columns if not c.nullable and c.name not in table.column_names]
     if missing:
@@ -61,7 +61,7 @@ def read_held(store: Store, name: str) -> pa.Table | None:
     return table
 
 
-def write_held(store: Store, name: str, rows: Iterable[Mapping[str, Any]]) -> None:
+def write_small(store: Store, name: str, rows: Iterable[Mapping[str, Any]]) -> None:
     """Replace the table; columns that a row does not name are null."""
     schema = table_schema(name)
     full = [{c.name: row.get(c.name) for c in schema.columns} for row in rows]
@@ -71,18 +71,18 @@ def write_held(store: Store, name: str, rows: Iterable[Mapping[str, Any]]) -> No
     content = sink.getvalue().to_pybytes()
     known = _known(store)
     both = {"bytes": len(content), "digest": bytes_digest(content)}
-    store.write_bytes(_DIGESTS, seal({**known, name: {**both, "before": known.get(name, {}).get("digest")}}))
-    store.write_bytes(held_path(name), content)
+    store.write_bytes(_DIGESTS, checked_json({**known, name: {**both, "before": known.get(name, {}).get("digest")}}))
+    store.write_bytes(small_path(name), content)
 
 
-def held_records(store: Store) -> dict[str, tuple[int, str]]:
+def small_records(store: Store) -> dict[str, tuple[int, str]]:
     """Bytes and digest of the small tables that roadscan wrote, by their paths.
 
     One whose writing was cut short is the one before it.
     """
     found: dict[str, tuple[int, str]] = {}
     for name, of in _known(store).items():
-        path = held_path(name)
+        path = small_path(name)
         if store.exists(path) and bytes_digest(content := store.read_bytes(path)) == of.get("before"):
             found[path] = (len(content), str(of["before"]))
         else:
@@ -95,6 +95,10 @@ def _known(store: Store) -> dict[str, Any]:
     if not store.exists(_DIGESTS):
         return {}
     try:
-        return {name: of for name, of in unseal(store.read_bytes(_DIGESTS)).items() if name in WAY_OUT and dict(of)}
+        return {
+            name: of
+            for name, of in parse_checked(store.read_bytes(_DIGESTS)).items()
+            if name in REPAIR_HINT and dict(of)
+        }
     except (StoreError, ValueError, TypeError):
         return {}

@@ -12,12 +12,12 @@ _SEAL: Final = b',\n "checksum": "%b"'
 _END: Final = b"\n}"
 
 
-def seal(values: Mapping[str, Any]) -> bytes:
+def checked_json(values: Mapping[str, Any]) -> bytes:
     """An object that is not empty, with its checksum."""
     return _sealed(json.dumps(values, indent=1, sort_keys=True).encode())
 
 
-def unseal(content: bytes) -> dict[str, Any]:
+def parse_checked(content: bytes) -> dict[str, Any]:
     """The object without its checksum, if it has one, as files of older versions have not; ValueError for damage."""
     mark, _, _ = _SEAL.partition(b"%b")
     start = content.rfind(mark)

@@ -23,8 +23,8 @@ from roadscan.store.logs import (
     write_log_record,
 )
 from roadscan.store.manifest import Manifest, OutputRecord
-from roadscan.store.mend import mend_records
 from roadscan.store.records import Packed, sound_rows, table_of
+from roadscan.store.repair_records import repair_records
 from roadscan.store.store import Store, bytes_digest
 
 
@@ -78,14 +78,14 @@ def test_what_a_damaged_part_may_have_replaced_is_not_believed(
     if killed:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(Store, "set_aside", _killed)
-            mend_records(store)
+            repair_records(store)
     said: list[str] = []
-    mend_records(store, said.append)
+    repair_records(store, said.append)
     assert Manifest(store).of("pic") == {"a": first["a"], "d": last}
     assert store.read_bytes(f"damaged/{path}") == content
     assert store.exists("manifest/changing")  # files without a record go with the next whole run
     assert len(said) == 1 and f"it was set aside (damaged/{path})" in said[0]
-    mend_records(store, said.append)
+    repair_records(store, said.append)
     assert len(said) == 1
 
 
@@ -139,7 +139,7 @@ def test_a_damaged_log_record_is_mended_by_its_copy(store: Store, damage: str, c
     with pytest.raises(DamagedError, match="the log record is damaged"):
         read_log_records(store)
     said: list[str] = []
-    mend_records(store, said.append)
+    repair_records(store, said.append)
     assert len(said) == 1 and f"damaged/{path}" in said[0]
     assert read_log_records(store) == ([first, second] if copy == "there" else [second])
     assert has_log(store, "one") == (copy == "there")
@@ -164,10 +164,10 @@ def test_records_of_older_versions_stay_readable_and_get_a_copy(store: Store) ->
     text = json.dumps(dataclasses.asdict(record), indent=1, sort_keys=True).encode()
     store.write_bytes(record_path("one"), text)
     assert read_log_records(store) == [record]
-    mend_records(store)
+    repair_records(store)
     assert store.read_bytes(copy_path("one")) == text
     store.write_bytes(record_path("one"), text[:-5])
-    mend_records(store)
+    repair_records(store)
     assert read_log_records(store) == [record]
     retire_log(store, record)
     assert not store.exists(copy_path("one"))
@@ -189,8 +189,8 @@ def test_what_cannot_be_read_stays_where_it_is(tmp_path: Path, path: str, monkey
     with monkeypatch.context() as patch:
         patch.setattr(type(store.fs), "cat_file", lambda _, asked: refusing(asked))
         with pytest.raises(StoreError, match="cannot be read: Permission denied; see to its rights") as raised:
-            mend_records(store)
+            repair_records(store)
     assert raised.value.file == store.path(path)
     assert store.exists(path) and not store.exists("damaged")
-    mend_records(store)
+    repair_records(store)
     assert Manifest(store).get("pic", "a") is not None

@@ -23,7 +23,7 @@ from roadscan.store.store import Store, digest_holds
 Report = Callable[[str], None]
 
 
-def mend_records(store: Store, report: Report = lambda _: None) -> None:
+def repair_records(store: Store, report: Report = lambda _: None) -> None:
     """Set damaged records aside, by whoever has the store's lock; `report` hears of each, and what it costs."""
     _mend_logs(store, report)
     _mend_manifest(store, report)

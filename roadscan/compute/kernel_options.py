@@ -11,6 +11,7 @@ from typing import Any
 import numpy.typing as npt
 
 from roadscan.compute.compiler import cache_folder, compiled
+from roadscan.core.kept import kept
 
 Kernel = Callable[..., Any]
 
@@ -67,13 +68,25 @@ def _folder_of(function: Kernel) -> str:
 @functools.cache
 def _folder_of_source(source: str) -> str:
     """Folder for the compiled kernels of a source file: it changes with the file and the kernels that it imports."""
-    unseen, seen = [Path(source), Path(__file__)], set[Path]()
+    file, library = Path(source), Path(__file__).parents[1]
+    if not file.is_relative_to(library):
+        return cache_folder("kernels", _reached(file))
+    names = kept(
+        f"kernels of {file.relative_to(library).as_posix()}",
+        lambda: "\n".join(sorted(one.relative_to(library).as_posix() for one in _reached(file))),
+    )
+    return cache_folder("kernels", [library / name for name in names.split("\n")])
+
+
+def _reached(file: Path) -> set[Path]:
+    """The file, the kernel files that it imports, those that these import, and so on, with this file."""
+    unseen, seen = [file, Path(__file__)], set[Path]()
     while unseen:
-        file = unseen.pop()
-        if file not in seen:
-            seen.add(file)
-            unseen += _imported_kernels(file)
-    return cache_folder("kernels", seen)
+        one = unseen.pop()
+        if one not in seen:
+            seen.add(one)
+            unseen += _imported_kernels(one)
+    return seen
 
 
 @functools.cache

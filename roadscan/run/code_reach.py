@@ -34,6 +34,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
 
+from roadscan.core.kept import kept
 from roadscan.core.private_folder import UnsafeFolderError, cache_place, check_private, make_private
 
 Place: TypeAlias = tuple[str, str | None]
@@ -44,7 +45,9 @@ Brought: TypeAlias = tuple[str, str, str | None]
 CARRIERS: Final = (
     "roadscan.compute.compiler",
     "roadscan.compute.kernel_options",
+    "roadscan.core.kept",
     "roadscan.core.plugins",
+    "roadscan.run.code_reach",
     "roadscan.run.engine.compute",
     "roadscan.run.engine.fingerprint",
     "roadscan.core.errors",
@@ -86,6 +89,12 @@ def name_of(kind: type) -> str:
 
 @functools.cache
 def _digest_of(entries: tuple[str, ...]) -> str:
+    if {"roadscan"} != _OWN:  # code of other packages counts too
+        return _computed(entries)
+    return kept(f"digest of {' '.join(entries)}", lambda: _computed(entries))
+
+
+def _computed(entries: tuple[str, ...]) -> str:
     digest = hashlib.blake2b(digest_size=8)
     for text in reached_code(entries).values():
         digest.update(f"{text}\0".encode())

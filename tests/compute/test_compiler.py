@@ -156,6 +156,7 @@ kernels = Path("roadscan/feature/kernels").resolve()
 for file in sorted(kernels.rglob("*.py")):
     print(file.relative_to(kernels), _folder_of_source(str(file)))
 """
+CORE = ("__init__.py", "kept.py", "private_folder.py")
 COMPUTE = ("__init__.py", "compiler.py", "kernel_options.py")
 CHAIN = {
     "rooms/first.py": "from roadscan.feature.kernels.rooms import second\n",
@@ -170,7 +171,13 @@ CHAIN = {
 @pytest.mark.parametrize("changed", CHAIN)
 def test_a_changed_kernel_changes_the_folder_of_all_that_import_it(tmp_path: Path, changed: str) -> None:
     """Whatever the form of the import and the depth of the folder; no other kernel is compiled again."""
-    for name in ("__init__.py", "core/__init__.py", "core/private_folder.py", *(f"compute/{n}" for n in COMPUTE)):
+    for name in (
+        "__init__.py",
+        "core/__init__.py",
+        "core/private_folder.py",
+        "core/kept.py",
+        *(f"compute/{n}" for n in COMPUTE),
+    ):
         (tmp_path / "roadscan" / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / "roadscan" / name, tmp_path / "roadscan" / name)
     kernels = tmp_path / "roadscan/feature/kernels"

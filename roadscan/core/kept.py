@@ -1,0 +1,51 @@
+"""What follows from roadscan's sources alone: computed once, and kept on the disk until one of them changes."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import secrets
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from roadscan.core.private_folder import UnsafeFolderError, cache_place, check_private, make_private
+
+
+def kept(name: str, make: Callable[[], str]) -> str:
+    """The text that `make` returns, from the disk where the same sources gave it before.
+
+    Parameters
+    ----------
+    name : what the text is of; one name stands for one text, whatever process asks.
+    """
+    folder = _folder()
+    if folder is None:
+        return make()
+    file = folder / hashlib.blake2b(name.encode(), digest_size=12).hexdigest()
+    with contextlib.suppress(OSError):
+        return file.read_text(encoding="utf-8")
+    text = make()
+    scratch = file.with_suffix(f".{secrets.token_hex(4)}")
+    with contextlib.suppress(OSError):
+        scratch.write_text(text, encoding="utf-8")
+        scratch.replace(file)
+    return text
+
+
+@functools.cache
+def _folder() -> Path | None:
+    """Folder of what was kept of these sources; None where it cannot be written, or others could write to it."""
+    library = Path(__file__).parents[1]
+    digest = hashlib.blake2b(sys.version.encode(), digest_size=8)
+    for file in sorted(library.rglob("*.py")):
+        content = file.read_bytes()
+        digest.update(f"{file.relative_to(library).as_posix()}\0{len(content)}\0".encode() + content)
+    folder = cache_place() / f"of-sources-{digest.hexdigest()}"
+    try:
+        make_private(folder)
+        check_private(folder)
+    except (OSError, UnsafeFolderError):
+        return None
+    return folder

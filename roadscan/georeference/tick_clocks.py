@@ -26,9 +26,10 @@ from roadscan.navigation.wheel_ticks import (
     judge_ticks,
 )
 from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.bundles import cut_bundles, run_bundles
 from roadscan.run.engine.compute import Compute
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.stage import StageState
 from roadscan.store.logs import DataFile, LogRecord
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
@@ -103,6 +104,15 @@ def check_tick_clocks(
     stale = [task for task in tasks if not manifest.is_current(PRODUCT, task.unit, task.key)]
     failed = run_bundles(tick_clock, stale, lambda task: task.rows, _BUNDLE_ROWS, manifest, compute, report)
     return [(task.unit, reason) for task, reason in failed]
+
+
+def tick_state(plan: SurveyPlan, manifest: Manifest, workers: int) -> StageState:
+    """Sensors of runs whose ticks are compared with poses, and those whose are to be."""
+    tasks = _tasks(plan)
+    state = StageState.of(manifest, [(PRODUCT, task.unit, task.key) for task in tasks])
+    due = [task.rows for task in tasks if not manifest.is_current(PRODUCT, task.unit, task.key)]
+    state.tasks = len(cut_bundles(due, _BUNDLE_ROWS, workers))
+    return state
 
 
 def _tasks(plan: SurveyPlan) -> list[TickTask]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from roadscan.adjust.settings import AdjustConfig
-from roadscan.adjust.tasks.adjustment import adjust_survey, is_current, withdraw
+from roadscan.adjust.tasks.adjustment import adjust_survey, is_current, solution_key, why_due, withdraw
 from roadscan.adjust.tasks.hand_ties import read_hand_ties
 from roadscan.adjust.tasks.outcome import FOLDER, TABLES, known_findings, known_lines
 from roadscan.core.errors import ConfigError, RoadscanError
@@ -26,6 +27,13 @@ class Adjust(Stage):
     name = "adjust"
     title = "corrections of the poses, from passes that overlap and from ground control"
     after = ("footprints",)
+    section = "adjust"
+    units = "solutions"
+    reads = (
+        "scans", "returns", "cloud", "trajectory", "trajectory_accuracy", "control_points", "control_lines", "clocks",
+        "mountings", "footprints",
+    )  # fmt: skip
+    writes = ("ties", "control_sightings", *TABLES, "corrections", "mounting_corrections")
 
     def run(self, session: Session) -> None:
         """Adjust where evidence, settings or code are others than those of the last solution."""
@@ -60,12 +68,17 @@ class Adjust(Stage):
 
     def state(self, session: Session) -> StageState:
         """Whether the corrections are those of the survey as it is, and what they are worth."""
-        due = int(not is_current(plan_of(session), session.manifest))
-        notes = []
-        if due and AdjustConfig.of(session.survey).on:
-            notes = ["the adjustment is due: it may make more tiles stale than these"]
-        lines = known_lines(session.manifest)
-        return StageState(1 - due, due, next_run={self.name: due}, notes=notes, lines=lines)
+        plan, asked = plan_of(session), self.is_asked(session.survey)
+        why = why_due(plan, session.manifest)
+        notes = ["the adjustment is due: it may make more tiles stale than these"] if why and asked else []
+        return StageState(
+            int(not why),
+            int(bool(why)),
+            why=Counter([why] if why else []),
+            keys=[solution_key(plan)] if asked else [],
+            notes=notes,
+            lines=known_lines(session.manifest),
+        )
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """What the last solution doubts."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from roadscan.assets.kind import AssetKind
 from roadscan.assets.kinds.lane_line import LaneLine
 from roadscan.assets.paint.contrast import ROUGHEST_M
 from roadscan.assets.tasks.drives import drives_key, load_drives
@@ -49,6 +50,16 @@ class Assets(Stage):
     name = "assets"
     title = "what stands on, beside and over the road: ground, kerbs, markings, signs, poles, by kind"
     after = ("condition",)
+    section = "assets"
+    units = "outputs"
+    reads = (
+        "scans", "returns", "cloud", "trajectory", "trajectory_accuracy", "clocks", "mountings", "mounting_corrections",
+        "corrections", "footprints", "reference_lines", "images",
+    )  # fmt: skip
+    writes = (
+        "intensity_samples", "intensity_gains", "asset_evidence", "asset_screens", "asset_visibility", "asset_objects",
+        "classified_points", "bare_earth", "ground_sections", AssetKind,
+    )  # fmt: skip
 
     def run(self, session: Session) -> None:
         """Compute what is missing or stale."""
@@ -173,8 +184,11 @@ class Assets(Stage):
         if not stale:
             stale = len(due_joins(plan, manifest)) or self._files_due(session, plan)
         current = sum(made.get(name, 0) for name in (EVIDENCE, OBJECTS, TABLES))
-        next_run = {"asset squares": len(work.squares)} if work.squares else {}
-        return StageState(current, stale, next_run=next_run or ({"assets": stale} if stale else {}))
+        tasks = evidence_tasks(plan, work.squares, current_gains(work.gains, manifest), session.compute.workers)
+        state = StageState(current, stale)
+        if work.squares:
+            state.tasks, state.raw_bytes = len(tasks), sum(t.load.readings.raw_bytes for t in tasks)
+        return state
 
     def _files_due(self, session: Session, plan: AssetPlan) -> int:
         manifest, context = session.manifest, plan.context

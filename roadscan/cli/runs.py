@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadscan.cli.arguments import USUAL, AsJson, Dashboard, Scheduler, SurveyFile, Workers, surveys_for
-from roadscan.cli.state import found_status, print_status
+from roadscan.cli.state import plan
 from roadscan.cli.survey import Where, run_and_sum_up, run_survey, stages_named, sum_up
 from roadscan.cli.terminal import print_table
 
@@ -24,13 +24,11 @@ def run(
     dashboard: Dashboard = False,
     as_json: AsJson = False,
     flow: Annotated[bool, typer.Option("--flow", help="Record a Prefect flow run even without an API.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done: `plan`.")] = False,
 ) -> None:
     """Run a survey: all stages, from ingest to condition and assets, and the report. Does only what is due."""
     if dry_run:
-        found = found_status(survey_file)
-        print_status(found, survey_file)
-        raise typer.Exit(2 if found.would_fail else 0)
+        plan(survey_file, workers, as_json)
     if flow or os.environ.get("PREFECT_API_URL"):
         from flows.conduct import require_api
         from flows.survey import survey

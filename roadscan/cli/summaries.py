@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from roadscan.core.counted import counted
+from roadscan.core.counted import counted, size_in_words
 
 if TYPE_CHECKING:
     from roadscan.core.survey import Survey
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 _MOST_REASONS = 10
 _MOST_FINDINGS = 20
 _WIDTH = 14
-_UNITS = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 
 
 def print_summary(survey: Survey, store: Store, *, as_json: bool = False, beside: dict[str, Any] | None = None) -> None:
@@ -53,7 +52,7 @@ def _lines(found: SurveySummary) -> Iterator[tuple[str, str]]:
             break
         yield "left out" if one.left_out else "doubtful", one.line
     for product, files in found.files.items():
-        yield product, f"{counted(files.files, 'file')}, {_size(files.bytes)}, in {files.folder}"
+        yield product, f"{counted(files.files, 'file')}, {size_in_words(files.bytes)}, in {files.folder}"
     for failure in found.failures:
         yield "failed", f"{failure['stage']} {failure['unit']}: {failure['reason']}"
     if not found.failures:
@@ -87,10 +86,3 @@ def _of_tiles(tiles: TilesSummary) -> Iterator[tuple[str, str]]:
 
 def _spread(values: Spread) -> str:
     return f"median {values.median * 1e3:.2f} mm, largest {values.largest * 1e3:.2f} mm"
-
-
-def _size(size: int) -> str:
-    for unit, name in _UNITS:
-        if size >= unit:
-            return f"{size / unit:,.1f} {name}"
-    return f"{size:,} bytes"

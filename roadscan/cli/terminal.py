@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,12 @@ from typing import Any
 import typer
 
 
-def print_table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
-    """Print rows below their head, in columns as wide as they need."""
+def print_table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], numbers: Collection[str] = ()) -> None:
+    """Print rows below their head, in columns as wide as they need; those of `numbers` end on one line."""
     widths = [max(len(str(r[i])) for r in [head, *rows]) for i in range(len(head))]
+    aligned = [str.rjust if name in numbers else str.ljust for name in head]
     for row in [head, tuple("─" * w for w in widths), *rows]:
-        typer.echo("  ".join(str(v).ljust(w) for v, w in zip(row, widths, strict=True)).rstrip())
+        typer.echo("  ".join(to(str(v), w) for v, w, to in zip(row, widths, aligned, strict=True)).rstrip())
 
 
 def print_whole(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:

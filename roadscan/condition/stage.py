@@ -53,6 +53,14 @@ class Condition(Stage):
     name = "condition"
     title = "the road's condition along its lanes: roughness, ruts, slopes, cracks, by section"
     after = ("surfaces", "products")
+    section = "condition"
+    units = "outputs"
+    reads = ("cells", "surface", "cracks", "trajectory", "trajectory_accuracy")
+    writes = (
+        "reference_lines", "lanes", "profiles_longitudinal", "cross_sections", "lane_texture", "lane_line_offsets",
+        "road_edge_offsets", "road_surface", "roughness_regions", "roughness_sections", "condition_values",
+        "condition_sections", "condition_tiles", "ravelling_patches",
+    )  # fmt: skip
 
     def run(self, session: Session) -> None:
         """Compute what is missing or stale."""
@@ -124,7 +132,7 @@ class Condition(Stage):
         units = len(work.stretches) + len(work.edges) + len(work.pieces) + len(work.patches)
         units += sum(len(g.indices) for g in work.groups)
         current = units - stale
-        return StageState(max(current, 0), stale, next_run={"condition": stale} if stale else {})
+        return StageState(max(current, 0), stale)
 
     def _stale(self, work: ConditionWork) -> int:
         return (

@@ -2,7 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Final
+
+_SIZES: Final = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
+"""Units of sizes, the largest first."""
+
 
 def counted(number: int, one: str) -> str:
     """A number of things, such as ``1 file`` and ``1,000 files``."""
     return f"{number:,} {one}{'' if number == 1 else 's'}"
+
+
+def size_in_words(size: int) -> str:
+    """A size in bytes, such as ``1,234.5 GB``."""
+    for unit, name in _SIZES:
+        if size >= unit:
+            return f"{size / unit:,.1f} {name}"
+    return f"{size:,} bytes"

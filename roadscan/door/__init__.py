@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from roadscan.inventory.inventory import Inventory
     from roadscan.run.selection import Selection
     from roadscan.store.store import Store
+    from roadscan.survey.plan import RunPlan
     from roadscan.survey.status import Status
 
 __all__ = ["LogTables", "MadeProduct", "OpenSurvey", "open_survey", "read_log"]
@@ -113,10 +114,16 @@ class OpenSurvey:
         return self.status()
 
     def status(self) -> Status:
-        """What is ingested, current, stale and failed, and what the next run would do."""
+        """What is ingested, current, stale and failed."""
         from roadscan.survey.status import survey_status
 
         return survey_status(self.session)
+
+    def plan(self, workers: int | None = None) -> RunPlan:
+        """What the next run would do on so many workers, stage by stage; reads no log through and writes nothing."""
+        from roadscan.survey.plan import run_plan
+
+        return run_plan(self.survey, self.store, workers)
 
     def verify(self) -> list[str]:
         """The faults of all files that the store should hold, each of which is read and compared with its record; and

@@ -24,10 +24,11 @@ from roadscan.georeference.reach import Touched, joined
 from roadscan.georeference.reading_counts import fate_words, reading_counts
 from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice
 from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.bundles import cut_bundles, run_bundles
 from roadscan.run.engine.compute import Compute
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session, found_once
+from roadscan.run.stage import StageState
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, bytes_digest
@@ -98,6 +99,16 @@ def index_footprints(
 def stale_footprints(plan: SurveyPlan, manifest: Manifest) -> list[FootprintTask]:
     """A task for each data file whose footprints are missing or stale."""
     return _stale(_tasks(plan), manifest)
+
+
+def footprint_state(plan: SurveyPlan, manifest: Manifest, workers: int) -> StageState:
+    """Data files of which it is known, or not known any more, which tiles they touch."""
+    tasks = _tasks(plan)
+    stale = _stale(tasks, manifest)
+    state = StageState.of(manifest, [(PRODUCT, t.slice.file, t.key) for t in tasks])
+    state.tasks = len(cut_bundles([t.work for t in stale], _ROW_GROUPS, workers))
+    state.raw_bytes = sum(t.slice.bytes for t in stale)
+    return state
 
 
 def _tasks(plan: SurveyPlan) -> list[FootprintTask]:

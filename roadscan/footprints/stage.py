@@ -9,13 +9,13 @@ from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import (
     PRODUCT,
+    footprint_state,
     footprints_of,
     index_footprints,
-    stale_footprints,
     unplaced_logs,
 )
 from roadscan.georeference.plan.plan import empty_passes, plan_of
-from roadscan.georeference.tick_clocks import check_tick_clocks, tick_findings
+from roadscan.georeference.tick_clocks import check_tick_clocks, tick_findings, tick_state
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
@@ -34,6 +34,9 @@ class Footprints(Stage):
     name = "footprints"
     title = "which raw block touches which tile"
     after = ("navigate",)
+    units = "data files, clocks"
+    reads = ("scans", "returns", "cloud", "trajectory", "clocks", "mountings")
+    writes = ("footprints",)
 
     def run(self, session: Session) -> None:
         """Index the data files whose footprints are missing or stale."""
@@ -47,18 +50,19 @@ class Footprints(Stage):
         session.failed(self.name, [*found, *unplaced_logs(plan, manifest)])
 
     def state(self, session: Session) -> StageState:
-        """Data files of which it is not known, or not known any more, which tiles they touch."""
-        stale, current = len(stale_footprints(plan_of(session), session.manifest)), len(session.manifest.of(PRODUCT))
-        state = StageState(current - stale, stale, next_run={"footprints": stale})
+        """Data files of which it is not known, or not known any more, which tiles they touch; and clocks by ticks."""
+        asked = plan_of(session), session.manifest, session.compute.workers
+        state = footprint_state(*asked)
         state.notes = outdated_calibrations(plan_of(session))
         state.faults = faults_of_plan(session)
-        if not current:
-            state.next_run["raw_bytes"] = plan_of(session).raw_bytes
+        if not session.manifest.of(PRODUCT):
             state.hides_rest = True
-        elif stale:
+        elif state.stale:
             state.notes.append(
-                f"{stale:,} data files have no footprints, or old ones: more tiles than these may be due"
+                f"{state.stale:,} data files have no footprints, or old ones: more tiles than these may be due"
             )
+        state.join(tick_state(*asked))
+        state.raw_bytes = state.raw_bytes or None  # clocks alone: of their rows two columns are read
         return state
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:

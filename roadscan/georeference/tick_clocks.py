@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Final, NamedTuple
@@ -26,9 +26,10 @@ from roadscan.navigation.wheel_ticks import (
     judge_ticks,
 )
 from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.bundles import cut_bundles, run_bundles
 from roadscan.run.engine.compute import Compute
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.stage import StageState
 from roadscan.store.logs import DataFile, LogRecord
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
@@ -74,7 +75,10 @@ _NAMED: Final = 3
 
 @dataclass(frozen=True)
 class TickTask:
-    """Profiles of a sensor in a run; it holds no data."""
+    """Profiles of a log; it holds no data."""
+
+    unit: str
+    """Its name in the manifest."""
 
     store: Store
     source: ReadingSource
@@ -82,11 +86,6 @@ class TickTask:
     files: tuple[DataFile, ...]
     max_gap_s: float
     key: str
-
-    @property
-    def unit(self) -> str:
-        """Its name in the manifest."""
-        return f"{self.source.run}/{self.source.sensor}"
 
     @property
     def rows(self) -> int:
@@ -105,16 +104,32 @@ def check_tick_clocks(
     return [(task.unit, reason) for task, reason in failed]
 
 
+def tick_state(plan: SurveyPlan, manifest: Manifest, workers: int) -> StageState:
+    """Sensors of runs whose ticks are compared with poses, and those whose are to be."""
+    tasks = _tasks(plan)
+    state = StageState.of(manifest, [(PRODUCT, task.unit, task.key) for task in tasks])
+    due = [task.rows for task in tasks if not manifest.is_current(PRODUCT, task.unit, task.key)]
+    state.tasks = len(cut_bundles(due, _BUNDLE_ROWS, workers))
+    return state
+
+
 def _tasks(plan: SurveyPlan) -> list[TickTask]:
     code = code_digest("roadscan.georeference.tick_clocks:tick_clock")
-    return [
-        TickTask(
-            plan.store, source, source.trajectory, tuple(sorted(files, key=lambda file: file.span or (0, 0))),
-            plan.ground.max_gap_s, key_of(code, source.key, [file.digest for file in files]),
-        )
-        for source, files in plan.sources
-        if source.table == "scans" and source.trajectory is not None
-    ]  # fmt: skip
+    tasks: list[TickTask] = []
+    logs: Counter[str] = Counter()
+    for source, files in plan.sources:
+        if source.table != "scans" or source.trajectory is None:
+            continue
+        sensor = f"{source.run}/{source.sensor}"
+        logs[sensor] += 1  # of a sensor that wrote several logs in a run, the others have a number
+        tasks.append(
+            TickTask(
+                sensor if logs[sensor] == 1 else f"{sensor}/{logs[sensor]}", plan.store, source, source.trajectory,
+                tuple(sorted(files, key=lambda file: file.span or (0, 0))), plan.ground.max_gap_s,
+                key_of(code, source.key, [file.digest for file in files]),
+            )
+        )  # fmt: skip
+    return tasks
 
 
 def tick_clock(task: TickTask) -> OutputRecord:

@@ -65,10 +65,11 @@ Logs: TypeAlias = tuple[list[PlannedLog], list[UnplannedLog]]
 """Logs that can be planned, and those that cannot."""
 
 
-def plan_logs(survey: Survey, store: Store) -> Logs:
+def plan_logs(survey: Survey, store: Store, *, only_looks: bool = False) -> Logs:
     """All logs of the survey file, trajectories first, with their keys; and those that cannot be planned.
 
-    Bytes are read only to fingerprint them. A log that was ingested and then moved away keeps its fingerprint.
+    Bytes are read only to fingerprint them. A log that was ingested and then moved away keeps its fingerprint. Who
+    `only_looks` reads none: a log that the store does not know by its size and time counts as not ingested.
     """
     listed: list[tuple[str, LogConfig | ControlConfig]] = [
         (run.id, log) for run in survey.config.runs for log in run.logs
@@ -76,7 +77,7 @@ def plan_logs(survey: Survey, store: Store) -> Logs:
     listed += [(CONTROL_RUN, control) for control in survey.config.control]
     planned: list[PlannedLog] = []
     unplanned: list[UnplannedLog] = []
-    with open_sources(store, survey.folder) as sources:
+    with open_sources(store, survey.folder, only_looks=only_looks) as sources:
         opened = [_open_log(survey, config, sources) for _, config in listed]
         for (run, config), log in zip(listed, opened, strict=True):
             try:
@@ -234,4 +235,4 @@ def log_source(
 @found_once
 def logs_of(session: Session) -> Logs:
     """Logs of the survey file with their keys, trajectories first; and those that cannot be planned."""
-    return plan_logs(session.survey, session.store)
+    return plan_logs(session.survey, session.store, only_looks=session.only_looks)

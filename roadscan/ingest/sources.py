@@ -34,7 +34,8 @@ class Sources:
     logs may move together.
     """
 
-    def __init__(self, store: Store, folder: Path, threads: ThreadPoolExecutor) -> None:
+    def __init__(self, store: Store, folder: Path, threads: ThreadPoolExecutor, only_looks: bool = False) -> None:
+        self._fingerprint = _unread if only_looks else _fingerprint
         self._store = store
         self._folder = folder
         self._threads = threads
@@ -67,7 +68,7 @@ class Sources:
             missing = next((file for file in named.values() if not file.exists()), None)
             if missing is not None:
                 raise FormatError("a file that the log's options name does not exist", file=missing)
-            return {n: self._threads.submit(_fingerprint, file, before.get(n)) for n, file in named.items()}
+            return {n: self._threads.submit(self._fingerprint, file, before.get(n)) for n, file in named.items()}
         if before:
             return {name: _done(known) for name, known in before.items()}
         raise FormatError("the log does not exist", change="check its path in the survey file", file=path)
@@ -100,16 +101,22 @@ class Sources:
 
 
 @contextlib.contextmanager
-def open_sources(store: Store, folder: Path) -> Iterator[Sources]:
-    """Fingerprints of a store's logs, hashed on all cores; what was learnt is kept at the end."""
+def open_sources(store: Store, folder: Path, *, only_looks: bool = False) -> Iterator[Sources]:
+    """Fingerprints of a store's logs, hashed on all cores; what was learnt is kept at the end.
+
+    Parameters
+    ----------
+    only_looks : no log is hashed and nothing is kept; files of another size or time get a fingerprint that no log has.
+    """
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        sources = Sources(store, folder, threads)
+        sources = Sources(store, folder, threads, only_looks)
         try:
             yield sources
         except BaseException:
             threads.shutdown(cancel_futures=True)
             raise
-        sources.save()
+        if not only_looks:
+            sources.save()
 
 
 def listed_name(path: Path, folder: Path) -> str:
@@ -209,6 +216,16 @@ def _fingerprint(file: Path, known: Known | None) -> Known:
         return [stat.st_size, stat.st_mtime_ns, file_digest(file)]
     except OSError as error:
         raise FormatError(f"the log cannot be read: {error.strerror}", file=file) from error
+
+
+def _unread(file: Path, known: Known | None) -> Known:
+    """The fingerprint that is known of a file, or one that only its size and time make."""
+    try:
+        stat = file.stat()
+    except OSError as error:
+        raise FormatError(f"the log cannot be read: {error.strerror}", file=file) from error
+    size_and_time = [stat.st_size, stat.st_mtime_ns]
+    return known if known is not None and known[:2] == size_and_time else [*size_and_time, "not read yet"]
 
 
 def _done(known: Known) -> Future[Known]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
@@ -16,13 +17,14 @@ from roadscan.ingest.overlap import (
     empty_logs,
     reject_findings,
 )
-from roadscan.ingest.planned_logs import logs_of
+from roadscan.ingest.planned_logs import PlannedLog, logs_of
+from roadscan.ingest.reading.format import LogFormat
 from roadscan.ingest.same_content import same_content_findings
 from roadscan.run.memory import BYTES_PER_READING, WORKER_BASE_BYTES
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
-from roadscan.store.logs import LogRecord, has_log
-from roadscan.store.manifest import Manifest
+from roadscan.store.logs import LogRecord, has_log, read_log_records
+from roadscan.store.manifest import CHANGED, MISSING, Manifest
 from roadscan.store.salvage import read_lost
 
 
@@ -31,6 +33,8 @@ class Ingest(Stage):
 
     name = "ingest"
     title = "raw logs into tables"
+    units = "logs"
+    writes = (LogFormat, "rejects")
 
     def run(self, session: Session) -> None:
         """Read the logs that the store does not hold."""
@@ -50,16 +54,19 @@ class Ingest(Stage):
         """Logs that wait to be read."""
         planned, unplanned = logs_of(session)
         waiting = [log for log in planned if not has_log(session.store, log.key)]
+        state = StageState(len(planned) - len(waiting), keys=[log.key for log in planned])
         if not waiting and not unplanned:
-            records = ingested_of(session)
-            return StageState(len(planned), faults=[fault.told for fault in _empty(session, records)])
+            state.faults = [fault.told for fault in _empty(session, ingested_of(session))]
+            return state
+        known = {(r.run, r.path): r.content for r in read_log_records(session.store, damaged=[])}
+        state.why = Counter(_why_due(log, known, session.only_looks) for log in waiting)
+        state.why.update({"cannot be read": len(unplanned)} if unplanned else {})
+        state.stale = len(waiting) + len(unplanned)
+        state.tasks, state.raw_bytes = len(waiting), sum(log.bytes for log in waiting)
         most = session.survey.config.tiles.max_block_readings
-        doing = {
-            "logs": len(waiting),
-            "raw_bytes": sum(log.bytes for log in waiting),
-            "worker_memory_bytes_at_most": WORKER_BASE_BYTES + BYTES_PER_READING * most,
-        }
-        return StageState(len(planned) - len(waiting), len(waiting) + len(unplanned), next_run=doing, hides_rest=True)
+        state.worker_memory_bytes = WORKER_BASE_BYTES + BYTES_PER_READING * most
+        state.hides_rest = True
+        return state
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """What readers and checks of rows doubt, and logs of which much was rejected or stands under one stamp."""
@@ -67,6 +74,16 @@ class Ingest(Stage):
         own = [one for record in records for one in record.findings]
         own += same_content_findings(survey, records)
         return [*own, *reject_findings(records, share), *one_stamp_findings(records)]
+
+
+def _why_due(log: PlannedLog, known: Mapping[tuple[str, str], str], only_looks: bool) -> str:
+    """Why a log is to be read, `known` being the fingerprints of the logs of the store by run and path."""
+    before = known.get((log.run, str(log.config.path)))
+    if before is None:
+        return MISSING
+    if before == log.content:
+        return "with other settings or another reader"
+    return "of another size or time" if only_looks else CHANGED
 
 
 def _empty(session: Session, records: Sequence[LogRecord]) -> list[Fault]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from roadscan.calibrate.tasks.calibrate import renew_reports
@@ -15,7 +16,7 @@ from roadscan.navigation.tasks.navigation_status import navigation_status, traje
 from roadscan.run.session import Session, manifest_of
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord, read_log_records
-from roadscan.store.manifest import Manifest
+from roadscan.store.manifest import MISSING, Manifest
 
 
 class Navigate(Stage):
@@ -24,6 +25,11 @@ class Navigate(Stage):
     name = "navigate"
     title = "trajectories from GNSS, IMU and odometer, clocks from shared motion"
     after = ("ingest",)
+    units = "trajectories"
+    reads = ("gnss", "imu", "encoder", "trajectory", "trajectory_accuracy")
+    writes = (
+        "trajectory", "trajectory_accuracy", "navigation_states", "innovations", "clocks", "clock_residuals",
+    )  # fmt: skip
     uses_workers = False
 
     def run(self, session: Session) -> None:
@@ -46,9 +52,10 @@ class Navigate(Stage):
         held = {r.key: r for r in read_log_records(session.store, damaged=[])}
         own = [held[log.key] for log in logs_of(session)[0] if log.key in held]
         found = navigation_status(session.survey, session.store, own, held)
-        waiting = sum(one["state"] != "computed" for one in found.trajectories)
-        lines = list(found.lines())
-        return StageState(len(found.trajectories) - waiting, waiting, lines=lines)
+        why = Counter(one["state"] for one in found.trajectories if one["state"] != "computed")
+        why = Counter({MISSING if state == "waiting" else state: count for state, count in why.items()})
+        due = why.total()
+        return StageState(len(found.trajectories) - due, due, why=why, tasks=due, lines=list(found.lines()))
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """What computed trajectories, held against their own measurements, are doubted for."""

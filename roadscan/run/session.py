@@ -50,6 +50,8 @@ class Session:
     """True where a run before this one did not come to its end; None before the first stage."""
     began_ns: int = 0
     """When the first stage began (Unix ns)."""
+    only_looks: bool = False
+    """True where no log is read through to fingerprint it, and nothing is written."""
     damaged: list[StoreError] | None = None
     """Hears of damaged records; what is sound counts then. None where damage is an error."""
     _found: dict[Callable[[Session], Any], Any] = field(default_factory=dict)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Self
 
 from roadscan.core.errors import ConfigError, RoadscanError, nearest
 from roadscan.core.plugins import found_kinds
@@ -31,8 +32,16 @@ class StageState:
     """Units that are missing or out of date."""
     empty: int = 0
     """Units that were looked at and hold nothing: a run's progress counts these, too."""
-    next_run: dict[str, int] = field(default_factory=dict)
-    """What the next run would do, by words of its own: tasks, bytes read."""
+    why: Counter[str] = field(default_factory=Counter)
+    """How many of the stale units are due for which reason, as far as the manifest tells."""
+    keys: Collection[str] = ()
+    """Keys of the units that should be there, where they are known before the stage has run."""
+    tasks: int | None = None
+    """Tasks of the next run on the session's workers; None where that is not known."""
+    raw_bytes: int | None = None
+    """Bytes of logs or of ingested rows that the next run would read; None where that is not known."""
+    worker_memory_bytes: int | None = None
+    """Memory that a worker of the next run needs at most, about; None where that is not known."""
     notes: list[str] = field(default_factory=list)
     """What the user should know."""
     lines: list[str] = field(default_factory=list)
@@ -41,6 +50,21 @@ class StageState:
     """Units that the next run cannot do, with the reason, as far as that is known before it."""
     hides_rest: bool = False
     """True where nothing can be said of later stages before this one has run."""
+
+    @classmethod
+    def of(cls, manifest: Manifest, units: Iterable[tuple[str, str, str]]) -> Self:
+        """The state of units by their product, name and key."""
+        asked = list(units)
+        why = Counter(filter(None, (manifest.why_due(*one) for one in asked)))
+        return cls(len(asked) - why.total(), why.total(), why=why, keys=[key for _, _, key in asked])
+
+    def join(self, other: StageState) -> None:
+        """Count the units of another state, and their tasks, with these."""
+        self.current += other.current
+        self.stale += other.stale
+        self.why += other.why
+        self.keys = [*self.keys, *other.keys]
+        self.tasks = (self.tasks or 0) + (other.tasks or 0)
 
 
 class Stage(ABC):
@@ -56,6 +80,15 @@ class Stage(ABC):
     """Name on the command line where it is not `name`."""
     uses_workers: ClassVar[bool] = True
     """False for a stage that computes in the run's own process."""
+    section: ClassVar[str] = ""
+    """Section of the survey file without which a run passes over it."""
+    units: ClassVar[str] = "units"
+    """What its state counts, in the plural."""
+    reads: ClassVar[tuple[str | type, ...]] = ()
+    """Tables and products of other stages that it reads. A class of plugins stands for those that the survey asks for:
+    products, and the tables of formats or kinds of assets."""
+    writes: ClassVar[tuple[str | type, ...]] = ()
+    """Tables and products that it writes, in the same way; pictures beside them are left out."""
 
     @abstractmethod
     def run(self, session: Session) -> None:
@@ -74,6 +107,11 @@ class Stage(ABC):
             where that cannot be said: `status` shows the reason.
         """
         return StageState()
+
+    def is_asked(self, survey: Survey) -> bool:
+        """True unless the survey file has no section for it, or switches that off."""
+        settings = getattr(survey.config, self.section) if self.section else survey
+        return settings is not None and getattr(settings, "on", True)
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """What the witnesses of its inputs said: told during a run, in the summary, by `status` and in the report.

@@ -23,6 +23,12 @@ _CHANGING: Final = "manifest/changing"
 _OLDER: Final = b"older files, too"
 _DAMAGED: Final = "damaged"
 """Key of outputs whose files are not as recorded."""
+MISSING: Final = "missing"
+"""Of an output that is due: it was never finished."""
+CHANGED: Final = "changed"
+"""Its inputs, settings or code are others than those that it was made with: a key does not tell which."""
+DAMAGED: Final = "damaged"
+"""Its file is not as recorded."""
 _MOST_PARTS: Final = 256
 """More parts than that are merged: a long run would begin with thousands of files to read."""
 _LOOKS: Final = 10
@@ -97,10 +103,16 @@ class Manifest:
 
     def is_current(self, product: str, unit: str, key: str) -> bool:
         """True if the output has this key and its file is there in its recorded size."""
+        return not self.why_due(product, unit, key)
+
+    def why_due(self, product: str, unit: str, key: str) -> str:
+        """Why an output is due: `MISSING`, `CHANGED` or `DAMAGED`; empty where it is current."""
         record = self.get(product, unit)
-        if record is None or record.key != key:
-            return False
-        return not record.path or self._store.size(record.path) == record.bytes
+        if record is None:
+            return MISSING
+        if record.key != key:
+            return DAMAGED if record.key == _DAMAGED else CHANGED
+        return DAMAGED if record.path and self._store.size(record.path) != record.bytes else ""
 
     def add(self, records: Iterable[OutputRecord]) -> None:
         """Record finished outputs; durable when this returns. Files under older names are removed by :meth:`settle`."""

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.run.session import Session
-from roadscan.run.stage import Stage
+from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.strips.findings import strip_findings
-from roadscan.strips.work import compare_strips
+from roadscan.strips.work import PRODUCT, compare_strips, strip_tasks
 
 
 class Strips(Stage):
@@ -20,10 +20,17 @@ class Strips(Stage):
     name = "strips"
     title = "what sensors saw of the same strips of road, held against one another"
     after = ("footprints",)
+    units = "strips"
+    reads = ("scans", "returns", "cloud", "trajectory", "trajectory_accuracy", "clocks", "mountings", "footprints")
 
     def run(self, session: Session) -> None:
         """Compare the strips that are not compared yet."""
         session.failed(self.name, compare_strips(session, session.manifest))
+
+    def state(self, session: Session) -> StageState:
+        """Stretches that are compared, and those that are due."""
+        tasks = strip_tasks(session, session.manifest)
+        return StageState.of(session.manifest, [(PRODUCT, one.unit, one.key) for one in tasks])
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """Sensors that the others contradict, and those that see no road."""

@@ -89,13 +89,18 @@ class StripTask:
 
 def compare_strips(session: Session, manifest: Manifest) -> list[tuple[str, str]]:
     """Compare the sensors on some stretches of each run where that was not done; returns what failed."""
-    tasks = list(_tasks(session)) if manifest.of(FOOTPRINTS) else []
+    tasks = strip_tasks(session, manifest)
     manifest.remove(manifest.beside([PRODUCT], {task.unit for task in tasks}))
     stale = [task for task in tasks if not manifest.is_current(PRODUCT, task.unit, task.key)]
     failed = run_bundles(
         compare_strip, stale, lambda _: 1.0, 1.0, manifest, session.compute, session.bar("strips of road")
     )
     return [(f"strip {task.unit}", reason) for task, reason in failed]
+
+
+def strip_tasks(session: Session, manifest: Manifest) -> list[StripTask]:
+    """A task for each stretch that is compared; reads the poses of these stretches, and no readings."""
+    return list(_tasks(session)) if manifest.of(FOOTPRINTS) else []
 
 
 def _tasks(session: Session) -> Iterator[StripTask]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from roadscan.georeference.plan.plan import plan_of
@@ -13,6 +14,7 @@ from roadscan.surface.tasks.surface_colours import check_colours, colour_notes
 from roadscan.surface.tasks.surface_plan import SURFACE, files_without_surface
 from roadscan.surface.tasks.surface_work import plan_surface_work
 from roadscan.surface.tasks.surfaces import compute_surfaces
+from roadscan.tiles.product import SurfaceProduct
 from roadscan.tiles.tasks.tiles import run_tasks
 
 
@@ -22,6 +24,10 @@ class Surfaces(Stage):
     name = "surfaces"
     title = "cells or points into the reconstructed surface and its files"
     after = ("tiles",)
+    section = "surface"
+    units = "tiles"
+    reads = ("cells", "scans", "returns", "cloud", "trajectory", "corrections", "footprints", "images")
+    writes = ("regions", SurfaceProduct)
 
     def run(self, session: Session) -> None:
         """Reconstruct what is missing or stale."""
@@ -51,9 +57,16 @@ class Surfaces(Stage):
     def state(self, session: Session) -> StageState:
         """Tiles whose surface is missing or stale, of those that hold cells by now."""
         work = plan_surface_work(session)
-        waiting = set() if work.planned is None else work.planned.waiting & work.planned.cells.keys()
-        stale = len(work.chosen) + len(waiting)
-        return StageState(len(session.manifest.of(SURFACE)) - len(work.chosen), stale, next_run={"surfaces": stale})
+        if work.planned is None:
+            return StageState()
+        waiting = work.planned.waiting & work.planned.cells.keys()
+        return StageState(
+            len(work.planned.keys) - len(work.chosen),
+            len(work.chosen) + len(waiting),
+            why=Counter([*work.why.values(), *("tile due" for _ in waiting)]),
+            keys=[*work.planned.keys.values()],
+            tasks=len(work.planned.tasks(work.chosen, session.compute.workers)),
+        )
 
     def folders(self) -> Sequence[str]:
         """Outlines of the regions; files of surfaces lie beside those of tiles."""

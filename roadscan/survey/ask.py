@@ -10,6 +10,7 @@ from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.survey import Survey
 from roadscan.ingest.reading.format import log_formats
 from roadscan.navigation.tasks.navigate import known_keys
+from roadscan.run.stage import stages
 from roadscan.store.asset_schema import asset_tables
 from roadscan.store.schema import schema_names
 from roadscan.store.sql import missing_table, query
@@ -18,35 +19,12 @@ from roadscan.tiles.product import SurveyProduct, products
 from roadscan.tiles.tasks.wanted_products import wanted_products
 
 _MADE_BY: Final = {
-    "cells": "`roadscan run` makes it",
-    "overviews": "`roadscan run` makes it",
-    "footprints": "`roadscan run` makes it",
-    "outputs": "`roadscan run` makes it",
-    "clocks": "`roadscan clocks` makes it, where the survey file says what a clock is found from",
-    "clock_residuals": "`roadscan clocks` makes it, where the survey file says what a clock is found from",
-    **dict.fromkeys(
-        (
-            "corrections",
-            "mounting_corrections",
-            "ties",
-            "tie_residuals",
-            "control_sightings",
-            "control_residuals",
-            "relative_accuracy",
-            "absolute_accuracy",
-            "accuracy_by_distance",
-        ),
-        "`roadscan adjust` makes it, where passes overlap or come by ground control",
-    ),
     "mountings": "`roadscan calibrate` makes it, from the [[calibration]] of the survey file",
-    "intensity_gains": "`roadscan assets` makes it, where the survey file has a section [assets]",
-    "asset_visibility": "`roadscan assets` makes it, where the survey file has a section [assets]",
-    "innovations": "`roadscan navigate` makes it, for runs with GNSS and IMU",
-    "navigation_states": "`roadscan navigate` makes it, for runs with GNSS and IMU",
-    "regions": 'a run makes it with regions = "found" in [surface]',
+    "outputs": "`roadscan run` makes it",
     "reading_classes": "`roadscan classes` writes it as a file of its own; read that with read_parquet",
+    "regions": 'a run makes it with regions = "found" in [surface]',
 }
-"""What makes the tables that are neither ingested nor a product."""
+"""What makes tables that no stage writes, or not always."""
 
 
 def ask(
@@ -96,6 +74,10 @@ def _way_to(table: str, survey: Survey) -> str | None:
     if table in _MADE_BY:
         return _MADE_BY[table]
     formats = [name for name, one in log_formats().items() if table in one.yields]
-    return "no log of the survey that is in the store yields it" + (
-        f"; these do: {', '.join(formats)}" if formats else ""
-    )
+    if formats:
+        return f"no log of the survey that is in the store yields it; these do: {', '.join(formats)}"
+    stage = next((one for one in stages() if table in one.writes), None)
+    if stage is None:
+        return None
+    asked = "" if stage.is_asked(survey) else f", where [{stage.section}] of the survey file asks for it"
+    return f"`roadscan {stage.word}` makes it ({stage.title}){asked}"

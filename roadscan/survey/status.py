@@ -47,6 +47,8 @@ class Status:
     """What there is and what is to do, by stage; without those of which nothing can be said yet."""
     outputs: dict[str, int] = field(default_factory=dict)
     """Finished files by product."""
+    ingested: dict[str, int] = field(default_factory=dict)
+    """Files of ingested rows by table."""
     failures: list[dict[str, str]] = field(default_factory=list)
     """What failed in the last run."""
     checked: list[str] = field(default_factory=list)
@@ -78,9 +80,11 @@ class Status:
         return [*self.checked, *found, *(note for state in self.stages.values() for note in state.notes)]
 
     @property
-    def next_run(self) -> dict[str, int]:
-        """What the next run would do: tasks, tiles, raw bytes, bytes of memory a worker."""
-        return {word: count for state in self.stages.values() for word, count in state.next_run.items()}
+    def due(self) -> dict[str, int]:
+        """How many units the next run would make, by stage, as far as is known by now; :mod:`roadscan.survey.plan`
+        says more.
+        """
+        return {name: state.stale for name, state in self.stages.items() if state.stale}
 
     def of(self, stage: str) -> StageState:
         """State of a stage; an empty one where nothing can be said of it yet."""
@@ -105,6 +109,9 @@ def survey_status(session: Session) -> Status:
     keys = {*(log.key for log in planned), *known_keys(session.survey, store, logs_of(session))}
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
     status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
+    files = (one for r in records.values() if r.key in keys for one in r.tables.items())
+    for table, own in files:
+        status.ingested[table] = status.ingested.get(table, 0) + len(own)
     status.readings = reading_counts([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])
     status.findings = findings_of(session.survey, [r for r in records.values() if r.key in keys], manifest)
     for stage in stages():

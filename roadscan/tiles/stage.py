@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from roadscan.core.ids import TileId
@@ -17,6 +18,7 @@ from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.surface.tasks.surface_colours import check_colours
+from roadscan.tiles.product import TileProduct
 from roadscan.tiles.tasks.passes_apart import apart_findings
 from roadscan.tiles.tasks.tile_files import tile_file_names
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
@@ -31,6 +33,12 @@ class Tiles(Stage):
     title = "readings into points, cells and tile files"
     after = ("adjust",)
     command = "tile"
+    units = "tiles"
+    reads = (
+        "scans", "returns", "cloud", "trajectory", "clocks", "mountings", "mounting_corrections", "corrections",
+        "footprints",
+    )  # fmt: skip
+    writes = ("cells", "overviews", TileProduct)
 
     def run(self, session: Session) -> None:
         """Compute the tiles that are missing or stale, or those that are chosen."""
@@ -78,17 +86,19 @@ class Tiles(Stage):
     def state(self, session: Session) -> StageState:
         """Tiles, tasks and memory."""
         work = plan_tile_work(session)
-        tasks = list(work.planned.tasks(work.chosen))
+        tasks = list(work.planned.tasks(work.chosen, session.compute.workers))
         stale = {str(tile) for t in tasks for tile in t.block.tiles}
         current = sum(1 for r in session.manifest.of(TILE).values() if r.path and r.unit not in stale)
-        doing = {
-            "tasks": len(tasks),
-            "tiles": len(stale),
-            "raw_bytes": sum(t.raw_bytes for t in tasks),
-            "worker_memory_bytes": memory_of(tasks),
-        }
-        empty = len(session.manifest.without_file(TILE) - stale)
-        return StageState(current, len(stale), empty, next_run=doing)
+        return StageState(
+            current,
+            len(stale),
+            len(session.manifest.without_file(TILE) - stale),
+            why=Counter(work.why.values()),
+            keys=work.planned.tiles.keys,
+            tasks=len(tasks),
+            raw_bytes=sum(t.raw_bytes for t in tasks),
+            worker_memory_bytes=memory_of(tasks),
+        )
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """Logs of which many readings have no pose, and passes that lie at different heights."""

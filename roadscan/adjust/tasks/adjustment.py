@@ -67,7 +67,7 @@ from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session
-from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.manifest import CHANGED, DAMAGED, MISSING, Manifest, OutputRecord
 from roadscan.store.store import file_digest
 
 Float64 = npt.NDArray[np.float64]
@@ -133,14 +133,19 @@ def solution_key(plan: SurveyPlan) -> str:
 
 def is_current(plan: SurveyPlan, manifest: Manifest) -> bool:
     """True where nothing has changed since the last solution, and what it made is there."""
+    return not why_due(plan, manifest)
+
+
+def why_due(plan: SurveyPlan, manifest: Manifest) -> str:
+    """Why the solution is due; empty where it is current."""
     record = manifest.get(ADJUSTMENT, SOLUTION)
     if not AdjustConfig.of(plan.survey).on:
-        return record is None
+        return "" if record is None else "switched off"
     if record is None or record.key != solution_key(plan):
-        return False
+        return MISSING if record is None else CHANGED
     parts = [r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()]
     whole = all(manifest.is_current(r.product, r.unit, r.key) for r in parts)
-    return whole and record.figures()["table"] == digests_of(plan.store)
+    return "" if whole and record.figures()["table"] == digests_of(plan.store) else DAMAGED
 
 
 def withdraw(session: Session) -> None:

@@ -78,9 +78,10 @@ class SurfacePlan:
     waiting: frozenset[TileId] = frozenset()
     """Tiles whose surface depends on cells that are missing or out of date: what there is of it stays."""
 
-    def stale(self, manifest: Manifest) -> list[TileId]:
-        """Tiles whose surface is missing or out of date, or lacks a product."""
-        return [tile for tile, key in self.keys.items() if not self._is_current(tile, key, manifest)]
+    def stale(self, manifest: Manifest) -> dict[TileId, str]:
+        """Tiles whose surface is missing or out of date, or lacks a product, each with the reason."""
+        reasons = ((tile, self._why_due(str(tile), key, manifest)) for tile, key in self.keys.items())
+        return {tile: why for tile, why in reasons if why}
 
     def near(self, chosen: Iterable[TileId]) -> set[TileId]:
         """Tiles whose surface depends on one of the chosen."""
@@ -126,16 +127,14 @@ class SurfacePlan:
     def _in_reach(self, tile: TileId) -> list[TileId]:
         return self.grid.tiles.tiles_in(self.grid.reach(tile))
 
-    def _is_current(self, tile: TileId, key: str, manifest: Manifest) -> bool:
-        unit = str(tile)
+    def _why_due(self, unit: str, key: str, manifest: Manifest) -> str:
         record = manifest.get(SURFACE, unit)
-        if record is None or record.key != key:
-            return False
-        return not record.figures()["cells"] or all(
-            manifest.is_current(name, unit, key_of(key, wanted.key))
-            for wanted in self.products
-            for name in wanted.files
-        )
+        why = manifest.why_due(SURFACE, unit, key)
+        if why or record is None or not record.figures()["cells"]:
+            return why
+        files = ((name, key_of(key, wanted.key)) for wanted in self.products for name in wanted.files)
+        faults = ((name, manifest.why_due(name, unit, own)) for name, own in files)
+        return next((f"{name} {why}" for name, why in faults if why), "")
 
 
 def plan_surfaces(

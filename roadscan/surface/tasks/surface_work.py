@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from roadscan.core.ids import TileId
 from roadscan.footprints.footprints import footprints_of
@@ -31,6 +31,8 @@ class SurfaceWork:
     gone: Sequence[OutputRecord]
     """Files of surfaces that are no longer due, and of products no longer wanted."""
     note: str = ""
+    why: Mapping[TileId, str] = field(default_factory=dict)
+    """Why each tile's surface is due, unless tiles were chosen."""
 
 
 def plan_surface_work(session: Session) -> SurfaceWork:
@@ -65,9 +67,9 @@ def plan_surface_work(session: Session) -> SurfaceWork:
     stale = planned.stale(manifest)
     note = _waiting_note(len(planned.waiting), found)
     if selection is None:
-        return SurfaceWork(planned, stale, gone, note)
+        return SurfaceWork(planned, list(stale), gone, note, stale)
     own = set(chosen_tiles(selection, tiles.tiles, footprints, plan.ground.grid))
-    due = own | (planned.near(own) & set(stale))
+    due = own | (planned.near(own) & stale.keys())
     return SurfaceWork(planned, [tile for tile in planned.keys if tile in due], gone, note)
 
 

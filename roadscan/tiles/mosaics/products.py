@@ -63,6 +63,12 @@ class OutputTask:
 
 def plan_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask], list[OutputRecord]]:
     """Files of survey products that are missing or stale, and records of those no longer due."""
+    due, gone = wanted_outputs(plan, manifest)
+    return [t for t in due if not manifest.is_current(t.product.name, t.output.name, t.key)], gone
+
+
+def wanted_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask], list[OutputRecord]]:
+    """Files of survey products that there should be of the tiles that there are, and records of others."""
     context = product_context(plan)
     records = sorted((r for r in manifest.of(TILE).values() if r.path), key=lambda r: TileId.parse(r.unit))
     keys = {r.unit: r.key for r in records}
@@ -86,8 +92,7 @@ def plan_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask]
     ]
     due = {(t.product.name, t.output.name) for t in tasks}
     kinds = {name for name, p in products().items() if isinstance(p, SurveyProduct)}
-    gone = [r for r in manifest.beside(kinds, ()) if (r.product, r.unit) not in due]
-    return [t for t in tasks if not manifest.is_current(t.product.name, t.output.name, t.key)], gone
+    return tasks, [r for r in manifest.beside(kinds, ()) if (r.product, r.unit) not in due]
 
 
 def make_products(

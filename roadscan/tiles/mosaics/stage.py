@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
-from roadscan.tiles.mosaics.products import make_products, plan_outputs
-from roadscan.tiles.product import SurveyProduct, products
+from roadscan.tiles.mosaics.products import make_products, wanted_outputs
+from roadscan.tiles.product import SurfaceProduct, SurveyProduct, products
 from roadscan.tiles.tasks.cell_size import density_notes
 
 
@@ -18,6 +18,9 @@ class Products(Stage):
     name = "products"
     title = "mosaics, pictures and tables over all tiles"
     after = ("surfaces",)
+    units = "files"
+    reads = ("cells", "overviews", "trajectory", SurfaceProduct)
+    writes = (SurveyProduct,)
 
     def run(self, session: Session) -> None:
         """Make the files that are missing or stale."""
@@ -28,10 +31,10 @@ class Products(Stage):
 
     def state(self, session: Session) -> StageState:
         """Files that are missing or stale."""
-        stale = len(plan_outputs(plan_of(session), session.manifest)[0])
-        made = sum(session.manifest.files().get(name, 0) for name in _of_survey())
-        notes = density_notes(session.survey, session.store, session.manifest)
-        return StageState(made - stale, stale, next_run={"products": stale}, notes=notes)
+        wanted, _ = wanted_outputs(plan_of(session), session.manifest)
+        state = StageState.of(session.manifest, [(t.product.name, t.output.name, t.key) for t in wanted])
+        state.notes = density_notes(session.survey, session.store, session.manifest)
+        return state
 
     def folders(self) -> Sequence[str]:
         """A folder a product."""

@@ -186,12 +186,11 @@ def _correction_digests(f: FootprintRanges, plan: SurveyPlan) -> npt.NDArray[np.
     return found
 
 
-def stale_tiles(tiles: PlannedTiles, products: Sequence[WantedProduct], manifest: Manifest) -> list[TileId]:
-    """Tiles that are missing, changed, or lack a wanted product."""
-    if not manifest.of(TILE):
-        return list(tiles)
+def stale_tiles(tiles: PlannedTiles, products: Sequence[WantedProduct], manifest: Manifest) -> dict[TileId, str]:
+    """Tiles that are missing, changed, or lack a wanted product, each with the reason."""
     pairs = zip(tiles.ids, tiles.keys, strict=True)
-    return [tile for tile, key in pairs if not _is_current(tile, key, products, manifest)]
+    reasons = ((tile, _why_due(str(tile), key, products, manifest)) for tile, key in pairs)
+    return {tile: why for tile, why in reasons if why}
 
 
 @dataclass(frozen=True)
@@ -263,17 +262,15 @@ class TilePlan:
         )
 
 
-def _is_current(tile: TileId, key: str, products: Sequence[WantedProduct], manifest: Manifest) -> bool:
-    if not manifest.is_current(TILE, str(tile), key):
-        return False
-    record = manifest.get(TILE, str(tile))
-    if record is not None and not record.path:
-        return True  # without points there are no files
-    if not manifest.is_current(OVERVIEWS, str(tile), key):
-        return False
-    return all(
-        manifest.is_current(name, str(tile), key_of(key, wanted.key)) for wanted in products for name in wanted.files
-    )
+def _why_due(unit: str, key: str, products: Sequence[WantedProduct], manifest: Manifest) -> str:
+    """Why a tile is due; empty where it is current, and where it is without points and so without files."""
+    record = manifest.get(TILE, unit)
+    why = manifest.why_due(TILE, unit, key)
+    if why or record is None or not record.path:
+        return why
+    files = ((name, key_of(key, wanted.key)) for wanted in products for name in wanted.files)
+    faults = ((name, manifest.why_due(name, unit, own)) for name, own in ((OVERVIEWS, key), *files))
+    return next((f"{name} {why}" for name, why in faults if why), "")
 
 
 @found_once

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from roadscan.core.ids import TileId
 from roadscan.footprints.footprints import footprints_of
@@ -28,6 +28,8 @@ class TileWork:
     """Tiles to compute now."""
     gone: list[OutputRecord]
     """Files of tiles that no reading touches any more, and of products no longer wanted."""
+    why: Mapping[TileId, str] = field(default_factory=dict)
+    """Why each tile is due, unless tiles were chosen."""
 
 
 def plan_tile_work(session: Session) -> TileWork:
@@ -37,15 +39,15 @@ def plan_tile_work(session: Session) -> TileWork:
     check_surface_ahead(plan)  # before the tiles are computed for it
     wanted = tuple(wanted_tile_products(survey, context))
     tiles, footprints = tiles_of(session), footprints_of(session)
+    why = {} if session.selection is not None else stale_tiles(tiles, wanted, manifest)
+    chosen = list(why)
     if session.selection is not None:
         chosen = chosen_tiles(session.selection, tiles, footprints, plan.ground.grid)
-    else:
-        chosen = stale_tiles(tiles, wanted, manifest)
     per_tile = tile_file_names()
     dropped = per_tile - tile_file_names({w.product.name for w in wanted})
     gone = manifest.beside({TILE, OVERVIEWS, *per_tile} - dropped, {str(t) for t in tiles})
     gone += manifest.beside(dropped, ())
-    return TileWork(TilePlan(plan, footprints, tiles, wanted, context), chosen, gone)
+    return TileWork(TilePlan(plan, footprints, tiles, wanted, context), chosen, gone, why)
 
 
 def memory_of(tasks: Sequence[TileTask]) -> int:

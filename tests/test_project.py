@@ -84,8 +84,7 @@ def contracts(folder: Path) -> subprocess.CompletedProcess[str]:
 def copied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("house")
     shutil.copy(ROOT / "pyproject.toml", folder)
-    for package in ("roadscan", "flows"):
-        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "roadscan", folder / "roadscan", ignore=shutil.ignore_patterns("__pycache__"))
     return folder
 
 

@@ -32,9 +32,9 @@ def run(
         print_status(found, survey_file)
         raise typer.Exit(2 if found.would_fail else 0)
     if flow or os.environ.get("PREFECT_API_URL"):
-        from flows.conduct import require_api
-        from flows.survey import survey
         from roadscan.core.errors import ConfigError
+        from roadscan.flows.conduct import require_api
+        from roadscan.flows.survey import survey
 
         if dashboard:
             raise ConfigError("--dashboard of a flow run", expected="a run without Prefect", change="leave one out")

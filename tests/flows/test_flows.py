@@ -18,9 +18,9 @@ from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
 from prefect.client.schemas.objects import FlowRun, State, StateType
 
-from flows.reprocess import reprocess
-from flows.survey import survey
 from roadscan.core.errors import ConfigError, RoadscanError, RunError
+from roadscan.flows.reprocess import reprocess
+from roadscan.flows.survey import survey
 from roadscan.simulate import SimulatedSurvey
 
 pytestmark = pytest.mark.usefixtures("prefect_api")

@@ -19,13 +19,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import shapely
 from rasterio.features import shapes
 from scipy.ndimage import label
 
+from roadscan.core.extras import cv2
 from roadscan.core.settings.distress import PotholeDetection, PotholeJoining
 from roadscan.distress.kernels.crack_response import fill_holes
 from roadscan.surface.heights import HEIGHT_STEP_M, HeightWindow

@@ -57,10 +57,12 @@ from roadscan.adjust.tasks.tie_work import TIES, KnownTies, TieTask, collect_tie
 from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
 from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
 from roadscan.core.counted import counted as count_of
+from roadscan.core.extras import can_draw
 from roadscan.core.settings.tie_settings import PlaceSettings
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.plan.road import road_key
+from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.poses.movement import largest
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
@@ -138,8 +140,13 @@ def is_current(plan: SurveyPlan, manifest: Manifest) -> bool:
     if record is None or record.key != solution_key(plan):
         return False
     parts = [r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()]
-    whole = all(manifest.is_current(r.product, r.unit, r.key) for r in parts)
+    whole = all(manifest.is_current(r.product, r.unit, r.key) and _is_drawn(r) for r in parts)
     return whole and record.figures()["table"] == digests_of(plan.store)
+
+
+def _is_drawn(record: OutputRecord) -> bool:
+    """False of a picture that was left out for want of Matplotlib, which is there by now."""
+    return record.key != NOT_DRAWN or not can_draw()
 
 
 def withdraw(session: Session) -> None:

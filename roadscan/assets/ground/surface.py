@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -13,6 +12,7 @@ from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.kernels.lowest import counts
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
+from roadscan.core.extras import cv2
 from roadscan.core.settings.asset_ground import GroundSettings
 
 Float32 = npt.NDArray[np.float32]

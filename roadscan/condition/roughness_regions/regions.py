@@ -17,7 +17,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -28,6 +27,7 @@ from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rot
 from roadscan.condition.roughness_regions.raster import IntensityRaster, closed, intensity_raster
 from roadscan.condition.roughness_regions.severity import UNKNOWN, Severity, severity
 from roadscan.condition.roughness_regions.surface import RoadSurface, road_below
+from roadscan.core.extras import cv2
 from roadscan.core.settings.roughness_regions import RoughnessRegionsConfig
 
 Float64 = npt.NDArray[np.float64]

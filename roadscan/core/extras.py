@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from types import ModuleType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from roadscan.core.errors import ConfigError
 
@@ -87,7 +87,9 @@ class _Late:
         return value
 
 
-cv2: Any = _Late("cv2", "the work on images")
-"""OpenCV."""
-small_gicp: Any = _Late("small_gicp", "a calibration against a reference scan")
-"""Generalised ICP."""
+if TYPE_CHECKING:
+    import cv2 as cv2
+    import small_gicp as small_gicp
+else:
+    cv2 = _Late("cv2", "the work on images")
+    small_gicp = _Late("small_gicp", "a calibration against a reference scan")

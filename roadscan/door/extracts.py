@@ -82,7 +82,7 @@ def cell_grid(session: Session, box: Bounds | None, tile: str | None) -> xr.Data
     ConfigError
         where there are no cells, or more than 400 million places for them.
     """
-    xr: Any = needed("xarray", "a dataset of cells")
+    xarray: Any = needed("xarray", "a dataset of cells")
     grid = plan_of(session).ground.grid
     records = {TileId.parse(unit): r for unit, r in session.manifest.of(TILE).items() if r.path}
     if tile is not None:
@@ -113,7 +113,7 @@ def cell_grid(session: Session, box: Bounds | None, tile: str | None) -> xr.Data
     corner = grid.bounds(first)
     x = corner.easting_min_m + (np.arange(columns) + 0.5) * cell_m
     y = corner.northing_min_m + (np.arange(rows) + 0.5) * cell_m
-    data = xr.Dataset(
+    data: xr.Dataset = xarray.Dataset(
         {name: (("y", "x"), image) for name, image in images.items()}, {"y": y, "x": x},
         {"crs": session.survey.config.map.crs or LOCAL_WORLD, "cell_m": cell_m},
     )  # fmt: skip

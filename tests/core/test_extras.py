@@ -18,6 +18,7 @@ from roadscan.cli import app
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import EXTRAS, _Late, need, needed
 from roadscan.core.survey import Survey
+from roadscan.demo.demo import prepare_demo
 from roadscan.formats.cameras.video import look_into
 from roadscan.inventory.homes.postgis import PostGis
 from roadscan.run.engine.embedded import embedded
@@ -87,6 +88,9 @@ def test_what_asks_for_one_says_so_before_it_begins(without: pytest.MonkeyPatch,
     with pytest.raises(ConfigError, match=f"^a simulated camera {opencv}"):
         simulate(Scene(id="street", length_m=20.0, camera={"on": True}), tmp_path / "street")
     assert not (tmp_path / "street").exists()
+    with pytest.raises(ConfigError, match=f"^the demo {opencv}"):
+        prepare_demo(tmp_path / "demo", print)
+    assert not (tmp_path / "demo").exists()
     with pytest.raises(ConfigError, match=f"^a video {opencv}"):
         look_into(tmp_path / "front.mp4")
     with pytest.raises(ConfigError, match=r'^a home in PostGIS .* "roadscan\[postgis\]"$'):

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from roadscan.core.errors import ConfigError
 
+__all__ = ["EXTRAS", "can_draw", "cv2", "is_installed", "missing", "need", "needed", "small_gicp"]
+
 EXTRAS: Final = {
     "bokeh": ("bokeh", "dashboard"),
     "cv2": ("opencv-python-headless", "opencv"),
@@ -88,8 +90,8 @@ class _Late:
 
 
 if TYPE_CHECKING:
-    import cv2 as cv2
-    import small_gicp as small_gicp
+    import cv2
+    import small_gicp
 else:
     cv2 = _Late("cv2", "the work on images")
     small_gicp = _Late("small_gicp", "a calibration against a reference scan")

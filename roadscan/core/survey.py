@@ -422,11 +422,11 @@ class SurveyConfig(Strict):
     tiles: TileConfig = TileConfig()
     """Tiles and cells."""
     surface: SurfaceConfig | None = None
-    """Reconstruction of the road's surface; left out, there is none."""
+    """Reconstruction of the road's surface; left out, there is none. Needs the extra `opencv`."""
     condition: ConditionConfig | None = None
     """The road's condition along its lanes; left out, none is computed."""
     assets: AssetsConfig | None = None
-    """Assets on, beside and over the road; left out, none are sought."""
+    """Assets on, beside and over the road; left out, none are sought. Needs the extra `opencv`."""
     inventory: InventoryConfig = InventoryConfig()
     """The inventory of assets that people edit."""
     products: ProductConfig = ProductConfig()

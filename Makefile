@@ -96,13 +96,16 @@ $(VENV)/.created:
 	echo "No Python 3.11, 3.12 or 3.13 with venv was found (looked for: $(INTERPRETERS))." >&2; \
 	echo "On Debian or Ubuntu: apt-get install python3 python3-venv" >&2; exit 1
 
+# Between the arguments of a call, a comma of their own has to be named.
+comma := ,
+
 # uv is faster where it is present and finds the packages; pip is always there.
 install_into_venv = { command -v uv >/dev/null && uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint constraints.txt --editable '$(1)'; } \
 	|| $(BIN)/python -m pip install --quiet --prefer-binary --constraint constraints.txt --editable '$(1)'
 
 $(VENV)/.installed: $(VENV)/.created pyproject.toml constraints.txt
 	@echo "installing roadscan (one to two minutes the first time)"
-	@$(call install_into_venv,.)
+	@$(call install_into_venv,.[frames$(comma)icp$(comma)opencv$(comma)pictures])
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.created pyproject.toml constraints.txt

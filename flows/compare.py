@@ -9,9 +9,9 @@ from prefect import flow
 from prefect.client.schemas.objects import State
 from prefect.states import Completed
 
-from flows.conduct import failed
 from roadscan.condition.tasks.compare import compare_surveys
 from roadscan.core.errors import RoadscanError
+from roadscan.flows.conduct import failed
 from roadscan.run.session import Session
 
 

@@ -8,11 +8,11 @@ from typing import Any
 from prefect import flow
 from prefect.client.schemas.objects import State
 
-from flows.conduct import conduct, failed, run_name
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
+from roadscan.flows.conduct import conduct, failed, run_name
 from roadscan.run.selection import Selection
 
 

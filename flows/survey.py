@@ -7,7 +7,7 @@ from typing import Any
 from prefect import flow
 from prefect.client.schemas.objects import State
 
-from flows.conduct import conduct, run_name
+from roadscan.flows.conduct import conduct, run_name
 
 
 @flow(name="survey", flow_run_name=run_name, persist_result=False)

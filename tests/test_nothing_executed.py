@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import flows
 import roadscan
+from roadscan import flows
 from roadscan.cli import app
 
 FORBIDDEN_NAMES = {"eval", "exec", "execfile", "__import__"}

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import re
 import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from tests.house.figures import private_names
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -30,13 +34,99 @@ def test_constraints_are_names_and_versions_only() -> None:
     assert [line for line in lines if not re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.!+]+", line)] == []
 
 
-REQUIREMENTS = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["dev"]]
+EXTRAS = PROJECT["optional-dependencies"]
+REQUIREMENTS = [
+    text
+    for text in dict.fromkeys(
+        [*PROJECT["dependencies"], *(one for name in EXTRAS if name != "s3" for one in EXTRAS[name])]
+    )
+    if Requirement(text).name != PROJECT["name"]
+]
 
 
 @pytest.mark.parametrize("text", REQUIREMENTS)
 def test_every_dependency_is_pinned_within_its_range(text: str) -> None:
     requirement = Requirement(text)
     assert requirement.specifier.contains(PINNED[canonicalize_name(requirement.name)])
+
+
+REQUIRED = {
+    "blake3", "cryptography", "dask", "distributed", "duckdb", "fsspec", "isal", "jinja2", "laspy", "numba", "numpy",
+    "pandas", "pillow", "prefect", "psutil", "pyarrow", "pydantic", "pyogrio", "pyproj", "qdldl", "rasterio", "rich",
+    "scipy", "shapely", "typer",
+}  # fmt: skip
+"""What every installation has. Whatever only some surveys need belongs to an extra (`roadscan/core/extras.py`)."""
+MOST_DISTRIBUTIONS = 141
+"""Of an installation without extras, with all that its requirements require; Prefect and Dask alone are 119."""
+
+
+def test_required_packages_are_these() -> None:
+    assert {Requirement(text).name for text in PROJECT["dependencies"]} == REQUIRED
+
+
+def test_an_installation_has_few_distributions() -> None:
+    waiting = [
+        (canonicalize_name(r.name), extra)
+        for r in map(Requirement, PROJECT["dependencies"])
+        for extra in ("", *r.extras)
+    ]
+    found = {(canonicalize_name(PROJECT["name"]), "")}
+    while waiting:
+        one = waiting.pop()
+        if one not in found:
+            found.add(one)
+            for required in map(Requirement, importlib.metadata.requires(one[0]) or ()):
+                if required.marker is None or required.marker.evaluate({"extra": one[1]}):
+                    waiting += [(canonicalize_name(required.name), extra) for extra in ("", *required.extras)]
+    assert len({name for name, _ in found}) <= MOST_DISTRIBUTIONS
+
+
+def test_only_numba_has_an_upper_bound() -> None:
+    """Each line with a bound has its reason above it, and a test below that fails when the reason has gone."""
+    bounded = {Requirement(text).name for text in REQUIREMENTS if re.search(r"<|==|~=", text)}
+    assert bounded == {"numba"}
+    lines = (ROOT / "pyproject.toml").read_text().splitlines()
+    (at,) = (number for number, line in enumerate(lines) if line.strip().startswith('"numba'))
+    assert lines[at - 1].strip().startswith("# ")
+
+
+def test_numbas_bound_is_still_needed() -> None:
+    """Fails when no more than one file knows Numba's internals: then take `<` out of numba in pyproject.toml."""
+    assert private_names()["files with private names of Numba"] > 1
+
+
+def test_the_wheel_installs_roadscan_and_nothing_beside_it() -> None:
+    """What hatchling is told; `make nightly` builds one."""
+    target = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert target["packages"] == ["roadscan"]
+    assert all(inside.startswith("roadscan/") for inside in target["force-include"].values())
+    assert (ROOT / "roadscan" / "flows").resolve() == ROOT / "flows"
+
+
+@pytest.mark.nightly
+def test_a_wheel_works_without_the_repository(tmp_path: Path) -> None:
+    """Built by pip, unpacked into a folder of its own: one package, and the flows in it."""
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(tmp_path), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as files:
+        assert {name.partition("/")[0].partition("-")[0] for name in files.namelist()} == {"roadscan"}
+        files.extractall(tmp_path / "installed")
+    program = (
+        "import importlib.util, roadscan.flows.survey, roadscan.flows.reprocess, roadscan.flows.compare\n"
+        "from roadscan.store.schema import table_schema\n"
+        "table_schema('scans')\n"
+        "print(importlib.util.find_spec('flows'), roadscan.flows.survey.__file__)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", _WITHOUT_CHECKOUT + program], env={"PYTHONPATH": str(tmp_path / "installed")},
+        cwd=tmp_path, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.stdout.split() == ["None", str(tmp_path / "installed" / "roadscan" / "flows" / "survey.py")]
+
+
+_WITHOUT_CHECKOUT = f"import sys\nsys.path = [p for p in sys.path if p != {str(ROOT)!r}]\n"
+"""An editable installation puts the checkout on the path."""
 
 
 def test_hooks_call_make_targets_that_exist() -> None:
@@ -84,8 +174,7 @@ def contracts(folder: Path) -> subprocess.CompletedProcess[str]:
 def copied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("house")
     shutil.copy(ROOT / "pyproject.toml", folder)
-    for package in ("roadscan", "flows"):
-        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "roadscan", folder / "roadscan", ignore=shutil.ignore_patterns("__pycache__"))
     return folder
 
 

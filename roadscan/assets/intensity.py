@@ -227,7 +227,7 @@ def _slopes(ground: GroundModel) -> tuple[Float64, Float64]:
     """Slopes (rows, columns) to the east and to the north (m/m) of the least-squares plane through the cells around
     each cell in which ground was seen; 0 where there are none.
     """
-    import cv2
+    from roadscan.core.extras import cv2
 
     known = ground.seen & np.isfinite(ground.height_m)
     weight = known.astype(np.float64)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -15,6 +14,7 @@ from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.kernels import columns, voxels
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
+from roadscan.core.extras import cv2
 
 Bools = npt.NDArray[np.bool_]
 Int32 = npt.NDArray[np.int32]

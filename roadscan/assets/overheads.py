@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -13,6 +12,7 @@ from roadscan.assets.cubes import EDGE_M, Cubes
 from roadscan.assets.ground.grid import Grid
 from roadscan.assets.kernels import voxels
 from roadscan.assets.kernels.corridors import mark_corridor
+from roadscan.core.extras import cv2
 
 Bools = npt.NDArray[np.bool_]
 

@@ -28,7 +28,7 @@ class AssetsConfig(SurveySection):
     """What stands on, beside and over the road. Without this section no asset is sought."""
 
     table: ClassVar[str] = "assets"
-    meaning: ClassVar[str] = "Assets on, beside and over the road; left out, none are sought."
+    meaning: ClassVar[str] = "Assets on, beside and over the road; left out, none are sought. Needs the extra `opencv`."
     may_be_left_out: ClassVar[bool] = True
 
     kinds: list[str] | None = None

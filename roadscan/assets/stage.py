@@ -22,6 +22,7 @@ from roadscan.assets.tasks.work import AssetsWork, due_joins, plan_evidence
 from roadscan.condition.tasks.lines import roads_key, survey_roads
 from roadscan.condition.tasks.tasks import run_units
 from roadscan.core.errors import RoadscanError
+from roadscan.core.extras import need
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.run.session import Session
@@ -166,6 +167,8 @@ class Assets(Stage):
     def check(self, survey: Survey) -> list[RoadscanError]:
         """Kinds, their settings and sensors are such that there are."""
         try:
+            if survey.has("assets"):
+                need("cv2", "the section [assets]")
             check_assets(survey)
         except RoadscanError as error:
             return [error]

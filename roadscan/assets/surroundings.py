@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -17,6 +16,7 @@ from roadscan.assets.overheads import overhead_classes
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
 from roadscan.compute.kernel_options import read_only
+from roadscan.core.extras import cv2
 
 Bools = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]

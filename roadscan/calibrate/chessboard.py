@@ -13,19 +13,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError
+from roadscan.core.extras import cv2
 from roadscan.core.strict import Strict
 
 Float64 = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]
 
-_FLAGS: Final = int(cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
 _PARAMETERS: Final = 9
 """fx, fy, cx, cy, k1, k2, p1, p2, k3."""
 _COVER: Final = (6, 4)
@@ -35,7 +34,8 @@ _WINDOW: Final = 0.3
 _LEAP_PX: Final = 1.0
 _SIGNIFICANT: Final = 2.0
 _ROUNDS: Final = 4
-_STEPS: Final = (int(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS), 200, 1e-12)
+_MOST_STEPS: Final = 200
+_SETTLED: Final = 1e-12
 
 
 class Board(Strict):
@@ -133,7 +133,8 @@ class _Fit:
 
 def find_corners(grey: Grey, board: Board) -> npt.NDArray[np.float32] | None:
     """Inner corners (n, 2: u, v) of the board in a picture, row by row; None where it is not wholly seen."""
-    found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=_FLAGS)
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)
     if not found or corners is None or len(corners) != board.columns * board.rows:
         return None
     return _refined(grey, np.asarray(corners, np.float32).reshape(-1, 2), board)
@@ -269,7 +270,7 @@ def _fit(views: Sequence[_View], board: Board, size: tuple[int, int], radial: in
             start,
             np.zeros(5),
             flags=flags,
-            criteria=_STEPS,
+            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _MOST_STEPS, _SETTLED),
         )
     except cv2.error as error:
         raise ConfigError(

@@ -16,7 +16,6 @@ from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
-import small_gicp
 from pydantic import Field
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
@@ -25,6 +24,7 @@ from roadscan.calibrate.evidence import Known, Seen, Ties
 from roadscan.calibrate.surfels import Surfels
 from roadscan.compute.robust import scatter_about
 from roadscan.core.errors import ConfigError
+from roadscan.core.extras import small_gicp
 from roadscan.core.rig import Mounting
 from roadscan.core.strict import Strict
 

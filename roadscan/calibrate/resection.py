@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -25,6 +24,7 @@ from roadscan.calibrate.evidence import Known, Seen, Ties, Traverse
 from roadscan.calibrate.rotations import exponential, logarithm
 from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError, nearest
+from roadscan.core.extras import cv2
 from roadscan.core.rig import Mounting
 from roadscan.core.settings.calibration import CalibrationSettings
 
@@ -51,7 +51,8 @@ _WIDE_M: Final = (1.0, 1.0, 1.0)
 _WIDE_RAD: Final = (0.2, 0.2, 0.2)
 _BEHIND_M: Final = 0.1
 _INVERTED_PX: Final = 0.05
-_UNDISTORT: Final = (int(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS), 200, 1e-13)
+_ROUNDS: Final = 200
+_SETTLED: Final = 1e-13
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,8 @@ def project(interior: Interior, point_sensor_m: Float64) -> Float64:
 def tangents(interior: Interior, pixel: Float64) -> Float64:
     """Tangents (n, 2: right and down per metre ahead) of pixels (n, 2); NaN where the distortion has no inverse."""
     matrix, distortion = _opencv(interior)
-    found = cv2.undistortPoints(pixel.reshape(-1, 1, 2), matrix, distortion, criteria=_UNDISTORT).reshape(-1, 2)
+    settled = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ROUNDS, _SETTLED)
+    found = cv2.undistortPoints(pixel.reshape(-1, 1, 2), matrix, distortion, criteria=settled).reshape(-1, 2)
     back = project(interior, np.column_stack([np.ones(len(found)), found]))
     wrong = ~(np.linalg.norm(back - pixel, axis=1) < _INVERTED_PX)
     found[wrong] = np.nan

@@ -30,9 +30,9 @@ def run(
     if dry_run:
         plan(survey_file, workers, as_json)
     if flow or os.environ.get("PREFECT_API_URL"):
-        from flows.conduct import require_api
-        from flows.survey import survey
         from roadscan.core.errors import ConfigError
+        from roadscan.flows.conduct import require_api
+        from roadscan.flows.survey import survey
 
         if dashboard:
             raise ConfigError("--dashboard of a flow run", expected="a run without Prefect", change="leave one out")

@@ -90,7 +90,8 @@ class ConditionConfig(SectionConfig, SurveySection):
     road_edges: RoadEdgesConfig | None = None
     """Edges of the road's surface, by the readings or by polygons; left out, none are sought."""
     roughness_regions: RoughnessRegionsConfig | None = None
-    """Dim regions of the road's surface (utility cuts, patches, worn places), section by section; left out, none."""
+    """Dim regions of the road's surface (utility cuts, patches, worn places), section by section; left out, none. Needs
+    the extra `opencv`."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

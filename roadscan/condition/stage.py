@@ -21,6 +21,7 @@ from roadscan.condition.tasks.tile_summary import write_tiles
 from roadscan.condition.tasks.values import GroupTask, value_findings, values_of_group
 from roadscan.condition.tasks.work import ConditionWork, plan_condition
 from roadscan.core.errors import RoadscanError
+from roadscan.core.extras import need
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import plan_of
@@ -116,6 +117,9 @@ class Condition(Stage):
     def check(self, survey: Survey) -> list[RoadscanError]:
         """Layers of lines and polygons can be opened as stated; there is a surface where its heights are asked for."""
         try:
+            config = ConditionConfig.stated(survey)
+            if config is not None and config.roughness_regions is not None:
+                need("cv2", "the section [condition.roughness_regions]")
             check_layer(survey)
             check_surface_cells(survey)
             check_edge_polygons(survey)

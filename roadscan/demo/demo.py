@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from roadscan.compute.robust import scatter_about
 from roadscan.condition.tasks.against_truth import compared_values
+from roadscan.core.extras import need
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import plan_survey
 from roadscan.run.session import Session
@@ -93,9 +94,12 @@ def prepare_demo(folder: Path, report: Callable[[str], None], scene: str = "demo
 
     Raises
     ------
+    ConfigError
+        where OpenCV is not installed, which finds the demo's assets.
     FormatError
         where the folder holds a survey that was not simulated.
     """
+    need("cv2", "the demo")
     survey_file = folder / "SURVEY.toml"
     if survey_file.exists():
         truth.load(folder)

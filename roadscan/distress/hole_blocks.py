@@ -21,10 +21,10 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.extras import cv2
 from roadscan.distress.settings import PotholeDetection
 from roadscan.surface.heights import HEIGHT_STEP_M, HeightWindow
 from roadscan.surface.kernels.ground import depths, grounds, slopes

@@ -19,13 +19,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import shapely
 from rasterio.features import shapes
 from scipy.ndimage import label
 
+from roadscan.core.extras import cv2
 from roadscan.distress.hole_blocks import Blocks, block_cells, blocks_around
 from roadscan.distress.kernels.crack_response import fill_holes
 from roadscan.distress.settings import PotholeDetection, PotholeJoining

@@ -17,10 +17,10 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.extras import cv2
 from roadscan.distress.kernels.crack_response import add_bend, deepen, fill_holes, line_sums
 from roadscan.distress.settings import CrackDetection
 from roadscan.surface.heights import HEIGHT_STEP_M

@@ -23,10 +23,10 @@ import functools
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.extras import cv2
 from roadscan.distress.kernels.thinning import thin
 from roadscan.distress.settings import CrackDetection
 from roadscan.distress.valley_lines import (

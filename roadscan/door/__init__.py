@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 
 from roadscan.core.errors import ConfigError, RoadscanError, nearest
+from roadscan.core.extras import needed
 from roadscan.run.session import Reporter, Session
 
 if TYPE_CHECKING:
@@ -153,9 +154,9 @@ class OpenSurvey:
         RoadscanError
             where the maps differ, or a survey has no sections of condition.
         """
-        import geopandas
-
         from roadscan.condition.tasks.compare import compare_surveys
+
+        geopandas: Any = needed("geopandas", "a GeoDataFrame")
 
         found = compare_surveys(earlier.session, self.session)
         return geopandas.GeoDataFrame(found.table.to_pandas(), geometry=found.lines, crs=self.crs)
@@ -536,8 +537,7 @@ def _frame(rows: pa.Table, crs: str | None) -> pd.DataFrame:
     frame = rows.to_pandas()
     if not shapes:
         return cast("pd.DataFrame", frame)
-    import geopandas
-
+    geopandas: Any = needed("geopandas", "a GeoDataFrame")
     for name in shapes:
         frame[name] = geopandas.GeoSeries.from_wkb(frame[name], crs=crs)
     return cast("pd.DataFrame", geopandas.GeoDataFrame(frame, geometry=shapes[0], crs=crs))

@@ -10,6 +10,7 @@ import pyarrow as pa
 
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.errors import ConfigError, nearest
+from roadscan.core.extras import needed
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion, rph_from_rotation
 from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
@@ -81,8 +82,7 @@ def cell_grid(session: Session, box: Bounds | None, tile: str | None) -> xr.Data
     ConfigError
         where there are no cells, or more than 400 million places for them.
     """
-    import xarray as xr
-
+    xarray: Any = needed("xarray", "a dataset of cells")
     grid = plan_of(session).ground.grid
     records = {TileId.parse(unit): r for unit, r in session.manifest.of(TILE).items() if r.path}
     if tile is not None:
@@ -113,7 +113,7 @@ def cell_grid(session: Session, box: Bounds | None, tile: str | None) -> xr.Data
     corner = grid.bounds(first)
     x = corner.easting_min_m + (np.arange(columns) + 0.5) * cell_m
     y = corner.northing_min_m + (np.arange(rows) + 0.5) * cell_m
-    data = xr.Dataset(
+    data: xr.Dataset = xarray.Dataset(
         {name: (("y", "x"), image) for name, image in images.items()}, {"y": y, "x": x},
         {"crs": session.survey.config.map.crs or LOCAL_WORLD, "cell_m": cell_m},
     )  # fmt: skip

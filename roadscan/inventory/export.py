@@ -117,11 +117,14 @@ def _harmless(text: str | None) -> str | None:
 
 def _dxf(file: Path, kinds: dict[str, pa.Table], crs: str | None) -> None:
     """Geometries with their heights, a layer a kind."""
-    import geopandas
+    import pyogrio
 
     layers = [asset_schema(kind).table for kind, rows in kinds.items() for _ in range(rows.num_rows)]
-    frame = geopandas.GeoDataFrame({"Layer": layers}, geometry=list(_shapes(_together(kinds))), crs=crs)
-    frame.to_file(file, driver="DXF", engine="pyogrio", layer="entities")
+    shapes = _together(kinds)[GEOMETRY].to_numpy(zero_copy_only=False)
+    pyogrio.raw.write(
+        file, shapes, [np.array(layers, object)], ["Layer"], driver="DXF", layer="entities", crs=crs,
+        geometry_type="Unknown",
+    )  # fmt: skip
 
 
 def _together(kinds: dict[str, pa.Table]) -> pa.Table:

@@ -7,13 +7,14 @@ import getpass
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.core.errors import ConfigError, nearest
+from roadscan.core.extras import needed
 from roadscan.core.witness import Finding
 from roadscan.inventory.changes import EpochChanges, epoch_changes
 from roadscan.inventory.checks import faults_of
@@ -357,8 +358,7 @@ class Inventory:
 
     def assets(self, kind: str, as_of: When = None) -> pd.DataFrame:
         """Assets of a kind as a GeoDataFrame in the map's CRS, by id."""
-        import geopandas
-
+        geopandas: Any = needed("geopandas", "a GeoDataFrame")
         schema = asset_schema(kind)
         own = self.state(as_of).assets.get(kind)
         rows = asset_table(schema.kind).empty_table() if own is None else own.rows

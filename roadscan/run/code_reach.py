@@ -51,6 +51,7 @@ CARRIERS: Final = (
     "roadscan.run.engine.compute",
     "roadscan.run.engine.fingerprint",
     "roadscan.core.errors",
+    "roadscan.core.extras",
     "roadscan.core.strict",
     "roadscan.core.survey:Survey",
     "roadscan.core.survey:SurveyConfig",

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from roadscan.core.errors import ConfigError
+from roadscan.core.extras import need
 from roadscan.simulate import files, own_files, truth
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive, drives_of
@@ -66,8 +67,11 @@ def simulate(
     Raises
     ------
     ConfigError
-        where the folder holds something else, one of these files was edited, or the map's CRS cannot be used.
+        where the folder holds something else, one of these files was edited, or the map's CRS cannot be used; where
+        the scene has a camera, and OpenCV is not installed.
     """
+    if scene.camera.on:
+        need("cv2", "a simulated camera")
     target = Path(folder)
     _prepare(scene, target, overwrite)
     earth = Earth(scene.map.crs)

@@ -7,12 +7,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import shapely
 from PIL import Image
 
+from roadscan.core.extras import cv2
 from roadscan.site.layer import SiteLayer, Style
 from roadscan.site.material import Box, Material
 from roadscan.site.parts.rasters import Images, images_of

@@ -32,6 +32,7 @@ import pyarrow.parquet as pq
 from blake3 import blake3
 
 from roadscan.core.errors import DamagedError, FullDiskError, RoadscanError, StoreError
+from roadscan.core.extras import need
 
 try:
     import fcntl
@@ -369,13 +370,15 @@ def _opened(url: str) -> tuple[Any, str]:
     Lists of what an object store holds are not kept: workers write to it at the same time.
     """
     if "://" in url:
+        if url.startswith(("s3://", "s3a://")):
+            need("s3fs", f"the store {url}")
         try:
             opened: tuple[Any, str] = fsspec.core.url_to_fs(url, use_listings_cache=False)
         except (ImportError, ValueError) as error:
             raise StoreError(
                 f"the store {url} cannot be opened: {error}",
                 expected="a folder, or the URL of an object store",
-                change="S3 needs `pip install 'roadscan[s3]'`; other stores need their package of fsspec",
+                change="install the package of fsspec for such stores",
             ) from error
         return opened
     folders = fsspec.filesystem("file")

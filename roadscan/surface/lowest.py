@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
+
+from roadscan.core.extras import cv2
 
 CROWD_CELLS: Final = 5
 """Cells to either side whose readings a cell's are compared with."""

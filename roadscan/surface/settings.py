@@ -19,7 +19,7 @@ class SurfaceConfig(SurveySection):
     """How the road's surface is reconstructed, tile by tile. Without this section it is not."""
 
     table: ClassVar[str] = "surface"
-    meaning: ClassVar[str] = "Reconstruction of the road's surface; left out, there is none."
+    meaning: ClassVar[str] = "Reconstruction of the road's surface; left out, there is none. Needs the extra `opencv`."
     may_be_left_out: ClassVar[bool] = True
 
     method: Literal["cells", "points"]

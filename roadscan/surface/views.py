@@ -7,11 +7,11 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.camera import Interior
+from roadscan.core.extras import cv2
 from roadscan.surface.kernels.picture_colours import AROUND, HEIGHT, WIDTH, sample, take_better
 
 Float64 = npt.NDArray[np.float64]

@@ -28,6 +28,7 @@ from roadscan.core.crs import (
     world_frame_of,
 )
 from roadscan.core.errors import ConfigError, CrsError, FormatError, RoadscanError, StoreError
+from roadscan.core.extras import can_draw, missing, need
 from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.grid import TileGrid
 from roadscan.core.rig import SensorKind
@@ -391,8 +392,10 @@ def check_products(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_surface(asked: Asked) -> Iterator[RoadscanError]:
-    """Settings of the surface fit the tiles, and its polygons lie on the map."""
+    """Settings of the surface fit the tiles, its polygons lie on the map, and what computes it is installed."""
     surface = SurfaceConfig.stated(asked.survey)
+    if surface is not None:
+        yield from _faults(lambda: need("cv2", "the section [surface]"), None)
     if surface is not None and asked.frame is not None:
         yield from _faults(lambda: checked_surface(asked.survey, surface))
 
@@ -530,6 +533,8 @@ def _grouped(found: Sequence[RoadscanError]) -> Iterator[RoadscanError]:
 
 
 def _notes(asked: Asked) -> Iterator[str]:
+    if not can_draw():
+        yield f"pictures of figures are not drawn: {missing('matplotlib', 'drawing').change}"
     found, settings = _tables_of_sensors(asked), asked.survey.config.segmentation
     if settings is not None and (segmented := _segmented(asked)) and (rest := sorted(found.keys() - segmented)):
         yield (

@@ -18,9 +18,9 @@ from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
 from prefect.client.schemas.objects import FlowRun, State, StateType
 
-from flows.reprocess import reprocess
-from flows.survey import survey
 from roadscan.core.errors import ConfigError, RoadscanError, RunError
+from roadscan.flows.reprocess import reprocess
+from roadscan.flows.survey import survey
 from roadscan.simulate import SimulatedSurvey
 
 pytestmark = pytest.mark.usefixtures("prefect_api")
@@ -83,8 +83,7 @@ def test_survey_makes_every_product(survey_file: Path, simulated: SimulatedSurve
     ids = FlowRunFilter(id=FlowRunFilterId(any_=[run.id]))
     tasks = sorted(client.read_task_runs(flow_run_filter=ids), key=lambda t: t.expected_start_time)
     assert [t.name for t in tasks] == [
-        "ingest", "navigate", "footprints", "adjust", "strips", "tiles", "surfaces", "products", "condition",
-        "assets",
+        "ingest", "navigate", "footprints", "adjust", "strips", "tiles", "surfaces", "products", "condition", "assets",
     ]  # fmt: skip
 
     clouds = files(survey_file, "tiles/las").values()

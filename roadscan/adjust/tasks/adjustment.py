@@ -59,9 +59,11 @@ from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
 from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
 from roadscan.adjust.tie_settings import PlaceSettings
 from roadscan.core.counted import counted as count_of
+from roadscan.core.extras import can_draw
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.plan.road import road_key
+from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.poses.movement import largest
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
@@ -144,8 +146,13 @@ def why_due(plan: SurveyPlan, manifest: Manifest) -> str:
     if record is None or record.key != solution_key(plan):
         return MISSING if record is None else CHANGED
     parts = [r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()]
-    whole = all(manifest.is_current(r.product, r.unit, r.key) for r in parts)
+    whole = all(manifest.is_current(r.product, r.unit, r.key) and _is_drawn(r) for r in parts)
     return "" if whole and record.figures()["table"] == digests_of(plan.store) else DAMAGED
+
+
+def _is_drawn(record: OutputRecord) -> bool:
+    """False of a picture that was left out for want of Matplotlib, which is there by now."""
+    return record.key != NOT_DRAWN or not can_draw()
 
 
 def withdraw(session: Session) -> None:

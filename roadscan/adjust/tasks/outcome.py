@@ -13,8 +13,9 @@ import pyarrow as pa
 from roadscan.adjust.picture import AdjustmentPicture, draw_adjustment
 from roadscan.adjust.seams_picture import ShownSeam, draw_seams
 from roadscan.adjust.tasks.figures import Rows
+from roadscan.core.extras import can_draw
 from roadscan.core.witness import Finding
-from roadscan.navigation.tasks.recorded_pictures import keep_file
+from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN, keep_file
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.codecs.grey_picture import write_png
 from roadscan.store.manifest import Manifest, OutputRecord
@@ -34,6 +35,7 @@ FOLDER: Final = "products/adjustment"
 _WHOLE: Final = "all"
 SEAMS: Final = "seams"
 """Unit of the picture of seams."""
+_FILES: Final = {_WHOLE: "adjustment", SEAMS: "seams"}
 
 
 def known_lines(manifest: Manifest) -> list[str]:
@@ -68,15 +70,19 @@ def keep_pictures(
     shown: tuple[AdjustmentPicture, Sequence[ShownSeam]],
     sightings: Sequence[Mapping[str, Any]],
 ) -> None:
-    """Draw the outcome and seams, and the picture of each target as each pass saw it; remove those of no target."""
+    """Draw the outcome and seams, and the picture of each target as each pass saw it; remove those of no target.
+
+    Without Matplotlib there are only those of targets.
+    """
     outcome, seams = shown
     targets = {_target_name(row): row for row in sightings if row["picture"]}
-    manifest.remove(manifest.beside([PICTURES], {_WHOLE, *targets, *([SEAMS] if seams else [])}))
-    if not manifest.is_current(PICTURES, _WHOLE, key):
-        draw = partial(draw_adjustment, outcome)
-        keep_file(store, manifest, (PICTURES, _WHOLE), key, f"{FOLDER}/adjustment.png", draw)
-    if seams and not manifest.is_current(PICTURES, SEAMS, key):
-        keep_file(store, manifest, (PICTURES, SEAMS), key, f"{FOLDER}/seams.png", partial(draw_seams, seams))
+    figures = {_WHOLE: partial(draw_adjustment, outcome)} | ({SEAMS: partial(draw_seams, seams)} if seams else {})
+    manifest.remove(manifest.beside([PICTURES], {*figures, *targets}))
+    for name, draw in figures.items():
+        if not can_draw():
+            manifest.add([OutputRecord(PICTURES, name, NOT_DRAWN, "", 0, "")])
+        elif not manifest.is_current(PICTURES, name, key):
+            keep_file(store, manifest, (PICTURES, name), key, f"{FOLDER}/{_FILES[name]}.png", draw)
     for name, row in targets.items():
         own = key_of(row["picture"], row["picture_columns"], row["status"])
         if not manifest.is_current(PICTURES, name, own):

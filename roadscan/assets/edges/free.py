@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -15,6 +14,7 @@ from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.kernels.corridors import mark_corridor
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.core.extras import cv2
 
 _FENCE_M: Final = (0.35, 1.2)
 """Heights above the ground at which every fence and wall is seen."""

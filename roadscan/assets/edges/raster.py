@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -17,6 +16,7 @@ from roadscan.assets.kernels.low_heights import low_heights
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.smoothing import gaussian
+from roadscan.core.extras import cv2
 
 Float64 = npt.NDArray[np.float64]
 

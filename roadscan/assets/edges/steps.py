@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple, Self
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
@@ -24,6 +23,7 @@ from roadscan.assets.kernels.step_filter import (
     take_excess,
     thin,
 )
+from roadscan.core.extras import cv2
 
 Float64 = npt.NDArray[np.float64]
 

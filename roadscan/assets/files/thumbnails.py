@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import laspy
 import numpy as np
 import numpy.typing as npt
 import shapely
 
 from roadscan.assets import classes
+from roadscan.core.extras import cv2
 
 Float64 = npt.NDArray[np.float64]
 UInt8 = npt.NDArray[np.uint8]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -15,6 +14,7 @@ from roadscan.assets.ground.surface import Found, Place, Surface
 from roadscan.assets.ground.undersides import undersides
 from roadscan.assets.kernels.ground_cells import on_ground, scatter
 from roadscan.assets.kernels.lowest import lowest_returns
+from roadscan.core.extras import cv2
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]

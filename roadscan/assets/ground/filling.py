@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.kernels.filling import begin, halved, relax
+from roadscan.core.extras import cv2
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -20,6 +19,7 @@ from roadscan.assets.ground.surface import Found, Place, Surface, is_dense
 from roadscan.assets.kernels.heights import heights_above
 from roadscan.assets.kernels.lowest import lowest_returns
 from roadscan.assets.kernels.planes import planes
+from roadscan.core.extras import cv2
 
 _BLOCK_M: Final = 10.0
 """Planes are sought in squares of the map of this edge."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.ground.filling import distances
 from roadscan.assets.scene import GroundModel
+from roadscan.core.extras import cv2
 
 Bools = npt.NDArray[np.bool_]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -15,6 +14,7 @@ from roadscan.assets.ground.surface import Found, Place, Surface
 from roadscan.assets.kernels.ground_cells import cell_heights
 from roadscan.assets.kernels.heights import heights_above
 from roadscan.assets.kernels.lowest import lowest_returns
+from roadscan.core.extras import cv2
 
 Float32 = npt.NDArray[np.float32]
 

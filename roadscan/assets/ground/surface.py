@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -14,6 +13,7 @@ from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.kernels.lowest import counts
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
+from roadscan.core.extras import cv2
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.bins import cells_of
 from roadscan.assets.ground.grid import Grid
 from roadscan.assets.returns import Returns
+from roadscan.core.extras import cv2
 
 Bools = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]

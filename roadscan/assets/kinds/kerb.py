@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -24,6 +23,7 @@ from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
 from roadscan.compute.ways import way_along
+from roadscan.core.extras import cv2
 from roadscan.core.strict import Strict
 
 Float64 = npt.NDArray[np.float64]

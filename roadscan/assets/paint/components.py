@@ -105,7 +105,7 @@ def components_of(found: Contrast) -> list[Component]:
 
 def _painted(found: Contrast) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Cells that may be paint (rows, columns), and those of them that paint begins at."""
-    import cv2
+    from roadscan.core.extras import cv2
 
     size = 2 * round(_NEAR_M / CELL_M) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))

@@ -145,7 +145,7 @@ def _means(
 
     The last are the numbers of cells with enough returns, and of rough ones among them.
     """
-    import cv2
+    from roadscan.core.extras import cv2
 
     sums = np.zeros((shape[0] * shape[1], 5), np.float32)
     paint_sums(cell, contrast, noise, height, sums)

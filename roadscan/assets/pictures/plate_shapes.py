@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.pictures.plate_outlines import SHAPES, plate_outline
 from roadscan.assets.pictures.reader import CutOut
+from roadscan.core.extras import cv2
 
 Float64 = npt.NDArray[np.float64]
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -21,6 +20,7 @@ from roadscan.assets.screens import SCREENS
 from roadscan.assets.tasks.picture_work import CUT_OUTS, SEEN, PictureTask, SquareObjects, around, rows_by_square
 from roadscan.assets.tasks.recognition import recognition_of
 from roadscan.assets.tasks.sights import best_sights, named
+from roadscan.core.extras import cv2
 from roadscan.core.grid import Bounds
 from roadscan.run.engine.compute import reason_of
 from roadscan.store.manifest import OutputRecord, read_recorded
@@ -35,7 +35,7 @@ Float64 = npt.NDArray[np.float64]
 TOLD: Final = pa.schema([("object", pa.string()), ("pictures", pa.string()), ("told", pa.string())])
 """What pictures tell of objects: `told` holds columns of the kind as JSON."""
 FOLDER: Final = "products/asset_pictures"
-_JPEG: Final = [int(cv2.IMWRITE_JPEG_QUALITY), 90]
+_JPEG_QUALITY: Final = 90
 _LEAST_MARGIN_PX: Final = 6.0
 _GREY_STEP: Final = 16
 _GREY_WITHIN: Final = 3
@@ -156,7 +156,8 @@ class _Search:
 
     def _kept(self, one: SquareObjects, name: str, cut: CutOut) -> OutputRecord:
         """Write a cut-out."""
-        done, encoded = cv2.imencode(".jpg", np.ascontiguousarray(cut.pixels[:, :, ::-1]), _JPEG)
+        quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+        done, encoded = cv2.imencode(".jpg", np.ascontiguousarray(cut.pixels[:, :, ::-1]), quality)
         if not done:
             raise OSError(f"the cut-out {name} cannot be encoded")
         content, target = encoded.tobytes(), f"{FOLDER}/{one.kind}/{name}.jpg"

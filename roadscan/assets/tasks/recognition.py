@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.pictures.reader import CutOut, Recognition
 from roadscan.assets.pictures.settings import AssetPicturesSettings
 from roadscan.core.errors import ConfigError
+from roadscan.core.extras import cv2, need, needed
 from roadscan.store.store import file_digest
 
 Float32 = npt.NDArray[np.float32]
@@ -69,10 +68,7 @@ class OnnxModel:
     """
 
     def __init__(self, path: Path) -> None:
-        if importlib.util.find_spec("onnxruntime") is None:
-            raise ConfigError(
-                "assets.pictures.recogniser needs the package onnxruntime", change='pip install "roadscan[onnx]"'
-            )
+        need("onnxruntime", "assets.pictures.recogniser")
         if not path.is_file():
             raise ConfigError("the recogniser is not there", expected="a file of ONNX", file=path)
         import onnxruntime
@@ -132,8 +128,8 @@ def recognition_of(text: bool, model: Path | None) -> Recognition:
 
 def check_recognition(settings: AssetPicturesSettings, model: Path | None) -> None:
     """Raise :class:`ConfigError` where the survey asks for what is not installed, or a model that is not one."""
-    if settings.text and importlib.util.find_spec("rapidocr") is None:
-        raise ConfigError("assets.pictures.text needs the package rapidocr", change='pip install "roadscan[ocr]"')
+    if settings.text:
+        need("rapidocr", "assets.pictures.text")
     if model is not None:
         OnnxModel(model)
 
@@ -145,10 +141,7 @@ def _recognition(text: bool, model: Path | None, _content: str) -> Recognition:
 
 def _ocr() -> Any:
     """The OCR package with the models that it ships."""
-    if importlib.util.find_spec("rapidocr") is None:
-        raise ConfigError("assets.pictures.text needs the package rapidocr", change='pip install "roadscan[ocr]"')
-    import rapidocr
-
+    rapidocr: Any = needed("rapidocr", "assets.pictures.text")
     return rapidocr.RapidOCR(params={"Global.log_level": "error", **_ONE_THREAD})
 
 

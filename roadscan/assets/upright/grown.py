@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -17,6 +16,7 @@ from roadscan.assets.kernels.grown_cells import low_moments
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
 from roadscan.assets.upright.panels import panels_of
+from roadscan.core.extras import cv2
 from roadscan.core.strict import Strict
 
 Float64 = npt.NDArray[np.float64]

@@ -16,16 +16,17 @@ from roadscan.calibrate.picture import CalibrationPicture, draw_calibration
 from roadscan.calibrate.tasks.calibration_evidence import Collected, collect
 from roadscan.calibrate.unknowns import Estimate, ObjectPose
 from roadscan.core.errors import ConfigError, DamagedError, RunError, nearest
+from roadscan.core.extras import can_draw, need
 from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.ids import ALL_RUNS
 from roadscan.core.settings.calibration import CalibrationSettings, ObjectEvidence, OverlapEvidence
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import DatedMountings, SurveyPlan, plan_survey
 from roadscan.georeference.sources import load_mountings
-from roadscan.navigation.tasks.recorded_pictures import CALIBRATION, keep_file, picture_key
+from roadscan.navigation.tasks.recorded_pictures import CALIBRATION, NOT_DRAWN, keep_file, picture_key
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.store.manifest import Manifest
+from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
@@ -70,6 +71,8 @@ def calibrate_survey(survey: Survey, store: Store, say: Report = lambda _: None)
             "the survey file names no evidence for a calibration",
             expected='[[calibration]] with kind = "overlap", "object", "stop_and_go" or "reference"',
         )
+    if any(entry.kind == "reference" for entry in config.calibration):
+        need("small_gicp", 'a [[calibration]] with kind = "reference"')
     settings = config.navigation.calibration
     calibrated = _sound_mountings(store, say)
     plan = plan_survey(survey, store, calibrated)
@@ -123,6 +126,9 @@ def _write_report(store: Store, manifest: Manifest, unit: str, values: dict[str,
             draw_calibration(path, CalibrationPicture.of_values(values["picture"]))
 
     detail = json.dumps(values, sort_keys=True)
+    if unit == _PICTURE and not can_draw():
+        manifest.add([OutputRecord(CALIBRATION, unit, NOT_DRAWN, "", 0, "", detail)])
+        return
     key, target = picture_key(detail), TEXT if unit == _TEXT else PICTURE
     keep_file(store, manifest, (CALIBRATION, unit), key, target, write, detail)
 
@@ -133,9 +139,11 @@ def renew_reports(store: Store, say: Report = lambda _: None) -> None:
         return
     manifest = Manifest(store)
     for unit, record in manifest.of(CALIBRATION).items():
+        if record.key == NOT_DRAWN and not can_draw():
+            continue
         if not manifest.is_current(CALIBRATION, unit, picture_key(record.detail)):
             _write_report(store, manifest, unit, record.figures())
-            say(f"drawn: {record.path}")
+            say(f"drawn: {TEXT if unit == _TEXT else PICTURE}")
 
 
 class _Finder:

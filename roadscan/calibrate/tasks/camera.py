@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -26,6 +25,7 @@ from roadscan.calibrate.evidence import Traverse
 from roadscan.calibrate.resection import Exposure, Measured, Resection, Target, project, resect
 from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError, FormatError, RunError, nearest
+from roadscan.core.extras import cv2
 from roadscan.core.frames import body_from_axes, rph_from_rotation
 from roadscan.core.rig import Mounting, Rig, Sensor
 from roadscan.core.rig_text import update_rig_file

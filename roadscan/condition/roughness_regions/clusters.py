@@ -6,12 +6,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import shapely
 
 from roadscan.condition.roughness_regions.raster import IntensityRaster
+from roadscan.core.extras import cv2
 
 _EDGE_CELLS: Final = 3
 """How far the edge of a cluster can move out when it is drawn halfway between it and the road."""

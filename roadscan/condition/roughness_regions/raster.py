@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
 
 from roadscan.condition.natural_neighbour import interpolate
 from roadscan.condition.roughness_regions.points import RoadPoints
+from roadscan.core.extras import cv2
 
 Float64 = npt.NDArray[np.float64]
 

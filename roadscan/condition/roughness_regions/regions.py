@@ -17,7 +17,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -29,6 +28,7 @@ from roadscan.condition.roughness_regions.raster import IntensityRaster, closed,
 from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
 from roadscan.condition.roughness_regions.severity import UNKNOWN, Severity, severity
 from roadscan.condition.roughness_regions.surface import RoadSurface, road_below
+from roadscan.core.extras import cv2
 
 Float64 = npt.NDArray[np.float64]
 

@@ -18,6 +18,7 @@ from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.whole_sections import WholeSections
 from roadscan.condition.picture import Crossing, Strip, draw_crossings, draw_strips
 from roadscan.condition.tasks.values import VALUES, Group, GroupTask, load_lane
+from roadscan.core.extras import can_draw
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
@@ -52,7 +53,9 @@ class PictureTask:
 
 
 def plan_pictures(tasks: Sequence[GroupTask], manifest: Manifest) -> list[PictureTask]:
-    """Both pictures of each group whose values are there."""
+    """Both pictures of each group whose values are there; none without Matplotlib."""
+    if not can_draw():
+        return []
     held = manifest.of(VALUES)
     code = code_digest("roadscan.condition.tasks.pictures:draw_picture")
     drawn = {name: one.drawn for name, one in condition_indices().items()}

@@ -17,6 +17,8 @@ from roadscan.condition.on_lane.ravelling import RavelledPatch, RavelledSection
 from roadscan.condition.on_lane.squares import SQUARE_M
 from roadscan.condition.ravelling_picture import DrawnLane, draw_ravelling
 from roadscan.condition.tasks.values import Group, GroupTask, load_lane
+from roadscan.core.extras import can_draw
+from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of
@@ -66,7 +68,7 @@ def plan_patches(tasks: Sequence[GroupTask]) -> list[PatchTask]:
 
 def due_patches(tasks: Sequence[PatchTask], manifest: Manifest) -> list[PatchTask]:
     """Those that are missing or stale."""
-    names = (RAVELLING, RAVELLING_PICTURES)
+    names = (RAVELLING, RAVELLING_PICTURES) if can_draw() else (RAVELLING,)
     return [t for t in tasks if not all(manifest.is_current(n, t.units[0], t.key) for n in names)]
 
 
@@ -150,6 +152,8 @@ def _draw(one: PatchTask, lane: LaneData, found: Found) -> OutputRecord:
             drawn.append(DrawnLane(title, held.texture_mm / section.background_mm, corner, SQUARE_M, outlines))
     if not drawn:
         return OutputRecord(RAVELLING_PICTURES, one.units[0], one.key, "", 0, "")
+    if not can_draw():
+        return OutputRecord(RAVELLING_PICTURES, one.units[0], NOT_DRAWN, "", 0, "")
     target = f"products/{RAVELLING_PICTURES}/{one.units[0].replace('/', '_')}.png"
     with one.task.store.scratch() as folder:
         path = folder / "ravelling.png"

@@ -19,8 +19,10 @@ from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.tasks import PieceTask
 from roadscan.condition.tasks.tiles_beside import tiles_beside
+from roadscan.core.extras import can_draw
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
+from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of
@@ -93,7 +95,8 @@ def plan_pieces(
 
 def due_pieces(pieces: Sequence[Piece], manifest: Manifest) -> list[Piece]:
     """Those that are missing or stale."""
-    return [p for p in pieces if not all(manifest.is_current(n, p.unit, p.key) for n in _OUTPUTS)]
+    names = _OUTPUTS if can_draw() else _OUTPUTS[:-1]
+    return [p for p in pieces if not all(manifest.is_current(n, p.unit, p.key) for n in names)]
 
 
 def regions_of_pieces(task: RegionTask) -> TaskResult:
@@ -209,6 +212,8 @@ def _draw(task: RegionTask, piece: Piece, found: Sequence[SectionRegions]) -> Ou
     ]  # fmt: skip
     if not drawn:
         return OutputRecord(REGION_PICTURES, piece.unit, piece.key, "", 0, "")
+    if not can_draw():
+        return OutputRecord(REGION_PICTURES, piece.unit, NOT_DRAWN, "", 0, "")
     target = f"products/{REGION_PICTURES}/{piece.unit.replace('/', '_')}.png"
     with task.store.scratch() as folder:
         path = folder / "regions.png"

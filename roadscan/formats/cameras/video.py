@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError, FormatError
+from roadscan.core.extras import need
 from roadscan.store.codecs.avi_index import frames_in_place
 from roadscan.store.codecs.child import Child, ChildError
 
@@ -79,9 +80,12 @@ def look_into(path: Path) -> Video:
 
     Raises
     ------
+    ConfigError
+        without OpenCV, which opens it.
     FormatError
         if it cannot be read as a video, or takes far too long.
     """
+    need("cv2", "a video")
     size = path.stat().st_size
     arguments = (str(path), str(size // LEAST_FRAME_BYTES), str(LARGEST_DECODED_BYTES))
     try:

@@ -27,11 +27,11 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final, Literal, Self
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import FormatError
+from roadscan.core.extras import cv2
 from roadscan.store.codecs.image_files import ImageError, jpeg_size, plain_png, png_size
 
 UInt8 = npt.NDArray[np.uint8]

@@ -20,6 +20,7 @@ import shapely
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError
+from roadscan.core.extras import needed
 from roadscan.inventory.home import CHOICES, FID, Author, Content, Decision, Home, HomeError, Mark, Sheet
 from roadscan.inventory.homes.map_crs import into_map
 from roadscan.inventory.homes.postgis_schema import ROLES, statements
@@ -54,12 +55,7 @@ class PostGis(Home):
         self, address: str, schema: str = "inventory", srid: int | None = None, kinds: Sequence[str] | None = None,
         project: Path | None = None, frame: MapFrame | None = None,
     ) -> None:  # fmt: skip
-        try:
-            import psycopg
-        except ImportError as error:
-            raise ConfigError(
-                "the driver of PostgreSQL is missing", change="`pip install 'roadscan[postgis]'`"
-            ) from error
+        psycopg: Any = needed("psycopg", "a home in PostGIS")
         try:
             self._parts = psycopg.conninfo.conninfo_to_dict(address)
         except psycopg.Error:

@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from roadscan.core.clock_evidence import MotionEvidence
 from roadscan.core.errors import ConfigError, RoadscanError, RunError, nearest
+from roadscan.core.extras import can_draw
 from roadscan.core.survey import LogConfig, Survey
 from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
 from roadscan.ingest.clocks.stated_pairs import log_pairs
@@ -104,7 +105,7 @@ def estimate_clocks(
         done = {(e.run, e.sensor, e.applied) for e in found}
         found += [e for place, e in known.items() if place not in done]
     else:
-        remove_others(manifest, CLOCK_PICTURE, [task.unit for task in tasks])
+        remove_others(manifest, CLOCK_PICTURE, [task.unit for task in tasks] if can_draw() else [])
     if sorted(map(_place, found)) != sorted(map(_place, known.values())):
         keep_estimates(store, found)
     if failures:
@@ -341,8 +342,8 @@ def _estimate(
 
 
 def _draw(survey: Survey, store: Store, manifest: Manifest, task: _Task, estimate: ClockEstimate) -> None:
-    """Draw the picture of an estimate's residuals, unless it is there."""
-    if estimate.residuals is None:
+    """Draw the picture of an estimate's residuals, unless it is there or there is no Matplotlib."""
+    if estimate.residuals is None or not can_draw():
         return
     picture = ClockPicture(
         title=f"{survey.config.id} · run {estimate.run} · clock of {', '.join(task.sensors)}",

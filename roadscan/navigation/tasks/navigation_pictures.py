@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.core.extras import can_draw
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.ids import of_run
 from roadscan.core.survey import Survey
@@ -45,11 +46,15 @@ def draw_trajectories(
 ) -> None:
     """Draw the pictures of computed trajectories that are missing, damaged or out of date; remove those of no run.
 
+    Without Matplotlib there are none.
+
     Parameters
     ----------
     records : of the computed trajectories that hold.
     runs : those that shall have one.
     """
+    if not can_draw():
+        runs, records = (), ()
     if not runs and not store.files(_FOLDER):
         return
     manifest = Manifest(store)

@@ -19,6 +19,8 @@ NAVIGATION_PICTURE: Final = "navigation_picture"
 CLOCK_PICTURE: Final = "clock_picture"
 CALIBRATION: Final = "calibration"
 """Products of the records."""
+NOT_DRAWN: Final = "not drawn"
+"""Key of the record of a picture that was left out for want of Matplotlib."""
 _DRAWN_BY: Final = ("roadscan.calibrate.picture", "roadscan.navigation.clocks.picture", "roadscan.navigation.picture")
 
 

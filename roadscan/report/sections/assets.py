@@ -13,6 +13,7 @@ import shapely
 
 from roadscan.assets.files.layers import Layer
 from roadscan.assets.tasks.tables import TABLES, read_layer
+from roadscan.core.extras import is_installed
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.report.asset_thumbnails import Thumbnails
 from roadscan.report.blocks import Block, Drawing, Line, Picture, Table
@@ -48,7 +49,7 @@ class Assets(Section):
             yield _drawing(held)
         thumbnails = Thumbnails(material.session)
         for schema, layer in held:
-            some = thumbnails.of(layer)
+            some = thumbnails.of(layer) if is_installed("cv2") else None
             if some is not None:
                 yield Picture(some, f"{schema.title}: {_SEEN}")
             shown = ["road", "station_m", "offset_m", *(c.name for c in schema.own if not c.is_evidence), "probability"]

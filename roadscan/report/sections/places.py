@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 from urllib.parse import quote
 
+from roadscan.core.extras import is_installed
 from roadscan.georeference.plan.plan import NothingToPlaceError
 from roadscan.report.blocks import Block, Paragraph, Picture
 from roadscan.report.section import Material, Section
@@ -32,7 +33,9 @@ class Places(Section):
     position = 120
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """Pictures that lead into the page where a published site lies beside the report."""
+        """Pictures that lead into the page where a published site lies beside the report; none without OpenCV."""
+        if not is_installed("cv2"):
+            return
         site = Site(material.session)
         try:
             extent_m = site.extent_m

@@ -11,7 +11,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,8 @@ from distributed import Client, Nanny, Scheduler, Security, SpecCluster, Worker
 from distributed.worker_memory import parse_memory_limit
 from tornado.ioloop import PeriodicCallback
 
-from roadscan.core.errors import ConfigError, RunError
+from roadscan.core.errors import RunError
+from roadscan.core.extras import need
 from roadscan.core.private_folder import Code, check_private
 from roadscan.core.stopping import Stopped
 from roadscan.run.engine.on_dask import QUIET_CLIENT, OnDask
@@ -113,11 +113,8 @@ def embedded(workers: int | None = None, dashboard: Callable[[str], None] | None
     RunError
         The workers end as soon as they start.
     """
-    if dashboard is not None and find_spec("bokeh") is None:
-        raise ConfigError(
-            "a dashboard is asked for, and Bokeh, which draws it, is not installed",
-            change="pip install 'roadscan[dashboard]', or leave out --dashboard",
-        )
+    if dashboard is not None:
+        need("bokeh", "--dashboard")
     with contextlib.ExitStack() as opened:
         opened.enter_context(dask.config.set(QUIET_CLUSTER | {"temporary-directory": opened.enter_context(_scratch())}))
         with _held_back(), _without_interrupts():

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -14,6 +13,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
+from roadscan.core.extras import cv2
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import stream

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.extras import cv2
 from roadscan.simulate.caster import Hits, World
 from roadscan.simulate.kernels import things as body
 from roadscan.simulate.scene.roadside import Sign

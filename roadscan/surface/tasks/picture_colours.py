@@ -7,10 +7,10 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.extras import cv2
 from roadscan.store.codecs.image_files import ImageError, image_size
 from roadscan.surface.tasks.pictures import Pictures
 from roadscan.surface.views import HEIGHT, NO_VIEW, WIDTH, Shown, best_views, sampled

@@ -1,4 +1,4 @@
-"""Cubic triangles that meet smoothly: Clough–Tocher with cubic precision.
+"""Piecewise cubic surface over triangles with continuous slopes: Clough–Tocher with cubic precision.
 
 Each triangle is split at its centroid into three cubic Bézier triangles (Clough & Tocher 1965; Farin 1986). The paper
 (section 3.2.3) gives heights of control points on the edges from slopes at the ends: a third of the way along an edge
@@ -51,17 +51,17 @@ NOWHERE: Final = np.nan
 
 @dataclass(frozen=True)
 class CubicSurface:
-    """A surface of cubic triangles."""
+    """A C¹ surface of cubic triangles."""
 
     sites: Sites
     mesh: Triangulation
     patches: npt.NDArray[np.float64]
-    """(n, 19) heights of control points (m); their order stands in ``kernels.surface.clough_tocher``."""
+    """(n, 19) heights of control points (m); ``kernels.surface.clough_tocher`` defines their order."""
 
     def heights(self, window: GridWindow) -> npt.NDArray[np.float64]:
-        """(rows, columns) heights (m) at the nodes of a window, south row first, NaN where no triangle lies.
+        """Returns heights (rows, columns) (m) at the nodes of a window, south row first, NaN outside all triangles.
 
-        A node on an edge belongs to the last triangle in the order of the sites, whatever else the region holds.
+        A node on an edge belongs to the last triangle in the order of the sites, whatever else the region contains.
         """
         found = np.full((window.rows, window.columns), NOWHERE)
         if not found.size or not len(self.mesh):
@@ -76,7 +76,7 @@ class CubicSurface:
 
 
 def cubic_surface(sites: Sites, mesh: Triangulation, slopes: npt.NDArray[np.float64]) -> CubicSurface:
-    """The surface through sites with given slopes.
+    """Returns the surface through sites with given slopes.
 
     Parameters
     ----------

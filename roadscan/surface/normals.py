@@ -52,9 +52,9 @@ from roadscan.surface.sites import Sites
 from roadscan.surface.triangulation import Triangulation
 
 RINGS: Final = MOST_RINGS
-"""Farthest neighbours that a slope depends on, in edges."""
+"""Greatest distance of a neighbour on which a slope depends, in edges."""
 _TOGETHER: Final = 4096
-"""Sites whose neighbourhoods are held at a time."""
+"""Sites whose neighbourhoods are in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Slopes:
 
 
 def slopes_at(sites: Sites, mesh: Triangulation, kind: SlopeKind) -> Slopes:
-    """Slopes at all sites; zero at those without a triangle."""
+    """Returns slopes at all sites; zero at those without a triangle."""
     starts, neighbours = mesh.neighbours(len(sites))
     slopes, sources = np.zeros((len(sites), 2)), np.full(len(sites), LEVEL, np.uint8)
     if kind == "cubic":
@@ -85,10 +85,10 @@ def _splines(
     slopes: npt.NDArray[np.float64],
     sources: npt.NDArray[np.uint8],
 ) -> None:
-    """Slopes of splines where the neighbours bear one."""
+    """Returns slopes of splines where the neighbours determine one."""
     x, y = sites.local_m()
     ring, seen = np.empty(len(sites) + 1, np.int64), np.full(len(sites), -1)
-    work = np.empty(math.prod(WORK) + 8)  # from a multiple of 64 bytes on: a register's load is one line of the cache
+    work = np.empty(math.prod(WORK) + 8)  # aligned to 64 bytes, so that one register is one cache line
     work = work[-work.ctypes.data % 64 // 8 :][: math.prod(WORK)].reshape(WORK)
     for first in range(0, len(sites), _TOGETHER):
         many = min(_TOGETHER, len(sites) - first)

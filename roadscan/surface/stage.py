@@ -1,4 +1,4 @@
-"""Stage `surfaces`: cells or points into the reconstructed surface and its products."""
+"""Stage `surfaces`: cells or points are turned into the reconstructed surface and its products."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from roadscan.tiles.tasks.tiles import run_tasks
 
 
 class Surfaces(Stage):
-    """The road's surface, where the survey file has a section `[surface]`."""
+    """The stage of the road's surface; it runs where the survey file has a section `[surface]`."""
 
     name = "surfaces"
     title = "cells or points into the reconstructed surface and its files"
@@ -49,12 +49,12 @@ class Surfaces(Stage):
         session.failed(self.name, failures)
 
     def state(self, session: Session) -> StageState:
-        """Tiles whose surface is missing or stale, of those that hold cells by now."""
+        """Returns tiles whose surface is missing or stale, of those that have cells by now."""
         work = plan_surface_work(session)
         waiting = set() if work.planned is None else work.planned.waiting & work.planned.cells.keys()
         stale = len(work.chosen) + len(waiting)
         return StageState(len(session.manifest.of(SURFACE)) - len(work.chosen), stale, next_run={"surfaces": stale})
 
     def folders(self) -> Sequence[str]:
-        """Outlines of the regions; files of surfaces lie beside those of tiles."""
+        """Returns folders: outlines of the regions; files of surfaces are beside those of tiles."""
         return ("tables/regions",)

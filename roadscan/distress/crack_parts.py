@@ -83,7 +83,7 @@ def parts_of(
 
 
 def _closed(whole: Network) -> Iterator[Int64]:
-    """Returns the pieces of each connected set that lies on closed polygons, bridges left out."""
+    """Yields the pieces of each connected set that lies on closed polygons, bridges left out."""
     kept = np.flatnonzero(~bridges(whole.ends))
     if kept.size:
         yield from grouped(kept, components(whole.ends[kept]))
@@ -121,7 +121,7 @@ def _mark_strokes(whole: Network, rest: Int64, part: Int64, kinds: list[int]) ->
 
 
 def _pairs(pieces: Int64, outwards: Float64, only_two: bool) -> list[tuple[int, int]]:
-    """Yields pairs of the pieces that meet at a node and continue one another, the straightest first."""
+    """Returns pairs of the pieces that meet at a node and continue one another, the straightest first."""
     count = len(pieces)
     if count == 2 and only_two:
         return [(int(pieces[0]), int(pieces[1]))]

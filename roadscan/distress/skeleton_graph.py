@@ -104,7 +104,7 @@ class SkeletonGraph:
         return np.where((self.degree == 2)[:, None], 0.5 * place + 0.25 * total, place)
 
     def paths(self, own: Bool) -> Iterator[list[int]]:
-        """Returns the paths (cells) from node to node over the edges (m,) that are `own`.
+        """Yields the paths (cells) from node to node over the edges (m,) that are `own`.
 
         A node is a cell with other than two neighbours, or one where these edges end.
         """

@@ -198,7 +198,7 @@ class _Compared:
         self.makers.append(maker)
 
     def significant(self) -> Iterator[Change]:
-        """Returns changes up to the largest probability p(k) ≤ q k / m (Benjamini and Hochberg 1995, eq. 1)."""
+        """Yields changes up to the largest probability p(k) ≤ q k / m (Benjamini and Hochberg 1995, eq. 1)."""
         ordered = np.sort(np.concatenate([np.empty(0), *self.chances]))
         holds = np.flatnonzero(ordered <= _FALSE_SHARE * np.arange(1, ordered.size + 1) / max(ordered.size, 1))
         limit = ordered[holds[-1]] if holds.size else -1.0

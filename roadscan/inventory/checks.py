@@ -120,7 +120,7 @@ def _parent_fault(change: Change, kinds: Mapping[str, str], state: State) -> str
 
 
 def _doubles(changes: Changes, state: State, unit_m: float) -> Iterator[EditFault]:
-    """Returns faults for new points on an asset of their kind, and for new shapes that equal an existing one."""
+    """Yields faults for new points on an asset of their kind, and for new shapes that equal an existing one."""
     for change in changes.drawn:
         assets = state.assets.get(change.kind)
         if assets is None or not assets.ids.size or _geometry_fault(change.kind, change.new) is not None:
@@ -138,7 +138,7 @@ def _doubles(changes: Changes, state: State, unit_m: float) -> Iterator[EditFaul
 
 
 def _at_zero(changes: Changes, state: State, unit_m: float) -> Iterator[EditFault]:
-    """Returns faults for shapes at height 0, which programs write where none is set, among assets at other heights."""
+    """Yields faults for shapes at height 0, which programs write where none is set, among assets at other heights."""
     for change in (*changes.drawn, *changes.changed):
         if change.attribute != GEOMETRY or _geometry_fault(change.kind, change.new) is not None:
             continue
@@ -164,7 +164,7 @@ def _heights_around(state: State, place_m: npt.NDArray[np.float64]) -> npt.NDArr
 
 
 def _circles(changes: Changes, state: State) -> Iterator[EditFault]:
-    """Returns faults for assets that are, through a chain of parents, their own parents."""
+    """Yields faults for assets that are, through a chain of parents, their own parents."""
     given = {c.asset_id: c for c in changes.changed if c.attribute == "parent" and c.new is not None}
     if not given:
         return

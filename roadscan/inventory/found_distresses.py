@@ -54,7 +54,7 @@ class FoundKind(NamedTuple):
 
 
 def found_distresses(session: Session) -> Iterator[FoundKind]:
-    """Returns rows of each kind of distress that the survey was searched for."""
+    """Yields rows of each kind of distress that the survey was searched for."""
     searched = {kind: records for kind in asset_kind_names() if (records := _records(session, asset_schema(kind)))}
     if not searched:
         return

@@ -201,7 +201,7 @@ def _size_difference(known: Floats, found: Floats, pairs: Pairs) -> Floats:
 
 
 def _assign(pairs: Pairs, result: Ints) -> None:
-    """Returns pairs, one to one: as many as possible, with the least sum of costs."""
+    """Choose pairs, one to one: as many as possible, with the least sum of costs."""
     if not pairs.known.size:
         return
     known, a = np.unique(pairs.known, return_inverse=True)

@@ -75,14 +75,14 @@ _FACADE_RISE_M: Final = 100.0
 
 
 def questions_of(changes: Changes, state: State) -> Iterator[EditFault]:
-    """Returns possible but unlikely changes, compared with the inventory that they are to be taken into."""
+    """Yields possible but unlikely changes, compared with the inventory that they are to be taken into."""
     yield from _emptied(changes, state)
     yield from _sizes(changes, state)
     yield from _places(changes, state)
 
 
 def _emptied(changes: Changes, state: State) -> Iterator[EditFault]:
-    """Returns questions for layers of which all or many rows are missing; their record is the name of the layer."""
+    """Yields questions for layers of which all or many rows are missing; their record is the name of the layer."""
     for kind, count in Counter(kind for kind, one in changes.deleted if _stands(state, one)).items():
         held = sum(_stands(state, one) for one in changes.before[kind]["asset_id"].to_pylist())
         if any(count > share * held and count >= least for share, least in _MOST_AND):
@@ -97,7 +97,7 @@ def _stands(state: State, asset_id: str) -> bool:
 
 
 def _sizes(changes: Changes, state: State) -> Iterator[EditFault]:
-    """Returns questions for lengths and heights that are unlike what was found."""
+    """Yields questions for lengths and heights that are unlike what was found."""
     drawn = {change.asset_id for change in changes.drawn}
     reshaped = drawn | {change.asset_id for change in changes.changed if change.attribute == GEOMETRY}
     given = [

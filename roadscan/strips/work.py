@@ -282,7 +282,7 @@ def _seen_by(task: StripTask, placer: Georeferencer, way: Way, slices: Sequence[
 def _placed(
     task: StripTask, placer: Georeferencer, way: Way, slices: Sequence[RawSlice]
 ) -> Iterator[tuple[int, PlacedReadings]]:  # fmt: skip
-    """Returns thinned readings of the row groups, and their number before thinning."""
+    """Yields thinned readings of the row groups, and their number before thinning."""
     geometry = geometry_of(slices[0].source)
     rows = sum(rows for one, rows in zip(task.slices, task.rows, strict=True) if one in slices)
     wanted = _READINGS if geometry is None else _PROFILES_PER_M * way.length_m

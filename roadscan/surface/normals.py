@@ -85,7 +85,7 @@ def _splines(
     slopes: npt.NDArray[np.float64],
     sources: npt.NDArray[np.uint8],
 ) -> None:
-    """Returns slopes of splines where the neighbours determine one."""
+    """Compute slopes of splines where the neighbours determine one."""
     x, y = sites.local_m()
     ring, seen = np.empty(len(sites) + 1, np.int64), np.full(len(sites), -1)
     work = np.empty(math.prod(WORK) + 8)  # aligned to 64 bytes, so that one register is one cache line

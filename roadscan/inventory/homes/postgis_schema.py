@@ -38,7 +38,7 @@ CREATE TABLE {s}.roadscan_inventory (
 
 
 def statements(schema: str, srid: int, kinds: Sequence[str], *, is_new: bool = True) -> Iterator[str]:
-    """Returns statements that create the tables of a new schema, or missing ones in an existing schema.
+    """Yields statements that create the tables of a new schema, or missing ones in an existing schema.
 
     Names of the schema and of the kinds are validated: letters, digits, `_`.
     """
@@ -59,7 +59,7 @@ def statements(schema: str, srid: int, kinds: Sequence[str], *, is_new: bool = T
 
 
 def grants(schema: str, kinds: Sequence[str]) -> Iterator[str]:
-    """Returns grants: readers look; editors change assets and decide conflicts; administrators do all."""
+    """Yields grants: readers look; editors change assets and decide conflicts; administrators do all."""
     names = ", ".join(f"{schema}_{role}" for role in ROLES)
     yield f"GRANT USAGE ON SCHEMA {schema} TO {names}"
     yield f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {names}"

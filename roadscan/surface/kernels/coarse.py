@@ -189,7 +189,7 @@ def median_of_rows(above, here, below, out):
 
 @inner
 def median_of_some(surface, p, k, some):
-    """Returns median of those present of the 3 × 3 nodes around (p, k); of an even number the mean of the middle two.
+    """Returns the median of those of the 3 × 3 nodes around (p, k) that exist; of an even number the mean of two.
 
     some : (9,) float64, scratch.
     """

@@ -34,7 +34,7 @@ def keep_nearest(x, y, i, ring, count, white, far):
 
 @kernel
 def units(x, y, i, ring, count, axes):
-    """Returns the lower triangular 2 × 2 factor that turns offsets into units of their spread.
+    """Compute the lower triangular 2 × 2 factor that turns offsets into units of their spread.
 
     The units are the same in all directions, so that the ground is as rough along as across, except where the ring is
     longer than `STRETCH` times its width.

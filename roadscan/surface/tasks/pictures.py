@@ -295,7 +295,7 @@ def _fits(camera: Sensor, taken: TakenPictures) -> npt.NDArray[np.bool_]:
 
 
 def _poses(plan: SurveyPlan, source: TrajectorySource, epochs_gps_ns: Int64) -> Iterator[Poses]:
-    """Returns poses of the body, piece by piece, at epochs (n,) in order."""
+    """Yields poses of the body, piece by piece, at epochs (n,) in order."""
     pieces = epochs_gps_ns // _PIECE_NS
     for part in np.split(epochs_gps_ns, np.flatnonzero(np.diff(pieces)) + 1):
         span = (int(part[0]), int(part[-1]))

@@ -23,7 +23,7 @@ _FILLED: Final = 0.3
 """A cell is seen if it has this share of the usual weight."""
 _DEEPEST_M: Final = 0.05
 """Readings farther than this from the height of their cell (m) are not road."""
-_EDGE_CELLS: Final = 3  # A cell is used if this many cells around are seen.
+_EDGE_CELLS: Final = 3  # Edge of the square of cells around one that must all be seen.
 _LEAST_CELLS: Final = 64  # An image with fewer cells is empty.
 _FEW: Final = 2000
 """Readings on either side of the middle from which the spacing of readings is measured."""

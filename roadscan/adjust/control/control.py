@@ -29,7 +29,7 @@ SightStatus = Literal["found", "missed", "doubled", "moved", "picked", "height",
 """`height`: no target is looked for, the height alone was measured; `unseen`: not even that, or the pass did not see
 the road where the target is looked for."""
 
-_NEAR_M: Final = 3.0  # A pass by a point may be off by the step of its track, at most by this (m).
+_NEAR_M: Final = 3.0  # Longer steps of a track count as this long (m).
 _LONGEST_NS: Final = 20 * NS_PER_S  # longest part of a traverse to either side of its nearest time (ns)
 
 

@@ -25,7 +25,7 @@ Bool = npt.NDArray[np.bool_]
 
 _BLOCKS: Final = 6
 """Blocks along an edge whose means give the σ of a mean over the patch."""
-_LEAST_BLOCKS: Final = 6  # A mean needs this many filled blocks.
+_LEAST_BLOCKS: Final = 6  # From this many filled blocks on, the scatter of their means gives σ.
 _UNEVEN: Final = 2.0
 """Slope hidden from the fitted plane by a step of unevenness, in RMS of the unevenness over the patch's edge."""
 

@@ -11,8 +11,8 @@ from roadscan.inventory.home import CHOICES
 from roadscan.store.asset_schema import AssetColumn, asset_schema
 from roadscan.store.inventory_schema import asset_columns, editable_columns
 
-_NOT_NULL: Final = 1  # Bit of QGIS's constraint flags.
-_EXPRESSION: Final = 4  # Bit of QGIS's constraint flags.
+_NOT_NULL: Final = 1  # Bit of QGIS's constraint flags: not null.
+_EXPRESSION: Final = 4  # Bit of QGIS's constraint flags: expression.
 _HARD: Final = 1
 """Constraint strength: QGIS refuses values that violate it; 2 would warn."""
 

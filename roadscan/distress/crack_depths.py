@@ -1,25 +1,25 @@
 """Depth of a crack's bottom, from the lowest readings of its cells.
 
-The robust height of a cell of which a crack takes in less than half is that of the ground beside it. But the bottom was
-measured: where some readings of a cell lie on it, the cell's lowest reading is one of them.
+A crack that covers less than half of a cell leaves the cell's robust height at that of the ground beside it. But the
+bottom was measured: if some readings of a cell lie on it, the cell's lowest reading is one of them.
 
 1. *Low*: at each place of the crack, how far the lowest reading of the cell in which the section's middle lies is below
-   the ground. Of the lows of 10 cells to both sides a quantile is taken, because single ones deceive: one wrong
+   the ground. Of the lows of 10 cells to both sides a quantile is taken, because single ones mislead: one wrong
    reading decides the lowest of a cell, and of cells with few readings many missed the bottom.
-2. *Level*: which quantile depends on the readings of a cell that lie on a strip along the crack 1 mm wide, which is
-   what shows the depth of a crack of 5 mm: with b of them that of `_HALF_READINGS` / (`_HALF_READINGS` + b). In cells
+2. *Level*: the level of that quantile depends on b, a cell's number of readings on a strip of 1 mm along the crack, the
+   part that shows the depth of a crack of 5 mm: it is `_HALF_READINGS` / (`_HALF_READINGS` + b). In cells
    of 5 mm with 25 readings nearly all hit the bottom, but of 2 % wrong readings a fifth of them has a low that is far
-   too deep: the lower third is deep enough and safe. With two readings few cells hit it and one in fifty deceives:
-   nearly the deepest.
-3. *Drop*: for noise and texture alone lowest readings lie below the ground, by as much as they do beside the crack. The
-   bottom is met by some readings of a cell only, so that a share of the drop, `_DROP_SHARE`, is taken off (the lowest
+   too deep: the lower third is deep enough and safe. With two readings few cells hit it and one in fifty is wrong:
+   nearly the deepest is taken.
+3. *Drop*: from noise and texture alone, lowest readings lie below the ground, by as much as they do beside the crack.
+   Only some readings of a cell meet the bottom, so that a share of the drop, `_DROP_SHARE`, is subtracted (the lowest
    of 5 normal values lies 1.2 σ below their mean, that of 25 2.0 σ, and the quantile above is below the median).
-4. *Floor*: of the readings at a level floor the lowest lies as far below the others as it does beside the crack. Where
+4. *Floor*: on a level floor, the lowest reading is as far below the others as it is beside the crack. Where
    lowest readings (their median over the same cells) lie no more than `_FLOOR_BEGIN` times as far below their cell's
    robust height as beside the crack, the cells lie on the floor, and the depth is the median of their robust heights;
    from `_FLOOR_END` times on they do not.
-5. *Width*: a valley wider than :data:`NARROW_CELLS`, as cells show it, has more and more of its depth from their robust
-   heights, and all from :data:`WIDE_CELLS` on, where cells lie in it alone: what is wide needs no single reading.
+5. *Width*: a valley wider than :data:`NARROW_CELLS`, as cells show it, gets more and more of its depth from robust
+   heights, and all from :data:`WIDE_CELLS` on, where whole cells lie in it: a wide crack needs no single reading.
 
 `_HALF_READINGS` and `_DROP_SHARE` were chosen on cracks of 3 to 10 mm in cells of 2 to 5 mm with 1 to 100 readings,
 with and without wrong ones (``benchmarks/bench_cracks.py``); a quarter more or less of either changes depths by 3 %.

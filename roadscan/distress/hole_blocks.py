@@ -6,8 +6,8 @@
    largest hole is wide; the lowest of these 16 less the block. A kerb makes no hole, because away from it nothing
    stands higher, nor does a rut, which is open along the road; a hole beside a kerb or in a rut stays one. Most of a
    hole's walls are steep somewhere (`min_wall_slope`): hollows of an uneven road are not.
-3. *Ground*: each ray meets the rim where it comes as high as the lowest of the 16, but for a share of the depth, and
-   goes on flat. The ground above the block is that height, brought back by the median slope beyond the rim (so a crown
+3. *Ground*: each ray meets the rim where it gets as high as the lowest of the 16, less a share of the depth, and
+   continues flat. The ground above the block is that height, extrapolated by the median slope beyond the rim (a crown
    is no hollow); the mean of all rays by distance, without those that end on higher ground, such as that behind a kerb.
 
 Blocks are counted from the map's origin, and each depends on those within a stated distance alone

@@ -99,7 +99,7 @@ def cross_sections(heights, row, column, north, east, flank, reach, out):
     flank : (n,) int64, where its flanks begin (cells); reach : most cells to either side.
     out : (n, 5) float64: depth below the line between both flanks (m), width at half that depth and how far the middle
         lies to the right (cells), depth below the lower flank (m), height of that line at the cell (m). NaN where it
-        cannot be told.
+        is not known.
     """
     size = 2 * BINS * reach + 1
     total, count, depth = np.empty(size), np.empty(size), np.empty(size)

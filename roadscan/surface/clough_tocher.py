@@ -23,7 +23,7 @@ Where a corner lies much nearer to the edge than the other (four times), its r i
 noise in heights would be multiplied by 1 / 2y, and by the wide triangle's y once more. There M is solved, by least
 squares, from two equations that a cubic through the wide triangle's corner meets exactly: the slope across the edge
 given at the thin corner, and the condition above times the small y. Where the thin corner lies over an end of the edge
-(on random points, beside one node in some hundred or fewer), it tells nothing of the middle, and M is the mean of the
+(on random points, beside one node in some hundred or fewer), it does not determine M, which is the mean of the
 ends, exact for quadratics only.
 
 An edge on the rim

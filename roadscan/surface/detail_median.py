@@ -14,7 +14,7 @@ lines, as in Nieminen, Heinonen and Neuvo (1987), "A new class of detail-preserv
 4. *Direction*: the one whose medians have the least risk at the 49 cells around. Risk is Stein's (1981) unbiased
    estimate of the squared error: misfit² + 2 σ² for each cell that is its own median. Without the second term lines
    across a wall would win: their median is the cell in the middle, noise and all. A misfit is cut off at
-   `outlier_sigmas`, so that an outlier has no say.
+   `outlier_sigmas`, so that outliers have little weight.
 5. *Support*: a crack 20 cells wide could be smoothed more than by a line of seven, one cell wide at a bend less. So
    on detail there are means of 3 and of 13 cells along the line and paraboloids over 7 × 7 and 9 × 9 besides
    (outliers replaced by the line's median), and of all that of least risk (``surface/kernels/supports.py``).
@@ -24,8 +24,8 @@ lines, as in Nieminen, Heinonen and Neuvo (1987), "A new class of detail-preserv
    every second one (a median of medians smooths no more: it keeps whatever rises or falls steadily). Cells with
    detail are left out.
 
-What is not measured counts nowhere, and places beyond the grid are like that. In means and fits a cell counts only
-together with its mirror image, so that a slope has no say at borders and holes.
+Cells without a measurement or beyond the grid count nowhere. In means and fits a cell counts only
+together with its mirror image, so that a slope has no effect at borders and holes.
 """
 
 from __future__ import annotations

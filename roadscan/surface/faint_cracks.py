@@ -10,9 +10,9 @@ where eight directions are tried at each cell. Over 21 rows it stands out by 8 �
 3. *Strip*: along the best of these a strip of some width is fitted to 21 × 7 cells: volume and level by least squares,
    axis in quarters of a cell, slope and width tried. A mean along the line would be 20 to 25 % too shallow: a slanting
    axis lies now in the middle of a cell, now between two, and the mean along it is that of all these places.
-4. *Confirmed* is what gains `_GAIN_ALONE` σ, or `_GAIN_TOGETHER` where another strip that does goes on 11 to 18 cells
-   further. In twelve million cells of noise with 2 % wrong readings that is three strips; 5.5 σ alone would be 22.
-   Where lines beside a strip vary more than those of independent cells, it counts for less by as much.
+4. *Confirmed* are strips that gain `_GAIN_ALONE` σ, or `_GAIN_TOGETHER` if another such strip continues them 11 to 18
+   cells further. In twelve million cells of noise with 2 % wrong readings three strips do; 5.5 σ alone would give 22.
+   Where lines beside a strip vary more than those of independent cells, its gain is reduced by as much.
    It is drawn, as one more support that the risk decides about (``surface/detail_median.py``).
 """
 

@@ -11,7 +11,7 @@ Neighbours are sites joined by edges of kept triangles, so a slope never looks a
     *Spline models for observational data*, SIAM 1990, chapters 1 and 4). Heights are z = p + s + noise, with p a
     quadratic polynomial that is not penalised, and s of a covariance that falls with distance⁵, as that of a quintic
     spline (r⁵; Duchon 1977), written as Wendland's C⁴ function of a reach of 12 units, which is positive definite.
-    How much is noise the heights say themselves: of two variances, one all but nothing (0.001) and one that leaves
+    The heights determine the share of noise: of two variances, one almost zero (0.001) and one that leaves
     little more than the polynomial (3), each counts by the restricted likelihood that it gives the heights of the
     neighbourhood (generalised maximum likelihood, Wahba 1985, Annals of Statistics 13, 1378-1402).
 

@@ -1,9 +1,9 @@
 """Delaunay triangulation of a region that agrees, triangle by triangle, with that of its neighbours.
 
 Qhull triangulates. Its answer depends on tolerances of the whole region and, where four points lie on a circle (every
-mesh of gridded points), on chance. So its edges are then asked again in exact arithmetic and flipped where they are
-not Delaunay's; of four points on a circle, the diagonal of the first point (by northing, then easting) is taken. What
-comes out is the one Delaunay triangulation of the points, with ties broken as if the points had been moved by
+mesh of gridded points), on chance. So its edges are then tested in exact arithmetic and flipped where they are
+not Delaunay's; of four points on a circle, the diagonal of the first point (by northing, then easting) is taken. The
+result is the one Delaunay triangulation of the points, with ties broken as if the points had been moved by
 infinitely little, in the order of their absolute place (Lawson 1977; Edelsbrunner & Mücke 1990).
 
 Cut: a triangle is kept if the circle through its corners is at most ``max_gap_m`` wide. That circle holds no point, so

@@ -22,7 +22,7 @@ UInt8 = npt.NDArray[np.uint8]
 __all__ = ["AROUND", "HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Sights", "Views",
            "best_views", "sampled", "sights"]  # fmt: skip
 
-NO_VIEW: Final = -1
+NO_VIEW: Final = -1  # Number that stands for no picture.
 _LEAST_TURNED: Final = float(np.sin(np.radians(10.0)))
 """Least cosine between the ray and the direction in which a front faces."""
 

@@ -1,8 +1,8 @@
 """The rounds of an adjustment: solve, judge each observation by the others, update weights.
 
 The surveys of control points are judged elsewhere, all of them at once (:mod:`roadscan.adjust.control.control_test`):
-here they count as they are told to, wholly or not at all. A target that one pass alone saw and its survey exclude one
-another, and no weight that both get round by round tells which of them is wrong.
+here they count as that module decides, fully or not at all. A target that only one pass saw and its survey may exclude
+one another, and no weight from repeated rounds shows which of them is wrong.
 """
 
 from __future__ import annotations

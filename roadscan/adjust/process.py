@@ -2,10 +2,10 @@
 
 An error is b(t) u(t) + e(t) v(t). Here u is a first-order Gauss–Markov process of unit variance, with the covariance
 e^(−|Δt|/τ) (Gelb 1974, 3.8), and b(t) is the σ that the logs state of each pose. In an outage, where σ is much larger
-than usual, b stays at a bound and e(t) = √(σ² − b²): v is another such process, and each outage has its own, because
-what an outage adds says nothing of the error before and after it. At knots u is the sequence u(k+1) = φ u(k) + w,
-φ = e^(−h/τ), var w = 1 − φ², without any approximation. Between knots the adjustment puts a straight line; by how much
-the process leaves it has a variance in closed form (`line_variance`).
+than usual, b stays at a bound and e(t) = √(σ² − b²): v is another such process, independent in each outage, because
+the error in an outage is independent of those before and after it. At knots u is the sequence u(k+1) = φ u(k) + w,
+φ = e^(−h/τ), var w = 1 − φ², without any approximation. Between knots the adjustment is linear; the variance of
+the process about the line has a closed form (`line_variance`).
 """
 
 from __future__ import annotations

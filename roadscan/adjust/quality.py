@@ -177,7 +177,7 @@ def relative_accuracy(station_m: Float64, before_m: Float64, after_m: Float64, l
     ----------
     station_m : (n,) where each difference was found, along the road.
     before_m, after_m : (n,) difference of two passes before and after the adjustment; where some were withheld from
-        it, those say more.
+        it, those are the better test.
     length_m : of a section.
     """
     number = np.floor(station_m / length_m).astype(np.int64)

@@ -134,7 +134,7 @@ def passes_by(track: Track, easting_m: float, northing_m: float, radius_m: float
 
 
 def _step_m(track: Track) -> float:
-    """Returns the longest step between positions of a track, without gaps."""
+    """Returns the longest step between positions of a track (m); gaps count as 3 m."""
     steps = np.hypot(np.diff(track.easting_m), np.diff(track.northing_m))
     return float(min(steps.max(initial=0.0), _NEAR_M))
 

@@ -1,7 +1,7 @@
 """Test of the control: each surveyed coordinate against its prediction from poses, ties and the other control.
 
-The adjustment first leaves the surveys aside. What it then says of each point, with the covariance of all of them, is
-all that is needed: a point that is wrong is found by its normalised leave-one-out residual (data snooping, Baarda
+The adjustment first leaves the surveys aside. Its prediction of each point, with the covariance of all of them, is
+all that is needed: a wrong point is found by its normalised leave-one-out residual (data snooping, Baarda
 1968), an offset that all points share by its least-squares estimate over its σ. Both are tested by quantiles of the
 normal distribution that right control passes with a stated chance, all tests together.
 """
@@ -198,10 +198,10 @@ def judged(groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: Adjustme
     groups : of neighbours, by which single points are tested; together all points.
     spread : points that show an offset of all; those of the only group, or some of each.
 
-    Two explanations are compared, single wrong points and a common offset with what is wrong beside it; the one with
-    fewer faults holds, that of single points where both have as many. Right control is found wrong with the chance of
-    `rules.false_alarm`, and doubted as a whole with that of `rules.datum_false_alarm`. Where many points are found
-    wrong, the stated σ of the survey is asked as well.
+    Two explanations are compared: single wrong points, and a common offset with further wrong points. The one with
+    fewer faults is accepted, or that of single points if both have as many. Right control is found wrong by chance
+    `rules.false_alarm`, and doubted as a whole by chance `rules.datum_false_alarm`. Where many points are found
+    wrong, the stated σ of the survey is tested as well.
     """
     groups, spread = [_in_datum(own, rules) for own in groups], _in_datum(spread, rules)
     found, shift = _with_shift(groups, spread, rules)

@@ -1,7 +1,7 @@
 """Evidence that a place shows the shape: shares of paint, outline and clear road.
 
-A value is paint where it lies above the middle between road and paint. Shares, and not sums of residuals, tell worn
-paint from no paint: wear takes a part of each share, while another thing misses one of them altogether.
+A value is paint where it lies above the middle between road and paint. Shares, and not sums of residuals, distinguish
+worn paint from no paint: wear reduces each share by a part, while another thing lacks one of them altogether.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Search of a painted control target in the intensities of one pass.
 
 Places that look like the target (:mod:`candidates`) are tested by the shares of paint, outline and clear road that
-it should have (:mod:`evidence`), its shape is fitted to the readings (:mod:`fit`), and the shares are asked again where
-the fit puts it. One place that holds is the target, two are too many. Its height is that of a surface through the
+it should have (:mod:`evidence`), its shape is fitted to the readings (:mod:`fit`), and the shares are tested again at
+the fitted place. One place that passes is the target; two are ambiguous. Its height is that of a surface through the
 readings at its centre (:mod:`heights`).
 """
 

@@ -2,9 +2,9 @@
 
 Each intensity becomes a label from 0, the road around, to 1, paint. The shape gives the chance of paint at each place;
 its centre, size and turn are those under which the labels are likeliest. Paint may be worn off, and there may be some
-beside the shape; how often, the labels themselves say. So the fit knows that missing paint says little and that paint
-outside the shape says much: a worn edge does not pull the centre away from it. The chance passes from paint to road
-over a blur that begins wide, so that the search finds its way, and ends at the distance between readings.
+beside the shape; both chances are estimated from the labels. So missing paint has little weight, and paint outside the
+shape has much: a worn edge does not pull the centre away from it. The chance changes from paint to road
+over a blur that is wide at first, so that the search converges, and at last as wide as the distance of readings.
 """
 
 from __future__ import annotations

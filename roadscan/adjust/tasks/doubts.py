@@ -224,8 +224,8 @@ def offset_line(verdict: ControlVerdict, applied: AppliedOffset) -> str:
 def datum_figures(verdict: ControlVerdict, applied: AppliedOffset) -> dict[str, tuple[float, float]]:
     """Returns poses minus control as a whole (m; of a place its length), and 1 σ (m) of the datum, by known component.
 
-    Where the poses define the datum, the mean square of their offset, unknown before, is the sum of its square and σ²;
-    where the poses are followed, or the control is not used, it is their σ alone.
+    The mean square of an offset that nobody knew before is the sum of the squares of its size and of the poses' σ.
+    Where the poses are followed, or the control is not used, 1 σ is that of the poses alone.
     """
     found = {}
     for name, axes in COMPONENTS.items():

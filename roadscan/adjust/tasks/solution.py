@@ -62,7 +62,7 @@ Bool = npt.NDArray[np.bool_]
 
 _WIDENED: Final = 3
 """Adjustments, at most, until no mounting is off by more than its σ allows."""
-_NONE: Final = (GaussMarkov(0.0, 1.0),) * 6  # processes of a run without errors
+_NONE: Final = (GaussMarkov(0.0, 1.0),) * 6  # processes of a run without readings
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Ties that are measured again after the solution moved the passes, and larger patches before the first solution.
 
-Poses of two passes may lie decimetres apart. What is then compared is not one place of the road: shifts are not found,
-and heights are those of neighbouring spots. So the solution of the first ties says where to look again, until no place
-moves by more than a share of its patch. Where too few places match to begin with, larger patches are sought first.
+Poses of two passes may lie decimetres apart. Then the compared patches are not one place of the road: shifts are not
+found, and heights are those of neighbouring spots. So places are measured again where the solution puts them until no
+place moves by more than a share of its patch. Where too few match to begin with, larger patches are sought first.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Calibration of probabilities: curves from the probability that a kind derives from evidence to the observed share.
 
-A kind's weights rank its objects; how often objects of that evidence are what they say was counted on drawn streets
+A kind's weights rank its objects. The share of right objects by evidence was counted on simulated streets
 whose truth is known: `benchmarks/bench_asset_probability.py` fits these curves and tests them on other streets.
 A curve is Platt's (1999): a straight line between the logarithms of the odds.
 """

@@ -1,15 +1,15 @@
 """Intensity calibrated from the data themselves: a gain per sensor and laser, by range and by angle of incidence.
 
-Places of half a metre on the ground are seen by several lasers, from several ranges. What a place reflects is unknown,
-but the same for all of them; so differences within places tell the gains (as Levinson and Thrun, 2010, *Unsupervised
-calibration for multi-beam lasers*, do for the beams of one scanner). The logarithm of an intensity is modelled as
+Places of half a metre on the ground are seen by several lasers, from several ranges. The reflectance of a place is
+unknown, but the same for all of them; so differences within places show the gains (as Levinson and Thrun, 2010,
+*Unsupervised calibration for multi-beam lasers*, do for one scanner). The logarithm of an intensity is modelled as
 
     log I = log ρ(place) + laser(sensor, laser) + range(sensor, r) + incidence(sensor, θ),
 
 with functions of r and θ that are linear between nodes. It is fitted to the mean intensities themselves, zeros
 included, as a generalised linear model with a logarithmic link (McCullagh and Nelder, 1989, section 8), so that dark
-ground and coarse digital numbers leave no bias. What the data do not tell (the common factor, a trend that
-range and incidence could both explain) is held at the smallest gains.
+ground and coarse digital numbers leave no bias. What the data do not determine (the common factor, a trend that
+range and incidence could both explain) is set to the smallest gains.
 """
 
 from __future__ import annotations

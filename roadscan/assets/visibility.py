@@ -1,9 +1,9 @@
 """Number of passes that had a place in sight: the ground of each cell, and the air above it by height.
 
-Returns tell where a sensor looked. A return's ray passed all places on its way, saw what it hit, and did not see what
+Returns show where a sensor looked. A return's ray passed all places on its way, saw its hit, and did not see what
 lies behind. A pass had a place in sight where enough of its rays reached it, and no fewer than were stopped before.
-Where nothing came back, as from the sky, rays are not known; there a place counts as in sight that lies above one that
-is, unless half of the rays that lower places let expect were stopped before it.
+Where nothing came back, as from the sky, rays are not known; there a place counts as in sight if it is above one that
+is, unless half of the rays expected from lower places were stopped before it.
 """
 
 from __future__ import annotations

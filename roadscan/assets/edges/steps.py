@@ -80,7 +80,7 @@ def step_places(raster: HeightRaster, settings: StepSettings = DEFAULT) -> Place
 
     Each side of the edge gets a line across it, of cells within `half_along_m` along and `across_m` across; the step is
     the difference of both lines at the edge, and its evidence the step over its σ, which grows with the scatter of the
-    cells about the lines. A place is kept for the direction that tells most, where no neighbour across tells more.
+    cells about the lines. A place is kept for its most significant direction, unless a neighbour across exceeds it.
     """
     whole, part = raster, _part(raster, settings)
     raster = replace(raster, **{name: getattr(raster, name)[part] for name in ("count", "height_m", "sigma_m")})

@@ -33,9 +33,9 @@ class PaintReader(ColourReader):
 def paint_colour(own: UInt8, beside: UInt8) -> Mapping[str, Any]:
     """Columns `colour` and `colour_probability` from colours (n, 3) of paint and (m, 3) of the surface beside it.
 
-    Asphalt and concrete are grey, so dividing by the surface's colour takes out the light and the camera's white
-    balance. Blue against red and green then tells white from yellow. The median over the places decides, and nothing
-    is told where fewer than five places are brighter than the surface, or where the picture has no colours.
+    Asphalt and concrete are grey, so dividing by the surface's colour removes the light and the camera's white
+    balance. Blue against red and green then distinguishes white from yellow, by the median over the places. There is no
+    colour if fewer than five places are brighter than the surface, or if the picture has no colours.
     """
     if len(own) < _LEAST_PLACES or len(beside) < _LEAST_PLACES or _is_grey(own, beside):
         return {}

@@ -27,9 +27,9 @@ _LEAST_PX: Final = 12.0  # Smaller cut-outs (pixels) are not used.
 def shape_of(cut_outs: Sequence[CutOut], shape: str, width_m: float, height_m: float) -> tuple[str, float]:
     """Returns the shape of a plate and its probability.
 
-    Every shape in the plate's bounding box is laid over the cut-outs. Where it is the right one, colours differ all
+    Every shape in the plate's bounding box is compared with the cut-outs. For the right one, colours differ all
     along its outline from just within to just beyond it. A shape's weight grows exponentially with the mean of these
-    steps; that which the returns speak for begins with 0.7. Without a cut-out of 12 pixels or more only that is told.
+    steps; the shape of the returns starts with 0.7. Without a cut-out of 12 pixels or more only that is reported.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ class CutOut:
 
 @dataclass(frozen=True, eq=False)
 class ColourPlaces:
-    """Places of an object whose colours tell something, and others beside it to hold them against; (n, 3), (m, 3)."""
+    """Places of an object whose colours are used, and places beside it for comparison; (n, 3), (m, 3)."""
 
     own_m: Float64
     beside_m: Float64

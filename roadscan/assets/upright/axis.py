@@ -48,7 +48,7 @@ def fit_axis(xyh: Float64, sensor_xy: Float64, *, lean: bool = True) -> Axis:
 
     Sight lines meet a cylinder evenly across its width, so the spread of the returns across their sight lines shows the
     radius, and the middle of that spread the axis across them; along them the axis lies where the returns are one
-    radius away from it (Gauss–Newton, Huber weights). A circle fit alone tells neither for shafts as thin as the range
+    radius away from it (Gauss–Newton, Huber weights). A circle fit alone shows neither for shafts as thin as the range
     noise.
 
     lean : the axis may lean; otherwise it is upright.

@@ -42,7 +42,7 @@ class SignReader(CutOutReader):
         return np.vstack([on_plate(_BOX * _size(one), middle, *turn), on_plate(shape, middle, *turn)])
 
     def read(self, one: AssetObject, cut_outs: Sequence[CutOut], recognition: Recognition) -> Mapping[str, Any]:
-        """Columns colour, shape, message and type, each with its probability as far as it is told."""
+        """Returns columns colour, shape, message and type, each with its probability where it is known."""
         told: dict[str, Any] = {}
         shape, probability = shape_of(cut_outs, one.attributes.get("shape") or "other", *_size(one).tolist())
         told |= {"shape": shape, "shape_probability": probability}

@@ -31,7 +31,7 @@ _FLAT: Final = 0.25
 _WIDE: Final = 0.1
 """Least 1 σ of a plane's returns along both of its axes, as a share of the cube."""
 _TRIM: Final = 3.0  # Returns farther from the plane (σ) are left out.
-_LEAST_VARIANCE_M2: Final = 1e-10  # Least variance (m²), against division by zero.
+_LEAST_VARIANCE_M2: Final = 1e-10  # Least variance of a plane (m²).
 _FIRST: Final = (0, 0, 0, 1, 1, 2)  # Rows of the six products of a symmetric 3 × 3 matrix …
 _SECOND: Final = (0, 1, 2, 1, 2, 2)  # … and their columns.
 _SHARE: Final = 6

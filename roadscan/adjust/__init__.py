@@ -1,1 +1,1 @@
-"""Where passes meet, what ties them together and to control points, and the corrections of the poses that follow."""
+"""The adjustment: places where passes meet, ties between passes and to control points, and corrections of the poses."""

@@ -37,23 +37,23 @@ Bool = npt.NDArray[np.bool_]
 
 _DOWN: Final = COMPONENTS.index("down_m")
 _AT_ONCE: Final = 200
-"""Control points that are judged with the covariance of all of them: three coordinates each are 600 rows."""
+"""Control points that are judged with the covariance of all of them: three coordinates each give 600 rows."""
 _NEIGHBOURS: Final = 50
-"""Of more, so many at most are judged together."""
+"""With more points, at most this many neighbours are judged together."""
 _SCALED: Final = 3
-"""So many times at most the stated σ of single runs are made larger, until none is too small."""
+"""The stated σ of single runs are enlarged at most this many times, until none is too small."""
 SURVEY_FACTOR: Final = "control_survey"
 """Name of the factor of the surveys' stated variances."""
 
 _FASTER: Final = (4.0, 16.0)
-"""So many times shorter correlation times are tried: 30 s and 8 s in place of two minutes."""
+"""Factors by which correlation times are shortened in a trial: 30 s and 8 s in place of two minutes."""
 
 __all__ = ["Adjustment", "AdjustmentSettings", "ControlErrors", "adjust"]
 
 
 @dataclass(frozen=True)
 class ControlErrors:
-    """What the adjustment says of each control point; c of them, one for each run where each is adjusted alone."""
+    """Errors of the control points after the adjustment; c of them, one for each run where each is adjusted alone."""
 
     place: Int64
     """(c,) number of the point, as in the observations."""
@@ -64,36 +64,36 @@ class ControlErrors:
     error_m: Float64
     """(c, 3) estimated error of the survey (surveyed minus adjusted); NaN where not observed."""
     weight: Float64
-    """(c, 3) that the survey counted with, 0 = rejected; NaN where not observed."""
+    """(c, 3) weight of the survey, 0 = rejected; NaN where not observed."""
     left_out_m: Float64
-    """(c, 3) surveyed minus what all others say of the point: leave-one-out, coordinate by coordinate."""
+    """(c, 3) surveyed minus the prediction without the coordinate: leave-one-out, coordinate by coordinate."""
     left_out_sigma_m: Float64
-    """(c, 3) 1 σ of it, that of the survey included."""
+    """(c, 3) 1 σ of that difference, with that of the survey."""
 
     def chosen(self, which: Bool) -> ControlErrors:
-        """Those of some points (c,)."""
+        """Returns the errors of some points (c,)."""
         return ControlErrors(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
 
 @dataclass(frozen=True)
 class MountingErrors:
-    """What the adjustment says of the mountings of s sensors."""
+    """Errors of the mountings of s sensors after the adjustment."""
 
     sensors: tuple[tuple[str, str], ...]
-    """Run, "*" for all, and sensor."""
+    """Run ("*" for all) and sensor."""
     prior_sigma: Float64
     """(s, 7) as it came in, `MOUNTED`; 0: not estimated."""
     error: Float64
-    """(s, 7) what has to be added to the mounting (m, rad, share); 0 where not estimated."""
+    """(s, 7) correction that is added to the mounting (m, rad, share); 0 where not estimated."""
     sigma: Float64
-    """(s, 7) 1 σ of the mounting then; that of the prior where nothing tells of it."""
+    """(s, 7) 1 σ of the corrected mounting; that of the prior where no observation determines it."""
     covariance: Float64
-    """(7 s, 7 s) of the errors of all sensors, without the height that all of them have in common."""
+    """(7 s, 7 s) of the errors of all sensors, without the height error common to all."""
 
 
 @dataclass(frozen=True)
 class Adjustment:
-    """Corrections of each run, and what they say of the observations."""
+    """The result of an adjustment: corrections of each run, and residuals of the observations."""
 
     runs: tuple[str, ...]
     epochs_gps_ns: tuple[Int64, ...]
@@ -123,36 +123,36 @@ class Adjustment:
     settled: bool
     """False where weights still changed in the last round."""
     verdict: ControlVerdict
-    """What the surveys of the control points are worth."""
+    """Verdict on the surveys of the control points."""
     applied: AppliedOffset
-    """Offset that the surveys were taken to have in common."""
+    """Common offset that was attributed to the surveys."""
     priors: tuple[RunPrior, ...]
-    """As they came in, or with shorter correlation times where the evidence asks for these."""
+    """Priors as given, or with shorter correlation times where the evidence requires these."""
     active: Bool
     """(runs, 6) components that were estimated."""
     response: tuple[Float64, ...]
-    """(k, 6, 5) of each run: by how much its corrections move for a metre of a common offset of the control, north,
-    east, down, and for a metre by which points of which heights alone are used lie elsewhere, north, east."""
+    """(k, 6, 5) of each run: derivatives of its corrections by a common offset of the control, north, east, down, and
+    by a shift, north, east, of the points of which only heights are used."""
     run_factors: Float64
-    """(runs, 6) by which the stated variances of single runs' poses were multiplied."""
+    """(runs, 6) factors by which the stated variances of single runs' poses were multiplied."""
     fixed: tuple[FixedRun, ...] = ()
-    """What is known of the errors of the runs that are held."""
+    """Estimated errors of the runs that are held fixed."""
 
     @property
     def sigma(self) -> tuple[Float64, ...]:
-        """(k, 6) 1 σ of each run's knots, with that of an offset of the control."""
+        """Returns 1 σ (k, 6) of each run's knots, including that of an offset of the control."""
         common = block_diag(self.applied.covariance_m2, self.verdict.shift.covariance_m2)
         shared = [np.einsum("kia,ab,kib->ki", r, common, r) for r in self.response]
         return tuple(np.sqrt(np.einsum("kii->ki", c) + more) for c, more in zip(self.covariance, shared, strict=True))
 
     def corrections(self, run: str) -> Corrections:
-        """A run's corrections as navigation takes them."""
+        """Returns a run's corrections as navigation takes them."""
         index = self.runs.index(run)
         values = self.values[index]
         return Corrections(self.epochs_gps_ns[index], values[:, :3].copy(), values[:, 3:].copy())
 
     def sigma_of(self, run_index: int, epochs_gps_ns: Int64, partials: Float64) -> Float64:
-        """1 σ (n,) of a predicted movement: of knots, of neighbours together, and of the line between them.
+        """Returns 1 σ (n,) of a predicted movement: from knots, their correlation, and the line between them.
 
         Parameters
         ----------
@@ -186,7 +186,7 @@ def adjust(
     settings: AdjustmentSettings,
     mountings: Sequence[MountingPrior] = (),
 ) -> Adjustment:
-    """Corrections of all runs.
+    """Returns the adjustment of all runs.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def adjust(
         return found
     for _ in range(_SCALED):
         more = _by_group(found.run_factors)
-        more[[prior.fixed for prior in priors]] = 1.0  # what contradicts a run that is held is told, and moves nothing
+        more[[prior.fixed for prior in priors]] = 1.0  # a contradiction of a fixed run is reported, and moves nothing
         if (more == 1.0).all():
             break
         own = [p.wider(f) for p, f in zip(priors, wider * more, strict=True)]
@@ -216,12 +216,12 @@ def adjust(
 
 
 def _still_doubted(before: Adjustment, after: Adjustment) -> list[tuple[int, ...]]:
-    """Axes in which control is doubted as a whole, also with larger σ of a run: these do not explain it."""
+    """Returns axes in which control is doubted as a whole even with larger σ of a run: these do not explain it."""
     return [SURVEYED[name] for name in before.verdict.doubted if name in after.verdict.doubted]
 
 
 def _by_group(factors: Float64) -> Float64:
-    """Factors (runs, 6), the largest of position and of attitude for all three: who states one too small states all."""
+    """Factors (runs, 6), the largest of position and of attitude for all three: σ are usually wrong together."""
     position, attitude = factors[:, :3].max(axis=1), factors[:, 3:].max(axis=1)
     return np.repeat(np.stack([position, attitude], axis=1), 3, axis=1)
 
@@ -232,7 +232,7 @@ def _once(
     settings: AdjustmentSettings,
     mountings: Sequence[MountingPrior],
 ) -> Adjustment:
-    """An adjustment with the stated σ of each run's poses."""
+    """Returns an adjustment with the stated σ of each run's poses."""
     order = _canonical(observations)
     ordered = observations.chosen(order)
     which = _used(ordered, settings.mode)
@@ -267,7 +267,7 @@ def _once(
 def _without_surveys(
     unknowns: Unknowns, observations: Observations, settings: AdjustmentSettings
 ) -> tuple[Sequence[RunPrior], Unknowns, Rounds, Estimate]:
-    """All rounds with the surveys of control points left aside, and the priors that they hold with.
+    """Returns all rounds without the surveys of control points, and the priors that they used.
 
     Where stated σ of poses turn out too small, their errors may as well vary faster than the correlation time says,
     which nobody states: the shorter time is taken where it alone explains the evidence.
@@ -291,7 +291,7 @@ def _without_surveys(
 
 
 def _canonical(observations: Observations) -> Int64:
-    """Order that depends on the observations alone, not on how they arrived."""
+    """Returns an order that depends on the observations alone, not on how they arrived."""
     o = observations
     keys = [o.kind, o.place, *o.run.T, *o.sensor.T, *o.epoch_gps_ns.T, o.observed_m, o.sigma_m, o.survey_sigma_m]
     keys += list(o.partials.reshape(o.size, 2 * len(COMPONENTS)).T)
@@ -299,7 +299,7 @@ def _canonical(observations: Observations) -> Int64:
 
 
 def _used(observations: Observations, mode: str) -> Bool:
-    """Observations that a mode takes: only control for each run alone, only upright ones for heights."""
+    """Returns observations that a mode uses: only control for each run alone, only upright ones for heights."""
     if mode == "each_pass":
         return np.asarray((observations.run == FIXED).any(axis=1))
     if mode == "vertical":
@@ -308,7 +308,7 @@ def _used(observations: Observations, mode: str) -> Bool:
 
 
 def _problem(unknowns: Unknowns, observations: Observations) -> Problem:
-    """Rows of the observations, then of the surveys of control points."""
+    """Returns the rows of the observations, then of the surveys of control points."""
     rows, lines = unknowns.rows(observations, unknowns.control.of_observation)
     numbers = unknowns.of_control
     surveyed = numbers[numbers >= 0]
@@ -316,7 +316,7 @@ def _problem(unknowns: Unknowns, observations: Observations) -> Problem:
     _, first, own = np.unique(observations.group, return_index=True, return_inverse=True)
     rank = np.empty(first.size, np.int64)
     rank[np.argsort(first)] = np.arange(first.size)
-    # Height and horizontal place of a point's survey fall apart: one may be wrong, and the other right.
+    # Height and horizontal place of a point's survey are separate: one may be wrong while the other is right.
     part = (2 * np.arange(len(numbers))[:, None] + np.array([0, 0, 1]))[numbers >= 0]
     return Problem(
         unknowns,
@@ -334,7 +334,7 @@ def _problem(unknowns: Unknowns, observations: Observations) -> Problem:
 
 
 def _surveyed(unknowns: Unknowns) -> tuple[Int64, Int64, Float64]:
-    """Control point, axis and σ (m,) of each surveyed coordinate, in the order of their unknowns."""
+    """Returns control point, axis and σ (m,) of each surveyed coordinate, in the order of their unknowns."""
     point, axis = np.nonzero(unknowns.of_control >= 0)
     return point.astype(np.int64), axis.astype(np.int64), unknowns.control.sigma_m[point, axis]
 
@@ -342,10 +342,10 @@ def _surveyed(unknowns: Unknowns) -> tuple[Int64, Int64, Float64]:
 def _survey_errors(
     unknowns: Unknowns, observations: Observations, alone: Estimate, rounds: Rounds
 ) -> tuple[list[SurveyErrors], SurveyErrors]:
-    """What poses and ties say of the surveys: groups of neighbours, and points that stand for all of them.
+    """Returns the surveys' errors from poses and ties: for groups of neighbours, and for points that stand for all.
 
-    Many points are too many for one covariance. A point that is wrong is told by its neighbours; an offset of all is
-    told by points that are spread over all.
+    Many points are too many for one covariance. A wrong point is found by its neighbours; an offset of all is
+    found by points that are spread over all.
     """
     point, axis, sigma = _surveyed(unknowns)
     in_time = _in_time(unknowns.control, observations)
@@ -364,7 +364,7 @@ def _survey_errors(
 
 
 def _in_time(control: ControlPoints, observations: Observations) -> Int64:
-    """Control points in the order in which a run first came by them."""
+    """Returns control points in the order in which a run first passed them."""
     first = np.full(control.place.size, np.iinfo(np.int64).max)
     seen = control.of_observation >= 0
     np.minimum.at(first, control.of_observation[seen], observations.epoch_gps_ns[seen].max(axis=1))
@@ -372,7 +372,7 @@ def _in_time(control: ControlPoints, observations: Observations) -> Int64:
 
 
 def _counting(unknowns: Unknowns, verdict: ControlVerdict, refused: Sequence[str]) -> Float64:
-    """1 for each surveyed coordinate (m,) that is right, and 0 for what is wrong or refused."""
+    """Returns 1 for each surveyed coordinate (m,) that is right, and 0 for wrong or refused ones."""
     point, axis, _ = _surveyed(unknowns)
     component = {a: name for name, axes in SURVEYED.items() for a in axes}
     names = [component[a] for a in axis.tolist()]
@@ -383,7 +383,7 @@ def _counting(unknowns: Unknowns, verdict: ControlVerdict, refused: Sequence[str
 def _with_control(
     unknowns: Unknowns, alone: Estimate, rounds: Rounds, verdict: ControlVerdict, applied: AppliedOffset
 ) -> tuple[Estimate, Float64, tuple[Float64, ...]]:
-    """The solution with surveys that are right, the same with fixed runs held, and by how much each knot follows an
+    """Returns the solution with right surveys, the same with fixed runs held, and derivatives of each knot by an
     offset of all surveys.
 
     Fixed runs are estimated like all others as long as observations are judged: what contradicts their poses within
@@ -406,7 +406,7 @@ def _with_control(
 
 
 def _understated_runs(unknowns: Unknowns, rounds: Rounds, verdict: ControlVerdict, estimate: Estimate) -> Float64:
-    """By how much (runs, 6) the stated σ of single runs' poses are too small.
+    """Returns factors (runs, 6) by which the stated σ of single runs' poses are too small.
 
     Control that the poses contradict as a whole is followed first: where all runs are off by it, they are right and it
     is not, and where one of them is, it is the other way round.
@@ -421,7 +421,7 @@ def _understated_runs(unknowns: Unknowns, rounds: Rounds, verdict: ControlVerdic
 
 
 def _of_solution(unknowns: Unknowns, solution: Float64) -> list[Float64]:
-    """Corrections (k, 6) of each run's knots."""
+    """Returns corrections (k, 6) of each run's knots."""
     numbers = [unknowns.of_run(run) for run in range(len(unknowns.priors))]
     parts = [np.where(n >= 0, solution[n], 0.0) * s for n, s in zip(numbers, unknowns.sigmas, strict=True)]
     return [own.reshape(len(own), -1, len(COMPONENTS)).sum(axis=1) for own in parts]
@@ -430,9 +430,9 @@ def _of_solution(unknowns: Unknowns, solution: Float64) -> list[Float64]:
 def _of_knots(
     unknowns: Unknowns, estimate: Estimate, solution: Float64
 ) -> tuple[tuple[Float64, ...], tuple[Float64, ...], tuple[Float64, ...]]:
-    """Values, covariances, and those with the next knot, of each run.
+    """Returns values, covariances, and those with the next knot, of each run.
 
-    Where a run is held, the others leave the most likely solution for its sake; their covariance is the mean square
+    Where a run is fixed, the others differ from the most likely solution; their covariance is the mean square
     error of what is published: that of the most likely solution, and the square of the way from there.
     """
     covariance, with_next, values = [], [], _of_solution(unknowns, solution)
@@ -446,7 +446,7 @@ def _of_knots(
 
 
 def _blocks(estimate: Estimate, first: tuple[Int64, Float64], second: tuple[Int64, Float64]) -> Float64:
-    """Covariances (k, 6, 6) of what two tables of unknowns add up to, each with what it is scaled by."""
+    """Returns covariances (k, 6, 6) of the sum of two tables of unknowns, each with its scale."""
     i, j = np.broadcast_arrays(first[0][:, :, None], second[0][:, None, :])
     there = (i >= 0) & (j >= 0)
     blocks = np.zeros(i.shape)
@@ -460,7 +460,7 @@ def _blocks(estimate: Estimate, first: tuple[Int64, Float64], second: tuple[Int6
 def _of_observations(
     unknowns: Unknowns, observations: Observations, used: Int64, estimate: Estimate
 ) -> tuple[Float64, Float64, Float64, Float64]:
-    """Residual, weight, redundancy and normalised residual of each observation, also of those not used."""
+    """Returns residual, weight, redundancy and normalised residual of each observation, also of unused ones."""
     size, n = observations.size, used.size
     rows, _ = unknowns.rows(observations, np.full(size, -1, np.int64))
     residual = observations.observed_m - rows.times(estimate.solution)
@@ -488,7 +488,7 @@ def _of_mountings(unknowns: Unknowns, estimate: Estimate, solution: Float64) -> 
 
 
 def _of_control(unknowns: Unknowns, estimate: Estimate, n: int, factor: float) -> ControlErrors:
-    """The rows after the first n are those of surveys."""
+    """Returns the errors of control: rows after the first n are those of surveys."""
     control, numbers = unknowns.control, unknowns.of_control
     there = numbers >= 0
 
@@ -499,7 +499,7 @@ def _of_control(unknowns: Unknowns, estimate: Estimate, n: int, factor: float) -
 
     without, sigma = estimate.without, control.sigma_m
     error = table(estimate.solution[numbers[there]]) * sigma
-    # The survey says that its error is nought; what the others say of it is the prediction.
+    # The survey states zero for its error; the others predict it.
     left_out = table(-without.residual[n:]) * sigma
     left_out_sigma = table(np.sqrt(factor + without.variance[n:])) * sigma
     return ControlErrors(control.place, control.run, sigma, error, table(estimate.weight[n:]), left_out, left_out_sigma)

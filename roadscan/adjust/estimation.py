@@ -1,8 +1,8 @@
-"""The rounds of an adjustment: solve, judge each observation by the others, weigh anew.
+"""The rounds of an adjustment: solve, judge each observation by the others, update weights.
 
 The surveys of control points are judged elsewhere, all of them at once (:mod:`roadscan.adjust.control.control_test`):
-here they count as they are told to, wholly or not at all. A target that one pass alone saw and its survey exclude one
-another, and no weight that both get round by round tells which of them is wrong.
+here they count as that module decides, fully or not at all. A target that only one pass saw and its survey may exclude
+one another, and no weight from repeated rounds shows which of them is wrong.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 SURVEY: Final = len(KINDS)
-"""Kind of the rows that say that a control point lies where it was surveyed."""
-_HUBER_ROUNDS: Final = 10
+"""Kind of the rows that observe a control point at its surveyed place."""
+_HUBER_ROUNDS: Final = 10  # Rounds with Huber's weights before IGG III.
 _SETTLED: Final = 0.01
 """Weights, and logarithms of factors, that change by less are final."""
 _CALM: Final = 15
-"""From this round on, a weight goes half of the way: two that exclude one another no longer take turns."""
+"""From this round on, weights move only halfway: two observations that exclude one another no longer alternate."""
 _LEAST: Final = 1e-6
-"""Weight of a rejected survey: the point is then free, but has a place."""
+"""Weight of a rejected survey: the point is then free, but its coordinates stay determined."""
 _ENOUGH: Final = 30.0
-"""Redundancy from which on a factor of variances is estimated."""
-_FACTORS: Final = (1e-3, 1e3)
+"""Least redundancy for which a factor of variances is estimated."""
+_FACTORS: Final = (1e-3, 1e3)  # Bounds of a factor of variances.
 _STEP: Final = 4.0
-"""A factor changes by no more in a round."""
+"""Greatest change of a factor in one round."""
 _UNDERSTATED: Final = 3.0
-"""Variances that are so many times those stated are estimated, whether that was asked for or not: with σ that are 1.7
+"""Variances this many times those stated are estimated even where that was not asked for: with σ that are 1.7
 times too small, right observations are rejected and published σ are wrong."""
 _FREE: Final = 100.0
-"""Variances of the poses are made so much larger to see whether they were too small."""
+"""Factor of the poses' variances in the test whether they were too small."""
 _SOME: Final = 1.0
-"""Redundancy from which on the σ of poses that turned out too small is estimated, however roughly."""
+"""Least redundancy for which the σ of poses that turned out too small is estimated, however roughly."""
 _ALSO: Final = 0.1
-"""A component whose factor is below this share of the largest one keeps its stated σ: it follows the other's errors."""
+"""A component whose factor is below this share of the largest one keeps its stated σ: it follows other components."""
 _SURE: Final = 0.99
 """Share of right solutions whose corrections are no larger."""
 _RIGID: Final = 1e14
-"""Weight, in units of the prior's, of an unknown that is held at 0: what others pull at it moves it by nothing that a
-double would show in a millimetre."""
+"""Weight, in units of the prior's, of an unknown that is held at 0: others move it by less than a double shows in a
+millimetre."""
 _MEDIAN: Final = 0.6745
-"""Median of the absolute of a standard normal number."""
+"""Median of the absolute value of a standard normal number."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Problem:
     variance: Float64
     """(n,) as stated."""
     line_variance: Float64
-    """(n, 6) that lines between knots add."""
+    """(n, 6) added by the straight lines between knots."""
     kind: Int64
     """(n,) index into `KINDS`, or `SURVEY`."""
     groups: Groups
@@ -76,7 +76,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the rounds end with."""
+    """The result of the rounds."""
 
     solution: Float64
     """(u,)"""
@@ -95,7 +95,7 @@ class Estimate:
 
 
 class Rounds:
-    """An adjustment at work."""
+    """The state of an adjustment during its rounds."""
 
     def __init__(self, problem: Problem, settings: AdjustmentSettings) -> None:
         self.problem, self.settings = problem, settings
@@ -111,7 +111,7 @@ class Rounds:
         self._enough, self._fixed = _ENOUGH, np.zeros(len(COMPONENTS), bool)
 
     def without_surveys(self) -> Estimate:
-        """All rounds, with the surveys of control points left aside."""
+        """Returns all rounds without the surveys of control points."""
         done = 0
         while done < min(_HUBER_ROUNDS, self.settings.max_rounds - 1):
             done += 1
@@ -121,7 +121,7 @@ class Rounds:
         estimate = self._rounds(done)
         if self.settings.estimate_variance_components is not None or not self._is_understated(estimate):
             return estimate
-        # Ties that contradict poses of too small a σ look wrong themselves: poses are asked first.
+        # Ties that contradict poses of too small a σ look wrong themselves: poses are tested first.
         self._processes *= _FREE
         freed = self._rounds(estimate.rounds)
         if self._wide_kinds(freed).any():
@@ -136,18 +136,18 @@ class Rounds:
         return self._rounds(estimate.rounds)
 
     def _keep_stated(self, components: Bool) -> None:
-        """σ of some components of the poses stays as it was stated."""
+        """Fix the σ of some components of the poses at the stated one."""
         self._fixed = self._fixed | components
         self._processes[self._fixed] = 1.0
 
     def with_surveys(self, weight: Float64, observed: Float64, factor: float, done: int) -> Estimate:
-        """Rounds from there on, with surveys that count by a weight of 1 or 0 each.
+        """Returns rounds from there on, with surveys that count by a weight of 1 or 0 each.
 
         Parameters
         ----------
-        observed : error that each survey states of itself, in its σ: 0, or an offset that all of them have.
+        observed : error that each survey states for itself, in its σ: 0, or a common offset of all.
         factor : of the surveys' stated variances.
-        done : rounds so far.
+        done : number of rounds so far.
         """
         self._survey_weight, self._kinds[SURVEY] = weight, factor
         self._observed[self._surveyed] = observed
@@ -155,7 +155,7 @@ class Rounds:
         return self._rounds(done)
 
     def _rounds(self, done: int) -> Estimate:
-        """Rounds of IGG III after those that are done."""
+        """Run rounds of IGG III after those that are done."""
         for number in range(self.settings.max_rounds):
             estimate = self._judged(done + number + 1, calm=number >= _CALM)
             if estimate.settled:
@@ -163,11 +163,11 @@ class Rounds:
         return estimate
 
     def covariances(self, groups: Sequence[Int64]) -> list[Float64]:
-        """Covariance (m, m) of the unknowns of each group, in their σ, by the last solution."""
+        """Returns covariances (m, m) of the unknowns of each group, in their σ, from the last solution."""
         return self._equations.covariances(groups)
 
     def holding(self, fixed: Bool) -> Float64:
-        """The last solution (u,) where some unknowns (u,) are 0, with the weights that the rounds without it gave."""
+        """Last solution (u,) with some unknowns (u,) held at 0, and the weights of the rounds without that."""
         value = self._value / np.append(self._processes, 1.0)[self._component]
         own = fixed[self._row] & (self._row == self._column)
         rows, scaled = self.problem.rows, self._counted() / self._own()
@@ -176,23 +176,23 @@ class Rounds:
         return np.where(fixed, 0.0, self._equations.solve(right))
 
     def response(self, shift: Float64) -> Float64:
-        """By how much the last solution (u,) moves where surveys state `shift` more of an error, in their σ."""
+        """Returns the derivative of the last solution (u,) by an error `shift` of the surveys, in their σ."""
         whole = np.zeros(self._observed.size)
         whole[self._surveyed] = shift
         scaled = self._counted() / self._own()
         return self._equations.solve(self.problem.rows.transposed_times(scaled * whole, self.problem.unknowns.size))
 
     def _own(self) -> Float64:
-        """Variance of each row beside that of the corrections at the knots."""
+        """Returns the variance of each row apart from that of the corrections at the knots."""
         lines = self.problem.line_variance @ self._processes
         return np.asarray(self.problem.variance * self._kinds[self.problem.kind] + lines)
 
     def _counted(self) -> Float64:
-        """Weights that the equations are summed with."""
+        """Returns the weights in the sum of the equations."""
         return np.where(self.problem.kind == SURVEY, np.maximum(self._weight, _LEAST), self._weight)
 
     def _solved(self) -> tuple[Float64, Float64]:
-        """Solution and residuals with the weights of now."""
+        """Returns solution and residuals with the current weights."""
         rows, scaled = self.problem.rows, self._counted() / self._own()
         self._equations.factor(scaled, self._value / np.append(self._processes, 1.0)[self._component])
         right = rows.transposed_times(scaled * self._observed, self.problem.unknowns.size)
@@ -200,7 +200,7 @@ class Rounds:
         return solution, self._observed - rows.times(solution)
 
     def _judged(self, rounds: int, *, calm: bool) -> Estimate:
-        """One round of IGG III; it is settled when what comes out of it is what went in."""
+        """Run one round of IGG III; it is settled when its result equals its input."""
         solution, residual = self._solved()
         inverse = self._equations.inverse()
         own, weight = self._own(), self._weight.copy()
@@ -214,7 +214,7 @@ class Rounds:
         return Estimate(solution, inverse, residual, weight, without, kinds, processes, rounds, moved < _SETTLED)
 
     def _moved_to(self, weight: Float64) -> float:
-        """Weights of the next round; one that has all but gone is 0, so that 0 says that a row does not count."""
+        """Returns weights of the next round; one close to 0 becomes 0, so that 0 marks a row that does not count."""
         weight = np.where(weight < _SETTLED, 0.0, weight)
         weight[self._surveyed] = self._survey_weight
         moved = float(np.abs(weight - self._weight).max(initial=0.0))
@@ -222,7 +222,7 @@ class Rounds:
         return moved
 
     def _is_understated(self, estimate: Estimate) -> bool:
-        """Whether the stated σ of a kind of observation, or of a component of the poses, is much too small."""
+        """Returns whether the stated σ of a kind of observation, or of a component of the poses, is much too small."""
         if self._wide_kinds(estimate).any():
             return True
         kinds, processes, own = self._kinds.copy(), self._processes.copy(), self._own()
@@ -233,13 +233,13 @@ class Rounds:
         return bool((found > _UNDERSTATED).any())
 
     def contradicts_poses(self, estimate: Estimate) -> bool:
-        """Whether corrections of some component are larger than its process allows, by the quantile of χ²."""
+        """Returns whether corrections of some component are larger than its process allows, by the quantile of χ²."""
         ratio, redundancy = self._process_ratios(estimate.solution, estimate.inverse)
         known = redundancy >= _SOME
         return bool((ratio * redundancy > chdtri(np.maximum(redundancy, _SOME), 1.0 - _SURE))[known].any())
 
     def understated(self, estimate: Estimate) -> Float64:
-        """By how much (runs, 6) the stated σ of components of single runs are too small; 1 where nothing says so.
+        """Returns factors (runs, 6) by which the stated σ of components of single runs are too small; 1 where none is.
 
         Corrections are then larger than the process allows, by the quantile of χ² over all runs and components, and σ
         too small by what :data:`_UNDERSTATED` says, beside the factor that all runs have.
@@ -265,7 +265,7 @@ class Rounds:
         return np.where(known & (squares > limit), np.sqrt(squares / np.maximum(told, _SOME)), 1.0)
 
     def _process_ratios(self, solution: Float64, inverse: SelectedInverse) -> tuple[Float64, Float64]:
-        """Squares over redundancy (6,) of each component's process with the factor of now, and the redundancy."""
+        """Squares over redundancy (6,) of each component's process with the current factor, and the redundancy."""
         twice = np.where(self._row == self._column, 1.0, 2.0) * self._value
         moved = twice * solution[self._row] * solution[self._column]
         shrunk = twice * inverse.at(self._row, self._column)
@@ -278,9 +278,9 @@ class Rounds:
         return squares / np.maximum(told, 1e-300), told
 
     def _wide_kinds(self, estimate: Estimate) -> Float64:
-        """Factors of the stated variances of kinds of observations that are much too small; 0 of the others.
+        """Returns factors of the stated variances of kinds of observations that are much too small; 0 of the others.
 
-        The median tells, because observations that contradict a σ that is too small were rejected.
+        The median is used, because observations that contradict a σ that is too small were rejected.
         """
         statistic, found = np.abs(estimate.without.statistic), np.zeros(len(KINDS) + 1)
         for kind in range(len(KINDS)):
@@ -299,9 +299,9 @@ class Rounds:
         own: Float64,
         weight: Float64,
     ) -> float:
-        """Estimate the factors once more (Förstner 1979); the largest change of their logarithms."""
+        """Estimate the factors again (Förstner 1979); returns the largest change of their logarithms."""
         before = np.concatenate([self._kinds, self._processes])
-        # Of an observation's variance, the share that is its own counts; the rest is that of lines between knots.
+        # Only the observation's share of its variance counts; the rest is that of lines between knots.
         share = self.problem.variance * self._kinds[self.problem.kind] / own
         squares, redundancy = weight * residual**2 / own, np.where(weight > 0.0, without.redundancy, 0.0)
         for kind in range(len(KINDS)):
@@ -320,7 +320,7 @@ class Rounds:
 def _stepped(
     factor: float, ratio: float, redundancy: float, share: float = 1.0, enough: float = _ENOUGH
 ) -> float:  # fmt: skip
-    """The factor that makes squares as large as their redundancy; the same where that is too little to tell.
+    """Returns the factor that makes squares as large as their redundancy; unchanged where redundancy is too small.
 
     Parameters
     ----------

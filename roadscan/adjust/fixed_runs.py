@@ -1,4 +1,4 @@
-"""Runs that are held fixed: their recorded poses hold, and what all other evidence says of the errors of these."""
+"""Runs that are held fixed: their recorded poses are final, and other evidence estimates the errors of these."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FixedRun:
-    """A run that is held, and the corrections that it would have if it were not."""
+    """A run that is held fixed, and the corrections that it would have if it were not."""
 
     run: str
     error: Float64
@@ -26,10 +26,10 @@ class FixedRun:
     sigma: Float64
     """(k, 6) 1 σ of its poses, as stated."""
     spans: Float64
-    """(6,) correlation times that its drive lasts, 1 at least: so many numbers are independent of one another."""
+    """(6,) number of correlation times in its drive, at least 1: the number of independent values."""
 
     def contradicted(self, false_alarm: float) -> list[tuple[str, float, float]]:
-        """Component, largest error and its size in σ, of each that right poses would exceed with that chance only.
+        """Component, largest error and its size in σ, of each error that right poses would exceed with that chance.
 
         An estimated error scatters by no more than the stated σ.
         """
@@ -46,7 +46,7 @@ class FixedRun:
 
 
 def fixed_runs(unknowns: Unknowns, error: Sequence[Float64]) -> tuple[FixedRun, ...]:
-    """Those of the adjustment; error : (k, 6) of each run, where no run is held."""
+    """Returns the fixed runs of the adjustment; error : (k, 6) of each run, where no run is held."""
     found = []
     for number, (prior, knots) in enumerate(zip(unknowns.priors, unknowns.knots, strict=True)):
         if prior.fixed:

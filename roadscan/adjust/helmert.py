@@ -1,4 +1,4 @@
-"""The rigid movement that brings a survey onto its control (Helmert), and what the other targets say of each of them.
+"""The rigid transformation of a survey onto its control (Helmert), and a leave-one-out test of each target.
 
 Poses are not corrected run by run, so their errors stay, and count as noise of what a run saw: it is σ of the poses
 that tells whether a point contradicts the others. A point that does is left out as a whole, the worst first.
@@ -26,8 +26,8 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _THIN: Final = 1e-3
-"""Points whose second extent is below this share of their first lie on a line."""
-_DOWN: Final = 2
+"""Points whose second extent is below this share of their first are collinear."""
+_DOWN: Final = 2  # Index of the component down.
 
 
 @dataclass(frozen=True)
@@ -52,21 +52,21 @@ class Helmert:
 
     @property
     def variance_factor(self) -> float:
-        """Weighted squared residuals over their redundancy: about 1 where the stated σ is true."""
+        """Returns weighted squared residuals over their redundancy: about 1 where the stated σ is true."""
         whitened = self.residual_m / self.sigma_m
         return float((whitened**2).sum() / max(whitened.size - len(self.covariance), 1))
 
     def apply(self, points_m: Float64) -> Float64:
-        """Points (n, 3) of `from` in the axes of `to`."""
+        """Returns points (n, 3) of `from` in the axes of `to`."""
         return np.asarray(self._turned(points_m) + self.centre_to_m)
 
     def sigma_of(self, points_m: Float64) -> Float64:
-        """1 σ (n, 3) that the transformation adds to points (n, 3) of `from`, axes of `to`."""
+        """Returns 1 σ (n, 3) that the transformation adds to points (n, 3) of `from`, axes of `to`."""
         rows = _derivatives(self._turned(points_m), with_scale=len(self.covariance) == 7)
         return np.asarray(np.sqrt(np.einsum("nai,ij,naj->na", rows, self.covariance, rows)))
 
     def corrections(self, epochs_gps_ns: Int64, position_m: Float64, level_from_body: Float64) -> Corrections:
-        """Corrections of a run that amount to this transformation.
+        """Returns corrections of a run that are equivalent to this transformation.
 
         Parameters
         ----------
@@ -91,7 +91,7 @@ class Helmert:
 def helmert(
     points_from_m: Float64, points_to_m: Float64, sigma_m: npt.ArrayLike, *, with_scale: bool = False
 ) -> Helmert:
-    """Least-squares transformation of points of one frame into another.
+    """Returns the least-squares transformation of points of one frame into another.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def _check(source: Float64, target: Float64) -> None:
 
 
 def _derivatives(turned: Float64, *, with_scale: bool) -> Float64:
-    """Of turned points (n, 3) by shift, small rotation, and the scale's logarithm: (n, 3, 6 or 7)."""
+    """Derivatives of turned points (n, 3) by shift, small rotation, and the scale's logarithm: (n, 3, 6 or 7)."""
     rows = np.zeros((len(turned), 3, 7))
     x, y, z = turned.T
     rows[:, [0, 1, 2], [0, 1, 2]] = 1.0
@@ -168,7 +168,7 @@ def _derivatives(turned: Float64, *, with_scale: bool) -> Float64:
 
 @dataclass(frozen=True)
 class RigidFit:
-    """A Helmert transformation of what was measured onto what was surveyed."""
+    """A Helmert transformation of measured onto surveyed points."""
 
     helmert: Helmert
     """Axes north, east, down from the origin."""
@@ -176,7 +176,7 @@ class RigidFit:
     """(3,) easting, northing, height."""
     convergence_rad: float
     control: ControlErrors
-    """Of all points that were seen; left-out figures are NaN where too few points are left."""
+    """Errors of all points that were seen; leave-one-out figures are NaN where too few points remain."""
 
 
 @dataclass(frozen=True)
@@ -193,12 +193,12 @@ class _Seen:
     """(n, 3) of the measurement and of the poses together."""
 
     def fit(self, rows: Bool) -> Helmert:
-        """The transformation from some sightings."""
+        """Returns the transformation from some sightings."""
         sigma = np.hypot(self.survey_sigma_m, self.seen_sigma_m)
         return helmert(self.measured_m[rows], self.surveyed_m[rows], sigma[rows])
 
     def left_out(self, point: int, counting: Bool) -> tuple[Float64, Float64]:
-        """Surveyed minus what the other points that count say of a point, and its σ: (3,) each; NaN: they are too few.
+        """Returns surveyed minus the prediction from the other points that count, and its σ: (3,) each; NaN: too few.
 
         counting : (n,) sightings of points that count.
         """
@@ -215,7 +215,7 @@ class _Seen:
 
 
 def rigid_fit(sightings: Sequence[Sighting], sigma_pose_m: Float64, false_alarm: float = 0.01) -> RigidFit:
-    """The movement of a survey onto its targets.
+    """Returns the rigid transformation of a survey onto its targets.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ def rigid_fit(sightings: Sequence[Sighting], sigma_pose_m: Float64, false_alarm:
 
 
 def _contradiction(away_m: Float64, sigma_m: Float64, false_alarm: float, tests: int) -> float:
-    """How far a point lies from where the others put it, in limits of its height or of its place; 0: not known."""
+    """Distance of a point from its prediction, relative to the limit of its height or place; 0: not known."""
     if not np.isfinite(away_m).all():
         return 0.0
     sigmas = np.abs(away_m / sigma_m)

@@ -1,4 +1,4 @@
-"""Observations of an adjustment: each is one number that the corrections of one or two poses explain.
+"""Observations of an adjustment: each is one number that corrections of one or two poses explain.
 
 A correction is that of `schemas/corrections.toml`: north, east, down (m, local level) and a small turn about the axes
 of the body (rad). A point of the body, `arm_body_m` from its origin, moves in local level by
@@ -34,7 +34,7 @@ UInt8 = npt.NDArray[np.uint8]
 KINDS: Final = (
     "height_tie", "shift_tie", "plane_tie", "control_height", "control_position", "head_tie", "hand_tie",
 )  # fmt: skip
-"""Height of one pass against another's; shift of one picture or relief against another's; distance of two planes;
+"""Height of one pass against another's; shift of one image or relief against another's; distance of two planes;
 height, or a component of the place, of a control point; height of one head against that of another of the same pass;
 what a person found in two passes."""
 
@@ -69,13 +69,13 @@ class Observations:
     group: Int64
     """(n,) observations of one group stand or fall together: the two components of one shift."""
     place: Int64
-    """(n,) place, or control point, that it was made at."""
+    """(n,) number of the place, or control point."""
     survey_sigma_m: Float64 = field(default_factory=lambda: np.zeros(0))
     """(n,) of control: 1 σ of the surveyed coordinate along the direction, apart from `sigma_m`, which is that of the
     measurement alone. All observations of a control point share the error of its survey. 0 for ties; zeros where none
     are given."""
     sensor: Int32 = field(default_factory=lambda: np.zeros((0, 2), np.int32))
-    """(n, 2) number of the sensor that saw each end; −1 where its mounting is not asked for, as where none is given."""
+    """(n, 2) number of the sensor that saw each end; −1 where its mounting is not estimated."""
     mount_partials: Float64 = field(default_factory=lambda: np.zeros((0, 2, len(MOUNTED))))
     """(n, 2, 7) derivatives by `MOUNTED` of that sensor, the sign of the end included."""
 
@@ -90,12 +90,12 @@ class Observations:
 
     @property
     def size(self) -> int:
-        """Number of observations."""
+        """Returns the number of observations."""
         return self.kind.size
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """All of them, in order; groups are numbered anew."""
+        """Returns all of them, in order; groups are numbered anew."""
         if not parts:
             return cls.none()
         columns = {f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)}
@@ -109,19 +109,19 @@ class Observations:
 
     @classmethod
     def none(cls) -> Self:
-        """No observation."""
+        """Returns an empty set."""
         return cls(
             np.zeros(0, np.uint8), np.zeros((0, 2), np.int32), np.zeros((0, 2), np.int64), np.zeros((0, 2, 6)),
             np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64),
         )  # fmt: skip
 
     def chosen(self, which: npt.NDArray[np.bool_] | Int64) -> Self:
-        """Some of them."""
+        """Returns a subset."""
         return type(self)(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
 
 def mount_partials(in_body: Float64, arm_turns: Float64, arm_along_m: Float64, seat: Seat) -> Float64:
-    """Derivatives (n, 7) of the movement along a direction by the mounting of a sensor.
+    """Returns derivatives (n, 7) of the movement along a direction by the mounting of a sensor.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def mount_partials(in_body: Float64, arm_turns: Float64, arm_along_m: Float64, s
 
 
 def partials(direction_level: Float64, level_from_body: Float64, arm_body_m: Float64) -> Float64:
-    """Derivatives (n, 6) of the movement along a direction by the corrections of a pose.
+    """Returns derivatives (n, 6) of the movement along a direction by the corrections of a pose.
 
     Parameters
     ----------

@@ -21,12 +21,12 @@ UInt16 = npt.NDArray[np.uint16]
 
 
 Shift: TypeAlias = tuple[float, float, float]
-"""Of a traverse as a whole: north, east, down (m, local level)."""
+"""Shift of a whole traverse: north, east, down (m, local level)."""
 
 
 @dataclass(frozen=True)
 class PassReadings:
-    """Readings of one traverse near a place, placed with the recorded or the corrected poses."""
+    """Readings of one traverse near a place, georeferenced with the recorded or the corrected poses."""
 
     run: int
     """Index of the run."""
@@ -47,9 +47,9 @@ class PassReadings:
     level_from_body: Float64
     """(p, 3, 3) north, east, down from body axes."""
     convergence_rad: float = 0.0
-    """Grid north is this far clockwise from true north."""
+    """Angle of grid north, clockwise from true north."""
     returns: bool = False
-    """Sparse returns of a lidar, of which planes are compared in place of cells."""
+    """True for sparse returns of a lidar, of which planes are compared instead of cells."""
 
     def __post_init__(self) -> None:
         n, p = self.pose.size, self.epoch_gps_ns.size
@@ -62,7 +62,7 @@ class PassReadings:
             )
 
     def pose_at(self, epoch_gps_ns: int) -> int:
-        """Row of the pose nearest to an epoch."""
+        """Returns the row of the pose nearest to an epoch."""
         after = int(np.searchsorted(self.epoch_gps_ns, epoch_gps_ns))
         if after in (0, self.epoch_gps_ns.size):
             return min(after, self.epoch_gps_ns.size - 1)
@@ -70,13 +70,13 @@ class PassReadings:
         return after if behind - epoch_gps_ns < epoch_gps_ns - before else after - 1
 
     def arm_body_m(self, point_m: Float64, pose: Int64) -> Float64:
-        """From the body's origin to points (k, 3; easting, northing, height) in the body axes of poses (k,): (k, 3)."""
+        """Vectors (k, 3) from the body's origin to points (k, 3; easting, northing, height), axes of bodies (k,)."""
         away = level_from_map(point_m - self.body_m[pose], self.convergence_rad)
         return np.asarray(np.einsum("nji,nj->ni", self.level_from_body[pose], away))
 
 
 def shifted(readings: PassReadings, shift_level_m: Float64) -> PassReadings:
-    """The readings of a traverse and the poses that saw them, shifted (3,; north, east, down) as one."""
+    """Returns the readings of a traverse and its poses, shifted together (3,; north, east, down)."""
     if not np.any(shift_level_m):
         return readings
     away = map_from_level(np.asarray(shift_level_m, np.float64)[None], readings.convergence_rad)[0]
@@ -87,14 +87,14 @@ def shifted(readings: PassReadings, shift_level_m: Float64) -> PassReadings:
 
 
 def level_from_map(vector_m: Float64, convergence_rad: float) -> Float64:
-    """Vectors (n, 3) of the map (easting, northing, height) as north, east, down of the local level."""
+    """Returns vectors (n, 3) of the map (easting, northing, height) as north, east, down of the local level."""
     e, n, h = np.asarray(vector_m).T
     c, s = math.cos(convergence_rad), math.sin(convergence_rad)
     return np.stack([c * n - s * e, s * n + c * e, -h], axis=-1)
 
 
 def map_from_level(vector_m: Float64, convergence_rad: float) -> Float64:
-    """Vectors (n, 3) of the local level (north, east, down) as easting, northing, height of the map."""
+    """Returns vectors (n, 3) of the local level (north, east, down) as easting, northing, height of the map."""
     n, e, d = np.asarray(vector_m).T
     c, s = math.cos(convergence_rad), math.sin(convergence_rad)
     return np.stack([c * e - s * n, c * n + s * e, -d], axis=-1)
@@ -124,11 +124,11 @@ class Patch:
     inside: Inside
     cell_m: float
     height_m: Float64
-    """(k, k); NaN where too little was seen."""
+    """(k, k); NaN where there are too few readings."""
     sigma_m: Float64
     """(k, k) 1 σ of the height from the spread of the cell's readings, noise and texture alike."""
     used: Int32
-    """(k, k) readings that the height comes from."""
+    """(k, k) number of readings in the height."""
     intensity: Float64
     """(k, k) mean."""
     pose: int
@@ -136,23 +136,23 @@ class Patch:
 
     @property
     def seen(self) -> npt.NDArray[np.bool_]:
-        """(k, k) cells with a height."""
+        """Returns a mask (k, k) of the cells with a height."""
         return np.isfinite(self.height_m)
 
     @property
     def epoch_gps_ns(self) -> int:
-        """Epoch of the pose in the middle of the readings."""
+        """Returns the epoch of the pose in the middle of the readings."""
         return int(self.readings.epoch_gps_ns[self.pose])
 
     @cached_property
     def middle_m(self) -> Float64:
-        """(k,) coordinates of the middles of rows along, and of columns across."""
+        """Returns coordinates (k,) of the middles of rows along, and of columns across."""
         edge = len(self.height_m)
         return np.asarray((np.arange(edge) + 0.5 - 0.5 * edge) * self.cell_m)
 
 
 def patch_of(place: Place, readings: PassReadings, cell_m: float, least_readings: int) -> Patch | None:
-    """Cells of a traverse at a place; None where it saw nothing of it.
+    """Returns the cells of a traverse at a place; None where it saw nothing of it.
 
     cell_m : edge of a cell. least_readings : a cell with fewer has no height.
     """
@@ -164,7 +164,7 @@ def patch_of(place: Place, readings: PassReadings, cell_m: float, least_readings
     cells = Cells._make(np.empty(edge * edge, t) for t in (np.float64, np.float64, np.int32, np.float64))
     fill_cells(inside.number, inside.height_m, inside.intensity, count, least_readings, cells)
     usual = np.nanmedian(cells.spread_m) if np.isfinite(cells.spread_m).any() else math.nan
-    # The quartiles of a handful are worth little by themselves.
+    # Quartiles of a handful of readings are unreliable.
     spread = np.sqrt((cells.spread_m**2 + usual**2) / 2.0)
     sigma = np.where(np.isfinite(spread), spread, usual) / np.sqrt(np.maximum(cells.used, 1))
     shape = (edge, edge)
@@ -175,7 +175,7 @@ def patch_of(place: Place, readings: PassReadings, cell_m: float, least_readings
 
 
 def _inside(place: Place, readings: PassReadings, cell_m: float, edge: int, count: Int64) -> Inside:
-    """Readings inside the cells of a place, which are counted into `count`."""
+    """Returns the readings inside the cells of a place, and counts them into `count`."""
     along, across = np.empty(readings.pose.size), np.empty(readings.pose.size)
     local_axes(readings.easting_m, readings.northing_m, frame_of(place), along, across)
     number = np.empty(along.size, np.int32)
@@ -188,12 +188,12 @@ def _inside(place: Place, readings: PassReadings, cell_m: float, edge: int, coun
 
 
 def frame_of(place: Place) -> Frame:
-    """Axes of a place, as kernels take them."""
+    """Returns the axes of a place, as kernels take them."""
     return Frame(place.easting_m, place.northing_m, math.sin(place.heading_rad), math.cos(place.heading_rad))
 
 
 def map_from_axes(place: Place, along_m: Float64, across_m: Float64, height_m: Float64) -> Float64:
-    """Points (n, 3) of the map from coordinates (n,) along and across a place, and heights."""
+    """Returns points (n, 3) of the map from coordinates (n,) along and across a place, and heights."""
     sine, cosine = math.sin(place.heading_rad), math.cos(place.heading_rad)
     easting = place.easting_m + along_m * sine + across_m * cosine
     northing = place.northing_m + along_m * cosine - across_m * sine

@@ -1,4 +1,4 @@
-"""Picture of an adjustment: where its evidence lies and what is left of it, before and after."""
+"""Figure of an adjustment: map and histograms of the residuals before and after."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Float64 = npt.NDArray[np.float64]
 
 _BEFORE: Final = "#d1495b"
 _AFTER: Final = "#1f5fa8"
-_LEAST_MM: Final = 0.5
+_LEAST_MM: Final = 0.5  # Least half range of the axes (mm).
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Residuals:
 
 @dataclass(frozen=True)
 class AdjustmentPicture:
-    """What is drawn."""
+    """Contents of the figure."""
 
     title: str
     ways_m: tuple[Float64, ...]
@@ -44,7 +44,7 @@ class AdjustmentPicture:
 
 
 def draw_adjustment(shown: AdjustmentPicture, path: Path) -> None:
-    """A row a kind: a map of what is left, and histograms of before and after. Equal input gives equal bytes."""
+    """Draw a row for each kind: a map of residuals, and histograms before and after. Equal input gives equal bytes."""
     known = [one for one in shown.residuals if one.before_m.size]
     figure = empty_figure(11.0, 1.0 + 3.2 * max(len(known), 1), 120)
     figure.suptitle(shown.title)

@@ -1,4 +1,4 @@
-"""Pictures of a patch that are shifted against each other: its relief and its paint, without what changes slowly."""
+"""Images of a patch that are shifted against each other: its relief and its paint, without slow variation."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from roadscan.adjust.patches import Patch
 Float64 = npt.NDArray[np.float64]
 
 BLUR_CELLS: Final = 1.2
-"""Pictures are smoothed with a Gaussian of this σ: else interpolation between cells would damp their noise and draw
+"""σ (cells) of the Gaussian that smooths images: else interpolation between cells would damp their noise and draw
 shifts to half cells."""
 _FILLED: Final = 0.3
-"""A cell is seen where it holds this share of the usual weight."""
+"""A cell is seen if it has this share of the usual weight."""
 _DEEPEST_M: Final = 0.05
-"""Readings farther than this from the height of their cell are no road."""
-_EDGE_CELLS: Final = 3
-_LEAST_CELLS: Final = 64
+"""Readings farther than this from the height of their cell (m) are not road."""
+_EDGE_CELLS: Final = 3  # Edge of the square of cells around one that must all be seen.
+_LEAST_CELLS: Final = 64  # An image with fewer cells is empty.
 _FEW: Final = 2000
-"""Readings on either side of the middle that tell how the readings are spaced."""
+"""Readings on either side of the middle from which the spacing of readings is measured."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Picture:
     value: Float64
     """(k, k; along, across) NaN where nothing was seen."""
     sampling_m2: Float64
-    """(2, 2; along, across) variance of where an edge lies that runs along the grid of the readings."""
+    """(2, 2; along, across) variance of the position of an edge that runs along the grid of the readings."""
 
 
 def pictures_of(patch: Patch, cell_m: float) -> tuple[Picture, Picture]:
-    """Relief and intensity of a patch in cells of `cell_m`."""
+    """Returns relief and intensity of a patch in cells of `cell_m`."""
     edge = max(round(2.0 * patch.place.radius_m / cell_m), 8)
     half, inside = 0.5 * edge * cell_m, patch.inside
     sums = Splat._make(np.zeros((edge, edge)) for _ in range(3))
@@ -57,9 +57,9 @@ def pictures_of(patch: Patch, cell_m: float) -> tuple[Picture, Picture]:
 
 
 def _sampling(patch: Patch) -> Float64:
-    """Variance (2, 2) of an edge's place between readings: spacing² / 12, along the line of a profile and beside it.
+    """Returns the variance (2, 2) of an edge's position between readings: spacing² / 12, along a profile and beside it.
 
-    An edge that runs along the grid is late or early by the same part of a step over its whole length, which no
+    An edge that runs along the grid is displaced by the same part of a step over its whole length, which no
     residual shows.
     """
     inside = patch.inside
@@ -70,7 +70,7 @@ def _sampling(patch: Patch) -> Float64:
     step = np.stack([np.diff(along)[pair], np.diff(across)[pair]], axis=-1)
     length = np.hypot(step[:, 0], step[:, 1])
     usual = float(np.median(length)) if length.size else math.sqrt(each)
-    # Neighbours in a profile lie closer than neighbours at random.
+    # Neighbours in a profile are closer than random neighbours.
     on_line = (length > 0.5 * usual) & (length < 2.0 * usual)
     if 2 * int(pair.sum()) < pair.size or usual <= 0.0 or not on_line.any() or usual**2 > 4.0 * each:
         return np.eye(2) * each / 12.0
@@ -80,9 +80,9 @@ def _sampling(patch: Patch) -> Float64:
 
 
 def _without_slow(mass: Float64, totals: Sequence[Float64]) -> list[Float64]:
-    """Smoothed values of cells minus a surface of the second degree; NaN where nothing was seen.
+    """Returns smoothed values of cells minus a surface of the second degree; NaN where nothing was seen.
 
-    A running mean would be one-sided at the rims, and its error would be the same in all pictures, as if nothing had
+    A running mean would be one-sided at the rims, and its error would be the same in all images, as if nothing had
     moved.
     """
     pictures = [np.full(mass.shape, np.nan) for _ in totals]

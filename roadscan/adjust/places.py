@@ -27,14 +27,14 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _STEP_M: Final = 2.0
-"""Samples of a track are no farther apart; the chord of a bend of 10 m leaves it by 5 cm."""
+"""Greatest spacing of samples (m); the chord of a bend of 10 m leaves it by 5 cm."""
 _ASIDE: Final = (0.0, -0.8, 0.8, -0.4, 0.4)
-"""Where in a wide strip places lie in turns: roll shows at its edges."""
+"""Positions of places in a wide strip, in turns: roll shows at its edges."""
 
 
 @dataclass(frozen=True)
 class Track:
-    """Where a sensor went in one run, and how far it saw to both sides."""
+    """The path of a sensor in one run, and its reach to both sides."""
 
     run: int
     """Index of the run."""
@@ -42,17 +42,17 @@ class Track:
     epoch_gps_ns: Int64
     """(n,) ascending."""
     easting_m: Float64
-    """(n,) map, of the road below what the sensor sees: of a line scanner, a point on its line."""
+    """(n,) map, of the road below the sensor's view: of a line scanner, a point on its line."""
     northing_m: Float64
     height_m: Float64
     heading_rad: Float64
     """(n,) of the vehicle, clockwise from grid north."""
     left_m: float | Float64
-    """Reach on the ground to the left of the position, (n,) or the same for all; negative where the sensor sees nothing
-    but the right."""
+    """Reach on the ground to the left of the position, (n,) or the same for all; negative where the sensor sees only
+    the right."""
     right_m: float | Float64
     ahead_m: float = 0.0
-    """How far ahead and behind a lidar is taken to see; 0 for sensors that see a line across. A place of such a sensor
+    """Reach of a lidar ahead and behind; 0 for sensors that see a line across. A place of such a sensor
     may have one traverse: it is seen for a while."""
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Traverse:
-    """One pass by a place, of one sensor."""
+    """One pass of one sensor by a place."""
 
     run: int
     """Index of the run."""
@@ -79,7 +79,7 @@ class Traverse:
 
 @dataclass(frozen=True)
 class Place:
-    """A square of road that is compared between passes."""
+    """A square of road at which passes are compared."""
 
     number: int
     """From 0, in the order of the leading track, then along it."""
@@ -96,7 +96,7 @@ class Place:
     """Whether heads of one pass meet there, in a strip too narrow for other ties."""
 
     def quality_only(self, return_s: float) -> bool:
-        """Whether the traverses are heads of one run at one time: one correction moves them all."""
+        """Returns whether the traverses are heads of one run at one time: one correction moves them all."""
         first, last = self.traverses[0], self.traverses[-1]
         apart_s = (max(t.first_gps_ns for t in self.traverses) - min(t.last_gps_ns for t in self.traverses)) / NS_PER_S
         return len(self.traverses) > 1 and first.run == last.run and apart_s < return_s
@@ -108,7 +108,7 @@ def places_of_overlap(tracks: Sequence[Track], settings: PlaceSettings) -> list[
     Parameters
     ----------
     tracks : of all runs and sensors, by run; those of one run beside one another.
-    settings : how many, how large, what counts as another pass.
+    settings : number and size of places, and the criteria of another pass.
     """
     spacing_m = 1000.0 / settings.per_km
     every = max(1, math.ceil(spacing_m / _STEP_M))
@@ -128,7 +128,7 @@ def places_of_overlap(tracks: Sequence[Track], settings: PlaceSettings) -> list[
 
 
 def _sampled(track: Track, number: int, step_m: float, origin_gps_ns: int, gap_s: float) -> Samples:
-    """Samples of one track each `step_m` of its path."""
+    """Returns samples of one track, one each `step_m` of its path."""
     moved = np.hypot(np.diff(track.easting_m), np.diff(track.northing_m))
     station = np.concatenate([[0.0], np.cumsum(moved)])[: track.epoch_gps_ns.size]
     since = (track.epoch_gps_ns - origin_gps_ns) / NS_PER_S
@@ -147,7 +147,7 @@ def _sampled(track: Track, number: int, step_m: float, origin_gps_ns: int, gap_s
 
 
 def _visits(samples: Samples, limits: Limits, step_m: float) -> Visits:
-    """Visits of the cross-lines of all samples."""
+    """Returns visits of the cross-lines of all samples."""
     reach = np.maximum(np.abs(samples.left_m), np.abs(samples.right_m)).max()
     edge = 2.0 * float(reach) + 2.0 * step_m
     west, south = float(samples.easting_m.min()), float(samples.northing_m.min())
@@ -170,7 +170,7 @@ def _visits(samples: Samples, limits: Limits, step_m: float) -> Visits:
 
 
 def _between(samples: Samples, found: Visits, number: Int64, every: int, return_s: float) -> Bool:
-    """Samples (n,) that lead as well, because a visit, a crossing say, comes between the even leads.
+    """Returns samples (n,) that lead as well, because a visit, such as a crossing, lies between the even leads.
 
     A visit goes on from sample to sample of the lead. Of one that no even lead within `every` samples meets, the middle
     sample leads.
@@ -179,7 +179,7 @@ def _between(samples: Samples, found: Visits, number: Int64, every: int, return_
     tracks = np.int64(samples.track.max()) + 1
     pair = samples.track[found.lead] * tracks + samples.track[found.first]
     since = samples.since_s[found.first]
-    # One pass of the other track beside this one has one label.
+    # Passes of the other track beside this one are labelled separately.
     order = np.lexsort((since, pair))
     begins = np.append(True, (np.diff(pair[order]) != 0) | (np.diff(since[order]) >= return_s))[: order.size]
     label = np.empty(order.size, np.int64)
@@ -199,7 +199,7 @@ def _between(samples: Samples, found: Visits, number: Int64, every: int, return_
 
 
 def _of_leads(found: Visits, leads: Int64, size: int) -> Visits:
-    """Visits of some samples, numbered by their place among them."""
+    """Returns the visits of some samples, numbered by their index among them."""
     rank = np.full(size, -1, dtype=np.int64)
     rank[leads] = np.arange(leads.size)
     kept = rank[found.lead] >= 0
@@ -253,7 +253,7 @@ def _places(
 def _windows(
     samples: Samples, foot: Float64, track: npt.NDArray[np.int32], reach_m: Float64, longest_s: float
 ) -> tuple[Float64, Float64]:
-    """First and last time (q,) since the origin at which tracks are within `reach_m` (q,) of their foot, along them."""
+    """Returns first and last time (q,) since the origin at which tracks are within `reach_m` (q,) of their foot."""
     number = np.arange(samples.track.size, dtype=np.float64)
     first_of = np.searchsorted(samples.track, track, side="left").astype(np.float64)
     last_of = np.searchsorted(samples.track, track, side="right") - 1.0

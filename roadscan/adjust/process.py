@@ -2,10 +2,10 @@
 
 An error is b(t) u(t) + e(t) v(t). Here u is a first-order Gauss–Markov process of unit variance, with the covariance
 e^(−|Δt|/τ) (Gelb 1974, 3.8), and b(t) is the σ that the logs state of each pose. In an outage, where σ is much larger
-than usual, b stays at a bound and e(t) = √(σ² − b²): v is another such process, and each outage has its own, because
-what an outage adds says nothing of the error before and after it. At knots u is the sequence u(k+1) = φ u(k) + w,
-φ = e^(−h/τ), var w = 1 − φ², without any approximation. Between knots the adjustment puts a straight line; by how much
-the process leaves it has a variance in closed form (`line_variance`).
+than usual, b stays at a bound and e(t) = √(σ² − b²): v is another such process, independent in each outage, because
+the error in an outage is independent of those before and after it. At knots u is the sequence u(k+1) = φ u(k) + w,
+φ = e^(−h/τ), var w = 1 − φ², without any approximation. Between knots the adjustment is linear; the variance of
+the process about the line has a closed form (`line_variance`).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _OUTAGE: Final = float(np.sqrt(2.0))
-"""σ above the usual one by this factor is that of an outage: half of its variance or more is not of the usual kind."""
+"""Factor of σ above the usual one that marks an outage: at least half of its variance is not of the usual kind."""
 _BUDGET: Final = 4.0
-"""So many times as many knots as evenly spaced ones are added to a run at most."""
+"""Knots added to a run, at most, as a multiple of the evenly spaced ones."""
 _MOST_MORE: Final = 15
-"""An interval of the even knots gets no more within it: they are 6 ms apart where the others are 0.1 s."""
+"""Most knots added within an interval of even knots: they are 6 ms apart where the others are 0.1 s."""
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,14 @@ class GaussMarkov:
     """First-order Gauss–Markov process of one component."""
 
     sigma: float
-    """Usual 1 σ (m or rad), and that of all times where a run's logs state none; 0: the component is not corrected."""
+    """Usual 1 σ (m or rad), also at all times where a run's logs state none; 0: the component is not corrected."""
     tau_s: float
     """Correlation time (s)."""
 
 
 @dataclass(frozen=True)
 class StatedSigma:
-    """1 σ of a run's poses over time, as its logs state it."""
+    """Stated 1 σ of a run's poses over time, from its logs."""
 
     epochs_gps_ns: Int64
     """(k,) ascending, one or more."""
@@ -63,14 +63,14 @@ class StatedSigma:
             )
 
     def at(self, epochs_gps_ns: Int64) -> Float64:
-        """Linear between the stated epochs, and the end values beyond them: (n, 6)."""
+        """Returns σ (n, 6), linear between the stated epochs, and the end values beyond them."""
         since, known = ((e - self.epochs_gps_ns[0]).astype(np.float64) for e in (epochs_gps_ns, self.epochs_gps_ns))
         return np.stack([np.interp(since, known, column) for column in self.sigma.T], axis=-1)
 
 
 @dataclass(frozen=True)
 class RunPrior:
-    """What is known of the errors of a run's poses before the adjustment."""
+    """Prior knowledge of the errors of a run's poses."""
 
     run: str
     first_gps_ns: int
@@ -78,9 +78,9 @@ class RunPrior:
     processes: tuple[GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov]
     """In the order of `COMPONENTS`; independent of one another."""
     stated: StatedSigma | None = None
-    """σ over time, in place of the usual one of the components that it states and that are corrected."""
+    """σ over time, which replaces the usual one in the corrected components that it states."""
     fixed: bool = False
-    """The recorded poses hold, and those of other runs are adjusted to them."""
+    """True where the recorded poses are final, and those of other runs are adjusted to them."""
 
     def __post_init__(self) -> None:
         if self.last_gps_ns < self.first_gps_ns:
@@ -98,11 +98,11 @@ class RunPrior:
 
     @property
     def sigmas(self) -> Float64:
-        """(6,) usual 1 σ."""
+        """Returns (6,) usual 1 σ."""
         return np.array([p.sigma for p in self.processes])
 
     def sigma_at(self, epochs_gps_ns: Int64) -> Float64:
-        """1 σ (n, 6) of the poses' errors at epochs (n,)."""
+        """Returns 1 σ (n, 6) of the poses' errors at epochs (n,)."""
         usual = np.broadcast_to(self.sigmas, (epochs_gps_ns.size, len(COMPONENTS)))
         if self.stated is None:
             return usual.copy()
@@ -110,14 +110,14 @@ class RunPrior:
         return np.where(np.isfinite(stated) & (usual > 0.0), stated, usual)
 
     def parts_at(self, epochs_gps_ns: Int64) -> Float64:
-        """The parts b and e of that σ at epochs (n,): (n, 6), or (n, 12) with e where there is an outage among them."""
+        """Parts b and e of that σ at epochs (n,): (n, 6), or (n, 12) with e where there is an outage among them."""
         sigma = self.sigma_at(epochs_gps_ns)
         usual = np.minimum(sigma, _OUTAGE * self.sigmas)
         extra = np.sqrt(np.maximum(sigma**2 - usual**2, 0.0))
         return np.concatenate([usual, extra], axis=1) if extra.any() else usual
 
     def widened(self, more_m: Float64) -> RunPrior:
-        """The same with so much more (3,; north, east, down) 1 σ of the position, at all times."""
+        """Returns the same with this much added 1 σ (3,; north, east, down) of the position, at all times."""
         more = np.concatenate([more_m, np.zeros(3)])
         n, e, d, r, p, h = (
             replace(o, sigma=float(np.hypot(o.sigma, m))) for o, m in zip(self.processes, more, strict=True)
@@ -126,13 +126,13 @@ class RunPrior:
         return replace(self, processes=(n, e, d, r, p, h), stated=stated)
 
     def faster(self, position: float, attitude: float) -> RunPrior:
-        """The same with correlation times that are so many times shorter."""
+        """Returns the same with correlation times that are so many times shorter."""
         times = (position,) * 3 + (attitude,) * 3
         n, e, d, r, p, h = (replace(o, tau_s=o.tau_s / t) for o, t in zip(self.processes, times, strict=True))
         return replace(self, processes=(n, e, d, r, p, h))
 
     def wider(self, factors: Float64) -> RunPrior:
-        """The same with σ that are (6,) times as large."""
+        """Returns the same with σ that are (6,) times as large."""
         pairs = zip(self.processes, factors.tolist(), strict=True)
         n, e, d, r, p, h = (replace(o, sigma=o.sigma * factor) for o, factor in pairs)
         stated = None if self.stated is None else replace(self.stated, sigma=self.stated.sigma * factors)
@@ -140,28 +140,28 @@ class RunPrior:
 
     @property
     def taus_s(self) -> Float64:
-        """(6,) correlation times (s)."""
+        """Returns (6,) correlation times (s)."""
         return np.array([p.tau_s for p in self.processes])
 
 
 @dataclass(frozen=True)
 class MountingPrior:
-    """What is known of the mounting of a sensor before the adjustment."""
+    """Prior knowledge of the mounting of a sensor."""
 
     sensor: str
     sigma: Float64
     """(7,) 1 σ of its errors (m, rad, share), in the order of `MOUNTED`; 0: not estimated."""
     run: str = "*"
-    """Run in which it is mounted so; "*": all that have none of their own."""
+    """Run with this mounting; "*": all runs without a separate one."""
 
     @property
     def key(self) -> tuple[str, str]:
-        """Run and sensor."""
+        """Returns run and sensor."""
         return self.run, self.sensor
 
 
 def knots_of(prior: RunPrior, spacing_s: float) -> Int64:
-    """Epochs (k,) of a run's knots from its first epoch to its last, at most `spacing_s` apart.
+    """Returns epochs (k,) of a run's knots from its first epoch to its last, at most `spacing_s` apart.
 
     They are evenly spaced but where σ is larger than usual: there they are closer, as the variance by which the process
     leaves a line between knots, about σ² h / (3 τ), would grow with σ². How many there are has a bound.
@@ -183,7 +183,7 @@ def knots_of(prior: RunPrior, spacing_s: float) -> Int64:
 
 
 def _more_knots(prior: RunPrior, even: Int64) -> Int64:
-    """How many knots (k − 1,) each interval of the even ones gets within it."""
+    """Returns the number of knots (k − 1,) added within each even interval."""
     usual = np.where(prior.sigmas > 0.0, prior.sigmas, np.inf)
     within = np.concatenate([even, (even[:-1] + even[1:]) // 2])
     ratio = (prior.sigma_at(within) / usual).max(axis=1)
@@ -194,7 +194,7 @@ def _more_knots(prior: RunPrior, even: Int64) -> Int64:
 
 
 def precision_of(epochs_gps_ns: Int64, tau_s: float) -> tuple[Float64, Float64]:
-    """Inverse covariance of a process of σ = 1 at knots: its diagonal (k,) and the one beside it (k − 1,).
+    """Returns the inverse covariance of a process of σ = 1 at knots: its diagonal (k,) and the one beside it (k − 1,).
 
     Rue & Held (2005, 1.1): a Markov process has a tridiagonal one.
     """
@@ -207,7 +207,7 @@ def precision_of(epochs_gps_ns: Int64, tau_s: float) -> tuple[Float64, Float64]:
 
 
 def stretches(there: npt.NDArray[np.bool_]) -> list[slice]:
-    """Runs of neighbours that are True."""
+    """Returns runs of neighbours that are True."""
     return [slice(first, end) for first, end in runs_of(there).tolist()]
 
 
@@ -217,7 +217,7 @@ def line_variance(
     tau_s: float | Float64,
     sigma: tuple[float | Float64, float | Float64] = (1.0, 1.0),
 ) -> Float64:
-    """Variance by which a process leaves the straight line between two knots.
+    """Returns the variance of a process about the straight line between two knots.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""From a solution to the corrections that hold: what moves no pose stays as it is, to the bit."""
+"""From a solution to the published corrections: those that move no pose stay bit-identical."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Int64 = npt.NDArray[np.int64]
 
 
 _SAME_SIGMA: Final = 0.05
-"""σ that differ by no more than this share are the same: evidence changes them a little with each new run."""
+"""σ that differ by no more than this share are equal: evidence changes them a little with each new run."""
 
 
 def published(before: Corrections | None, solved: Corrections, moved_m: float, arm_m: float) -> Corrections:
@@ -58,7 +58,7 @@ def left_after(
     runs: Sequence[str],
     mountings: Float64 | None = None,
 ) -> Float64:
-    """What is left (n,) of each observation once poses and mountings are corrected (m).
+    """Returns the residual (n,) of each observation once poses and mountings are corrected (m).
 
     runs are counted as in `runs`; mountings : (s, 7) what is added to those that `Observations.sensor` counts.
     """

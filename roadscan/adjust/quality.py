@@ -15,21 +15,21 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 NSSDA_VERTICAL: Final = 1.9600
-"""95 % of normal errors lie within so many RMSE (FGDC-STD-007.3-1998, 3.2.1 and appendix 3-A)."""
+"""Ratio of the 95 % quantile of normal errors to the RMSE (FGDC-STD-007.3-1998, 3.2.1 and appendix 3-A)."""
 NSSDA_HORIZONTAL: Final = 1.7308
-"""The same of a length in the plane whose two components are equally accurate (ibid.)."""
+"""The same for a length in the plane whose two components are equally accurate (ibid.)."""
 NSSDA_CHECK_POINTS: Final = 20
-"""Check points that a statement of NSSDA takes at least (ibid., 3.2.2)."""
+"""Least number of check points for a statement of NSSDA (ibid., 3.2.2)."""
 ASPRS_CHECK_POINTS: Final = 30
-"""Fewer check points do not make a statement after ASPRS (2023, 7.12); the figures are computed all the same."""
+"""With fewer check points there is no statement after ASPRS (2023, 7.12); the figures are computed all the same."""
 DISTANCES_M: Final = (0.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0, 1600.0, float("inf"))
 """Bounds of the classes of distance to the nearest ground control."""
-_DOWN: Final = 2
+_DOWN: Final = 2  # Index of the component down.
 
 
 @dataclass(frozen=True)
 class VerticalAccuracy:
-    """Of heights (m)."""
+    """Accuracy of heights (m)."""
 
     count: int
     mean: float
@@ -47,7 +47,7 @@ class VerticalAccuracy:
 
 @dataclass(frozen=True)
 class HorizontalAccuracy:
-    """Of places in the plane (m)."""
+    """Accuracy of places in the plane (m)."""
 
     count: int
     mean_north: float
@@ -67,7 +67,7 @@ class HorizontalAccuracy:
 def vertical_accuracy(
     error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0, point: Int64 | None = None
 ) -> VerticalAccuracy:
-    """Accuracy of heights.
+    """Returns the accuracy of heights.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def vertical_accuracy(
 def horizontal_accuracy(
     error_m: Float64, survey_sigma_m: npt.ArrayLike = 0.0, point: Int64 | None = None
 ) -> HorizontalAccuracy:
-    """Accuracy of places in the plane.
+    """Returns the accuracy of places in the plane.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def horizontal_accuracy(
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """What each control point's survey says against the adjustment without it; accuracy None where not observed."""
+    """Survey of each control point against the adjustment without it; accuracy None where not observed."""
 
     vertical: VerticalAccuracy | None
     horizontal: HorizontalAccuracy | None
@@ -142,7 +142,7 @@ class LeaveOneOut:
 
 
 def leave_one_out(control: ControlErrors) -> LeaveOneOut:
-    """Accuracy by leaving out one control coordinate at a time, from the one adjustment that there is.
+    """Returns the accuracy by leaving out one control coordinate at a time, all from the same adjustment.
 
     Surveys that were found wrong are left out of the figures, not of `normalised`.
     """
@@ -161,9 +161,9 @@ class Sections:
     """Figures of s sections of a road."""
 
     first_station_m: Float64
-    """(s,) where each begins."""
+    """(s,) station of the beginning of each section."""
     count: Int64
-    """(s,) differences that it holds; no section is empty."""
+    """(s,) number of differences; no section is empty."""
     rms_before_m: Float64
     """(s,) of the differences between passes before the adjustment."""
     rms_after_m: Float64
@@ -171,13 +171,13 @@ class Sections:
 
 
 def relative_accuracy(station_m: Float64, before_m: Float64, after_m: Float64, length_m: float = 100.0) -> Sections:
-    """How well passes agree, by section of the road.
+    """Returns how well passes agree, by section of the road.
 
     Parameters
     ----------
     station_m : (n,) where each difference was found, along the road.
     before_m, after_m : (n,) difference of two passes before and after the adjustment; where some were withheld from
-        it, those say more.
+        it, those are the better test.
     length_m : of a section.
     """
     number = np.floor(station_m / length_m).astype(np.int64)
@@ -190,7 +190,7 @@ def relative_accuracy(station_m: Float64, before_m: Float64, after_m: Float64, l
 
 @dataclass(frozen=True)
 class DistanceClass:
-    """Accuracy of heights at points that lie about as far from ground control."""
+    """Accuracy of heights at points in one class of distance from ground control."""
 
     from_m: float
     to_m: float
@@ -200,7 +200,7 @@ class DistanceClass:
 
 
 def accuracy_by_distance(distance_m: Float64, error_m: Float64, point: Int64 | None = None) -> list[DistanceClass]:
-    """How the error of heights grows with the distance to ground control, by class that holds a point.
+    """Returns the error of heights by distance to ground control, for each class with a point.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def accuracy_by_distance(distance_m: Float64, error_m: Float64, point: Int64 | N
 
 
 def nearest_m(station_m: Float64, point: Int64, control_m: Float64, control: Int64) -> Float64:
-    """Distance (n,) of points at stations to the nearest of other control points, all of one run (m); NaN without any.
+    """Distance (n,) of points at stations to the nearest of other control points, all of one run (m), or NaN.
 
     point : (n,) number of each; control_m, control : stations and numbers (c,) of the control; no point is its own.
     """
@@ -236,7 +236,7 @@ def _there(error_m: Float64, there: npt.NDArray[np.bool_]) -> Float64:
 
 
 def _shares(size: int, point: Int64 | None) -> tuple[int, Float64]:
-    """Number of points, and the share (n,) of each error in their mean: all points count alike."""
+    """Returns the number of points, and the weight (n,) of each error in their mean: all points count alike."""
     if point is None:
         return size, np.full(size, 1.0 / size)
     _, own, seen = np.unique(point, return_inverse=True, return_counts=True)

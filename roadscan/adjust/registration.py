@@ -1,7 +1,7 @@
-"""How far one picture lies from another: the best correlation, whether it is the only one, and the shift with its σ.
+"""Registration of two images: the best correlation, its uniqueness, and the shift with its σ.
 
-The shift is that of least squares on the pictures (Lucas and Kanade 1981), with the slopes of both. Its covariance is
-made of two sums: the information, from products of one picture's slopes with the other's, to which noise in the slopes
+The shift is that of least squares on the images (Lucas and Kanade 1981), with the slopes of both. Its covariance is
+made of two sums: the information, from products of one image's slopes with the other's, to which noise in the slopes
 adds nothing, and the scatter of the scores (slope times residual) of blocks of cells, which counts whatever the noise
 is, whether cells are correlated, and where it is larger (White 1980, clustered).
 """
@@ -29,47 +29,47 @@ AMBIGUOUS: Final = "another shift fits as well"
 FEATURELESS: Final = "no direction is known well enough"
 
 _SAMPLES: Final = 2500
-"""About so many cells of the first picture are correlated."""
+"""Approximate number of cells of the first image that are correlated."""
 _STEP: Final = 2
-"""Shifts of the search, in cells: the pictures are smooth over more than that."""
-_LEAST_SHARE: Final = 0.25
+"""Step of the search (cells): the images are smooth over more than that."""
+_LEAST_SHARE: Final = 0.25  # Shifts with a smaller share of the cells in common are not correlated.
 _LOBE_CELLS: Final = 4.0
-"""Correlations this near to the best one, along what is known of the shift, belong to it."""
+"""Correlations within this distance (cells) of the best one, along the known directions, belong to its peak."""
 _LEFT_OVER: Final = 2.0
-"""Of the variance that the best shift leaves of a picture, so many times is much more."""
-_ROUNDS: Final = 12
-_DONE_CELLS: Final = 0.01
+"""A rival shift fails if it leaves this many times the variance that the best shift leaves."""
+_ROUNDS: Final = 12  # Iterations of least squares, at most.
+_DONE_CELLS: Final = 0.01  # Steps below this (cells) end the iteration.
 _COARSE: Final = 3
-"""Every so-manieth cell is enough until a step is this short."""
-_NEAR_CELLS: Final = 0.05
-_ASTRAY_CELLS: Final = 4.0
-_HUBER: Final = 3.0
-_BLOCK_CELLS: Final = 8
+"""Stride of the cells used (rows and columns) until a step is short."""
+_NEAR_CELLS: Final = 0.05  # Steps above this (cells) use the coarse stride.
+_ASTRAY_CELLS: Final = 4.0  # A shift farther than this from its start (cells) has diverged.
+_HUBER: Final = 3.0  # Huber's limit for residuals (σ).
+_BLOCK_CELLS: Final = 8  # Edge of the blocks whose scores are summed (cells).
 _INDEPENDENT: Final = 4.0 * math.pi * (BLUR_CELLS**2 + 1.0 / 6.0)
-"""Cells that count as one independent value: area under the correlation of smoothed noise (bilinear splat too)."""
+"""Number of cells that count as one independent value: area under the correlation of smoothed noise (bilinear too)."""
 _SHARP: Final = 9
-"""An edge that leaves the axes by some degrees crosses the grid of the readings often enough to lie anywhere in it."""
+"""Exponent of cos² 2θ: an edge that leaves the axes by some degrees crosses the readings' grid at many positions."""
 _PRIOR_BLOCKS: Final = 4.0
-"""So many blocks is the noise of the whole picture worth beside the scatter of the blocks."""
+"""Weight of the noise of the whole image beside the scatter of the blocks, in blocks."""
 
 
 @dataclass(frozen=True)
 class Shift:
-    """What the second picture says of its shift against the first."""
+    """The shift of the second image against the first."""
 
     value_m: Float64
-    """(2,) along, across: a place of the first lies there in the second."""
+    """(2,) along, across: position in the second image of a place of the first."""
     directions: Float64
-    """(d, 2) unit vectors (along, across), d = 0, 1 or 2, in which it is known; components of it are independent."""
+    """(d,) unit vectors (along, across), d = 0, 1 or 2, in which it is known; components of it are independent."""
     sigma_m: Float64
     """(d,) 1 σ."""
     felt_m: Float64
-    """(2,) along, across, from the middle of the picture: where the slopes are that it was felt by."""
+    """(2,) along, across, from the middle of the image: weighted mean of the slopes that determine it."""
     correlation: float
     count: int
     """Cells in common."""
     why_not: str = ""
-    """Test that it failed; empty where it passed."""
+    """Test that it failed; empty if it passed."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class _Equations:
     step: Float64
     """(2,) to the solution."""
     common: Float64
-    """(2, 2) information of slopes that both pictures have."""
+    """(2, 2) information of slopes common to both images."""
     mean: Float64
     """(2, 2) information of the mean slopes."""
     score: Float64
@@ -91,12 +91,12 @@ class _Equations:
     felt: Float64
     """(2,) row and column."""
     aligned: float
-    """Share, 0 to 1, of the slopes that stand along or across the axes of the place, beyond those of any texture."""
+    """Share, 0 to 1, of the slopes aligned with the axes of the place, beyond that of any texture."""
     correlation: float
 
     @property
     def scores(self) -> Float64:
-        """(2, 2) covariance of the sum of scores, from blocks, with a few blocks' worth of what is expected."""
+        """Covariance (2, 2) of the sum of scores, from blocks, with a few blocks' worth of the expected one."""
         row, column = self.cell // _BLOCK_CELLS
         _, number = np.unique(row * 4096 + column, return_inverse=True)
         sums = np.stack([np.bincount(number, self.score[:, k]) for k in (0, 1)], axis=-1)
@@ -106,7 +106,7 @@ class _Equations:
 
 
 def shift_of(one: Picture, other: Picture, settings: TieSettings) -> Shift:
-    """The shift between two pictures of one place in cells of `settings.shift_cell_m`."""
+    """Returns the shift between two images of one place in cells of `settings.shift_cell_m`."""
     first, second = one.value, other.value
     reach = int(settings.search_m / settings.shift_cell_m) // _STEP
     shifts = _STEP * np.arange(-reach, reach + 1)
@@ -130,7 +130,7 @@ def shift_of(one: Picture, other: Picture, settings: TieSettings) -> Shift:
 
 
 def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, _Equations] | None:
-    """The shift (row, column; cells) of least squares near a start and the sums there; None where there is none."""
+    """Least-squares shift (row, column; cells) near a start and the sums there; None where there is none."""
     place, edge = start.copy(), len(first)
     laid = Laid(np.empty((edge, edge)), np.empty((edge, edge, 2)), np.empty((edge, edge, 2)))
     found, coarse = None, True
@@ -143,7 +143,7 @@ def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, 
         place = place + np.clip(sums.step, -1.0, 1.0)
         if np.abs(place - start).max() > _ASTRAY_CELLS:
             return None
-        # A direction that is hardly known need not come to rest.
+        # In a direction that is hardly known the iteration need not converge.
         moved = math.sqrt(float(sums.step @ sums.mean @ sums.step) / max(float(np.trace(sums.mean)), 1e-300))
         if not coarse:
             found = place, sums
@@ -154,10 +154,10 @@ def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, 
 
 
 def _equations(first: Float64, laid: Laid, every: int) -> _Equations | None:
-    """Sums over each `every`-th cell that both saw.
+    """Returns sums over each `every`-th cell that both saw.
 
-    Contrast and a surface of the second degree between the pictures are eliminated: each picture lacks such a surface
-    of its own, fitted to what that traverse saw, and the two saw different parts of a rut.
+    Contrast and a surface of the second degree between the images are eliminated: each image lacks a surface
+    that was fitted to what its traverse saw, and the two saw different parts of a rut.
     """
     row, column = (every * index for index in np.nonzero(np.isfinite(laid.left[::every, ::every])))
     if row.size < 64:
@@ -197,7 +197,7 @@ def _equations(first: Float64, laid: Laid, every: int) -> _Equations | None:
 
 
 def _weighed(nuisance: Float64, left: Float64) -> tuple[Float64, Float64, float]:
-    """Residuals without contrast and surface; Huber's weights (n,); 1 σ of the residuals."""
+    """Returns residuals without contrast and surface; Huber's weights (n,); 1 σ of the residuals."""
     weight = np.ones(left.size)
     for _ in range(2):
         weighted = nuisance * weight[:, None]
@@ -208,7 +208,7 @@ def _weighed(nuisance: Float64, left: Float64) -> tuple[Float64, Float64, float]
 
 
 def _known(place: Float64, sums: _Equations, sampling_m2: Float64, edge: int, settings: TieSettings) -> Shift:
-    """The shift in metres, and the directions in which it is known."""
+    """Returns the shift in metres, and the directions in which it is known."""
     cell = settings.shift_cell_m
     directions, sigma = _directions(sums, settings.coherence)
     common = sums.aligned * np.einsum("di,ij,dj->d", directions, sampling_m2, directions)
@@ -220,10 +220,10 @@ def _known(place: Float64, sums: _Equations, sampling_m2: Float64, edge: int, se
 
 
 def _directions(sums: _Equations, coherence: float) -> tuple[Float64, Float64]:
-    """Unit vectors (d, 2) of independent components of the shift and their σ (d,), cells.
+    """Returns unit vectors (d, 2) of independent components of the shift and their σ (d,), cells.
 
     With information `common` and scores of covariance S, the shift's error is common⁻¹ · score. Where one direction
-    holds more noise than slopes in common, only the component that the other one tells remains.
+    has more noise than slopes in common, only the component along the other one remains.
     """
     values, scores = np.linalg.eigvalsh(sums.mean), sums.scores
     if values[1] <= 0.0:
@@ -243,13 +243,13 @@ def _directions(sums: _Equations, coherence: float) -> tuple[Float64, Float64]:
 
 
 def _tested(likeness: Float64, shifts: Int64, start: Float64, shift: Shift, settings: TieSettings) -> Shift:
-    """A shift that lies inside the search, in the directions in which no other one fits as well."""
+    """Returns a shift that lies inside the search, in the directions in which no other one fits as well."""
     if (np.abs(shift.directions @ (shift.value_m / settings.shift_cell_m)) > shifts[-1] - _STEP).any():
         return replace(shift, why_not=AT_EDGE)
     if np.abs(start).max() >= shifts[-1] and len(shift.directions) == 2:
         return replace(shift, why_not=AT_EDGE)
     best = float(np.nanmax(likeness))
-    # What a rival leaves unexplained is not much more than what the best one does.
+    # A rival leaves little more unexplained than the best shift does.
     least = max(settings.rival_share * best, math.sqrt(max(1.0 - _LEFT_OVER * (1.0 - best**2), 0.0)))
     single = np.ones(len(shift.directions), bool)
     for r, c in zip(*(n.tolist() for n in np.nonzero(np.nan_to_num(likeness, nan=-1.0) >= least)), strict=True):
@@ -261,7 +261,7 @@ def _tested(likeness: Float64, shifts: Int64, start: Float64, shift: Shift, sett
 
 
 def _is_summit(likeness: Float64, row: int, column: int) -> bool:
-    """Whether no neighbour correlates better."""
+    """Returns whether no neighbour correlates better."""
     around = likeness[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
     return bool(likeness[row, column] >= np.nanmax(around))
 
@@ -271,7 +271,7 @@ def _nothing(why_not: str, correlation: float) -> Shift:
 
 
 def disagree(one: Shift, other: Shift, limit: float) -> bool:
-    """Whether two shifts of one pair differ by more than `limit` σ in a direction that both know."""
+    """Returns whether two shifts of one pair differ by more than `limit` σ in a direction that both know."""
     for (u, s), (v, t) in itertools.product(
         zip(one.directions, one.sigma_m, strict=True), zip(other.directions, other.sigma_m, strict=True)
     ):

@@ -1,4 +1,4 @@
-"""A seam to look at: the surfaces of two passes at one place, as they were recorded and as they are corrected."""
+"""Seam: the surfaces of two passes at one place, as recorded and as corrected."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class SeamView:
 
     @property
     def median_m(self) -> tuple[float, float]:
-        """Median difference before and after."""
+        """Returns the median difference before and after."""
         before, after = (float(np.nanmedian(d)) for d in self.difference_m)
         return before, after
 
@@ -47,7 +47,7 @@ def seam_view(
     settings: TieSettings,
     mountings: tuple[tuple[MountingChange, Seat] | None, tuple[MountingChange, Seat] | None] = (None, None),
 ) -> SeamView | None:
-    """Both passes at a place, without and with their corrections; None where they have no cell in common."""
+    """Returns both passes at a place, without and with their corrections; None where they have no cell in common."""
     states = [readings, tuple(moved(*one) for one in zip(readings, corrections, mountings, strict=True))]
     patches = [[patch_of(place, r, settings.cell_m, settings.least_readings) for r in pair] for pair in states]
     known = [[p for p in pair if p is not None] for pair in patches]
@@ -64,9 +64,9 @@ def seam_view(
 def moved(
     readings: PassReadings, corrections: Corrections | None, mounting: tuple[MountingChange, Seat] | None = None
 ) -> PassReadings:
-    """The readings of a traverse, placed with corrected poses; corrections are small, so turns are linear.
+    """Returns the readings of a traverse with corrected poses; corrections are small, so turns are linear.
 
-    mounting : change of that of the sensor, and its seat.
+    mounting : change of that of the sensor, with lever arm and beams.
     """
     if (corrections is None and mounting is None) or not readings.pose.size:
         return readings
@@ -85,7 +85,7 @@ def moved(
 
 
 def _plane(pair: list[Patch]) -> Float64:
-    """(k, k) plane through the cells of two passes."""
+    """Returns the plane (k, k) through the cells of two passes."""
     middle = pair[0].middle_m
     row, column = np.nonzero(np.isfinite(np.stack([p.height_m for p in pair])).any(axis=0))
     height = np.nanmean(np.stack([p.height_m[row, column] for p in pair]), axis=0)
@@ -96,7 +96,7 @@ def _plane(pair: list[Patch]) -> Float64:
 
 
 def _section(height_m: Float64) -> Float64:
-    """(k,) mean over the rows about the middle; NaN in columns that were not seen there."""
+    """Returns the mean (k,) over the rows about the middle; NaN in columns that were not seen there."""
     edge = len(height_m)
     half = max(round(0.5 * _SECTION * edge), 1)
     rows = height_m[edge // 2 - half : edge // 2 + half]

@@ -1,4 +1,4 @@
-"""Picture of seams: the surfaces of two passes at a place, before and after the adjustment."""
+"""Figure of seams: the surfaces of two passes at a place, before and after the adjustment."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Float64 = npt.NDArray[np.float64]
 
 _FIRST: Final = "#d1495b"
 _SECOND: Final = "#1f5fa8"
-_LEAST_MM: Final = 1.0
+_LEAST_MM: Final = 1.0  # Least half range of the colours (mm).
 _WORDS: Final = ("before", "after")
 
 
 @dataclass(frozen=True)
 class ShownSeam:
-    """A row of the picture."""
+    """A row of the figure."""
 
     title: str
     passes: tuple[str, str]
@@ -40,7 +40,7 @@ class ShownSeam:
 
 
 def draw_seams(shown: Sequence[ShownSeam], path: Path) -> None:
-    """A row a place: maps of the difference in height and cross-sections, each before and after.
+    """Draw a row for each place: maps of the difference in height and cross-sections, each before and after.
 
     Equal input gives equal bytes.
     """

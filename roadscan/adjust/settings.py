@@ -99,7 +99,7 @@ class TargetsConfig(TargetConfig):
     """1 σ of a picked place on each axis (m)."""
 
     def of_code(self, code: str | None) -> TargetConfig:
-        """The target of points with a code."""
+        """Returns the target of points with a code."""
         return self.codes.get(code or "", self)
 
 

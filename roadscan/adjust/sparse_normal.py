@@ -1,4 +1,4 @@
-"""Sparse normal equations: their factor, their solution, and the part of their inverse that is needed.
+"""Sparse normal equations: their factor, their solution, and the needed part of their inverse.
 
 The factor L D Lᵀ with an approximate minimum degree ordering is QDLDL's (Stellato et al. 2020; Davis 2005); the
 selected inverse is in `adjust/kernels/selected_inverse.py`.
@@ -34,7 +34,7 @@ class Rows:
 
     @classmethod
     def of(cls, unknown: Int64, derivative: Float64) -> Rows:
-        """From tables (n, w); entries of unknown −1 or of derivative 0 are left out, double ones are added up."""
+        """Rows from tables (n, w); entries of unknown −1 or of derivative 0 are left out, double ones are added up."""
         size, width = unknown.shape
         here = (unknown >= 0) & (derivative != 0.0)
         row = np.repeat(np.arange(size), width)[here.ravel()]
@@ -48,18 +48,18 @@ class Rows:
         return cls(first.astype(np.int64), column[new].astype(np.int64), np.asarray(value, np.float64))
 
     def times(self, x: Float64) -> Float64:
-        """Product (n,) with a vector of unknowns; each row is summed by itself."""
+        """Returns the product (n,) with a vector of unknowns; each row is summed separately."""
         products = np.concatenate([self.derivative * x[self.unknown], [0.0]])
         sums = np.add.reduceat(products, self.first[:-1]) if self.first.size > 1 else np.zeros(0)
         return np.where(np.diff(self.first) > 0, sums, 0.0)
 
     def transposed_times(self, y: Float64, unknowns: int) -> Float64:
-        """Sum (u,) over the rows, in their order, of derivative · y."""
+        """Returns the sum (u,) over the rows, in their order, of derivative · y."""
         row = np.repeat(np.arange(self.first.size - 1), np.diff(self.first))
         return np.bincount(self.unknown, self.derivative * y[row], minlength=unknowns).astype(np.float64)
 
     def pairs(self, unknowns: int) -> Any:
-        """Boolean pattern (u, u) of unknowns that share a row."""
+        """Returns the Boolean pattern (u, u) of unknowns that share a row."""
         ones = np.ones(self.unknown.size, np.int8)
         rows = scipy.sparse.csr_array((ones, self.unknown, self.first), shape=(self.first.size - 1, unknowns))
         return (rows.T.astype(bool) @ rows.astype(bool)).tocsc()
@@ -89,7 +89,7 @@ class NormalEquations:
         self._solver: Any = None
 
     def factor(self, weight: Float64, prior: Float64) -> None:
-        """Sum and factor.
+        """Sum and factor the equations.
 
         Parameters
         ----------
@@ -109,11 +109,11 @@ class NormalEquations:
             self._solver.update(upper, upper=True)
 
     def solve(self, right: Float64) -> Float64:
-        """Solution (u,) of the factored equations."""
+        """Returns the solution (u,) of the factored equations."""
         return np.asarray(self._solver.solve(right))
 
     def inverse(self) -> SelectedInverse:
-        """Covariance at the places of the factor."""
+        """Returns the covariance in the pattern of the factor."""
         lower, pivots, order = self._solver.factors()
         place = np.empty(self.size, np.int64)
         place[np.asarray(order)] = np.arange(self.size)
@@ -123,7 +123,7 @@ class NormalEquations:
         return SelectedInverse(place, starts, rows, diagonal, below)
 
     def covariances(self, groups: Sequence[Int64]) -> list[Float64]:
-        """Covariance (m, m) of the unknowns of each group: (L⁻¹ E)ᵀ D⁻¹ (L⁻¹ E), E their unit vectors."""
+        """Returns covariances (m, m) of the unknowns of each group: (L⁻¹ E)ᵀ D⁻¹ (L⁻¹ E), E their unit vectors."""
         lower, pivots, order = self._solver.factors()
         place = np.empty(self.size, np.int64)
         place[np.asarray(order)] = np.arange(self.size)
@@ -145,7 +145,7 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class SelectedInverse:
-    """Inverse of normal equations, at the places of their factor."""
+    """Inverse of normal equations in the pattern of their factor."""
 
     place: Int64
     """(u,) of each unknown in the order of the factor."""
@@ -155,14 +155,14 @@ class SelectedInverse:
     below: Float64
 
     def at(self, first: Int64, second: Int64) -> Float64:
-        """Covariances of pairs of unknowns, of any shape; NaN where the factor does not hold the pair."""
+        """Returns covariances of pairs of unknowns, of any shape; NaN where the factor lacks the pair."""
         found = np.empty(first.size)
         places = self.place[first.ravel()], self.place[second.ravel()]
         entries(*places, self.starts, self.rows, self.diagonal, self.below, found)
         return found.reshape(first.shape)
 
     def variances(self, rows: Rows) -> Float64:
-        """Variances (n,) of the rows' predictions."""
+        """Returns variances (n,) of the rows' predictions."""
         found = np.empty(rows.first.size - 1)
         unknown = self.place[rows.unknown]
         variances(rows.first, unknown, rows.derivative, self.starts, self.rows, self.diagonal, self.below, found)

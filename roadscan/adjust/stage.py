@@ -22,7 +22,7 @@ from roadscan.store.schema import table_schema
 
 
 class Adjust(Stage):
-    """Evidence is a file some places or a point; corrections are a small table that navigation applies."""
+    """The stage of the adjustment: evidence is a file for some places or a point; corrections are a small table."""
 
     name = "adjust"
     title = "corrections of the poses, from passes that overlap and from ground control"
@@ -36,7 +36,7 @@ class Adjust(Stage):
     writes = ("ties", "control_sightings", *TABLES, "corrections", "mounting_corrections")
 
     def run(self, session: Session) -> None:
-        """Adjust where evidence, settings or code are others than those of the last solution."""
+        """Adjust where evidence, settings or code differ from those of the last solution."""
         if is_current(plan_of(session), session.manifest):
             return
         if AdjustConfig.of(session.survey).on:
@@ -44,13 +44,13 @@ class Adjust(Stage):
         else:
             withdraw(session)
         session.take(plan_of, plan_of(session).corrected_anew())
-        # Corrections beyond what footprints leave room for make these anew, and nothing else does.
+        # Corrections beyond the margin of footprints make these anew, and nothing else does.
         found = index_footprints(plan_of(session), session.manifest, session.compute, session.bar("footprints"))
         session.forget(footprints_of)
         session.failed(self.name, found)
 
     def check(self, survey: Survey) -> list[RoadscanError]:
-        """Whether the file of picked targets is there, and that of ties by hand is one."""
+        """Check that the file of picked targets exists, and that the file of ties by hand is valid."""
         if not AdjustConfig.of(survey).on:
             return []
         found: list[RoadscanError] = []
@@ -81,10 +81,10 @@ class Adjust(Stage):
         )
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """What the last solution doubts."""
+        """Returns the findings of the last solution."""
         return known_findings(manifest)
 
     def folders(self) -> Sequence[str]:
-        """Evidence, tables of the outcome, pictures."""
+        """Returns folders: evidence, tables of the outcome, pictures."""
         locations = [table_schema(name).location for name in ("ties", "control_sightings", *TABLES)]
         return [*(location for location in locations if location is not None), FOLDER]

@@ -1,4 +1,4 @@
-"""The strip of road that a sensor sees, beside the way of its vehicle."""
+"""The strip of road that a sensor sees, relative to its vehicle."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Float64 = npt.NDArray[np.float64]
 _SHARE = 2.0
 """Per cent of the readings that lie beyond either side."""
 WHOLE: Final = 1.0 / (1.0 - 0.02 * _SHARE)
-"""All evenly spread readings of a profile reach so many times as far as the strip that holds most of them."""
+"""Ratio of the width of all evenly spread readings of a profile to that of the strip."""
 
 
 @dataclass(frozen=True)
 class Swath:
-    """Where the readings of a sensor lie, from the body's origin, along the vehicle's heading and to its right (m)."""
+    """The area of a sensor's readings, from the body's origin, along the vehicle's heading and to its right (m)."""
 
     forward_m: float
     """Middle, ahead."""
@@ -35,7 +35,7 @@ class Swath:
 
 
 def swath_of(points_m: Float64, poses: LevelPoses, pose: npt.NDArray[np.int64]) -> Swath:
-    """The strip that holds most of the points (n, 3; easting, northing, height) that poses (n,) saw."""
+    """Returns the strip that contains most of the points (n, 3; easting, northing, height) that poses (n,) saw."""
     away = points_m - poses.body_m[pose]
     sine, cosine = np.sin(poses.heading_rad)[pose], np.cos(poses.heading_rad)[pose]
     forward, right = away[:, 0] * sine + away[:, 1] * cosine, away[:, 0] * cosine - away[:, 1] * sine

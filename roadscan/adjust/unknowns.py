@@ -25,34 +25,34 @@ Int64 = npt.NDArray[np.int64]
 
 _SIZE = len(COMPONENTS)
 _MOUNT_SIZE = len(MOUNTED)
-_DOWN = 2
+_DOWN = 2  # Index of the component down.
 _ALONG = 0.5
-"""A direction with so much of an axis tells of the σ of that coordinate; every direction has it of one or two."""
+"""Least component of a direction along an axis for it to determine that coordinate; each has one or two such axes."""
 _NOT_COMMON = 1e6
-"""Weight, in units of the prior's, of the condition that the heights of all sensors are not off together."""
+"""Weight, in units of the prior's, of the condition that the heights of all sensors have no common error."""
 HEIGHT_ALONE = np.arange(_SIZE) == _DOWN
 """Components that a vertical adjustment corrects."""
 
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """c control points as the adjustment sees them; where each run is adjusted alone, one for each run that saw it."""
+    """c control points in the adjustment; where each run is adjusted alone, one for each run that saw it."""
 
     place: Int64
     """(c,) number of the point."""
     run: Int64
-    """(c,) run that it stands for, −1: all."""
+    """(c,) run of the point, −1: all."""
     sigma_m: Float64
-    """(c, 3) of its survey, north, east, down; 0 where no observation tells of the coordinate."""
+    """(c, 3) of its survey, north, east, down; 0 where no observation depends on the coordinate."""
     lean: Float64
-    """(c, 2) by how much its height, down, seems off for a metre by which it lies north, and east, of where it was
+    """(c, 2) derivatives of its height, down, by a shift of the point, north and east, from where it was
     surveyed: the slope of the road, where the height alone is compared, and 0 where the place is."""
     of_observation: Int64
-    """(n,) point of each observation, −1: none."""
+    """(n,) index of each observation's point, −1: none."""
 
     @classmethod
     def of(cls, observations: Observations, *, each_pass: bool) -> ControlPoints:
-        """The points whose survey has a σ."""
+        """Returns the points whose survey has a σ."""
         moving = observations.run.max(axis=1, initial=FIXED)
         seen = (observations.run == FIXED).any(axis=1) & (observations.survey_sigma_m > 0.0)
         run = np.where(each_pass, moving, FIXED)
@@ -81,7 +81,7 @@ def directions_of(observations: Observations) -> Float64:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Where each unknown stands."""
+    """Indices of all unknowns."""
 
     priors: tuple[RunPrior, ...]
     knots: tuple[Int64, ...]
@@ -100,7 +100,7 @@ class Unknowns:
         components: npt.NDArray[np.bool_],
         mountings: Sequence[MountingPrior] = (),
     ) -> Unknowns:
-        """Knots at most `spacing_s` apart; only some components are estimated."""
+        """Returns unknowns with knots at most `spacing_s` apart; only some components are estimated."""
         knots = tuple(knots_of(p, spacing_s) for p in priors)
         parts = [p.parts_at(own) for p, own in zip(priors, knots, strict=True)]
         sigmas = tuple(own * np.tile(components, own.shape[1] // _SIZE) for own in parts)
@@ -108,18 +108,18 @@ class Unknowns:
 
     @cached_property
     def active(self) -> npt.NDArray[np.bool_]:
-        """(runs, 6) components that are estimated."""
+        """Returns a mask (runs, 6) of the components that are estimated."""
         return np.array([(own[:, :_SIZE] > 0.0).all(axis=0) for own in self.sigmas], bool).reshape(-1, _SIZE)
 
     @cached_property
     def first(self) -> Int64:
-        """(runs + 1,) the first unknown of each run; the last is that of the control points."""
+        """Returns the first unknown (runs + 1,) of each run; the last is that of the control points."""
         sizes = [int((own > 0.0).sum()) for own in self.sigmas]
         return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
 
     @cached_property
     def fixed(self) -> npt.NDArray[np.bool_]:
-        """(u,) unknowns of runs that are held."""
+        """Returns a mask (u,) of the unknowns of runs that are held."""
         found = np.zeros(self.size, np.bool_)
         for run, prior in enumerate(self.priors):
             found[self.first[run] : self.first[run + 1]] = prior.fixed
@@ -127,22 +127,22 @@ class Unknowns:
 
     @property
     def size(self) -> int:
-        """Number of unknowns."""
+        """Returns the number of unknowns."""
         return self.first_mounting + int((self.mount_sigma > 0.0).sum())
 
     @property
     def first_mounting(self) -> int:
-        """The first unknown of a mounting."""
+        """Returns the first unknown of a mounting."""
         return int(self.first[-1]) + int((self.control.sigma_m > 0.0).sum())
 
     @cached_property
     def mount_sigma(self) -> Float64:
-        """(s, 7) prior σ of the mountings."""
+        """Returns (s, 7) prior σ of the mountings."""
         return np.array([one.sigma for one in self.mountings]).reshape(-1, _MOUNT_SIZE)
 
     @cached_property
     def of_mountings(self) -> Int64:
-        """(s, 7) unknown of each component of the mountings, −1: none."""
+        """Returns the unknown (s, 7) of each component of the mountings, −1: none."""
         there = self.mount_sigma > 0.0
         numbers = np.full(there.shape, -1, np.int64)
         numbers[there] = self.first_mounting + np.arange(int(there.sum()))
@@ -150,14 +150,14 @@ class Unknowns:
 
     @cached_property
     def of_control(self) -> Int64:
-        """(c, 3) unknown of each coordinate of the control points, −1: none."""
+        """Returns the unknown (c, 3) of each coordinate of the control points, −1: none."""
         there = self.control.sigma_m > 0.0
         numbers = np.full(there.shape, -1, np.int64)
         numbers[there] = self.first[-1] + np.arange(int(there.sum()))
         return numbers
 
     def of_run(self, run: int) -> Int64:
-        """Unknown of each knot and part of a run, as `sigmas`; −1: none."""
+        """Returns the unknown of each knot and part of a run, as `sigmas`; −1: none."""
         there = self.sigmas[run] > 0.0
         numbers = np.full(there.shape, -1, np.int64)
         numbers[there] = self.first[run] + np.arange(int(there.sum()))
@@ -174,7 +174,7 @@ class Unknowns:
         return before, share, step / NS_PER_S
 
     def rows(self, observations: Observations, point: Int64) -> tuple[Rows, Float64]:
-        """Rows of the observations (m per unit of each unknown), and the variance (n, 6) that lines between knots add.
+        """Rows of the observations (m per unit of each unknown), and the variance (n, 6) from lines between knots.
 
         That variance, a share for each component, is exact for one observation; those of neighbouring ones are taken
         as independent.
@@ -207,7 +207,7 @@ class Unknowns:
         return Rows.of(np.hstack([unknown, mounted]), np.hstack([derivative, by_mounting])), variance
 
     def _of_mounted(self, observations: Observations) -> tuple[Int64, Float64]:
-        """Unknowns and derivatives (n, 14), of the mountings of both ends; (n, 0) where none is estimated."""
+        """Returns unknowns and derivatives (n, 14), of the mountings of both ends; (n, 0) where none is estimated."""
         n = observations.size
         if not self.mountings:
             return np.zeros((n, 0), np.int64), np.zeros((n, 0))
@@ -218,7 +218,7 @@ class Unknowns:
         return unknown.reshape(n, 2 * _MOUNT_SIZE), derivative.reshape(n, 2 * _MOUNT_SIZE)
 
     def prior_entries(self) -> tuple[Int64, Int64, Float64, Int64]:
-        """Upper entries of the prior's inverse covariance: row, column, value, component.
+        """Returns upper entries of the prior's inverse covariance: row, column, value, component.
 
         Mountings have the component `len(COMPONENTS)`. Those of control points are not among them: their survey is an
         observation, which may be wrong.
@@ -238,10 +238,10 @@ class Unknowns:
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values), np.concatenate(components)
 
     def _of_mounting_priors(self) -> tuple[Int64, Int64, Float64, Int64]:
-        """Entries of the mountings: each has its σ, and no height is common to all sensors.
+        """Returns entries of the mountings: each has its σ, and all sensors have no common height error.
 
         Were all lever arms too long, all heights would be off: that is an error of the poses' heights, which are among
-        the unknowns, and known less well. A sensor whose height is not estimated tells the two apart.
+        the unknowns, and known less well. A sensor whose height is not estimated distinguishes the two.
         """
         mounted = self.of_mountings[self.of_mountings >= 0]
         parts = [(mounted, mounted, np.ones(mounted.size))]
@@ -254,11 +254,11 @@ class Unknowns:
 
     @cached_property
     def sharing(self) -> list[Int64]:
-        """Sensors (k,) whose heights could be off together: those of all runs, and those of each run with its own."""
+        """Sensors (k,) whose heights could have a common error: those of all runs, and each run's separate ones."""
         return sharing(tuple(one.run for one in self.mountings), self.mount_sigma)
 
     def wanted_pairs(self) -> tuple[Int64, Int64]:
-        """Pairs of unknowns whose covariance is asked for: of a knot, of neighbouring knots, of a control point, of all
+        """Pairs of unknowns whose covariance is needed: of a knot, of neighbouring knots, of a control point, of all
         mountings.
         """
         mounted = self.of_mountings.reshape(1, -1)
@@ -307,7 +307,7 @@ class Unknowns:
 
 
 def sharing(runs: Sequence[str], mount_sigma: Float64) -> list[Int64]:
-    """Sensors (k,) of mountings that hold in one run, or in all, where the heights of all of them are estimated."""
+    """Returns sensors (k,) of mountings of one run, or of all, where the heights of all of them are estimated."""
     groups = [np.flatnonzero([run == one for run in runs]) for one in dict.fromkeys(runs)]
     return [own for own in groups if (mount_sigma[own, _DOWN] > 0.0).all()]
 
@@ -327,7 +327,7 @@ def _refuse_strange_values(observations: Observations) -> None:
 
 
 def _pairs(first: Int64, second: Int64) -> tuple[Int64, Int64]:
-    """All pairs of unknowns of the same row of two tables (k, a), without those that are −1."""
+    """Returns all pairs of unknowns of the same row of two tables (k, a), without those that are −1."""
     i = np.broadcast_to(first[:, :, None], (*first.shape, second.shape[1]))
     j = np.broadcast_to(second[:, None, :], i.shape)
     there = (i >= 0) & (j >= 0)

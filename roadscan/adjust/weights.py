@@ -1,4 +1,4 @@
-"""How much each observation counts: Huber's weights first, then IGG III of residuals that leave their group out.
+"""Weights of observations: Huber's weights first, then IGG III of residuals that leave their group out.
 
 Huber's function (1964) has one minimum, so the start does not matter, but a false observation keeps some pull. From
 there, IGG III (Yang 1994) takes away all of it from what lies beyond a limit. Its statistic is the residual of a
@@ -20,12 +20,12 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 HUBER_LIMIT: Final = 1.5
-"""In units of σ: 95 % efficient or more where all is normal."""
+"""Huber's limit (σ): at least 95 % efficiency where all is normal."""
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What the others say of each observation."""
+    """Prediction of each observation from the others."""
 
     residual: Float64
     """(n,) observed minus predicted without it."""
@@ -38,7 +38,7 @@ class LeftOut:
 
 
 def left_out(residual: Float64, variance: Float64, own: Float64, weight: Float64) -> LeftOut:
-    """Residuals without the observation itself, from those with it (Cook & Weisberg 1982, 2.2).
+    """Returns residuals without the observation itself, from those with it (Cook & Weisberg 1982, 2.2).
 
     Parameters
     ----------
@@ -60,18 +60,18 @@ class Groups:
     """(n,) group of each, 0 to the last."""
 
     def lengths(self, statistic: Float64) -> tuple[Float64, Int64]:
-        """Root of the summed squares of each row's group, and the group's rows."""
+        """Returns the root of the summed squares of each row's group, and the group's rows."""
         count = np.bincount(self.of_row)
         total = np.bincount(self.of_row, statistic**2)
         return np.sqrt(total)[self.of_row], count[self.of_row]
 
     def huber(self, statistic: Float64) -> Float64:
-        """Huber's weights."""
+        """Returns Huber's weights."""
         length, rows = self.lengths(statistic)
         return np.minimum(1.0, _limits(HUBER_LIMIT, rows) / np.maximum(length, 1e-300))
 
     def igg_iii(self, statistic: Float64, whole: float, reject: float) -> Float64:
-        """Weights of IGG III: 1 up to `whole` σ, 0 from `reject` σ on."""
+        """Returns weights of IGG III: 1 up to `whole` σ, 0 from `reject` σ on."""
         length, rows = self.lengths(statistic)
         near, far = _limits(whole, rows), _limits(reject, rows)
         slope = (far - np.minimum(length, far)) / (far - near)
@@ -79,6 +79,6 @@ class Groups:
 
 
 def _limits(limit: float, rows: Int64) -> Float64:
-    """Of each row: what the length of its group exceeds as rarely as one standard normal number exceeds `limit`."""
+    """For each row the limit of its group's length that is as rare as `limit` for one standard normal number."""
     by_rows = np.array([length_limit(limit, max(int(n), 1)) for n in range(int(rows.max(initial=0)) + 1)])
     return by_rows[rows]

@@ -1,1 +1,1 @@
-"""Assets: what stands on, beside and over the road, found in returns of lidars and scanners, a kind a file."""
+"""Assets: objects on, beside and over the road, found in returns of lidars and scanners; each kind is one file."""

@@ -1,4 +1,4 @@
-"""Things sorted by the bin that they lie in."""
+"""Sorting of items by their bin."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Float64 = npt.NDArray[np.float64]
 
 
 def in_bins(number: npt.NDArray[np.integer[Any]], bins: int) -> tuple[Int64, Int64]:
-    """Where each bin begins (bins + 1,), and things (k,) by their bin, ascending in each.
+    """Returns the beginning of each bin (bins + 1,), and items (k,) by their bin, ascending in each.
 
-    number : (n,) bin of each thing; those of a negative one are left out.
+    number : (n,) bin of each item; items of a negative bin are left out.
     """
     starts, order = np.zeros(bins + 1, np.int64), np.empty(number.size, np.int64)
     by_number(np.ascontiguousarray(number, np.int32), starts, order)
@@ -27,7 +27,7 @@ def in_bins(number: npt.NDArray[np.integer[Any]], bins: int) -> tuple[Int64, Int
 def cells_of(
     x_m: Float64, y_m: Float64, grid: tuple[float, float, float], shape: tuple[int, int]
 ) -> npt.NDArray[np.int32]:
-    """Flat number (n,) of the cell of places (n,): row · columns + column; −1 outside.
+    """Returns the flat number (n,) of the cell of places (n,): row · columns + column; −1 outside.
 
     grid : x and y of the raster's corner, edge of a cell (m). shape : its rows and columns.
     """
@@ -37,7 +37,7 @@ def cells_of(
 
 
 def distinct_steps(epoch_gps_ns: Int64, step_ns: int) -> Int64:
-    """Steps of time (k,) that hold one of some epochs (n,), as whole numbers, ascending."""
+    """Returns the steps of time (k,) that contain one of some epochs (n,), as whole numbers, ascending."""
     found = np.empty(4096, np.int64)
     count = distinct(epoch_gps_ns, step_ns, found)
     if count > found.size:

@@ -1,7 +1,7 @@
-"""What evidence is worth: curves that turn the probability which a kind derives from it into the share that is right.
+"""Calibration of probabilities: curves from the probability that a kind derives from evidence to the observed share.
 
-A kind's weights rank its objects; how often objects of that evidence are what they say was counted on drawn streets
-whose truth is known: `benchmarks/bench_asset_probability.py` fits these curves and holds them against other streets.
+A kind's weights rank its objects. The share of right objects by evidence was counted on simulated streets
+whose truth is known: `benchmarks/bench_asset_probability.py` fits these curves and tests them on other streets.
 A curve is Platt's (1999): a straight line between the logarithms of the odds.
 """
 
@@ -11,21 +11,21 @@ import math
 from typing import Final, NamedTuple
 
 _LEAST: Final = 1e-4
-"""No evidence tells more than this."""
+"""Probabilities are clipped to this distance from 0 and 1."""
 
 
 class Curve(NamedTuple):
-    """Logarithm of the odds that are stated: `offset` + `slope` · that of the evidence."""
+    """A line between logarithms of odds: stated = `offset` + `slope` · evidence."""
 
     offset: float
     slope: float
 
     def stated(self, probability: float) -> float:
-        """Probability that is stated where the evidence says `probability`."""
+        """Returns the stated probability for the evidence's `probability`."""
         return _of_odds(self.offset + self.slope * _odds(probability))
 
     def of_evidence(self, stated: float) -> float:
-        """Probability of the evidence where `stated` is stated."""
+        """Returns the evidence's probability for the stated one."""
         return _of_odds((_odds(stated) - self.offset) / self.slope)
 
 
@@ -44,16 +44,16 @@ CURVES: Final = {
 others (seeds 0 to 9, 188 objects) the expected calibration error is 0.021, and 0.036 without them. A kind names its
 curve (:class:`roadscan.assets.kind.AssetKind`): kinds that share their evidence share one.
 """
-UNCHANGED: Final = Curve(0.0, 1.0)
+UNCHANGED: Final = Curve(0.0, 1.0)  # Identity: the evidence's probability is stated.
 
 
 def curve_named(name: str) -> Curve:
-    """Curve of a name; that of an empty one changes nothing."""
+    """Returns the curve of a name; the identity for an empty name."""
     return CURVES[name] if name else UNCHANGED
 
 
 def _odds(probability: float) -> float:
-    """Logarithm of the odds."""
+    """Returns the logarithm of the odds."""
     held = min(max(probability, _LEAST), 1.0 - _LEAST)
     return math.log(held / (1.0 - held))
 

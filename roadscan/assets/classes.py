@@ -1,31 +1,31 @@
-"""Classes of returns: ASPRS LAS 1.4 as far as it goes, and codes of our own from 64 on."""
+"""Classes of returns: ASPRS LAS 1.4 where it has them, and user-defined codes from 64 on."""
 
 from __future__ import annotations
 
 from typing import Final
 
-NEVER_CLASSIFIED: Final = 0
-UNCLASSIFIED: Final = 1
-GROUND: Final = 2
-LOW_VEGETATION: Final = 3
-MEDIUM_VEGETATION: Final = 4
-HIGH_VEGETATION: Final = 5
-BUILDING: Final = 6
-LOW_NOISE: Final = 7
-ROAD: Final = 11
-WIRE: Final = 14
-BRIDGE_DECK: Final = 17
-HIGH_NOISE: Final = 18
-OVERHEAD_STRUCTURE: Final = 19
-POLE: Final = 64
-SIGN: Final = 65
-KERB: Final = 66
-BARRIER: Final = 67
-MARKING: Final = 68
-VEHICLE: Final = 69
-PERSON: Final = 70
-FENCE: Final = 71
-SIDEWALK: Final = 72
+NEVER_CLASSIFIED: Final = 0  # LAS 1.4
+UNCLASSIFIED: Final = 1  # LAS 1.4
+GROUND: Final = 2  # LAS 1.4
+LOW_VEGETATION: Final = 3  # LAS 1.4
+MEDIUM_VEGETATION: Final = 4  # LAS 1.4
+HIGH_VEGETATION: Final = 5  # LAS 1.4
+BUILDING: Final = 6  # LAS 1.4
+LOW_NOISE: Final = 7  # LAS 1.4
+ROAD: Final = 11  # LAS 1.4
+WIRE: Final = 14  # LAS 1.4
+BRIDGE_DECK: Final = 17  # LAS 1.4
+HIGH_NOISE: Final = 18  # LAS 1.4
+OVERHEAD_STRUCTURE: Final = 19  # LAS 1.4
+POLE: Final = 64  # user-defined
+SIGN: Final = 65  # user-defined
+KERB: Final = 66  # user-defined
+BARRIER: Final = 67  # user-defined
+MARKING: Final = 68  # user-defined
+VEHICLE: Final = 69  # user-defined
+PERSON: Final = 70  # user-defined
+FENCE: Final = 71  # user-defined
+SIDEWALK: Final = 72  # user-defined
 
 CLASS_NAMES: Final = {
     NEVER_CLASSIFIED: "never classified",

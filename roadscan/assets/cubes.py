@@ -1,4 +1,4 @@
-"""How the returns above the ground scatter: linear, planar or in all directions."""
+"""Scatter of the returns above the ground in cubes: linear, planar or in all directions."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
 
 EDGE_M: Final = 0.3
-"""Edge of a cube; features are those of three by three by three."""
+"""Edge of a cube (m); features are those of three by three by three cubes."""
 LAYERS: Final = 64
 """Cubes above one another: up to 19 m above the ground."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cubes:
-    """Cubes that hold returns."""
+    """Cubes that contain returns."""
 
     number: npt.NDArray[np.int32]
-    """(n,) number of each return's cube, -1 for those of none."""
+    """(n,) number of each return's cube, -1 for none."""
     place: npt.NDArray[np.int32]
     """(cubes, 3) row, column and layer from the window's corner and the ground."""
     features: npt.NDArray[np.float32]
     """(cubes, 7), columns as in :mod:`roadscan.assets.kernels.voxels`."""
 
     def of_returns(self, column: int, otherwise: float = np.nan) -> npt.NDArray[np.float32]:
-        """A feature (n,) of each return's cube."""
+        """Returns a feature (n,) of each return's cube."""
         values = np.append(self.features[:, column], np.float32(otherwise))
         return np.asarray(values[self.number])
 
 
 def cubes_of(returns: Returns, above_m: npt.NDArray[np.float32], chosen: npt.NDArray[np.bool_], window: Box) -> Cubes:
-    """Cubes of the chosen returns (n,), and how those of each cube and its neighbours scatter."""
+    """Returns the cubes of the chosen returns (n,), with the scatter in each cube and its neighbours."""
     grid = grid_over(window, EDGE_M)
     index = np.full((*grid.shape, LAYERS), -1, np.int32)
     number = np.empty(len(returns), np.int32)

@@ -1,15 +1,15 @@
 """Intensity calibrated from the data themselves: a gain per sensor and laser, by range and by angle of incidence.
 
-Places of half a metre on the ground are seen by several lasers, from several ranges. What a place reflects is unknown,
-but the same for all of them; so differences within places tell the gains (as Levinson and Thrun, 2010, *Unsupervised
-calibration for multi-beam lasers*, do for the beams of one scanner). The logarithm of an intensity is modelled as
+Places of half a metre on the ground are seen by several lasers, from several ranges. The reflectance of a place is
+unknown, but the same for all of them; so differences within places show the gains (as Levinson and Thrun, 2010,
+*Unsupervised calibration for multi-beam lasers*, do for one scanner). The logarithm of an intensity is modelled as
 
     log I = log ρ(place) + laser(sensor, laser) + range(sensor, r) + incidence(sensor, θ),
 
 with functions of r and θ that are linear between nodes. It is fitted to the mean intensities themselves, zeros
 included, as a generalised linear model with a logarithmic link (McCullagh and Nelder, 1989, section 8), so that dark
-ground and coarse digital numbers leave no bias. What the data do not tell (the common factor, a trend that
-range and incidence could both explain) is held at the smallest gains.
+ground and coarse digital numbers leave no bias. What the data do not determine (the common factor, a trend that
+range and incidence could both explain) is set to the smallest gains.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ Int64 = npt.NDArray[np.int64]
 
 RANGE_NODES_M: Final = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 13.0, 17.0, 23.0, 32.0, 45.0, 64.0, 90.0])
 INCIDENCE_NODES_DEG: Final = np.array([0.0, 20.0, 40.0, 50.0, 60.0, 65.0, 70.0, 75.0, 79.0, 82.0, 85.0, 88.0, 90.0])
-PLACE_M: Final = 0.5
+PLACE_M: Final = 0.5  # Edge of a place (m).
 ON_GROUND_M: Final = 0.1
-"""Returns within this of the ground model tell of gains, and are on the ground."""
+"""Returns within this height of the ground model (m) determine gains, and are on the ground."""
 _MOST_PLACES: Final = 4000
-"""Places of a sample; which ones is told by a counter keyed by place."""
+"""Places of a sample; a counter keyed by place selects them."""
 _SLOPE_OVER_M: Final = 5.0
-"""The ground's normal is that of the plane through the ground that was seen in a square of this size."""
+"""Edge (m) of the square of seen ground whose plane gives the normal."""
 _EVEN_M2: Final = 0.01
 """Added to the variance of places across the plane, so that a row of cells leaves it level across (m²)."""
 _MOST_ROUNDS, _STILL = 60, 2e-3
-"""The fit ends when no logarithmic gain moves by more, or after so many rounds."""
-_EXCESS: Final = (-0.9, 2.0)
-_SCATTER, _LEAST_SCATTER = 0.3, 0.02
+"""The fit ends after so many rounds, or when no logarithmic gain moves by more."""
+_EXCESS: Final = (-0.9, 2.0)  # Bounds of the excess of an intensity over its expectation (share).
+_SCATTER, _LEAST_SCATTER = 0.3, 0.02  # σ of an intensity, and its least value (shares).
 _LASER_PRIOR: Final = 0.7
-"""1 σ of a laser's logarithmic gain before anything is measured."""
+"""Prior 1 σ of a laser's logarithmic gain."""
 _LEVEL_PRIOR: Final = 0.3
-"""1 σ of the logarithmic gains of range and of incidence, as a root mean square over their nodes: on a level road both
-tell the same trend, and a sum of two large ones would pass on the noise of the normals."""
+"""Prior 1 σ of the logarithmic gains of range and of incidence, as a root mean square over their nodes: on a level road
+both show the same trend, and a sum of two large ones would pass on the noise of the normals."""
 _BEND_PRIOR: Final = 0.05
-"""1 σ of the second differences of the functions of range and incidence from node to node."""
+"""Prior 1 σ of the second differences of the functions of range and incidence from node to node."""
 
 GAINS_SCHEMA: Final = pa.schema(
     [
@@ -69,10 +69,10 @@ GAINS_SCHEMA: Final = pa.schema(
 
 @dataclass(frozen=True, eq=False)
 class IntensitySample:
-    """What a piece of the map tells of gains: a row (m,) for each place that a laser of a sensor saw from one range."""
+    """Intensities of a piece of the map: a row (m,) for each place that a laser of a sensor saw from one range."""
 
     key: tuple[float, float]
-    """Corner of the piece: samples are put in the order of their keys."""
+    """Corner of the piece: samples are sorted by their keys."""
     sensors: tuple[str, ...]
     place: Int64
     """(m,) number of the place within the sample."""
@@ -89,7 +89,7 @@ class IntensitySample:
 
 
 class _Terms(NamedTuple):
-    """Unknowns of all sensors: where the terms of each begin in the vector of unknowns."""
+    """Unknowns of all sensors: indices at which the terms of each begin."""
 
     sensors: tuple[str, ...]
     lasers: tuple[Int64, ...]
@@ -98,7 +98,7 @@ class _Terms(NamedTuple):
 
 
 def intensity_sample(scene: Scene) -> IntensitySample:
-    """What the returns of a scene that lie on the ground, within its tile, tell of gains."""
+    """Returns the intensities of a scene's returns on the ground, within its tile."""
     found, tile = scene.returns, scene.tile
     rows = np.flatnonzero((np.abs(scene.above_ground_m) <= ON_GROUND_M) & tile.holds(found.x_m, found.y_m))
     ground = found.at(rows)
@@ -131,7 +131,7 @@ def intensity_sample(scene: Scene) -> IntensitySample:
 
 
 def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
-    """Gains (:data:`GAINS_SCHEMA`) that explain the samples best, the same for any order of them.
+    """Returns gains (:data:`GAINS_SCHEMA`) that explain the samples best, the same for any order of them.
 
     Iterated least squares: the unknown reflectance of each place is eliminated, rows that do not fit (paint that one
     laser saw and another did not) weigh less (Geman–McClure). An empty table of no samples.
@@ -161,7 +161,7 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
 
 
 def _place_means(rows: IntensitySample, response: Float64, weights: Float64) -> Float64:
-    """Expected intensity (m,) of each row: the reflectance of its place, as all rows of it tell, times the response."""
+    """Expected intensity (m,) of each row: the reflectance of its place, from all its rows, times the response."""
     weighted = weights * rows.returns
     factor = np.exp(response)
     total = np.bincount(rows.place, weights=weighted * rows.intensity)
@@ -171,7 +171,7 @@ def _place_means(rows: IntensitySample, response: Float64, weights: Float64) -> 
 
 
 def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Returns:
-    """The returns with calibrated intensity (`calibrated` true); where the table has no gain of a laser, it is 1.
+    """Returns the returns with calibrated intensity (`calibrated` true); the gain is 1 where the table lacks a laser.
 
     The angle of incidence is known on the ground; the gain of incidence of all other returns is 1.
     """
@@ -195,26 +195,26 @@ def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Return
         by_laser = np.zeros(int(np.iinfo(np.uint16).max) + 1)
         by_laser[lasers.astype(np.int64)] = of_laser
         log_gains(mine, returns.laser, range_m, incidence, on_ground, by_laser, of("range"), of("incidence"), log_gain)
-    log_gain[np.isnan(log_gain)] = 0.0  # it is not known where the sensor stood
+    log_gain[np.isnan(log_gain)] = 0.0  # the sensor's place is not known
     intensity = (returns.intensity * np.exp(log_gain)).astype(np.float32)
     return replace(returns, intensity=intensity, calibrated=True)
 
 
 def calibrated_scene(scene: Scene, gains: pa.Table) -> Scene:
-    """The scene with calibrated intensities."""
+    """Returns the scene with calibrated intensities."""
     return replace(scene, returns=calibrated(scene.returns, scene.ground, gains))
 
 
 def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
-    """Angle (n,) between each beam and the normal of the ground below its return (deg), 0 to 90.
+    """Returns the angle (n,) between each beam and the normal of the ground below its return (deg), 0 to 90.
 
-    Where the ground is not known, it is taken as level.
+    Where the ground is not known, it is assumed level.
     """
     return _beams(returns, ground, np.ones(len(returns), np.bool_))[1]
 
 
 def _beams(returns: Returns, ground: GroundModel, wanted: npt.NDArray[np.bool_]) -> tuple[Float64, Float64]:
-    """Range (n,) of each return (m), and the angle of incidence of those that are wanted (deg); 0 of all others."""
+    """Range (n,) of each return (m), and the angle of incidence of the wanted ones (deg); 0 of all others."""
     range_m, cosine = np.empty(len(returns)), np.empty(len(returns))
     place = tuple(map(read_only, (returns.x_m, returns.y_m, returns.height_m)))
     sensor = tuple(map(read_only, (returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m)))
@@ -257,7 +257,7 @@ def _slopes(ground: GroundModel) -> tuple[Float64, Float64]:
 
 
 def _places(ground: Returns) -> Int64:
-    """Number (n,) of the place of each return; returns of places beyond those that a sample takes share number −1."""
+    """Returns the number (n,) of the place of each return; −1 for places beyond those of a sample."""
     column = np.floor((ground.corner_m[0] + ground.x_m) / PLACE_M).astype(np.int64)
     row = np.floor((ground.corner_m[1] + ground.y_m) / PLACE_M).astype(np.int64)
     _, place = np.unique(np.stack([row, column]), axis=1, return_inverse=True)
@@ -265,7 +265,7 @@ def _places(ground: Returns) -> Int64:
 
 
 def _together(samples: Sequence[IntensitySample]) -> IntensitySample:
-    """All samples as one, in the order of their keys, without places that one group alone saw."""
+    """Returns all samples as one, in the order of their keys, without places that one group alone saw."""
     ordered = sorted(samples, key=lambda s: s.key)
     names = tuple(sorted({n for s in ordered for n in s.sensors}))
     first, parts = 0, []
@@ -289,7 +289,7 @@ def _values(sample: IntensitySample) -> tuple[npt.NDArray[Any], ...]:
 
 
 def _chosen(sample: IntensitySample) -> Int64:
-    """Rows of the places that two groups or more saw; of many such places every so-manieth."""
+    """Returns rows of the places that two groups or more saw; of many such places an even choice."""
     if not sample.place.size:
         return np.zeros(0, np.int64)
     groups = np.bincount(sample.place)
@@ -313,7 +313,7 @@ def _terms_of(rows: IntensitySample) -> _Terms:
 
 
 def _design(rows: IntensitySample, terms: _Terms) -> tuple[Int64, Float64]:
-    """Columns (m, 5) of the unknowns that each row depends on, and their factors (m, 5)."""
+    """Returns columns (m, 5) of the unknowns on which each row depends, and their factors (m, 5)."""
     size = rows.place.size
     columns, values = np.zeros((size, 5), np.int64), np.zeros((size, 5))
     for number, lasers in enumerate(terms.lasers):
@@ -336,7 +336,7 @@ def _design(rows: IntensitySample, terms: _Terms) -> tuple[Int64, Float64]:
 
 
 def _without_places(rows: IntensitySample, value: Float64, weights: Float64) -> Float64:
-    """Values (m,) less the weighted mean of their place."""
+    """Returns values (m,) less the weighted mean of their place."""
     total = np.bincount(rows.place, weights=weights)
     mean = np.bincount(rows.place, weights=weights * value) / np.maximum(total, 1e-12)
     out: Float64 = value - mean[rows.place]
@@ -350,7 +350,7 @@ def _solved(
     scale: float,
     terms: _Terms,
 ) -> tuple[Float64, Float64]:
-    """Unknowns and their covariance: normal equations without the places' reflectances, with the priors.
+    """Returns unknowns and their covariance: normal equations without the places' reflectances, with the priors.
 
     observed : (m,) logarithmic intensities and their weights.
     """
@@ -372,7 +372,7 @@ def _solved(
 
 
 def _prior(terms: _Terms) -> Float64:
-    """Information (k, k) of what is held before anything is measured: small gains, smooth in range and incidence."""
+    """Returns the prior information (k, k): small gains, smooth in range and incidence."""
     out = np.zeros((terms.unknowns, terms.unknowns))
     for lasers, first in zip(terms.lasers, terms.first, strict=True):
         if not lasers.size:
@@ -389,7 +389,7 @@ def _prior(terms: _Terms) -> Float64:
 
 
 def _common_part(rows: IntensitySample, terms: _Terms, design: tuple[Int64, Float64], solution: Float64) -> Float64:
-    """What to take from the unknowns (k,), of the lasers of all sensors, so that the mean gain of the rows is 1."""
+    """Returns what to subtract from the unknowns (k,) of all lasers so that the mean gain of the rows is 1."""
     columns, values = design
     mean = float(np.average((values * solution[columns]).sum(axis=1), weights=rows.returns))
     out = np.zeros(terms.unknowns)

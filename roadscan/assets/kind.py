@@ -1,4 +1,4 @@
-"""The contract of a kind of assets, and the registry that finds kinds by themselves.
+"""The contract of a kind of assets, and the registry that finds kinds automatically.
 
 A kind is one file of `roadscan/assets/kinds/` (or an entry point of the group ``roadscan.asset_kinds``) with a subclass
 of :class:`AssetKind`, and one file `schemas/assets/<name>.toml` with its columns. Evidence is found tile by tile;
@@ -53,13 +53,13 @@ class Marked:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a tile tells of a kind."""
+    """Evidence of a kind in a tile."""
 
     pieces: pa.Table
     """A row a piece, columns as the kind's `piece_schema`; coordinates are those of the map (easting, northing)."""
     marked: tuple[Marked, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
-    """What the record of the evidence keeps beside the number of pieces."""
+    """Counts that the record of the evidence stores beside the number of pieces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class AssetObject:
     sigma_horizontal_m: float
     sigma_height_m: float
     probability: float
-    """That it is an asset of this kind: of objects with 0.9, nine of ten are."""
+    """Probability that it is an asset of this kind: of objects with 0.9, nine of ten are."""
     returns: int
     passes: int
     first_epoch_gps_ns: int
@@ -83,27 +83,27 @@ class AssetObject:
 
 
 class AssetKind(ABC):
-    """A kind of assets: its evidence in a tile, and how pieces of all tiles become objects."""
+    """A kind of assets: its evidence in a tile, and the joining of pieces of all tiles to objects."""
 
     name: ClassVar[str]
-    """Of its table and its schema, such as `pole`."""
+    """Name of its table and its schema, such as `pole`."""
     title: ClassVar[str]
     curve: ClassVar[str] = ""
-    """Curve of :mod:`roadscan.assets.calibration` that states its probabilities; empty: as the evidence says."""
+    """Curve of :mod:`roadscan.assets.calibration` for its probabilities; empty: none."""
     options: ClassVar[type[Strict]] = NoOptions
     after: ClassVar[Sequence[str]] = ()
-    """Kinds whose objects this one looks at when it joins."""
+    """Kinds whose objects this one uses when it joins."""
     piece_schema: ClassVar[pa.Schema]
 
     @abstractmethod
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """Pieces of this kind in the scene's tile, a pure function of the scene."""
+        """Returns pieces of this kind in the scene's tile, a pure function of the scene."""
 
     @abstractmethod
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """Objects of the pieces of all tiles, in an order that depends on the objects alone.
+        """Returns objects of the pieces of all tiles, in an order that depends on the objects alone.
 
         `pieces` come in the order of tiles (row, column); `others` holds the objects of the kinds named by `after`.
         """
@@ -111,6 +111,6 @@ class AssetKind(ABC):
 
 @functools.cache
 def asset_kinds() -> dict[str, AssetKind]:
-    """All kinds by name."""
+    """Returns all kinds by name."""
     found = found_kinds("assets/kinds/*.py", AssetKind, ENTRY_POINT_GROUP)
     return {name: kind() for name, kind in found.items()}

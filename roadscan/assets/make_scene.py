@@ -1,4 +1,4 @@
-"""The scene of an asset tile: bare earth, heights above it, and the class of each return."""
+"""Scenes of asset tiles: bare earth, heights above it, and the class of each return."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from roadscan.assets.scene import Box, GroundModel, Scene, extent_of
 from roadscan.assets.surroundings import surroundings
 
 _ABOVE_M: Final = 0.1
-"""Returns are looked at that do not lie on the ground and stand higher above it."""
+"""Returns are classified that do not lie on the ground and stand higher above it than this (m)."""
 
 
 def make_scene(
@@ -30,7 +30,7 @@ def make_scene(
     drive_xyh_m: npt.NDArray[np.float64],
     settings: GroundSettings | None = None,
 ) -> Scene:
-    """Scene of an asset tile, a pure function of its arguments.
+    """Returns the scene of an asset tile, a pure function of its arguments.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def make_scene(
 
 
 def on_road(returns: Returns, model: GroundModel, drive_xyh_m: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Returns (n,) above cells that are known to be road."""
+    """Returns a mask (n,) of the returns above cells that are known to be road."""
     cells = road_cells(model, drive_xyh_m).astype(np.int32)
     at = np.empty(len(returns), np.int32)
     corner, always = np.array([model.x_min_m, model.y_min_m]), np.array([-np.inf, -np.inf])

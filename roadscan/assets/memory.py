@@ -1,4 +1,4 @@
-"""What several kinds find in one scene is found once."""
+"""Cache of results for one scene that several kinds need."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Found = TypeVar("Found")
 
 
 def once_a_scene(find: Callable[[Scene], Found]) -> Callable[[Scene], Found]:
-    """The same function, which looks at a scene once, as long as the scene is in memory."""
+    """Returns the same function, which processes a scene once while the scene is in memory."""
     known: weakref.WeakKeyDictionary[Scene, Found] = weakref.WeakKeyDictionary()
 
     @functools.wraps(find)

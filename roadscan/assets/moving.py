@@ -1,4 +1,4 @@
-"""Vehicles and people: those that move, and vehicles that are parked."""
+"""Vehicles and people: those that move, and parked vehicles."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ from roadscan.core.extras import cv2
 Bools = npt.NDArray[np.bool_]
 Int32 = npt.NDArray[np.int32]
 
-CELL_M: Final = 0.2
-LEVEL_M: Final = 0.2
+CELL_M: Final = 0.2  # Edge of a cell (m).
+LEVEL_M: Final = 0.2  # Height of a level (m).
 SLOT_NS: Final = 200_000_000
-"""Time is told in slots of this length, or of as many of them as leave no more than 64."""
-_SLOTS: Final = 64
+"""Length of a slot of time (ns); slots are longer if there would be more than 64."""
+_SLOTS: Final = 64  # Slots of time, at most: bits of a number.
 _THING_M: Final = (0.3, 2.5, 4.4)
-"""Returns between the first two heights are of things that may move, those up to the last may be the tops of these."""
+"""Returns between the first two heights (m) may be moving, those up to the last may be the tops of these."""
 _GAP: Final = 2
-"""What stands on the ground may have gaps of so many levels, as between a car's body and its roof."""
+"""Empty levels within what stands on the ground, at most, as between a car's body and its roof."""
 _START: Final = 5
-"""It begins below this level."""
+"""Level below which it begins."""
 _TALL: Final = 14
-"""What reaches this level is no vehicle that is parked: 2.8 m."""
+"""What reaches this level, 2.8 m, is no parked vehicle."""
 _BODY: Final = 0b111100
-"""Levels at which a vehicle has its body: 0.4–1.2 m."""
+"""Levels at which a vehicle has its body, as bits: 0.4–1.2 m."""
 _LOWEST_BODY: Final = 3
-"""What moves and does not reach above this level, 0.8 m, carries nothing that is higher than cars."""
+"""What moves and does not exceed this level, 0.8 m, carries nothing higher than cars."""
 _TALLEST: Final = 21
-"""Level that a moving lorry may reach: 4.2 m."""
-_LEAST_CELLS: Final = 6
+"""Greatest level of a moving lorry: 4.2 m."""
+_LEAST_CELLS: Final = 6  # Smaller groups of cells are no vehicle or person.
 _STAYS_SLOTS: Final = 8
-"""What is seen in so many slots, and in more than twice as many as the ground without it, stands."""
+"""What is seen in this many slots, and in more than twice as many as the ground without it, is stationary."""
 _TREE_CELLS: Final = 60
-"""Places that seem to move below a tree's crown count only from this size on (cells): branches swing."""
+"""Least number of cells of what seems to move below a tree's crown: branches swing."""
 _PERSON_M: Final = 1.2
-"""What moves along a narrower track is a person, on foot or on a bicycle (m)."""
+"""What moves along a narrower track (m) is a person, on foot or on a bicycle."""
 
 
 class Users(NamedTuple):
-    """Which returns (n,) are those of road users."""
+    """Masks (n,) of the returns of road users."""
 
     vehicle: Bools
     person: Bools
@@ -64,13 +64,13 @@ class Columns(NamedTuple):
     things: npt.NDArray[np.uint64]
     grounds: npt.NDArray[np.uint64]
     highs: npt.NDArray[np.uint64]
-    """Slots of time in which things, ground and what is higher were seen, as bits."""
+    """Slots of time in which things, ground and higher things were seen, as bits."""
 
 
 def road_users(
     returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bools, cubes: Cubes, window: Box
 ) -> Users:
-    """Returns of vehicles and people among those that do not lie on the ground."""
+    """Returns masks of vehicles and people among the returns that do not lie on the ground."""
     held = columns_of(returns, above_m, on_ground, window)
     moving = moving_cells(held)
     vehicle, person = tracks(held, moving)
@@ -82,7 +82,7 @@ def road_users(
 
 
 def columns_of(returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bools, window: Box) -> Columns:
-    """What stands in each cell of a window, and when it was seen."""
+    """Returns what stands in each cell of a window, and when it was seen."""
     grid = grid_over(window, CELL_M)
     levels = np.zeros(grid.shape, np.uint32)
     seen = np.zeros((3, *grid.shape), np.uint64)
@@ -105,7 +105,7 @@ def columns_of(returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bo
 
 
 def time_slots(epoch_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-    """Slot (n,) of each epoch: those in which nothing was seen are left out, so that passes follow one another."""
+    """Returns the slot (n,) of each epoch: empty ones are left out, so that passes follow one another."""
     steps = distinct_steps(epoch_gps_ns, SLOT_NS)
     slot = np.empty(epoch_gps_ns.size, np.uint8)
     columns.slots(epoch_gps_ns, SLOT_NS, steps, max(1, -(-steps.size // _SLOTS)), slot)
@@ -113,7 +113,7 @@ def time_slots(epoch_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
 
 
 def moving_cells(held: Columns) -> Bools:
-    """Cells (rows, columns) where things were seen for a while, and the ground for longer when they were not there."""
+    """Mask (rows, columns) of cells where things were seen for a while, and longer the ground without them."""
     things = np.bitwise_count(held.things).astype(np.int64)
     free = np.bitwise_count(held.grounds & ~held.things).astype(np.int64)
     both = np.bitwise_count(held.grounds & held.things).astype(np.int64)
@@ -131,7 +131,7 @@ def _around(cells: Bools) -> Int32:
 
 
 def tracks(held: Columns, moving: Bools) -> tuple[Int32, Int32]:
-    """Level that vehicles and people who move reach, in the cells of their tracks (rows, columns); 0 elsewhere."""
+    """Returns the level of moving vehicles and people, in the cells of their tracks (rows, columns); 0 elsewhere."""
     count, label, boxes, _ = cv2.connectedComponentsWithStats(moving.view(np.uint8), connectivity=8)
     vehicle, person = np.zeros(label.shape, np.int32), np.zeros(label.shape, np.int32)
     for k in range(1, count):
@@ -154,9 +154,9 @@ def tracks(held: Columns, moving: Bools) -> tuple[Int32, Int32]:
 
 
 def load_levels(held: Columns, part: tuple[slice, slice], inside: Bools) -> Int32:
-    """Level (rows, columns) of what moves along on a vehicle's track and is higher than cars; 0 elsewhere.
+    """Level (rows, columns) of loads that move along a vehicle's track and are higher than cars; 0 elsewhere.
 
-    It was seen in the slots in which the track's lower things were, or in those beside them, and in no others:
+    A load is seen in the slots of the track's lower things, or in those beside them, and in no others:
     branches, signs and decks are seen before and after. From afar a scanner shows some heights only, and not each in
     each cell, so lower things within two cells count.
     """
@@ -174,7 +174,7 @@ def load_levels(held: Columns, part: tuple[slice, slice], inside: Bools) -> Int3
 
 
 def _shifted(bits: npt.NDArray[np.uint64], step: int, axis: int) -> npt.NDArray[np.uint64]:
-    """Bits (rows, columns) of the cell so many steps away; 0 beyond the border."""
+    """Returns the bits (rows, columns) of the cell so many steps away; 0 beyond the border."""
     out = np.zeros_like(bits)
     size = bits.shape[axis]
     into, of = slice(max(-step, 0), size - max(step, 0)), slice(max(step, 0), size - max(-step, 0))
@@ -202,12 +202,12 @@ class Bodies(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """What is known of a group of cells that stand apart."""
+    """Figures of a group of cells that stand apart."""
 
     length_m: float
     width_m: float
     top_m: float
-    """Height that nine tenths of its cells do not surpass."""
+    """Height that nine tenths of its cells do not exceed."""
     fill: float
     """Share of its rectangle that its cells cover."""
     scattering: float
@@ -217,7 +217,7 @@ class Shape(NamedTuple):
 
     @property
     def is_vehicle(self) -> bool:
-        """Whether a vehicle looks so, or a part of one, or a row of them that stand close together."""
+        """Returns whether it looks like a vehicle, a part of one, or a row of them that stand close together."""
         if self.scattering > _LEAFY or not _LOWEST_M <= self.top_m <= _HIGHEST_M:
             return False
         low = self.top_m <= _CAR_TOP_M
@@ -230,12 +230,12 @@ class Shape(NamedTuple):
         return (one and (low or van)) or ((face or hidden) and low) or row
 
 
-_LEAFY: Final = 0.42
-_LOWEST_M, _CAR_TOP_M, _HIGHEST_M = 1.15, 2.25, 2.85
+_LEAFY: Final = 0.42  # Greatest mean scattering of a vehicle.
+_LOWEST_M, _CAR_TOP_M, _HIGHEST_M = 1.15, 2.25, 2.85  # Heights of vehicles (m): least, of a car, greatest.
 
 
 def parked_cells(held: Columns, moving: Bools, bodies: Bodies) -> Int32:
-    """Level that parked vehicles reach, in their cells (rows, columns); 0 elsewhere.
+    """Returns the level of parked vehicles, in their cells (rows, columns); 0 elsewhere.
 
     A vehicle's body stands apart from all that is tall, has the size and the surfaces of one, and ground around it.
     """
@@ -267,7 +267,7 @@ def parked_cells(held: Columns, moving: Bools, bodies: Bodies) -> Int32:
 
 
 def mean_scattering(label: Int32, grid: Grid, bodies: Bodies, count: int) -> npt.NDArray[np.float64]:
-    """Mean scattering (count,) of the returns above the cells of each label; NaN of none."""
+    """Returns the mean scattering (count,) of the returns above the cells of each label; NaN of none."""
     at = np.empty(len(bodies.returns), np.int32)
     lowest, highest = np.full(count, LEVEL_M), np.full(count, _TALL * LEVEL_M)
     x, y = bodies.returns.x_m, bodies.returns.y_m
@@ -280,14 +280,14 @@ def mean_scattering(label: Int32, grid: Grid, bodies: Bodies, count: int) -> npt
 
 
 def ground_around(inside: Bools, ground: Bools) -> float:
-    """Share of the cells in a ring about some cells (rows, columns) in which ground was seen."""
+    """Returns the share of the cells in a ring about some cells (rows, columns) in which ground was seen."""
     near = cv2.dilate(inside.view(np.uint8), np.ones((3, 3), np.uint8))
     ring = cv2.dilate(inside.view(np.uint8), np.ones((7, 7), np.uint8)) > near
     return float(np.count_nonzero(ground & ring)) / float(max(int(np.count_nonzero(ring)), 1))
 
 
 def returns_of(reached: Int32, held: Columns, returns: Returns, above_m: npt.NDArray[np.float32]) -> Bools:
-    """Returns (n,) in cells up to the level that is reached there, and one more."""
+    """Returns a mask (n,) of returns in cells up to the level that is reached there, and one more."""
     most = _TALLEST + 2
     lowest, highest = np.full(most + 1, -0.2), (np.arange(most + 1) + 1.0) * LEVEL_M
     at = np.empty(len(returns), np.int32)

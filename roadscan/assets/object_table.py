@@ -1,4 +1,4 @@
-"""Objects of a kind as rows, and back: one form for the store, for kinds that look at others, and for tables."""
+"""Objects of a kind as rows, and back: one form for the store, for other kinds, and for tables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import shapely
 from roadscan.assets.kind import AssetObject
 
 _PLACE_M: Final = 0.1
-"""Places that are equal in steps of this are one place to an object's name."""
+"""Places that are equal in steps of this (m) are one place in an object's name."""
 _OF_TABLES: Final = ("object", "easting_m", "northing_m", "height_m", "road", "station_m", "offset_m", "lane")
 """Columns that follow from the object's place."""
 _FIELDS: Final = (
@@ -25,7 +25,7 @@ _FIELDS: Final = (
 
 
 def reference_point(shape: shapely.Geometry) -> tuple[float, float, float]:
-    """Easting, northing and height of the place that stands for a shape.
+    """Returns easting, northing and height of the reference point of a shape.
 
     That is a point itself, the middle of a line, a point within an area (of an upright one the mean of its corners).
     The height is that of the line there, or the mean of an area's corners.
@@ -45,7 +45,7 @@ def reference_point(shape: shapely.Geometry) -> tuple[float, float, float]:
 
 
 def object_names(kind: str, places_m: npt.NDArray[np.float64]) -> list[str]:
-    """Names (n,) of objects at places (n, 2); of several at one place the name tells which, in their order."""
+    """Returns names (n,) of objects at places (n, 2); several at one place are distinguished by their order."""
     seen: dict[tuple[int, int], int] = {}
     names: list[str] = []
     for easting, northing in places_m.tolist():
@@ -57,7 +57,7 @@ def object_names(kind: str, places_m: npt.NDArray[np.float64]) -> list[str]:
 
 
 def table_of_objects(kind: str, objects: Sequence[AssetObject], schema: pa.Schema) -> pa.Table:
-    """Rows of objects, in the order of their places; where along the roads they lie is still to be told.
+    """Returns rows of objects, in the order of their places; their positions along the roads are filled in later.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def table_of_objects(kind: str, objects: Sequence[AssetObject], schema: pa.Schem
 
 
 def objects_of_table(rows: pa.Table) -> list[AssetObject]:
-    """The objects of rows, as :func:`table_of_objects` wrote them."""
+    """Returns the objects of rows, as :func:`table_of_objects` wrote them."""
     shapes = shapely.from_wkb(rows["geometry"].to_numpy())
     left_out = {*_FIELDS, *_OF_TABLES, "geometry"}
     return [_object(shape, row, left_out) for shape, row in zip(shapes, rows.to_pylist(), strict=True)]
@@ -101,7 +101,7 @@ def _object(shape: shapely.Geometry, row: Mapping[str, Any], left_out: set[str])
 
 
 def _known(value: Any) -> Any:
-    """A value, or None where it is no number."""
+    """Returns a value, or None where it is NaN."""
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,4 +1,4 @@
-"""Decks of bridges and other structures over the way of a drive, told from what hangs in cubes over the ground."""
+"""Decks of bridges and other structures over the path of a drive, from cubes above the ground."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from roadscan.core.extras import cv2
 Bools = npt.NDArray[np.bool_]
 
 _LOWEST_M: Final = 2.5
-"""What hangs lower over the way stands in it."""
+"""Least height of a structure over the path (m)."""
 _CORRIDOR_M: Final = 1.5
-"""To both sides of a drive."""
+"""Half width of the corridor of a drive (m)."""
 _LEAST_CELLS: Final = 4
-"""So many cells of the corridor hang under a structure."""
-_PLANAR: Final = 0.4
-_UPRIGHT: Final = 0.25
+"""Least number of cells of the corridor under a structure."""
+_PLANAR: Final = 0.4  # Least planarity of a deck's cube.
+_UPRIGHT: Final = 0.25  # Least upward part of its normal.
 _BELOW_CUBES, _ABOVE_CUBES = 1, 4
-"""Edges and parapets of a deck reach so far below and above its level cubes."""
+"""Edges and parapets of a deck reach this far below and above its level cubes (cubes)."""
 _DECK_CELLS: Final = 7
-"""A deck's lower face is so wide in both directions (cells of 0.3 m): that of a gantry is not."""
+"""Least extent of a deck's lower face in both directions (cells of 0.3 m): that of a gantry is less."""
 
 
 def overhead_classes(
     cubes: Cubes, grid: Grid, leafy: Bools, left_out: Bools, drive_xyh_m: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.uint8]:
-    """Class (cubes,) of each cube: bridge deck, overhead structure, or 0 for what is neither.
+    """Returns the class (cubes,) of each cube: bridge deck, overhead structure, or 0 for neither.
 
     What hangs together 2.5 m above the ground or higher, seen from above, is a structure over the way where a drive
     passes beneath it. It is a bridge deck where it holds a level plane of 2.1 m by 2.1 m above that drive; its edges
@@ -74,7 +74,7 @@ def overhead_classes(
 
 
 def _corridors(grid: Grid, drive_xyh_m: npt.NDArray[np.float64]) -> Bools:
-    """Cells (rows, columns) near the drives."""
+    """Returns a mask of cells (rows, columns) near the drives."""
     inside = np.zeros(grid.shape, np.bool_)
     for number in np.unique(drive_xyh_m[:, 3]).tolist():
         drive = drive_xyh_m[drive_xyh_m[:, 3] == number]

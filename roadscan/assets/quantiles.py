@@ -1,4 +1,4 @@
-"""Quantiles of few numbers: those of NumPy, to the bit, without what it takes to be general."""
+"""Quantiles of few numbers: bit-identical to NumPy's, and faster."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Float64 = npt.NDArray[np.float64]
 
 
 def quantiles(values: Float64, shares: Sequence[float]) -> list[float]:
-    """Numbers that these shares of values (n,) lie below, linear between two of them; values are finite, n ≥ 1."""
+    """Returns the numbers below which these shares of values (n,) lie, interpolated; values are finite, n ≥ 1."""
     last = values.size - 1
     places = [last * share for share in shares]
     lower = [min(int(place), last) for place in places]
@@ -26,7 +26,7 @@ def quantiles(values: Float64, shares: Sequence[float]) -> list[float]:
 
 
 def median(values: Float64) -> float:
-    """Median of values (n,); they are finite, n ≥ 1."""
+    """Returns the median of values (n,); they are finite, n ≥ 1."""
     half = values.size // 2
     if values.size % 2:
         return float(np.partition(values, half)[half])

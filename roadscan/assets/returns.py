@@ -1,4 +1,4 @@
-"""Returns of a piece of the map as the finders of assets get them."""
+"""Returns of a piece of the map, the input of the detection of assets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Returns:
     """
 
     corner_m: tuple[float, float]
-    """Easting and northing of the corner that x and y count from (m)."""
+    """Easting and northing of the corner from which x and y count (m)."""
     x_m: Float64
     y_m: Float64
     height_m: Float64
@@ -38,7 +38,7 @@ class Returns:
     """1 for the first return of a pulse."""
     number_of_returns: npt.NDArray[np.uint8]
     sensor_x_m: Float64
-    """Where the sensor stood when it saw the return: x, y from `corner_m` and height, like those of the return."""
+    """Position of the sensor when it saw the return: x, y from `corner_m` and height, like those of the return."""
     sensor_y_m: Float64
     sensor_height_m: Float64
     sensors: tuple[str, ...] = ()
@@ -50,7 +50,7 @@ class Returns:
 
     @property
     def range_m(self) -> Float64:
-        """Distance (n,) from the sensor to the return (m)."""
+        """Returns the distance (n,) from the sensor to the return (m)."""
         return np.sqrt(
             (self.x_m - self.sensor_x_m) ** 2
             + (self.y_m - self.sensor_y_m) ** 2
@@ -58,7 +58,7 @@ class Returns:
         )
 
     def at(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.integer[Any]]) -> Self:
-        """The returns at `rows`, a mask (n,) or indices."""
+        """Returns the returns at `rows`, a mask (n,) or indices."""
         arrays: dict[str, Any] = {
             f.name: v[rows] for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray)
         }

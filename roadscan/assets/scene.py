@@ -1,4 +1,4 @@
-"""What the finders of assets look at: returns with their height above the ground and their class."""
+"""Scenes, the input of the detection of assets: returns with height above the ground and class."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from roadscan.compute.kernel_options import read_only
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 
-_AROUND_M, _STEP_M = 2.0, 3.0
+_AROUND_M, _STEP_M = 2.0, 3.0  # Margin around the returns, and step of the extent (m).
 
 
 class Box(NamedTuple):
-    """A rectangle from the corner that returns count from (m); the least edges belong to it, the greatest do not."""
+    """A rectangle, coordinates as those of returns (m); it includes its least edges and excludes the greatest."""
 
     x_min_m: float
     y_min_m: float
@@ -29,18 +29,18 @@ class Box(NamedTuple):
     y_max_m: float
 
     def holds(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Which points (any shape) lie in the rectangle."""
+        """Returns a mask of the points (any shape) in the rectangle."""
         x, y = np.asarray(x_m), np.asarray(y_m)
         return (x >= self.x_min_m) & (x < self.x_max_m) & (y >= self.y_min_m) & (y < self.y_max_m)
 
     def comes_near(self, places_m: Float64, reach_m: float) -> bool:
-        """Whether the box around places (n, 2), wider by a reach on all sides, shares a place with the rectangle."""
+        """Returns whether the box around places (n, 2), grown by a reach on all sides, intersects the rectangle."""
         (west, south), (east, north) = places_m.min(axis=0) - reach_m, places_m.max(axis=0) + reach_m
         return bool(west < self.x_max_m and east >= self.x_min_m and south < self.y_max_m and north >= self.y_min_m)
 
 
 def extent_of(window: Box, returns: Returns) -> Box:
-    """The part of a window that returns lie in, 2 m wider and in steps of 3 m from its south-western corner.
+    """Returns the part of a window with returns, 2 m wider and in steps of 3 m from its south-western corner.
 
     3 m is a whole number of the cells of all rasters, so these have the same cells as over the whole window.
     """
@@ -63,7 +63,7 @@ class GroundModel:
     y_min_m: float
     cell_m: float
     height_m: Float32
-    """(rows, columns) height at the middle of each cell; NaN where nothing is known near."""
+    """(rows, columns) height at the middle of each cell; NaN where none is known near."""
     seen: npt.NDArray[np.bool_]
     """(rows, columns) True where ground was seen; elsewhere the height is interpolated between seen cells."""
     sigma_m: Float32 | None = None
@@ -71,7 +71,7 @@ class GroundModel:
     there elsewhere; NaN where the height is."""
 
     def height_at(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Float64:
-        """Height (as the points) of bare earth, bilinear between cells; NaN where it is not known."""
+        """Returns the height (as the points) of bare earth, bilinear between cells; NaN where it is not known."""
         x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
         out, places = np.empty(x.size), (np.ascontiguousarray(v).reshape(-1) for v in (x, y))
         grid = (float(self.x_min_m), float(self.y_min_m), float(self.cell_m))
@@ -85,7 +85,7 @@ class Scene:
 
     returns: Returns
     tile: Box
-    """The tile itself: a piece belongs to the tile that holds its reference point, lines and areas are cut at it."""
+    """The tile itself: a piece belongs to the tile that contains its reference point, lines and areas are cut at it."""
     window: Box
     """The tile with its halo."""
     ground: GroundModel
@@ -98,8 +98,8 @@ class Scene:
 
     @cached_property
     def extent(self) -> Box:
-        """The part of the window that holds returns, 2 m wider and in steps of 3 m from its south-western corner.
+        """Returns the part of the window with returns, 2 m wider and in steps of 3 m from its south-western corner.
 
-        Finders make their rasters over it; a window without returns is its own extent.
+        Rasters are made over it; a window without returns is its own extent.
         """
         return extent_of(self.window, self.returns)

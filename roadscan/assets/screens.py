@@ -1,4 +1,4 @@
-"""What hides things from a camera: voxels in which returns lie on a surface, and when a vehicle stood in them."""
+"""Occluders of views: voxels in which returns lie on a surface, and when a vehicle stood in them."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from roadscan.assets.scene import Scene
 Int64 = npt.NDArray[np.int64]
 
 EDGE_M: Final = 0.5
-"""Edge of a voxel; voxels are anchored at the map's origin and at height 0."""
+"""Edge of a voxel (m); voxels are anchored at the map's origin and at height 0."""
 SCREENS: Final = pa.schema(
     [(name, pa.int32()) for name in ("column", "row", "level")]
     + [(name, pa.int64()) for name in ("first_epoch_gps_ns", "last_epoch_gps_ns")]
 )
 """Voxels that hide what is behind them: number to the east, to the north and upwards, and from when to when."""
 ALWAYS: Final = (np.iinfo(np.int64).min, np.iinfo(np.int64).max)
-_LEAST_RETURNS: Final = 3
-_LEAST_ABOVE_M: Final = 0.3
+_LEAST_RETURNS: Final = 3  # Least number of returns of an occluder.
+_LEAST_ABOVE_M: Final = 0.3  # Least height of its returns above the ground (m).
 _LEAST_ACROSS_M: Final = 0.3
-"""What is narrower, such as a post, hides nothing."""
+"""Narrower things (m), such as a post, hide nothing."""
 _NO_SCREEN: Final = (
     classes.GROUND, classes.ROAD, classes.LOW_NOISE, classes.HIGH_NOISE, classes.PERSON, classes.WIRE,
 )  # fmt: skip
 
 
 def screens_of(scene: Scene) -> pa.Table:
-    """Voxels (:data:`SCREENS`) of the scene's tile that hide what is behind them, by column, row and level.
+    """Returns voxels (:data:`SCREENS`) of the scene's tile that hide what is behind them, by column, row and level.
 
     A voxel is one where three returns or more lie 0.3 m or more above the ground and spread by 0.3 m or more across.
     One that holds a vehicle hides things from its first return to its last, any other always.

@@ -12,7 +12,7 @@ Float64 = npt.NDArray[np.float64]
 
 
 def gaussian(values: Float64, sigma_cells: float, truncate: float) -> Float64:
-    """Values (rows, columns) through a Gaussian, up to `truncate` σ; the raster is mirrored at its edges."""
+    """Returns values (rows, columns) through a Gaussian, up to `truncate` σ; the raster is mirrored at its edges."""
     away = np.arange(int(truncate * sigma_cells + 0.5) + 1)
     half = np.exp(-0.5 / (sigma_cells * sigma_cells) * away**2)
     weights = half / np.concatenate([half[:0:-1], half]).sum()

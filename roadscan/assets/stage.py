@@ -1,4 +1,4 @@
-"""Stage `assets`: returns into evidence, evidence into objects, objects into tables and files."""
+"""Stage `assets`: returns are turned into evidence, evidence into objects, objects into tables and files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from roadscan.store.manifest import Manifest
 from roadscan.tiles.tasks.tiles import run_tasks
 
 _MOST_ROUGH: Final = 0.5
-"""Verges and kerbs are rough; half of the ground is so only where the readings are."""
+"""Share of rough ground from which readings are suspect: verges and kerbs are rough, but not half of the ground."""
 
 ROUGH_READINGS: Final = Witness(
     "rough_readings",
@@ -46,7 +46,7 @@ ROUGH_READINGS: Final = Witness(
 
 
 class Assets(Stage):
-    """What stands on, beside and over the road, where the survey file has a section `[assets]`."""
+    """The stage of objects on, beside and over the road; it runs where the survey file has a section `[assets]`."""
 
     name = "assets"
     title = "what stands on, beside and over the road: ground, kerbs, markings, signs, poles, by kind"
@@ -79,7 +79,7 @@ class Assets(Stage):
             self._write(session, work.plan, self._look(session, work.plan))
 
     def _calibrate(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
-        """Gains of the intensity: samples of some squares, then the table."""
+        """Compute gains of the intensity: samples of some squares, then the table."""
         manifest, due = session.manifest, work.samples
         failures = run_tasks(
             find_samples, sample_tasks(plan, due), len(due), lambda squares: sample_tasks(plan, due, squares),
@@ -100,7 +100,7 @@ class Assets(Stage):
         session.failed(self.name, failures)
 
     def _join(self, session: Session, plan: AssetPlan) -> None:
-        """Join pieces kind after kind, each after those that it looks at."""
+        """Join pieces kind after kind, each after those that it uses."""
         manifest = session.manifest
         clusters: dict[str, list[Cluster]] = {}
         for wanted in plan.kinds:
@@ -113,7 +113,7 @@ class Assets(Stage):
                 session.failed(self.name, failed)
 
     def _look(self, session: Session, plan: AssetPlan) -> PicturePlan:
-        """Hold objects against pictures, where there are any."""
+        """Search the pictures of objects, where there are any."""
         manifest = session.manifest
         pictures = plan_asset_pictures(plan, manifest)
         for note in pictures.notes:
@@ -151,7 +151,7 @@ class Assets(Stage):
         manifest.settle()
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """Where most of the ground is too rough to seek paint on it."""
+        """Returns a finding where most of the ground is too rough for the detection of paint."""
         records_of = manifest.of(EVIDENCE)
         found = [one.figures() for unit, one in records_of.items() if unit.startswith(f"{LaneLine.name}/")]
         dense, rough = (sum(one.get(name, 0) for one in found) for name in ("dense_cells", "rough_cells"))
@@ -165,7 +165,7 @@ class Assets(Stage):
         return (ROUGH_READINGS.finds("assets", said),)
 
     def check(self, survey: Survey) -> list[RoadscanError]:
-        """Kinds, their settings and sensors are such that there are."""
+        """Check that kinds, their settings and sensors exist."""
         try:
             if survey.has("assets"):
                 need("cv2", "the section [assets]")
@@ -175,7 +175,7 @@ class Assets(Stage):
         return []
 
     def state(self, session: Session) -> StageState:
-        """Outputs of squares, objects and files that are there, and those that are due as far as is known by now."""
+        """Outputs of squares, objects and files that exist, and those that are due as far as is known by now."""
         if not session.survey.has("assets"):
             return StageState()
         work = plan_evidence(session)
@@ -208,7 +208,7 @@ class Assets(Stage):
         return sum(not manifest.is_current(SECTIONS, unit, one.key) for one in sections for unit in one.units)
 
     def folders(self) -> Sequence[str]:
-        """Evidence, objects, tables and files, classified points, bare earth."""
+        """Returns folders: evidence, objects, tables and files, classified points, bare earth."""
         return (
             "tables/intensity_samples", "tables/intensity_gains", "tables/asset_evidence", "tables/asset_objects",
             "tables/asset_screens", "tables/asset_visibility", "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,

@@ -1,4 +1,4 @@
-"""Classes of what stands still beside and over the road: vegetation, buildings, wires, noise."""
+"""Classes of stationary things beside and over the road: vegetation, buildings, wires, noise."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ Bools = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]
 
 _PLANAR, _UPRIGHT, _THICK = 0.4, 0.25, 0.4
-"""A cube is part of an upright plane whose planarity is no less, whose normal points no more upwards, and that is no
-thicker (cubes)."""
+"""A cube is part of an upright plane with at least this planarity, at most this upward part of its normal, and at most
+this thickness (cubes)."""
 _WALL_CUBES, _WALL_M, _WALL_LENGTH_M = 2, 1.5, 4.0
-"""A wall has so many of them above one another, half of all that stand there, reaches this height, and is this long."""
+"""Least number of such cubes of a wall above one another, also half of all there, its least height and length (m)."""
 _FOOT_M: Final = 1.8
-"""It is seen below this height: a crown is not."""
+"""A wall is seen below this height (m): a crown is not."""
 _CUBES_UP: Final = 1 << 20
-"""Higher than any cube."""
+"""A level higher than any cube."""
 _IN_LEAVES: Final = 0.6
-"""What scatters more is no wall, even in front of one."""
+"""Surfaces with more scattering around are no wall, even in front of one."""
 _LEAFY: Final = 0.2
 """Mean scattering of the columns around from which things are vegetation."""
 _MEDIUM_M, _HIGH_M = 0.5, 2.0
-"""Heights from which vegetation is medium and high."""
+"""Heights from which vegetation is medium and high (m)."""
 _ROOF_M, _ROOF_LENGTH_M = 2.5, 6.0
-"""A roof lies above this height, and is this long."""
+"""Least height and length of a roof (m)."""
 _WIRE_LINEAR, _WIRE_LEVEL, _WIRE_M, _WIRE_LENGTH_M = 0.8, 0.4, 4.0, 3.0
-"""A wire is linear, level, above the ground by so much, and so long."""
+"""Least linearity of a wire, greatest upward part of its direction, least height and length (m)."""
 _NEAR_M: Final = 15.0
-"""A return alone in nine tenths of a metre is noise, so near to the sensor."""
+"""An isolated return is noise within this distance of the sensor (m)."""
 _CODES: Final = (
     classes.UNCLASSIFIED, classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
     classes.BUILDING, classes.WIRE, classes.HIGH_NOISE,
 )  # fmt: skip
 _LOW_M: Final = 0.3
-"""Returns within this of the ground that do not lie on it are low vegetation, where the ground is rough."""
+"""Returns up to this height (m) that do not lie on the ground are low vegetation, where the ground is rough."""
 
 
 def surroundings(
@@ -58,7 +58,7 @@ def surroundings(
     window: Box,
     drive_xyh_m: npt.NDArray[np.float64],
 ) -> npt.NDArray[np.uint8]:
-    """Classes (n,): those of `found`, and in place of `UNCLASSIFIED` what stands there."""
+    """Returns classes (n,): those of `found`, and in place of `UNCLASSIFIED` what stands there."""
     grid = grid_over(window, EDGE_M)
     features, bits = cubes.features, np.zeros(len(cubes.place), np.uint8)
     over = bits
@@ -83,7 +83,7 @@ def surroundings(
 
 
 def leaves(cubes: Cubes, grid: Grid) -> Bools:
-    """Cubes (cubes,) in columns that scatter in all directions, with those around."""
+    """Returns a mask (cubes,) of those in columns that scatter in all directions, with those around."""
     row, column = cubes.place[:, 0], cubes.place[:, 1]
     number, scattering = np.zeros(grid.shape), np.zeros(grid.shape)
     np.add.at(number, (row, column), 1.0)
@@ -95,7 +95,7 @@ def leaves(cubes: Cubes, grid: Grid) -> Bools:
 
 
 def walls_and_roofs(cubes: Cubes, grid: Grid) -> tuple[Bools, Bools]:
-    """Cubes (cubes,) at walls, the large upright planes, and of roofs: large planes that are not, above a man."""
+    """Returns masks (cubes,) of walls, the large upright planes, and of roofs: other large planes, above a person."""
     place, features = cubes.place, cubes.features
     row, column = place[:, 0], place[:, 1]
     planar = (features[:, voxels.PLANARITY] >= _PLANAR) & (features[:, voxels.THICKNESS] <= _THICK)
@@ -118,7 +118,7 @@ def walls_and_roofs(cubes: Cubes, grid: Grid) -> tuple[Bools, Bools]:
 
 
 def long_ones(cells: Bools, least_m: float) -> Bools:
-    """Groups of cells (rows, columns), a cell wider, that are no shorter than `least_m`."""
+    """Returns a mask (rows, columns) of groups of cells, a cell wider, that are no shorter than `least_m`."""
     wider = cv2.dilate(cells.view(np.uint8), np.ones((3, 3), np.uint8))
     count, label, boxes, _ = cv2.connectedComponentsWithStats(wider, connectivity=8)
     keep = (
@@ -130,7 +130,7 @@ def long_ones(cells: Bools, least_m: float) -> Bools:
 
 
 def wires(cubes: Cubes, grid: Grid) -> Bools:
-    """Cubes (cubes,) of wires: linear and level, high, with nothing else in their columns above a man's height."""
+    """Returns a mask (cubes,) of wires: linear, level and high, with nothing else in their columns above a person."""
     place, features = cubes.place, cubes.features
     row, column = place[:, 0], place[:, 1]
     linear = (features[:, voxels.LINEARITY] >= _WIRE_LINEAR) & (features[:, voxels.ALONG_UP] <= _WIRE_LEVEL)

@@ -1,4 +1,4 @@
-"""Squares of the map that are searched for assets one by one, each with a halo around it."""
+"""Squares of the map that are searched for assets separately, each with a halo around it."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ class AssetGrid:
 
     @property
     def edge_m(self) -> float:
-        """Edge of a square (m)."""
+        """Returns the edge of a square (m)."""
         return self.per_edge * self.tiles.size_m
 
     @property
     def squares(self) -> TileGrid:
-        """The squares as tiles of one cell."""
+        """Returns the squares as tiles of one cell."""
         return TileGrid(self.edge_m, self.edge_m)
 
     def of_tile(self, tile: TileId) -> TileId:
-        """Square that holds a tile of the survey."""
+        """Returns the square that contains a tile of the survey."""
         return TileId(tile.column // self.per_edge, tile.row // self.per_edge)
 
     def corner_m(self, square: TileId) -> tuple[float, float]:
-        """Easting and northing of the south-west corner of a square (m)."""
+        """Returns easting and northing of the south-west corner of a square (m)."""
         return square.column * self.edge_m, square.row * self.edge_m
 
     def window(self, square: TileId) -> Bounds:
-        """A square with its halo on the map (m)."""
+        """Returns a square with its halo on the map (m)."""
         (east, north), h, edge = self.corner_m(square), self.halo_m, self.edge_m
         return Bounds(east - h, north - h, east + edge + h, north + edge + h)
 
     @property
     def own_box(self) -> Box:
-        """A square from its own corner (m)."""
+        """Returns a square relative to its corner (m)."""
         return Box(0.0, 0.0, self.edge_m, self.edge_m)
 
     @property
     def window_box(self) -> Box:
-        """A square with its halo from its own corner (m)."""
+        """Returns a square with its halo relative to its corner (m)."""
         return Box(-self.halo_m, -self.halo_m, self.edge_m + self.halo_m, self.edge_m + self.halo_m)
 
     def tiles_under(self, square: TileId) -> list[TileId]:
-        """The survey's tiles that share ground with a square or its halo, by row and column."""
+        """Returns the survey's tiles that share ground with a square or its halo, by row and column."""
         return self.tiles.tiles_in(self.window(square))

@@ -1,4 +1,4 @@
-"""Cells that touch: numbers of the pieces that they make together."""
+"""Connected components of cells."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Int64 = npt.NDArray[np.int64]
 
 
 def touching(flat: Int64, steps: Iterable[int]) -> npt.NDArray[np.int32]:
-    """Number (n,) of the connected piece of each cell.
+    """Returns the number (n,) of the connected piece of each cell.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""How many passes had a place in sight: the ground of each cell, and the air above it by height.
+"""Number of passes that had a place in sight: the ground of each cell, and the air above it by height.
 
-Returns tell where a sensor looked. A return's ray passed all places on its way, saw what it hit, and did not see what
+Returns show where a sensor looked. A return's ray passed all places on its way, saw its hit, and did not see what
 lies behind. A pass had a place in sight where enough of its rays reached it, and no fewer than were stopped before.
-Where nothing came back, as from the sky, rays are not known; there a place counts as in sight that lies above one that
-is, unless half of the rays that lower places let expect were stopped before it.
+Where nothing came back, as from the sky, rays are not known; there a place counts as in sight if it is above one that
+is, unless half of the rays expected from lower places were stopped before it.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from roadscan.assets.kernels.sight import Places, Rays, follow_rays
 from roadscan.assets.scene import Scene
 
 CELL_M: Final = 0.5
-"""Edge of the cells, whose corners are multiples of it."""
+"""Edge of the cells (m), whose corners are multiples of it."""
 BANDS_M: Final = (-0.3, 0.5, 1.5, 3.0, 5.0, 8.0)
-"""Heights above the ground between which a cell's places lie."""
+"""Heights above the ground (m) between which a cell's places lie."""
 PASSES: Final = ("passes_ground", "passes_low", "passes_middle", "passes_high", "passes_top")
-"""Columns of the passes, a band each, upwards."""
+"""Columns of the passes, one a band, upwards."""
 _REACH_M: Final = 30.0
-"""What is farther from the sensor does not count as seen."""
-_HIT_M: Final = 0.5
+"""Places farther from the sensor (m) do not count as seen."""
+_HIT_M: Final = 0.5  # A hit counts as passed this far to both sides along the ray (m).
 _LEAST_RAYS: Final = 50.0
-"""Fewer rays do not tell that a place was seen, nor that something stood before it. A pole of 0.1 m gets a fifth of
+"""Fewer rays show neither that a place was seen nor that something stood before it. A pole of 0.1 m gets a fifth of
 the rays of its cell."""
 _MOST_RAYS: Final = 120_000
 """Of more rays of a pass, each second, third … is followed."""
 
 
 def passes_in_sight(scene: Scene) -> pa.Table:
-    """Cells of the scene's tile that any pass had in sight: column, row, ground height, passes by height.
+    """Returns cells of the scene's tile that any pass had in sight: column, row, ground height, passes by height.
 
-    Cells are those whose middles the tile holds; those of which the ground is not known are left out.
+    Only cells whose middles lie in the tile and of which the ground is known are returned.
     """
     (east, north), box, ground = scene.returns.corner_m, scene.tile, scene.ground
     least = np.array([_cells_before(east + box.x_min_m), _cells_before(north + box.y_min_m)])
@@ -68,7 +68,7 @@ def in_sight(passed: npt.NDArray[np.floating], hidden: npt.NDArray[np.floating])
     seen: npt.NDArray[np.bool_] = (passed >= _LEAST_RAYS) & (passed >= hidden)
     per_m = (passed + hidden) / np.diff(BANDS_M)
     for band in range(1, seen.shape[2]):
-        # rays that passed may not have come back, so those that were stopped are held against the bands below
+        # rays that passed may not have come back, so those that were stopped are compared with the bands below
         expected = per_m[:, :, 1:band].max(axis=2, initial=0.0) * (BANDS_M[band + 1] - BANDS_M[band])
         is_open = hidden[:, :, band] < np.maximum(_LEAST_RAYS, 0.5 * expected)
         seen[:, :, band] |= is_open & seen[:, :, band - 1]
@@ -76,12 +76,12 @@ def in_sight(passed: npt.NDArray[np.floating], hidden: npt.NDArray[np.floating])
 
 
 def _cells_before(place_m: float) -> int:
-    """Number of the first cell whose middle does not lie before a place."""
+    """Returns the number of the first cell whose middle does not lie before a place."""
     return int(np.ceil(place_m / CELL_M - 0.5))
 
 
 def _rays_of_passes(scene: Scene) -> list[tuple[Rays, float]]:
-    """Rays of each pass, and how many returns each of them stands for."""
+    """Returns rays of each pass, and the number of returns that each of them represents."""
     returns = scene.returns
     is_known = np.isfinite(returns.sensor_x_m) & np.isfinite(returns.sensor_height_m)
     found = []

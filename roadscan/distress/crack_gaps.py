@@ -1,4 +1,4 @@
-"""Gaps between the ends of cracks: where two of them face one another, the crack goes on unseen.
+"""Gaps between the ends of cracks are bridged where two ends face one another.
 
 A crack that is narrower than a cell is lost where it runs between two: less than half of either's readings lie in it.
 Two free ends within `bridge_m` are joined by a straight piece without depth or width if both point at one another, to
@@ -19,15 +19,15 @@ from roadscan.distress.cracks import CrackPiece
 
 Float64 = npt.NDArray[np.float64]
 
-_ASIDE: Final = math.tan(math.radians(30.0))
-_ASIDE_CELLS: Final = 1.5
+_ASIDE: Final = math.tan(math.radians(30.0))  # Tangent of the most that an end may point past the other.
+_ASIDE_CELLS: Final = 1.5  # Distance (cells) that is allowed aside on top of that angle.
 _OPPOSITE: Final = -0.5
-"""Cosine of the angle between the directions out of two ends, at most."""
-_CHORD_M: Final = 0.1
+"""Greatest cosine of the angle between the directions out of two ends."""
+_CHORD_M: Final = 0.1  # The direction of an end is that of a chord about this long (m).
 
 
 def outwards(line_m: Float64) -> Float64:
-    """Unit vector (2,) out of a line (n, 2) at its end, along a chord of about 0.1 m."""
+    """Returns the unit vector (2,) that points out of a line (n, 2) at its end, along a chord of about 0.1 m."""
     along = np.cumsum(np.hypot(*np.diff(line_m[::-1], axis=0).T))
     back = line_m[-1] - line_m[-2 - min(int(np.searchsorted(along, _CHORD_M)), len(line_m) - 2)]
     size = float(np.hypot(*back))
@@ -35,7 +35,7 @@ def outwards(line_m: Float64) -> Float64:
 
 
 def bridges_of(pieces: Sequence[CrackPiece], bridge_m: float, cell_m: float) -> list[CrackPiece]:
-    """Pieces that join the free ends of others; the order of `pieces` does not matter."""
+    """Returns pieces that join free ends of other pieces; the order of `pieces` does not matter."""
     met: dict[tuple[int, int], int] = {}
     for name in (name for one in pieces for name in (one.start, one.end)):
         met[name] = met.get(name, 0) + 1

@@ -1,4 +1,4 @@
-"""Pieces of cracks joined over all tiles to networks, and these parted into cracks with their figures and types."""
+"""Crack pieces of all tiles are joined to networks, and each network is split into cracks with figures and types."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ Int64 = npt.NDArray[np.int64]
 CrackType = Literal["longitudinal", "transverse", "diagonal", "alligator", "unknown"]
 
 _KINDS: Final[tuple[CrackType, ...]] = ("longitudinal", "transverse", "diagonal", "alligator", "unknown")
-"""By the types of ``crack_parts``."""
+"""Names of the types, by the numbers of ``crack_parts``."""
 _CHORD_M = 0.1
-"""Directions are those of chords about this long."""
+"""Directions are those of chords about this long (m)."""
 _BESIDE_NET_M = 0.25
-"""What hangs on a net and has its middle no farther from the net's hull is its fringe."""
+"""A branch that meets a net and has its middle within this distance (m) of the net's hull belongs to the net."""
 _LEAST_SHARE = 0.6
-"""What has the cross-section of a crack over less of its length, gaps left out, is an edge or a row of pits."""
+"""A candidate with the section of a crack over a smaller share of its length, gaps left out, is an edge or pits."""
 LEAST_SEEN: Final = 0.8
 """Where a crack's middle has a smaller share of the readings than the ground beside it, its bottom was not seen."""
 _NARROW_CELLS, _WIDE_CELLS = 0.8, 1.6
 """Widths at which a crack shows least of its bottom, and all of it."""
 _SIGMA_NARROW, _SIGMA_WIDE = 0.2, 0.05
-"""Standard deviations of depths at these widths, shares of the depth."""
+"""Standard deviations of depths at these widths, as shares of the depth."""
 _SIGMA_READING = 0.1
-"""The same where a cell has one reading; it falls with the root of their number."""
+"""Standard deviation of the depth, as a share, with one reading a cell; it falls with the root of their number."""
 _SIGMA_M = 0.0005
-"""What noise and texture leave of a depth."""
+"""Standard deviation of a depth from noise and texture (m)."""
 _ONE_NODE_CELLS = 4.0
-"""Junctions closer than this are one: thinning makes two of a crossing."""
+"""Junctions closer than this (cells) are one: thinning makes two of a crossing."""
 
 
 @dataclass(frozen=True)
@@ -48,17 +48,17 @@ class Crack:
     """A crack: a part of a network of one type, with its branches."""
 
     network: int
-    """Number of the network that it is a part of, from 1; parts that meet have the same."""
+    """Number of its network, from 1; cracks that meet have the same number."""
     kind: CrackType
     length_m: float
     """Along all branches (m)."""
     width_mean_m: float
-    """At half the depth, mean over the length (m); NaN where it is nowhere known."""
+    """At half the depth, mean over the length (m); NaN where it is known nowhere."""
     width_max_m: float
     depth_mean_m: float
     depth_max_m: float
     seen_share: float
-    """Readings in its middle over those beside it; 1 where none are counted."""
+    """Readings in its middle over those beside it; 1 where readings are not counted."""
     sigma_depth_mean_m: float
     """NaN where the bottom was not seen."""
     area_m2: float
@@ -66,17 +66,17 @@ class Crack:
     covered_m2: float
     """Convex hull of its line (m²)."""
     junctions: int
-    """Places on it where three or more branches meet, of whatever type."""
+    """Places on it where three or more branches of any type meet."""
     ends: int
-    """Places where it ends free."""
+    """Number of its free ends."""
     measured_share: float
     """Share of the length that has the cross-section of a crack."""
     polygons: int
-    """Pieces of ground that it closes in by itself."""
+    """Number of closed polygons that it forms alone."""
     azimuth_deg: float
     """Mean direction, clockwise from map north, 0 to 180 (degrees)."""
     lane_angle_deg: float
-    """Between that and the lane, 0 to 90 (degrees), where it is known; NaN where it is nowhere."""
+    """Angle between that direction and the lane, 0 to 90 (degrees); NaN where the lane's direction is known nowhere."""
     longitudinal_m: float
     """Length within `lane_angle_deg` of the lane's direction (m)."""
     transverse_m: float
@@ -84,13 +84,13 @@ class Crack:
     line: Any
     """shapely MultiLineString on the map (m)."""
     pieces: Int64
-    """Which pieces it is made of, gaps left out."""
+    """Indices of the pieces that it consists of, without those that bridge gaps."""
 
 
 def join_cracks(
     pieces: Sequence[CrackPiece], lane_azimuth_rad: npt.ArrayLike, cell_m: float, config: CrackJoining
 ) -> list[Crack]:
-    """Cracks of all networks that are long and deep enough, each as parts of one type, from south to north.
+    """Returns cracks that are long and deep enough, each a part of a network with one type, from south to north.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def join_cracks(
 
 
 def _is_crack(network: Sequence[CrackPiece], bridged_m: Float64, config: CrackJoining) -> bool:
-    """Whether pieces are a crack, with gaps between them of so many metres in all."""
+    """Returns whether pieces are a crack, given the total length of the gaps between them (m)."""
     length, measured = sum(p.length_m for p in network), sum(p.measured_m for p in network)
     long = length + float(bridged_m.sum()) >= config.min_length_m
     return long and measured > 0.0 and measured >= _LEAST_SHARE * length
@@ -133,14 +133,14 @@ def _is_crack(network: Sequence[CrackPiece], bridged_m: Float64, config: CrackJo
 
 @dataclass(frozen=True)
 class _Nodes:
-    """Nodes where pieces end; junctions closer than a few cells are one."""
+    """Nodes at which pieces end; junctions closer than a few cells are one node."""
 
     ends: Int64
-    """(n, 2) of each piece."""
+    """(n, 2) node numbers of each piece's ends."""
     apart: Int64
-    """(n, 2) the same with all junctions apart."""
+    """(n, 2) the same before close junctions are merged."""
     degree: Int64
-    """Ends that meet at a node, those of pieces within it left out."""
+    """Number of ends that meet at a node, without pieces inside the node."""
     cell_m: float
 
     @classmethod
@@ -151,7 +151,7 @@ class _Nodes:
         return cls(merged[ends], ends, np.bincount(merged[ends[~inner]].ravel(), minlength=nodes), cell_m)
 
     def figures(self, own: Int64) -> tuple[int, int, int]:
-        """Junctions and free ends on some pieces, and polygons that they close."""
+        """Returns the junctions and free ends on some pieces, and the number of polygons that they close."""
         nodes = np.unique(self.ends[own])
         degree = self.degree[nodes]
         apart = self.apart[own]
@@ -161,14 +161,14 @@ class _Nodes:
 
 @dataclass(frozen=True)
 class _Turned:
-    """Directions of each piece (n,)."""
+    """Directions of pieces (n,)."""
 
     turning: npt.NDArray[np.complex128]
     """Sum of the lengths of its chords, each with twice its azimuth."""
     to_lane: npt.NDArray[np.complex128]
     """The same with twice the angle to the lane; 0 where it is not known."""
     parts_m: Float64
-    """(n, 3) lengths along, across and aslant the lane; 0 where it is not known."""
+    """(n, 3) lengths along, across and diagonal to the lane; 0 where its direction is not known."""
 
     @classmethod
     def of(cls, pieces: Sequence[CrackPiece], azimuth: Float64, config: CrackJoining) -> _Turned:
@@ -180,7 +180,7 @@ class _Turned:
 def _parts(
     own: Int64, pieces: Sequence[CrackPiece], nodes: _Nodes, turned: _Turned, config: CrackJoining
 ) -> list[Crack]:
-    """Cracks of a network."""
+    """Returns the cracks of a network."""
     lines = [pieces[k].line_m for k in own.tolist()]
     shapes = np.array([shapely.LineString(line) for line in lines], object)
     out = np.array([[outwards(line[::-1]), outwards(line)] for line in lines])
@@ -241,11 +241,11 @@ def _crack(own: Int64, kind: CrackType, pieces: Sequence[CrackPiece], nodes: _No
 
 
 def depth_sigma_m(depth_m: float, width_cells: float, seen_share: float, readings: float) -> float:
-    """Standard deviation (m) of the mean depth of a crack; NaN where its bottom was not seen.
+    """Returns the standard deviation of a crack's mean depth (m); NaN where its bottom was not seen.
 
-    width_cells : its width at half the depth. What is narrow shows its walls more than its bottom.
+    width_cells : its width at half the depth. A narrow crack shows more of its walls than of its bottom.
     seen_share : readings in its middle over those beside it.
-    readings : of a cell beside it; infinite where none are counted.
+    readings : of a cell beside it; infinite where readings are not counted.
     """
     if not seen_share >= LEAST_SEEN:
         return math.nan
@@ -255,7 +255,7 @@ def depth_sigma_m(depth_m: float, width_cells: float, seen_share: float, reading
 
 
 def _directions(one: CrackPiece, lane: float, config: CrackJoining) -> tuple[complex, complex, list[float]]:
-    """Sums over the chords of a piece, of :class:`_Turned`."""
+    """Returns the sums over the chords of a piece that :class:`_Turned` describes."""
     count = max(1, round(one.length_m / _CHORD_M))
     picked = one.line_m[np.unique(np.linspace(0, len(one.line_m) - 1, count + 1).round().astype(np.int64))]
     chord = np.diff(picked, axis=0)

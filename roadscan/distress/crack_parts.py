@@ -1,4 +1,4 @@
-"""A network of cracks as parts: nets, and what runs along, across or aslant the lane.
+"""A network of cracks is split into parts: nets, and strokes along, across or diagonal to the lane.
 
 1. *Branches*: pieces joined where nothing else meets (the border of a tile). Junctions a few cells apart are one.
 2. *Nets*: branches that lie on closed polygons, without the bridges between such. A net that closes enough polygons
@@ -27,13 +27,13 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 NET: Final = 3
-"""Type of a net; 0, 1, 2 run along, across and aslant the lane."""
-UNKNOWN: Final = 4
+"""Type of a net; types 0, 1, 2 run along, across and diagonal to the lane."""
+UNKNOWN: Final = 4  # Type of a stroke nowhere on which the lane's direction is known.
 
 _FRINGE_M: Final = 0.5
-"""What is shorter and meets nothing but a net is its fringe."""
+"""Shorter parts (m) that meet nothing but a net belong to the net."""
 _STRAIGHT_RAD: Final = math.radians(45.0)
-"""Branches that turn by less at a junction go on."""
+"""Branches that turn by less than this at a junction are one stroke."""
 
 
 @dataclass(frozen=True)
@@ -41,22 +41,22 @@ class Network:
     """Pieces of one network of cracks; arrays are (n, …)."""
 
     ends: Int64
-    """(n, 2) numbers of the nodes where a piece begins and ends; junctions that are one have one number."""
+    """(n, 2) numbers of the nodes at a piece's start and end; merged junctions share a number."""
     length_m: Float64
     outwards: Float64
-    """(n, 2, 2) unit vectors at the begin and the end of a piece, out of it."""
+    """(n, 2, 2) unit vectors that point out of a piece at its start and its end."""
     directions_m: Float64
-    """(n, 3) lengths along, across and aslant the lane; 0 where it is not known."""
+    """(n, 3) lengths along, across and diagonal to the lane; 0 where its direction is not known."""
 
     def part(self, rows: Int64) -> Network:
-        """Some of the pieces."""
+        """Returns a subset of the pieces."""
         return Network(self.ends[rows], self.length_m[rows], self.outwards[rows], self.directions_m[rows])
 
 
 def parts_of(
     whole: Network, is_net: Callable[[Int64], bool], within: Callable[[Int64, Int64], Bool], least_m: float
 ) -> list[tuple[int, Int64]]:
-    """Parts of a network: type and pieces of each, in the order of their first pieces.
+    """Returns the parts of a network, each with its type and its pieces, in the order of their first pieces.
 
     Parameters
     ----------
@@ -83,14 +83,14 @@ def parts_of(
 
 
 def _closed(whole: Network) -> Iterator[Int64]:
-    """Pieces of each connected set that lies on closed polygons, bridges left out."""
+    """Yields the pieces of each connected set that lies on closed polygons, bridges left out."""
     kept = np.flatnonzero(~bridges(whole.ends))
     if kept.size:
         yield from grouped(kept, components(whole.ends[kept]))
 
 
 def _take_in(whole: Network, part: Int64, number: int, within: Callable[[Int64, Int64], Bool]) -> None:
-    """Add to a net what hangs on it and lies on its ground."""
+    """Add to a net the branches that meet it and lie on its ground."""
     closed = np.flatnonzero(part == number)
     while True:
         own = np.flatnonzero(part == number)
@@ -103,7 +103,7 @@ def _take_in(whole: Network, part: Int64, number: int, within: Callable[[Int64, 
 
 
 def _mark_strokes(whole: Network, rest: Int64, part: Int64, kinds: list[int]) -> None:
-    """Number the strokes of pieces `rest` in `part`, and add their types."""
+    """Number the strokes of the pieces `rest` in `part`, and append their types."""
     ends, outwards = whole.ends[rest], whole.outwards[rest]
     degree = np.bincount(whole.ends.ravel())
     pairs: list[tuple[int, int]] = []
@@ -121,7 +121,7 @@ def _mark_strokes(whole: Network, rest: Int64, part: Int64, kinds: list[int]) ->
 
 
 def _pairs(pieces: Int64, outwards: Float64, only_two: bool) -> list[tuple[int, int]]:
-    """Which of the pieces that meet at a node go on as another: the straightest first."""
+    """Returns pairs of the pieces that meet at a node and continue one another, the straightest first."""
     count = len(pieces)
     if count == 2 and only_two:
         return [(int(pieces[0]), int(pieces[1]))]
@@ -140,7 +140,7 @@ def _pairs(pieces: Int64, outwards: Float64, only_two: bool) -> list[tuple[int, 
 
 
 def _merge_short(whole: Network, part: Int64, kinds: Sequence[int], least_m: float) -> None:
-    """Give short parts to the longest that they meet, the shortest first."""
+    """Merge short parts, the shortest first, into the longest part that each meets."""
     length: list[float] = np.bincount(part, whole.length_m, len(kinds)).tolist()
     nodes: list[set[int]] = [set() for _ in kinds]
     parts_at: dict[int, set[int]] = {}
@@ -155,7 +155,7 @@ def _merge_short(whole: Network, part: Int64, kinds: Sequence[int], least_m: flo
     while waiting:
         size, number = heapq.heappop(waiting)
         if into[number] != number or size != length[number]:
-            continue  # it was given away, or has grown
+            continue  # merged already, or grown
         beside = sorted(set[int]().union(*(parts_at[node] for node in nodes[number])) - {number})
         if not beside or (size >= least_m and any(kinds[k] != NET for k in beside)):
             continue
@@ -165,7 +165,7 @@ def _merge_short(whole: Network, part: Int64, kinds: Sequence[int], least_m: flo
         nodes[longest] |= nodes[number]
         for node in nodes[number]:
             parts_at[node] = parts_at[node] - {number} | {longest}
-        for k in beside:  # they have grown, or meet something else now
+        for k in beside:  # grown, or with other neighbours by now
             if kinds[k] != NET and length[k] < limit:
                 heapq.heappush(waiting, (length[k], k))
     while (into != into[into]).any():
@@ -174,7 +174,7 @@ def _merge_short(whole: Network, part: Int64, kinds: Sequence[int], least_m: flo
 
 
 def _merge_same(whole: Network, part: Int64, kinds: Sequence[int]) -> None:
-    """Unite parts of one type that meet."""
+    """Merge parts of one type that meet."""
     kind = np.array(kinds)[part]
     for one in np.unique(kind).tolist():
         rows = np.flatnonzero(kind == one)
@@ -191,26 +191,26 @@ def _merge_same(whole: Network, part: Int64, kinds: Sequence[int]) -> None:
 
 
 def components(ends: Int64) -> Int64:
-    """(n,) number of the connected set that each edge (n, 2) between nodes lies in."""
+    """Returns the number (n,) of the connected set of each edge (n, 2) between nodes."""
     _, local = np.unique(ends, return_inverse=True)
     local = local.reshape(ends.shape)
     return united(local, int(local.max()) + 1)[local[:, 0]] if len(ends) else np.zeros(0, np.int64)
 
 
 def united(pairs: Int64, count: int) -> Int64:
-    """(count,) number of the connected set that each of so many lies in; pairs (n, 2) connect two of them."""
+    """Returns the number (count,) of each element's connected set; pairs (n, 2) connect two elements."""
     joined = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
 
 
 def grouped(rows: Int64, number: Int64) -> list[Int64]:
-    """Rows (n,) by their number (n,)."""
+    """Returns the rows of each number (n,)."""
     order = np.argsort(number, kind="stable")
     return np.split(rows[order], np.flatnonzero(np.diff(number[order])) + 1)
 
 
 def bridges(ends: Int64) -> Bool:
-    """Which edges (n, 2) between nodes lie on no closed polygon.
+    """Returns a mask of the edges (n, 2) between nodes that lie on no closed polygon.
 
     Tarjan (1974), "A note on finding the bridges of a graph", Information Processing Letters 2, 160-161. Several edges
     between the same nodes, and one from a node to itself, close polygons.

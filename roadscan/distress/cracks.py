@@ -1,4 +1,4 @@
-"""Cracks of a window of surface as pieces of line, which join over tiles (``crack_network.py``).
+"""Cracks in a window of the surface, as pieces of line that are joined over tiles (``crack_network.py``).
 
 The skeleton comes from ``valleys.py``. At each of its cells a cross-section is measured on heights *before*
 smoothing (impulses left out): all cells up to 4.5 cells along the crack are sorted by their distance from its line into
@@ -38,16 +38,16 @@ from roadscan.surface.heights import HeightWindow
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_SMOOTHINGS = 3
+_SMOOTHINGS = 3  # Passes that move each vertex of a line towards the middle of its neighbours.
 _LOWER_FLANK = 0.5
-"""A section whose lower flank stands less than this share as high as the line between both is that of an edge."""
+"""A section is an edge if its lower flank is lower than this share of the height of the line between both flanks."""
 _FARTHEST_CELLS = 1.5
-"""A middle farther from its cell of the skeleton is not believed."""
+"""A middle farther (cells) from its cell of the skeleton is discarded."""
 _BLUR_CELLS = 0.98
-"""Width at half its height of a cell folded with a bin and with the spread of directions (7.5°)."""
-_MOST_RAISED = 1.6
+"""Width at half height of a cell folded with a bin and with the spread of directions (7.5°), in cells."""
+_MOST_RAISED = 1.6  # The depth is raised by this factor at most: narrower cracks leave no trace of their depth.
 _LOWERED_M = 0.002
-"""Heights of sections are lowered to the lowest readings by so much at most."""
+"""Heights of sections are lowered to the lowest readings by this much at most (m)."""
 _SHOWN_SHARE = 0.5
 """A section of robust heights less than this share as deep as that of lowered ones is noise: heights do not show the
 crack there."""
@@ -55,12 +55,12 @@ crack there."""
 
 @dataclass(frozen=True)
 class CrackPiece:
-    """A stretch of crack from node to node. All sums can be added."""
+    """A piece of a crack from node to node. All sums can be added."""
 
     line_m: Float64
     """(n, 2) easting and northing (m)."""
     start: tuple[int, int]
-    """Row and column on the map of the cell where it begins: an end, a junction or the border of a tile."""
+    """Row and column on the map of the cell where it starts: an end, a junction or the border of a tile."""
     end: tuple[int, int]
     length_m: float
     measured_m: float
@@ -72,42 +72,42 @@ class CrackPiece:
     """Integral of the depth along the piece (m²)."""
     depth_max_m: float
     seen_sum_m: float = 0.0
-    """Integral along the piece of the readings that the cells in its middle hold (m) …"""
+    """Integral along the piece of the number of readings of a cell in its middle (m) …"""
     beside_sum_m: float = 0.0
-    """… and of those that a cell beside it holds (m)."""
+    """… and of a cell beside it (m)."""
 
     @property
     def middle_m(self) -> Float64:
-        """(2,) halfway along its line (m): a straight line that was simplified has no vertex there."""
+        """Returns the point (2,) halfway along its line (m): a simplified straight line has no vertex there."""
         along = way_along(self.line_m)
         return np.array([np.interp(0.5 * along[-1], along, axis) for axis in self.line_m.T])
 
 
 @dataclass(frozen=True)
 class Sections:
-    """Figures of each cell of a skeleton (n,)."""
+    """Figures of each cell (n,) of a skeleton."""
 
     place: Float64
     """(n, 2) column and row on the map, in cells; .5 is a cell's middle."""
     width_m: Float64
-    """NaN where it cannot be told."""
+    """NaN where the section does not show it."""
     depth_m: Float64
     seen: Float64
-    """(n, 2) readings of the cell in the crack's middle, and of a cell beside the crack; 0 where none are counted."""
+    """(n, 2) readings of the cell in the crack's middle, and of a cell beside the crack; 0 where not counted."""
 
 
 def halo_cells(config: CrackDetection, cell_m: float) -> int:
-    """Cells that a window needs beyond those of which cracks are wanted."""
+    """Returns the margin that a window needs around the cells in which cracks are wanted (cells)."""
     reach = math.ceil(math.hypot(4.5, section_cells(config, cell_m))) + 1
     walked = bridge_cells() + 2 + PRUNINGS * (_spur_cells(config, cell_m) + 2) + _SMOOTHINGS + 2
     return valleys.halo_cells(config, cell_m) + max(HALF_ALONG + reach, walked)
 
 
 def crack_pieces(window: HeightWindow, config: CrackDetection) -> list[CrackPiece]:
-    """Pieces of the cracks whose edges begin at the window's inner cells.
+    """Returns the pieces of the cracks whose edges start in the window's inner cells.
 
     Neighbouring windows give pieces that meet at common cells and do not overlap. None is left out for its length:
-    that is known when all are joined.
+    when all are joined its length is known.
     """
     window = needed_part(window, config)
     if not window.raw_m.size:
@@ -123,7 +123,7 @@ def crack_pieces(window: HeightWindow, config: CrackDetection) -> list[CrackPiec
 
 
 def needed_part(window: HeightWindow, config: CrackDetection) -> HeightWindow:
-    """The part of a window on which its pieces depend: near its inner cells, and near what was measured there."""
+    """Returns the part of a window on which its pieces depend: near its inner cells, and near measured ones."""
     halo = halo_cells(config, window.cell_m)
     own = window.inner()
     part = window.part(*((max(s.start - halo, 0), s.stop + halo) for s in own))
@@ -134,7 +134,7 @@ def needed_part(window: HeightWindow, config: CrackDetection) -> HeightWindow:
 
 
 def sharpened(width_cells: Float64, depth_m: Float64) -> tuple[Float64, Float64]:
-    """Width and depth of sections (n,) before they were seen through cells and bins.
+    """Returns width and depth of sections (n,), corrected for the blur of cells and bins.
 
     A section is the crack's, folded with a cell and with a bin. That adds the squares of widths and keeps the area:
     exact for bells, and good to some per cent for other forms. Depth is raised 1.6 times at most, where the crack is
@@ -145,7 +145,7 @@ def sharpened(width_cells: Float64, depth_m: Float64) -> tuple[Float64, Float64]
 
 
 def section_cells(config: CrackDetection, cell_m: float) -> int:
-    """Cells to either side that a cross-section takes in."""
+    """Returns the half width of a cross-section (cells)."""
     flank = flank_cells(config, cell_m)[-1]
     return flank + max(flank // 2, 2) + 1
 
@@ -159,7 +159,7 @@ def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config
     row, column = cells.row, cells.column
     out = _valley_sections(window.cleaned_m(), cells, window, config)
     hidden = np.zeros(row.size, bool)
-    if window.lowest is not None:  # what robust heights do not show, lowest readings may
+    if window.lowest is not None:  # where robust heights show no crack, lowest readings may
         lowered = _valley_sections(window.lowered_m(_LOWERED_M), cells, window, config)
         hidden = np.isnan(out[:, 0]) | (out[:, 0] < _SHOWN_SHARE * lowered[:, 0])
         out[hidden, :4] = lowered[hidden, :4]
@@ -178,7 +178,7 @@ def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config
 
 
 def _valley_sections(heights: Float64, cells: ValleyCells, window: HeightWindow, config: CrackDetection) -> Float64:
-    """(n, 5) of :func:`cross_sections`; where one is not that of a crack NaN but for the height of the ground."""
+    """Returns (n, 5) as :func:`cross_sections` does; all but the ground's height is NaN where there is no crack."""
     out = np.empty((cells.row.size, 5))
     reach = section_cells(config, window.cell_m)
     cross_sections(heights, cells.row, cells.column, cells.north, cells.east, cells.flank, reach, out)
@@ -189,7 +189,7 @@ def _valley_sections(heights: Float64, cells: ValleyCells, window: HeightWindow,
 
 
 def _valley_cells(found: Valleys) -> ValleyCells:
-    """All cells of the skeleton, those that are pruned later included: what is pruned depends on cells far away."""
+    """Returns all cells of the skeleton, also those pruned later: what is pruned depends on cells far away."""
     row, column = np.nonzero(found.skeleton)
     angle = found.direction[row, column] * (np.pi / DIRECTIONS)
     flank = np.maximum(found.flank[row, column], 2).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Potholes of a window of surface: where it lies well below all that stands around, in a compact form.
+"""Potholes in a window of the surface: compact areas well below all of their surroundings.
 
 1. *Blocks* (5 cm) of cells have mean heights, depths below what stands around, and ground
    (``distress/hole_blocks.py``). Where what was measured ends before a hole's rim, the hole is not known.
@@ -7,7 +7,7 @@
    between blocks.
 3. *Rim*: what lies between the outline and the rim is less deep than `edge_depth_m`. Its area follows from how fast the
    area of the hole shrinks with depth, A(d) ~ (D − d)^k with the greatest depth D: of a hole with a paraboloid's form k
-   is 1, of a cone 2, of one with upright walls 0, and mean depth over the outline's area says what it is.
+   is 1, of a cone 2, of one with upright walls 0; the mean depth over the outline's area determines it.
 4. Each tile has the pieces of its own cells; :func:`join_potholes` unites those that touch and judges the whole: area,
    depth, elongation (length over the diameter of the largest circle in it).
 """
@@ -36,54 +36,54 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _THIN_M = 0.03
-"""Parts narrower than this are no pothole (cracks that meet it)."""
+"""Parts narrower than this (m) are no pothole, such as cracks that meet it."""
 _MOST_POWER = 2.0
-"""Power of a cone: nothing opens wider towards its rim."""
+"""Greatest exponent of the area's law: that of a cone, since nothing opens wider towards its rim."""
 _ROUNDED = 1.5
-"""Standard deviation of what lies between outline and rim (a share of it): rounded rims reach farther than the power
+"""Standard deviation of the area between outline and rim (a share of it): rounded rims reach farther than the power
 law, by 1.1 to 2 times of it in the simulator's potholes of 30 to 100 mm."""
 
 
 _HIDDEN_PER_M = 0.8
-"""Floor that a wall hides, for a metre of depth: heads look at their lines under angles of 15 to 35 degrees (m/m)."""
-_MOST_HIDDEN_M = 0.15
+"""Floor that a wall hides per metre of depth (m/m): heads look at their lines under angles of 15 to 35 degrees."""
+_MOST_HIDDEN_M = 0.15  # A wall hides no more of the floor than this (m).
 _SIGMA_HIDDEN = 0.3
-"""Standard deviation of the area that walls hide, as a share of it."""
+"""Standard deviation of the area hidden by walls, as a share of it."""
 _SIGMA_OUTLINE_M = 0.003
-"""Standard deviation of the place of an outline: half a cell of 5 mm and the spot of a reading."""
+"""Standard deviation of an outline's position (m): half a cell of 5 mm and the spot of a reading."""
 _SIGMA_DEPTH = 0.03
-"""Standard deviation of a greatest depth, as a share of it: the lowest of many cells lies below their floor."""
+"""Standard deviation of a greatest depth, as a share of it: the lowest of many cells lies below the floor."""
 _SIGMA_GROUND_M = 0.002
-"""Standard deviation of the ground above a hole: texture and unevenness of what stands around."""
+"""Standard deviation of the ground above a hole (m): texture and unevenness of the surroundings."""
 
 
 @dataclass(frozen=True)
 class PotholePiece:
-    """The part of a pothole in a tile, or one that may be none."""
+    """The part of a possible pothole that lies in one tile."""
 
     outline: Any
     """shapely Polygon along the sides of cells on the map (m)."""
     area_m2: float
     volume_m3: float
     depth_max_m: float
-    """Of a cell (m)."""
+    """Greatest depth of a cell (m)."""
     block_depth_max_m: float
-    """Of a block, that is the mean of its cells, below the lowest that stands around (m)."""
+    """Greatest mean depth of a block below the lowest of its surroundings (m)."""
     edge_depth_m: float
     """Depth at which its outline runs (m)."""
     hidden_m2: float = 0.0
-    """Of its area where no reading is: a wall hides it from the sensor."""
+    """Part of its area without a reading, hidden from the sensor by a wall."""
 
 
 @dataclass(frozen=True)
 class Pothole:
-    """A pothole, over all tiles."""
+    """A pothole, joined over all tiles."""
 
     area_m2: float
     """Inside the outline, where the hole is `edge_depth_m` or more deep."""
     sigma_area_m2: float
     hidden_m2: float
-    """Of that area without a reading, which its walls hide."""
+    """Part of that area without a reading, hidden by its walls."""
     rim_area_m2: float
     """Inside the rim, estimated."""
     sigma_rim_area_m2: float
@@ -98,21 +98,21 @@ class Pothole:
     outline: Any
     """shapely Polygon on the map (m)."""
     pieces: Int64
-    """Which pieces it is made of."""
+    """Indices of the pieces that it consists of."""
 
 
 def halo_cells(config: PotholeDetection, cell_m: float) -> int:
-    """Smoothed cells that a window needs beyond those of which potholes are wanted."""
+    """Returns the margin of smoothed cells that a window needs around those in which potholes are wanted."""
     return 3 * _thin_cells(cell_m) + _hidden_cells(cell_m)
 
 
 def around_cells(config: PotholeDetection, cell_m: float) -> int:
-    """Cells before smoothing that a window needs beyond those of which potholes are wanted."""
+    """Returns the margin of cells before smoothing that a window needs around those in which potholes are wanted."""
     return halo_cells(config, cell_m) + (blocks_around(config) + 2) * block_cells(config, cell_m)
 
 
 def pothole_pieces(window: HeightWindow, config: PotholeDetection) -> list[PotholePiece]:
-    """What may be potholes, of the window's inner cells."""
+    """Returns the possible potholes in the window's inner cells."""
     blocks = Blocks.of(_measured_part(window, block_cells(config, window.cell_m)), config)
     if not (blocks.depth_m > 0.0).any():
         return []
@@ -130,7 +130,7 @@ def pothole_pieces(window: HeightWindow, config: PotholeDetection) -> list[Potho
 
 
 def _hidden(depth_m: Float64, edge_depth_m: float, cell_m: float) -> Bool:
-    """Cells without a reading that the walls of a hole hide, which get its depth.
+    """Returns a mask of the cells without a reading that the walls of a hole hide; they get the hole's depth.
 
     A triangulating head sees no floor behind a wall: up to `_HIDDEN_PER_M` metres of it a metre of depth. Ground beside
     a hole is seen, so what has no reading there and touches the hole is a part of it.
@@ -148,7 +148,7 @@ def _hidden(depth_m: Float64, edge_depth_m: float, cell_m: float) -> Bool:
 
 
 def _measured_part(window: HeightWindow, size: int) -> HeightWindow:
-    """Whole blocks from the first to the last with a reading, both ways."""
+    """Returns row and column slices of the whole blocks from the first to the last with a reading."""
     known = ~np.isnan(window.raw_m)
     spans = []
     for axis, first in ((1, window.first_row), (0, window.first_column)):
@@ -159,7 +159,7 @@ def _measured_part(window: HeightWindow, size: int) -> HeightWindow:
 
 
 def _bridged(depth_m: Float64, reach: int) -> Float64:
-    """Depths with holes up to 2 · `reach` cells wide filled from their rims: a cell without a reading is no ground."""
+    """Returns depths with gaps up to 2 · `reach` cells wide filled from their rims: such gaps are not ground."""
     known = (~np.isnan(depth_m)).astype(np.uint8)
     holes = cv2.morphologyEx(known, cv2.MORPH_CLOSE, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > known
     row, column = np.nonzero(holes[1:-1, 1:-1])
@@ -168,7 +168,7 @@ def _bridged(depth_m: Float64, reach: int) -> Float64:
 
 
 def join_potholes(pieces: Sequence[PotholePiece], config: PotholeJoining) -> list[Pothole]:
-    """Potholes of the pieces of all tiles, from south to north."""
+    """Returns the potholes that the pieces of all tiles form, from south to north."""
     if not pieces:
         return []
     outlines = [one.outline for one in pieces]
@@ -187,7 +187,7 @@ def join_potholes(pieces: Sequence[PotholePiece], config: PotholeJoining) -> lis
 
 
 def _widest_m(outline: Any) -> float:
-    """Diameter of the largest circle in an outline, islands counted: a strip along a bent kerb is narrow."""
+    """Returns the diameter of the largest circle in an outline, holes filled (m): a strip along a kerb is narrow."""
     return 2.0 * float(shapely.maximum_inscribed_circle(shapely.Polygon(outline.exterior)).length)
 
 
@@ -210,7 +210,7 @@ def _pothole(outline: Any, pieces: Sequence[PotholePiece], own: Int64) -> Pothol
 
 
 def rim_area_m2(area_m2: float, depth_mean_m: float, depth_max_m: float, edge_depth_m: float) -> float:
-    """Area (m²) inside the rim of a hole from that inside its outline, which runs at `edge_depth_m`."""
+    """Returns the area inside the rim of a hole (m²) from that inside its outline, which runs at `edge_depth_m`."""
     below, mean = depth_max_m - edge_depth_m, depth_mean_m - edge_depth_m
     if below <= 0.0 or mean <= 0.0:
         return area_m2

@@ -1,4 +1,4 @@
-"""The cells of a skeleton as a graph: who is whose neighbour, short side branches, paths from node to node."""
+"""The cells of a skeleton as a graph: neighbours, short side branches, paths from node to node."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
-PRUNINGS = 2
+PRUNINGS = 2  # Passes of pruning.
 
 
 @dataclass(frozen=True)
 class SkeletonGraph:
     """Cells (n,) in order of row and column, and edges (m, 2) between neighbours, the first cell before the second.
 
-    Cells that share a side are neighbours; those that share a corner are, unless another cell joins them by sides. So
+    Cells that share a side are neighbours; cells that share a corner are, unless sides of another cell join them. So
     three cells in a corner are no loop.
     """
 
@@ -30,7 +30,7 @@ class SkeletonGraph:
 
     @classmethod
     def of(cls, skeleton: Bool) -> SkeletonGraph:
-        """Graph of a grid of cells (rows, columns)."""
+        """Returns the graph of a grid of cells (rows, columns)."""
         row, column = np.nonzero(skeleton)
         number = np.full((skeleton.shape[0] + 1, skeleton.shape[1] + 2), -1)
         number[row, column + 1] = np.arange(row.size)
@@ -45,11 +45,11 @@ class SkeletonGraph:
 
     @property
     def degree(self) -> Int64:
-        """Neighbours of each cell (n,)."""
+        """Returns the number of neighbours (n,) of each cell."""
         return np.bincount(self.edges.ravel(), minlength=self.row.size)
 
     def neighbours(self) -> list[list[int]]:
-        """Of each cell its neighbours, ascending."""
+        """Returns the neighbours of each cell, ascending."""
         both = np.concatenate([self.edges, self.edges[:, ::-1]])
         both = both[np.lexsort((both[:, 1], both[:, 0]))]
         cuts = np.searchsorted(both[:, 0], np.arange(self.row.size + 1)).tolist()
@@ -57,7 +57,7 @@ class SkeletonGraph:
         return [beside[a:b] for a, b in itertools.pairwise(cuts)]
 
     def spurs(self, cells: int) -> list[int]:
-        """Cells of branches that end within `cells` of a junction; the longest goes on where no other branch does."""
+        """Returns the cells of branches that end within `cells` of a junction; if all do, the longest branch stays."""
         beside = self.neighbours()
         at: dict[int, list[list[int]]] = {}
         for end in np.flatnonzero(self.degree == 1).tolist():
@@ -78,9 +78,9 @@ class SkeletonGraph:
         return found
 
     def loose_ends(self, doubtful: Bool, cells: int) -> list[int]:
-        """Cells at ends of the skeleton that are `doubtful` (n,), as far as the first that is none or a junction.
+        """Returns `doubtful` cells (n,) at ends of the skeleton, up to the first that is not doubtful or is a junction.
 
-        At most so many cells of each end.
+        At most `cells` cells are taken from each end.
         """
         beside = self.neighbours()
         found: list[int] = []
@@ -97,16 +97,16 @@ class SkeletonGraph:
         return found
 
     def smoothed(self, place: Float64) -> Float64:
-        """Places (n, 2) moved halfway to the middle of both neighbours, where a cell has two."""
+        """Returns positions (n, 2) moved halfway to the middle of both neighbours, where a cell has two."""
         total = np.zeros_like(place)
         np.add.at(total, self.edges[:, 0], place[self.edges[:, 1]])
         np.add.at(total, self.edges[:, 1], place[self.edges[:, 0]])
         return np.where((self.degree == 2)[:, None], 0.5 * place + 0.25 * total, place)
 
     def paths(self, own: Bool) -> Iterator[list[int]]:
-        """Paths (cells) over those edges (m,) that are `own`, from node to node.
+        """Yields the paths (cells) from node to node over the edges (m,) that are `own`.
 
-        A node is a cell with other than two neighbours, or one where the own edges end.
+        A node is a cell with other than two neighbours, or one where these edges end.
         """
         mine = SkeletonGraph(self.row, self.column, self.edges[own])
         beside = mine.neighbours()
@@ -124,7 +124,7 @@ class SkeletonGraph:
 
 
 def trimmed(skeleton: Bool, doubtful: Bool, end_cells: int) -> Bool:
-    """A skeleton without those of its ends that are doubtful, so many cells of each at most; grids of cells."""
+    """Returns a skeleton without its doubtful ends, at most so many cells of each; all are grids of cells."""
     cells = skeleton.copy()
     if doubtful.any():
         graph = SkeletonGraph.of(cells)
@@ -134,7 +134,7 @@ def trimmed(skeleton: Bool, doubtful: Bool, end_cells: int) -> Bool:
 
 
 def pruned(skeleton: Bool, spur_cells: int) -> SkeletonGraph:
-    """Graph of a skeleton without its spurs."""
+    """Returns the graph of a skeleton without its spurs."""
     cells = skeleton.copy()
     graph = SkeletonGraph.of(cells)
     for _ in range(PRUNINGS):

@@ -1,4 +1,4 @@
-"""How far lines of cells lie below both flanks, and by how much more than the texture around.
+"""Depth of lines of cells below both flanks, and its ratio to the texture around.
 
 1. *Lines*: the mean height at 21 places a cell apart, in 24 directions, 7.5° apart. Noise and stones average out; a
    crack does not.
@@ -31,26 +31,26 @@ Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-DIRECTIONS = 24
-LINE_HALF = 10
-LINE_CELLS = 2 * LINE_HALF + 1
+DIRECTIONS = 24  # Directions of lines, 7.5° apart.
+LINE_HALF = 10  # Cells of a line to either side of its middle.
+LINE_CELLS = 2 * LINE_HALF + 1  # Cells of a line.
 _TEXTURE_M = 0.15
-"""Half the edge of the square in which texture is measured."""
-_TEXTURE_FLANK = 4
+"""Half the edge (m) of the square in which texture is measured."""
+_TEXTURE_FLANK = 4  # Distance of the flanks from which texture is measured (cells).
 FAR = 3
-"""Flanks are compared with lines this many times as far."""
+"""Flanks are compared with lines this many times as far from the middle."""
 _STEEPEST = 0.25
-"""Ground rises no more than this (m/m): beyond, it is another thing, such as a kerb."""
+"""Steeper rises (m/m) are not ground but another thing, such as a kerb."""
 _UNKNOWN = -90_000_000
-"""Height of what is not known, below all others: it lowers no flank (no rise) and makes none."""
+"""Value for unknown heights, below all others: it neither lowers a flank (no rise) nor makes one."""
 _NEARLY = 5 / 6
 """Share of `strong_sigmas` that is enough where lowered heights reach all of it."""
-MEASURED_HALF = 3
+MEASURED_HALF = 3  # Half the edge (cells) of the square of which half must be measured.
 _MEAN_TO_SIGMA = 1.2533
-"""σ of normal values over the mean of their absolutes."""
+"""Ratio of σ to the mean absolute value of normal values."""
 _CUT = 2.5
-"""Differences beyond this many means are no texture; of normal values that leaves a mean of 0.88."""
-_CUT_MEAN = 0.88
+"""Differences beyond this many means are not texture; for normal values that leaves a mean of 0.88."""
+_CUT_MEAN = 0.88  # The mean of normal values that is left after that cut, as a share.
 
 
 @dataclass(frozen=True)
@@ -62,15 +62,15 @@ class Lines:
     which: Int32
     """24 · number of the flank + direction."""
     weak: Bool
-    """Cells of valleys in which cracks go on …"""
+    """Cells that continue a crack: deeper than the lowest of three hysteresis thresholds …"""
     nearly: Bool
-    """… begin if lowest readings say so too …"""
+    """… cells that start a crack if the lowest readings agree …"""
     strong: Bool
-    """… or begin."""
+    """… and cells that start a crack."""
 
 
 def flank_cells(config: CrackDetection, cell_m: float) -> list[int]:
-    """Distances of flanks (cells): doubled until the widest crack lies between them."""
+    """Returns the distances of flanks (cells): doubled until the widest crack lies between them."""
     found = [2]
     while 2 * found[-1] * cell_m < 1.5 * config.max_width_m and found[-1] < 64:
         found.append(2 * found[-1])
@@ -78,15 +78,15 @@ def flank_cells(config: CrackDetection, cell_m: float) -> list[int]:
 
 
 def line_cells(config: CrackDetection, cell_m: float) -> int:
-    """Cells around one on which its lines depend, lowered heights included, and whether they are a crack's."""
+    """Returns how many cells around a cell its lines depend on, lowered heights included."""
     lines = LINE_HALF + FAR * flank_cells(config, cell_m)[-1] + _fill_cells(config, cell_m) + CROWD_CELLS
     return lines + 2 * _texture_half(cell_m) + LINE_HALF
 
 
 def lines_through(heights: Float64, cell_m: float, config: CrackDetection) -> Lines:
-    """Lines through heights (rows, columns) in m, NaN where there is none; holes are filled in them.
+    """Returns the lines through heights (rows, columns) in m, NaN where there is none; holes are filled.
 
-    Along the border, as wide as a line and its flanks, there are none.
+    A border as wide as a line and its flanks has no lines.
     """
     measured = ~np.isnan(heights)
     whole = _whole_numbers(_filled(heights, _fill_cells(config, cell_m)))
@@ -105,7 +105,7 @@ def lines_through(heights: Float64, cell_m: float, config: CrackDetection) -> Li
 
 @functools.cache
 def _lines() -> tuple[Int64, Int64]:
-    """(24, 21, 2) rows and columns of each direction's cells; (24, 2) the unit vectors to the right of them."""
+    """Returns the cells (24, 21, 2) of each direction in rows and columns, and unit vectors (24, 2) to their right."""
     angle = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
     step = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
     cells = np.rint(step[:, None, :] * np.arange(-LINE_HALF, LINE_HALF + 1)[None, :, None])
@@ -122,7 +122,7 @@ def _texture_half(cell_m: float) -> int:
 
 
 def _filled(heights: Float64, reach: int) -> Float64:
-    """Heights with holes filled up to `reach` cells from what was measured, so that lines may cross them."""
+    """Returns heights with holes filled up to `reach` cells from measured ones, so that lines may cross them."""
     known = ~np.isnan(heights)
     near = _count(known, reach) > 0
     inside = np.zeros_like(known)
@@ -133,7 +133,7 @@ def _filled(heights: Float64, reach: int) -> Float64:
 
 
 def _whole_numbers(heights: Float64) -> Int32:
-    """Heights in HEIGHT_STEP_M, less a whole number of them."""
+    """Returns heights in units of HEIGHT_STEP_M, less a whole number of them."""
     known = ~np.isnan(heights)
     if not known.any():
         return np.full(heights.shape, _UNKNOWN, np.int32)
@@ -142,7 +142,7 @@ def _whole_numbers(heights: Float64) -> Int32:
 
 
 def _deepest(whole: Int32, flanks: list[int], cell_m: float) -> tuple[Int32, Int32, Int32]:
-    """Depth (of sums), 24 · number of the flank + direction, and bends along both axes."""
+    """Returns the greatest depth (of sums), 24 · number of the flank + direction, and the bends along both axes."""
     margin = LINE_HALF + FAR * flanks[-1]
     rows, columns = whole.shape
     shape = (max(rows - 2 * margin, 0), max(columns - 2 * margin, 0))
@@ -163,7 +163,7 @@ def _deepest(whole: Int32, flanks: list[int], cell_m: float) -> tuple[Int32, Int
 
 
 def _texture_sigma(bend: Int32, measured: Bool, half: int) -> Float64:
-    """σ of a line's depth below the mean of its flanks, from the cells around; infinite where nothing was measured."""
+    """Returns σ of a line's depth below its flanks, from the cells around; infinite where nothing was measured."""
     level = _mean(bend, measured & (bend > 0), half)
     level = _mean(bend, measured & (bend > 0) & (bend < _CUT * level), half)
     # The bends of two directions were added, each twice the depth: |a| + |b| has twice the mean of |a|.
@@ -176,12 +176,12 @@ def _mean(values: Int32, where: Bool, half: int) -> Float64:
 
 
 def _count(cells: Bool, half: int) -> Int32:
-    """Cells in the square around each cell."""
+    """Returns the number of set cells in the square around each cell."""
     side = 2 * half + 1
     return np.asarray(cv2.boxFilter(cells.view(np.uint8), cv2.CV_32S, (side, side), None, (-1, -1), False, 0))
 
 
 def _sum(values: Int32, half: int) -> Float64:
-    """Sum over the square around each cell: of whole numbers, which float64 adds exactly."""
+    """Returns the sum over the square around each cell: of whole numbers, which float64 adds exactly."""
     side = 2 * half + 1
     return np.asarray(cv2.boxFilter(values, cv2.CV_64F, (side, side), None, (-1, -1), False, 0))

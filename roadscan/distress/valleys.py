@@ -1,4 +1,4 @@
-"""Narrow valleys of a gridded surface: where lines of cells lie below both flanks.
+"""Narrow valleys of a gridded surface: lines of cells that lie below both flanks.
 
 1. *Lines* (``valley_lines.py``) of 21 cells in 24 directions say how far a cell lies below both its flanks.
 2. *Cells*: valleys beyond `strong_sigmas`, grown on those beyond `weak_sigmas`, now and then over a cell that is none:
@@ -46,37 +46,37 @@ UInt8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 
 _GROWTHS, _LEAP = 20, 7
-"""Steps of growth of a cell each; every seventh leaps over a cell."""
+"""Steps by which valleys grow, a cell each; every seventh step leaps over a cell."""
 
 
 @dataclass(frozen=True)
 class Valleys:
-    """What the lines say about each cell of a window; all arrays (rows, columns)."""
+    """Figures of the deepest line through each cell of a window; all arrays (rows, columns)."""
 
     depth_m: Float64
-    """Mean depth of the deepest line through the cell below its lower flank (m)."""
+    """Mean depth of the line below its lower flank (m)."""
     direction: UInt8
-    """Of that line: n · 7.5° from the columns' axis to that of the rows."""
+    """Direction of that line: n · 7.5° from the columns' axis to that of the rows."""
     flank: UInt8
-    """Of that line: how far its flanks are away (cells)."""
+    """Distance of that line's flanks (cells)."""
     skeleton: Bool
     bridge: Bool
-    """Cells of the skeleton that lowest readings alone show."""
+    """Cells of the skeleton that only the lowest readings show."""
 
 
 def halo_cells(config: CrackDetection, cell_m: float) -> int:
-    """Cells beyond those that are wanted, on which the skeleton depends."""
-    thinned = 3 * _thinnings(config, cell_m) + 1  # two cells a pass, and as far as a pit
+    """Returns how many cells beyond the wanted ones the skeleton depends on."""
+    thinned = 3 * _thinnings(config, cell_m) + 1  # two cells a pass, and the reach of a pit
     return line_cells(config, cell_m) + bridge_cells() + thinned
 
 
 def border_cells(config: CrackDetection, cell_m: float) -> int:
-    """Cells beyond the last that was measured, on which the skeleton may depend where all beyond is empty."""
+    """Returns how many cells beyond the last measured one the skeleton may depend on where all beyond is empty."""
     return LINE_HALF + FAR * flank_cells(config, cell_m)[-1] + MEASURED_HALF + 1
 
 
 def find_valleys(window: HeightWindow, config: CrackDetection) -> Valleys:
-    """Valleys and the skeleton of a window. Along the border, as wide as a line and its flanks, nothing is found."""
+    """Returns valleys and the skeleton of a window. A border as wide as a line and its flanks has none."""
     lines = lines_through(window.cleaned_m(), window.cell_m, config)
     shown = cells = _grown(lines.strong, lines.weak)
     lowered = _lowered_lines(window, lines.nearly, config)
@@ -93,12 +93,12 @@ def find_valleys(window: HeightWindow, config: CrackDetection) -> Valleys:
 
 
 def bridge_cells() -> int:
-    """Cells from one that heights show as far as lowest readings lead."""
+    """Returns how many cells a crack may continue in lowest readings from a cell that heights show."""
     return _GROWTHS + _GROWTHS // _LEAP + 2
 
 
 def _lowered_lines(window: HeightWindow, begin: Bool, config: CrackDetection) -> Lines | None:
-    """Lines through lowered heights wherever cracks may lead that begin at these cells; None where nowhere."""
+    """Returns the lines through lowered heights where cracks that start at these cells may continue, or None."""
     if window.lowest is None or config.lowered_m <= 0.0:
         return None
     if config.lowest_alone:
@@ -118,9 +118,9 @@ def _lowered_lines(window: HeightWindow, begin: Bool, config: CrackDetection) ->
 
 
 def _boxes(cells: Bool, reach: int, beyond: int) -> list[tuple[slice, slice]]:
-    """Rows and columns of rectangles that hold all within `reach` of the cells.
+    """Returns slices of rectangles that cover all within `reach` of the cells.
 
-    Many where that is less to look at, each with `beyond` around it, else one.
+    Several, each with a margin of `beyond`, where that is less to compute, else one.
     """
     near = cv2.dilate(cells.view(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
     stats = cv2.connectedComponentsWithStats(near, connectivity=8)[2][1:].astype(np.int64)
@@ -132,12 +132,12 @@ def _boxes(cells: Bool, reach: int, beyond: int) -> list[tuple[slice, slice]]:
 
 
 def _thinnings(config: CrackDetection, cell_m: float) -> int:
-    """Passes that thin the widest valley."""
+    """Returns the number of passes that thin the widest valley."""
     return math.ceil(config.max_width_m / cell_m / 2) + 4
 
 
 def _grown(strong: Bool, weak: Bool) -> UInt8:
-    """Weak cells that strong ones reach, 1 or 0."""
+    """Returns a mask of the weak cells that are connected to strong ones, 1 or 0."""
     found, allowed = strong.astype(np.uint8), weak.astype(np.uint8)
     if not found.any():
         return found
@@ -149,7 +149,7 @@ def _grown(strong: Bool, weak: Bool) -> UInt8:
 
 
 def _thinned(cells: UInt8, passes: int) -> Bool:
-    """Cells of the skeleton."""
+    """Returns the cells of the skeleton."""
     cells = cells.copy()
     for side in (cells[0], cells[-1], cells[:, 0], cells[:, -1]):
         side[:] = 0
@@ -162,7 +162,7 @@ def _thinned(cells: UInt8, passes: int) -> Bool:
 
 @functools.cache
 def _deletable() -> UInt8:
-    """(2, 256): 1 where a cell with these neighbours goes in either half of a pass (Guo & Hall 1989, A1)."""
+    """Returns (2, 256): 1 where a cell with these neighbours goes in either half of a pass (Guo & Hall 1989, A1)."""
     found = np.zeros((2, 256), np.uint8)
     for bits in range(256):
         n, ne, e, se, s, sw, w, nw = (bool(bits >> k & 1) for k in range(8))

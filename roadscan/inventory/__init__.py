@@ -1,4 +1,4 @@
-"""The inventory: what was found of the assets and what people changed, a table a kind; nobody's work is lost.
+"""The inventory: assets as they were found and as people changed them, one table a kind; no one's work is lost.
 
-Its truth is appended and never changed (`store/asset_truth.py`); everything else is a view of it.
+Its truth is an append-only log (`store/asset_truth.py`); everything else is derived from it.
 """

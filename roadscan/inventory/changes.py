@@ -1,4 +1,4 @@
-"""What changed on the road between two survey epochs: appeared, gone, moved, changed, each with its significance.
+"""Changes on the road between two survey epochs: appeared, gone, moved, changed, each with its significance.
 
 Of two surveys of ten thousand assets some differ by 3 σ by chance alone. So moves, and changed values, count where the
 expected share of false ones among them stays below 1 % (Benjamini and Hochberg 1995, J. R. Stat. Soc. B 57, 289–300).
@@ -28,16 +28,16 @@ from roadscan.store.asset_schema import asset_schema
 from roadscan.store.asset_truth import AssetTruth, Commit
 from roadscan.store.inventory_schema import GEOMETRY, asset_table
 
-_MISSED_BY_A_PASS: Final = 0.1
-_FALSE_SHARE: Final = 0.01
-_MOST_SIGMAS: Final = 38.0
+_MISSED_BY_A_PASS: Final = 0.1  # Greatest share of the assets in sight that a pass misses.
+_FALSE_SHARE: Final = 0.01  # Expected share of false changes among those reported.
+_MOST_SIGMAS: Final = 38.0  # Largest significance (σ): smaller probabilities underflow.
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
 class Change(NamedTuple):
-    """One change of the road."""
+    """One change on the road."""
 
     change: str
     """`appeared`, `gone`, `moved` or `changed`."""
@@ -47,12 +47,12 @@ class Change(NamedTuple):
     before: str | None
     after: str | None
     significance: float | None
-    """σ; of gone the two-sided normal equivalent of its probability. Null where it has none."""
+    """In σ; of `gone` the two-sided normal equivalent of its probability. Null where it has none."""
     passes_expected: int | None
     distance_m: float | None
-    """How far a moved asset went, horizontally."""
+    """Horizontal distance by which an asset moved."""
     geometry: bytes
-    """Where it is; of what is gone where it was."""
+    """Where it is; where it was if it is gone."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ class EpochChanges:
     after: str
     changes: tuple[Change, ...]
     unseen: int
-    """Assets of the first epoch that the second did not see and may not have had in sight: they say nothing."""
+    """Assets of the first epoch that the second did not see and may not have had in sight: they count neither way."""
 
     def layer(self) -> pa.Table:
-        """The changes at points, as a layer; geometries are left out of the values."""
+        """Returns the changes as a layer at points; geometries are left out of the values."""
         fields = [pa.field(name, _TYPES.get(name, pa.string())) for name in Change._fields]
         rows = [c._asdict() | {GEOMETRY: _point(c.geometry)} for c in self.changes]
         return pa.Table.from_pylist(rows, pa.schema(fields))
@@ -78,7 +78,7 @@ _TYPES: Final = {
 
 
 def epoch_changes(truth: AssetTruth, before: str | None, after: str | None, unit_m: float) -> EpochChanges | None:
-    """Changes between two epochs by name, the last two where they are left out; None where there are less than two.
+    """Returns the changes between two epochs by name, by default the last two; None where there are fewer than two.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def epoch_changes(truth: AssetTruth, before: str | None, after: str | None, unit
 
 
 def _told_of(truth: AssetTruth, commit: Commit) -> pa.Array:
-    """Ids of the assets that a commit saw, or that people drew in it."""
+    """Returns ids of the assets that a commit saw, or that people drew in it."""
     name, told = ("seen", 1) if commit.kind == "found" else ("action", "create")
     rows = truth.rows(commit, ["asset_id", name])
     return rows.filter(pc.equal(rows[name], told))["asset_id"].combine_chunks()
@@ -144,7 +144,7 @@ class _Pair(NamedTuple):
     kind: str
     then: pa.Table
     now: pa.Table
-    """Rows of those that both saw, in the same order as `then`."""
+    """Rows of the assets in both epochs, in the same order as `then`."""
     then_alone: pa.Table
     appeared: pa.Table
     unseen: pa.Table
@@ -179,26 +179,26 @@ def _plain(change: str, row: dict[str, Any], significance: float | None, expecte
 
 
 def _sigmas(chance: float) -> float:
-    """σ of a normal variable that is exceeded to both sides with a probability; at most 38, where numbers end."""
+    """Returns the σ that a normal variable exceeds, to both sides, with a probability; at most 38 (underflow)."""
     from scipy.stats import norm
 
     return min(float(norm.isf(0.5 * max(chance, 1e-300))), _MOST_SIGMAS)
 
 
 class _Compared:
-    """Comparisons of one sort: the probability of so great a difference by chance, and what makes a change of it."""
+    """Comparisons of one sort: the probability of each difference by chance, and a function that makes its change."""
 
     def __init__(self) -> None:
         self.chances: list[Floats] = []
         self.makers: list[Callable[[int], Change]] = []
 
     def add(self, chances: Floats, maker: Callable[[int], Change]) -> None:
-        """Comparisons in a row; `maker` gets the place of one."""
+        """Add comparisons; `maker` gets the position of one."""
         self.chances.append(chances)
         self.makers.append(maker)
 
     def significant(self) -> Iterator[Change]:
-        """Changes up to the largest probability p(k) ≤ q k / m (Benjamini and Hochberg 1995, eq. 1), in their order."""
+        """Yields changes up to the largest probability p(k) ≤ q k / m (Benjamini and Hochberg 1995, eq. 1)."""
         ordered = np.sort(np.concatenate([np.empty(0), *self.chances]))
         holds = np.flatnonzero(ordered <= _FALSE_SHARE * np.arange(1, ordered.size + 1) / max(ordered.size, 1))
         limit = ordered[holds[-1]] if holds.size else -1.0
@@ -250,7 +250,7 @@ def _value_changes(pair: _Pair, name: str, places: Ints, *, is_text: bool) -> Ca
 
 
 def _away(old: npt.NDArray[Any], new: npt.NDArray[Any]) -> Floats:
-    """Horizontal distances of places, of lines and areas the median along them, in the map's own unit."""
+    """Returns horizontal distances in the map's unit; for lines and areas the median along them."""
     if not len(old) or shapely.get_type_id(old[0]) == 0:
         return np.asarray(shapely.distance(old, new), dtype=float)
     lines = outlines(old), outlines(new)

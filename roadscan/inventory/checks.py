@@ -1,4 +1,4 @@
-"""What is wrong with rows that people changed: each fault names its table, row and reason."""
+"""Checks of rows that people changed: each fault names its table, row and reason."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from roadscan.store.asset_schema import AssetColumn, asset_schema
 from roadscan.store.inventory_schema import GEOMETRY, asset_columns, editable_columns
 
 _FORMULA: Final = re.compile(r"^[=@\t\r\n＝＋－＠]|^[+-](?![\s\d.,])|^[+-].*(\w\(|\||![$A-Za-z])", re.DOTALL)
-"""Texts that a spreadsheet would run when it opens them; `+1` and `- leans` are none, calls and links to others are."""
+"""Texts that a spreadsheet would run on opening: calls and links to others, but not `+1` or `- leans`."""
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
-"""Characters that no text has, and some homes cut a text at."""
-_SAME_PLACE_M: Final = 0.05
-_AROUND_M: Final = 100.0
-_LEAST_HEIGHT_M: Final = 2.0
+"""Control characters, which no text contains and at which some homes truncate a text."""
+_SAME_PLACE_M: Final = 0.05  # New points nearer than this (m) to an asset of their kind are duplicates.
+_AROUND_M: Final = 100.0  # Radius (m) within which other assets show the usual height.
+_LEAST_HEIGHT_M: Final = 2.0  # Height 0 is a fault where assets around stand higher or lower than this (m).
 
 
 def faults_of(changes: Changes, state: State, unit_m: float = 1.0, confirmed: Collection[str] = ()) -> list[EditFault]:
-    """Faults of all changes, those that the comparison found first; then what is asked about.
+    """Returns the faults of all changes, those found by the comparison first; then the questions.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def _parent_fault(change: Change, kinds: Mapping[str, str], state: State) -> str
 
 
 def _doubles(changes: Changes, state: State, unit_m: float) -> Iterator[EditFault]:
-    """New points on an asset of their kind, and new shapes that equal one."""
+    """Yields faults for new points on an asset of their kind, and for new shapes that equal an existing one."""
     for change in changes.drawn:
         assets = state.assets.get(change.kind)
         if assets is None or not assets.ids.size or _geometry_fault(change.kind, change.new) is not None:
@@ -138,7 +138,7 @@ def _doubles(changes: Changes, state: State, unit_m: float) -> Iterator[EditFaul
 
 
 def _at_zero(changes: Changes, state: State, unit_m: float) -> Iterator[EditFault]:
-    """New and moved shapes at height 0, which programs give where none is set, among assets that stand elsewhere."""
+    """Yields faults for shapes at height 0, which programs write where none is set, among assets at other heights."""
     for change in (*changes.drawn, *changes.changed):
         if change.attribute != GEOMETRY or _geometry_fault(change.kind, change.new) is not None:
             continue
@@ -152,7 +152,7 @@ def _at_zero(changes: Changes, state: State, unit_m: float) -> Iterator[EditFaul
 
 
 def _heights_around(state: State, place_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Heights (n,) of the assets within 100 m of a place (m)."""
+    """Returns heights (n,) of the assets within 100 m of a place (m)."""
     found = [np.empty(0)]
     for assets in state.assets.values():
         x, y, z = (
@@ -164,7 +164,7 @@ def _heights_around(state: State, place_m: npt.NDArray[np.float64]) -> npt.NDArr
 
 
 def _circles(changes: Changes, state: State) -> Iterator[EditFault]:
-    """Assets that are their own parents in the end."""
+    """Yields faults for assets that are, through a chain of parents, their own parents."""
     given = {c.asset_id: c for c in changes.changed if c.attribute == "parent" and c.new is not None}
     if not given:
         return

@@ -1,7 +1,7 @@
-"""What people changed in a home: its rows against those that it held when it was published or last read.
+"""Comparison of a home's rows with those it had when it was published or last read: what people changed.
 
-Rows are known by their id. One without an id that has the number and the geometry, or the number and all values, of a
-row that is otherwise gone is that row; any other one was just drawn. Numbers alone say nothing: they are given again.
+Rows are identified by their id. A row without id that has the number and the geometry, or the number and all values,
+of a row otherwise missing is that row; any other was just drawn. A number alone identifies no row: it is reused.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from roadscan.store.inventory_schema import GEOMETRY, asset_table, evidence_table
 
 _STEP: Final = 1e-4
-"""Units of the map; coordinates of products have steps of 0.1 mm, and a way to another CRS and back costs less."""
+"""Tolerance of coordinates (map units): products round to 0.1 mm, and a detour through another CRS costs less."""
 
 
 class Change(NamedTuple):
-    """A value that differs from the one that was published."""
+    """A value that differs from the published one."""
 
     kind: str
     asset_id: str
@@ -40,22 +40,22 @@ class Change(NamedTuple):
 
 @dataclass(eq=False)
 class Changes:
-    """All that differs, and what cannot be told apart."""
+    """All differences, and the rows that could not be identified."""
 
     changed: list[Change] = field(default_factory=list)
     drawn: list[Change] = field(default_factory=list)
-    """New assets: their geometries; their other values stand among `changed`."""
+    """New assets with their geometries; their other values are among `changed`."""
     deleted: list[tuple[str, str]] = field(default_factory=list)
-    """Kind and id."""
+    """Kind and id of each deleted asset."""
     faults: list[EditFault] = field(default_factory=list)
     rows: dict[str, pa.Table] = field(default_factory=dict)
     """Rows of the home by kind, each with its id."""
     before: dict[str, pa.Table] = field(default_factory=dict)
-    """Rows that it was compared with."""
+    """Rows that they were compared with."""
 
 
 def published_table(content: Content) -> pa.Table:
-    """Rows of all kinds in one table, to be kept."""
+    """Returns the rows of all kinds in one table, for storage."""
     parts = []
     schema = pa.schema([pa.field(FID, pa.int64()), *evidence_table()])
     for kind, rows in sorted(content.rows.items()):
@@ -67,7 +67,7 @@ def published_table(content: Content) -> pa.Table:
 
 
 def published_rows(table: pa.Table) -> dict[str, pa.Table]:
-    """The same by kind again; columns that this version does not know are left out, others are null."""
+    """Returns the same rows by kind; columns unknown to this version are dropped, missing ones are null."""
     rows = {}
     for kind in pc.unique(table["kind"]).to_pylist():
         own = table.filter(pc.equal(table["kind"], kind))
@@ -82,7 +82,7 @@ def _nullable(schema: pa.Schema) -> pa.Schema:
 
 
 def compared(content: Content, base: Mapping[str, pa.Table], token: str) -> Changes:
-    """What differs between a home and what it held under `token`."""
+    """Returns the differences between a home and the rows stored under `token`."""
     changes = Changes()
     homes = {str(one): kind for kind, rows in base.items() for one in rows["asset_id"].to_pylist()}
     for kind in asset_kind_names():
@@ -141,7 +141,7 @@ def _compare_kind(side: _Side, changes: Changes) -> None:
 
 
 def _recovered(side: _Side, ids: list[str | None], place: Mapping[str, int]) -> dict[int, str]:
-    """Ids of rows that lost theirs, or never got one since they were first read."""
+    """Returns ids of rows that lost theirs, or never got one since they were first read."""
     if None not in ids:
         return {}
     present = {one for one in ids if one is not None}
@@ -190,14 +190,14 @@ def _differences(side: _Side, rows: list[int], before: list[int], ids: list[str 
 
 
 def _differing(now: pa.ChunkedArray, then: pa.ChunkedArray) -> npt.NDArray[np.int64]:
-    """Rows of which one is null and the other is not, or whose values are not equal."""
+    """Returns the rows of which one value is null and the other is not, or whose values differ."""
     same = pc.fill_null(pc.equal(now, then), False)
     neither = pc.and_(pc.is_null(now), pc.is_null(then))
     return np.flatnonzero(~np.asarray(pc.or_(same, neither)))
 
 
 def same_place(one: bytes | None, other: bytes | None) -> bool:
-    """True for geometries whose corners are the same to the step of coordinates: what came back from another CRS."""
+    """Returns True for geometries whose vertices agree within the tolerance, as after a detour through another CRS."""
     if one is None or other is None or one == other:
         return one == other
     first, second = shapely.from_wkb(one), shapely.from_wkb(other)
@@ -212,7 +212,7 @@ def _same_heights(first: Any, second: Any) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """A value as it counts: an empty text and a number that is none are nothing."""
+    """Returns a value in normal form: an empty text and NaN are None."""
     if value == "" or (isinstance(value, float) and math.isnan(value)):
         return None
     return value

@@ -1,4 +1,4 @@
-"""Conflicts: values on which a person and the evidence, or two persons, disagree. Nobody wins without being told."""
+"""Conflicts: values on which a person and the evidence, or two persons, disagree. A person decides each of them."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from roadscan.store.inventory_schema import GEOMETRY
 CONFLICT_COLUMNS: Final = (
     "asset_id", "layer", "attribute", "reason", "in_force", "other", "base", "sigmas", "who", "edit", "pictures",
 )  # fmt: skip
-"""Columns of the layer of conflicts that tell people what to decide."""
+"""Columns of the layer in which people see conflicts."""
 DECISION: Final = "decision"
-"""Its column that they fill in."""
+"""The column in which people write their decision."""
 SIGNIFICANT: Final = 3.0
-"""σ from which on values differ."""
+"""Values that differ by at least this many σ disagree."""
 
 _TYPES: Final = {"sigmas": pa.float64(), "geometry": pa.binary()}
 
@@ -40,20 +40,20 @@ class Conflict(NamedTuple):
     rejected the asset, or its parent, while another edited it; `undone`: the run that found the edited asset, or the
     pull that drew it, was undone."""
     edit: str
-    """Name of the edit that waits, or of the one in force."""
+    """Name of the waiting edit, or of the one in force."""
     in_force: str | None
     """Value in force, as JSON."""
     other: str | None
-    """Value of the evidence, or of the edit that waits."""
+    """Value of the evidence, or of the waiting edit."""
     base: str | None
-    """Value that both began from."""
+    """Value from which both started."""
     sigmas: float | None
-    """By how many σ the two differ; null where that has no meaning."""
+    """Difference of the two in σ; null where that has no meaning."""
     who: str
 
 
 def conflicts_of(state: State) -> list[Conflict]:
-    """All conflicts of a state, by asset and attribute."""
+    """Returns all conflicts of a state, by asset and attribute."""
     found = [one for edit in state.edits.in_force.values() if (one := _with_evidence(state, edit)) is not None]
     for key, waiting in state.edits.waiting.items():
         known = state.edits.in_force.get(key)
@@ -68,7 +68,7 @@ def conflicts_of(state: State) -> list[Conflict]:
 
 
 def _with_evidence(state: State, edit: Edit) -> Conflict | None:
-    """Where evidence now differs from the edit, and from the evidence that the person had before them, by over 3 σ."""
+    """Returns conflicts where evidence differs by over 3 σ from an edit, and from the evidence its author had seen."""
     row = state.row(edit.asset_id, evidence=True)
     if row is None or row["source"] is None or edit.asset_id in state.orphans:
         return None
@@ -98,7 +98,7 @@ def _with_edit(state: State, waiting: Edit, known: Edit | None) -> Conflict:
 
 
 def _rejected_while_edited(state: State) -> list[Conflict]:
-    """Edits of rejected assets, where neither person had seen what the other did."""
+    """Returns conflicts of edits on rejected assets where neither person had seen what the other did."""
     rejected = {e.asset_id: e for e in state.edits.in_force.values() if e.attribute == "status" and e.new == REJECTED}
     if not rejected:
         return []
@@ -115,7 +115,7 @@ def _rejected_while_edited(state: State) -> list[Conflict]:
 
 
 def _on_rejected_parents(state: State) -> list[Conflict]:
-    """Parents that people gave and that people rejected, until that is decided."""
+    """Returns conflicts of parents that people assigned and that people rejected, until they are decided."""
     rejected = set(state.edits.rejected)
     return [
         Conflict(e.asset_id, e.kind, e.attribute, "rejected", e.edit, e.new, None, e.evidence, None, e.who)
@@ -126,7 +126,7 @@ def _on_rejected_parents(state: State) -> list[Conflict]:
 
 
 def conflict_rows(state: State, conflicts: list[Conflict]) -> pa.Table:
-    """Conflicts as a layer: at the places of their assets, with an empty `decision`."""
+    """Returns the conflicts as a layer at the places of their assets, with an empty `decision`."""
     rows = []
     for one in conflicts:
         row: dict[str, Any] = state.row(one.asset_id) or {}
@@ -144,7 +144,7 @@ def conflict_rows(state: State, conflicts: list[Conflict]) -> pa.Table:
 
 
 def pictures_of(row: Mapping[str, Any]) -> str | None:
-    """Files of the pictures that show an asset best, a line each, the best first; None where no picture is named.
+    """Returns the files of the pictures that show an asset, one a line, the best first; None where no picture is named.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def pictures_of(row: Mapping[str, Any]) -> str | None:
 
 
 def value_shown(conflict: Conflict, name: str) -> str | None:
-    """A value of a conflict, `in_force`, `other` or `base`, as people read it: geometries as WKT to the millimetre."""
+    """Returns a value of a conflict (`in_force`, `other`, `base`) as readable text: geometries as WKT, to the mm."""
     value = decoded(conflict.kind, conflict.attribute, getattr(conflict, name))
     if isinstance(value, bytes):
         return str(shapely.to_wkt(shapely.from_wkb(value), rounding_precision=3))

@@ -1,4 +1,4 @@
-"""What differs between two states of the inventory."""
+"""Differences between two states of the inventory."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ _OF_THE_EVIDENCE: Final = frozenset(
         "sigma_size_m", "probability", "returns", "passes", "first_epoch_gps_ns", "last_epoch_gps_ns", "pictures",
     }
 )  # fmt: skip
-"""Columns that tell of the evidence alone, or what the geometry tells."""
-_CHANGES: Final = {-1: "removed", -2: "added"}
+"""Columns that describe the evidence alone, or follow from the geometry."""
+_CHANGES: Final = {-1: "removed", -2: "added"}  # Codes of the column of a difference.
 _AT_ONCE: Final = 8192
-"""Differences that are made of columns together."""
+"""Differences that are turned into columns at a time."""
 
 Ints: TypeAlias = npt.NDArray[np.int64]
 
 
 class Difference(NamedTuple):
-    """An asset, or one value of it, that differs."""
+    """An asset that came or went, or one value that differs."""
 
     asset_id: str
     kind: str
@@ -43,7 +43,7 @@ class Difference(NamedTuple):
 
 
 class Differences(Sequence[Difference]):
-    """All that differs, by kind, asset and attribute: columns, whose rows are made when they are asked for."""
+    """All differences by kind, asset and attribute: stored as columns; rows are made on demand."""
 
     def __init__(self, parts: Iterable[_OfKind]) -> None:
         self._parts = [part for part in parts if part.asset.size]
@@ -75,7 +75,7 @@ class Differences(Sequence[Difference]):
 
 
 def differences(before: State, after: State) -> Differences:
-    """All that differs, by kind, asset and attribute; rejected assets count as removed."""
+    """Returns all differences by kind, asset and attribute; rejected assets count as removed."""
     return Differences(
         _of_kind(kind, _shown(before.assets.get(kind), kind), _shown(after.assets.get(kind), kind))
         for kind in asset_kind_names()
@@ -95,19 +95,19 @@ class _OfKind(NamedTuple):
     ids: npt.NDArray[Any]
     """Ids of the assets of both states."""
     asset: Ints
-    """Which of them each difference is of; ascending."""
+    """Index of each difference's asset in `ids`; ascending."""
     column: Ints
-    """Which of the attributes differs, ascending within an asset; -1 of an asset that was removed, -2 of one that was
+    """Index of the attribute that differs, ascending within an asset; -1 for a removed asset, -2 for one that was
     added."""
     names: list[str]
     before: pa.Table
     after: pa.Table
     at_before: Ints
-    """Row of each difference in the table before, as far as it has one."""
+    """Row of each difference in the table before, where it has one."""
     at_after: Ints
 
     def rows(self, first: int, last: int) -> list[Difference]:
-        """Some of the differences."""
+        """Returns the rows of some of the differences."""
         part = slice(first, last)
         columns, ids = self.column[part], self.ids[self.asset[part]].tolist()
         out: list[Any] = [None] * columns.size
@@ -130,7 +130,7 @@ class _OfKind(NamedTuple):
 def _of_kind(kind: str, before: pa.Table, after: pa.Table) -> _OfKind:
     ids = [np.asarray(t["asset_id"].to_numpy(zero_copy_only=False), dtype=str) for t in (before, after)]
     both = np.union1d(*ids)
-    # places of the assets in each of the tables, -1 where they are not
+    # rows of the assets in each table, -1 where absent
     at = np.full((2, both.size), -1, np.int64)
     for number, own in enumerate(ids):
         at[number, np.searchsorted(both, own)] = np.arange(own.size)
@@ -151,7 +151,7 @@ def _of_kind(kind: str, before: pa.Table, after: pa.Table) -> _OfKind:
 
 
 def shown(difference: Difference) -> tuple[str, str]:
-    """Both values as people read them; geometries by their first point."""
+    """Returns both values as readable text; geometries by their first point."""
     import json
 
     import shapely

@@ -1,7 +1,7 @@
-"""Edits: what people changed, and which of their changes is in force.
+"""Edits: what people changed, and which edits are in force.
 
-Merging goes value by value. An edit is in force from its commit on, whatever later evidence says. An edit by somebody
-who had another value before them than the one that an edit has put in force meanwhile waits among the conflicts:
+Merging goes value by value. An edit is in force from its commit on, whatever later evidence says. If its author had
+not seen the value that another edit has since put in force, it waits among the conflicts: neither is dropped.
 neither is dropped.
 """
 
@@ -20,7 +20,7 @@ from roadscan.store.schema import table_schema
 from roadscan.store.store import bytes_digest
 
 REJECTED: Final = encoded("rejected")
-"""The status of an asset that a person rejected, as edits say it."""
+"""The status of a rejected asset, as edits encode it."""
 
 
 class Edit(NamedTuple):
@@ -44,12 +44,12 @@ class Edit(NamedTuple):
 
     @property
     def key(self) -> tuple[str, str]:
-        """The value that it changes."""
+        """Returns the key of the value that it changes."""
         return self.asset_id, self.attribute
 
 
 def named(edit: Edit) -> Edit:
-    """The same edit with its name: a digest of what it says, of the state that it was made on and of its place."""
+    """Returns the edit with its name: a digest of its content, of the state it was made on and of its place."""
     said = (
         edit.asset_id, edit.attribute, edit.action, edit.old, edit.new, edit.base_commit, edit.who, edit.made_at,
         *([edit.settles] if edit.settles else []),
@@ -58,13 +58,13 @@ def named(edit: Edit) -> Edit:
 
 
 def edit_rows(edits: Sequence[Edit]) -> pa.Table:
-    """Edits as rows of the table `asset_edits`."""
+    """Returns edits as rows of the table `asset_edits`."""
     ordered = sorted(edits, key=lambda e: (e.asset_id, e.attribute))
     return pa.Table.from_pylist([e._asdict() for e in ordered], table_schema("asset_edits").arrow())
 
 
 def read_edits(truth: AssetTruth, commits: Iterable[Commit]) -> list[Edit]:
-    """Edits of some commits, in their order."""
+    """Returns the edits of some commits, in order."""
     return [
         Edit(**row)
         for commit in commits
@@ -75,18 +75,18 @@ def read_edits(truth: AssetTruth, commits: Iterable[Commit]) -> list[Edit]:
 
 @dataclass
 class Folded:
-    """What is left of a sequence of edits."""
+    """The result of applying a sequence of edits."""
 
     in_force: dict[tuple[str, str], Edit] = field(default_factory=dict)
     waiting: dict[tuple[str, str], list[Edit]] = field(default_factory=lambda: defaultdict(list))
-    """Edits that met one in force which their maker had not seen, until a decision settles them."""
+    """Edits that conflict with one in force which their author had not seen, until a decision settles them."""
     created: dict[str, Edit] = field(default_factory=dict)
-    """By asset: the edit that drew it, whatever was done to it since."""
+    """By asset: the edit that drew it, whatever happened to it since."""
     settled: set[str] = field(default_factory=set)
-    """Names of edits of which a decision settled a conflict."""
+    """Names of edits whose conflicts a decision settled."""
 
     def take(self, edit: Edit) -> None:
-        """Fold one more edit in."""
+        """Apply one more edit."""
         if edit.action == "create":
             self.created.setdefault(edit.asset_id, edit)
         known = self.in_force.get(edit.key)
@@ -106,11 +106,11 @@ class Folded:
 
     @property
     def rejected(self) -> list[str]:
-        """Ids of the assets that people rejected."""
+        """Returns ids of the assets that people rejected."""
         return [asset for (asset, name), edit in self.in_force.items() if (name, edit.new) == ("status", REJECTED)]
 
     def holds(self, edit: Edit) -> bool:
-        """True if it says nothing new: the value is in force, or waits already."""
+        """Returns True if the edit says nothing new: its value is in force, or waits already."""
         known = self.in_force.get(edit.key)
         if edit.action == "withdraw":
             return known is None
@@ -120,7 +120,7 @@ class Folded:
 
 
 def folded(edits: Iterable[Edit]) -> Folded:
-    """Edits in force, and those that wait, after a sequence of commits."""
+    """Returns the edits in force, and those that wait, after a sequence of commits."""
     state = Folded()
     for edit in edits:
         state.take(edit)

@@ -1,4 +1,4 @@
-"""The inventory as files of other programs: GeoPackage, GeoJSON, CSV, DXF."""
+"""Export of the inventory to files of other programs: GeoPackage, GeoJSON, CSV, DXF."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from roadscan.store.csv import write_csv
 from roadscan.store.inventory_schema import GEOMETRY, asset_table
 
 _FORMULA: Final = re.compile(r"^[=@+\-\t\r\n＝＋－＠]")
-"""Texts that a spreadsheet may run: all that OWASP names (CSV Injection); a quote before them makes them text."""
+"""Texts that a spreadsheet may run, all that OWASP names (CSV Injection); a leading quote makes them text."""
 
 
 def export(state: State, file: Path, form: str, crs: str | None) -> int:
@@ -66,7 +66,7 @@ def _gpkg(file: Path, kinds: dict[str, pa.Table], crs: str | None) -> None:
 
 
 def _geojson(file: Path, kinds: dict[str, pa.Table], crs: str | None) -> None:
-    """All kinds in one collection, WGS 84 as RFC 7946 asks for; the map's own coordinates stay in the columns."""
+    """Write all kinds in one collection, WGS 84 as RFC 7946 demands; columns keep the map's coordinates."""
     import pyogrio
 
     if crs is None:
@@ -97,7 +97,7 @@ def _to_wgs84(crs: str) -> Callable[[Any], Any]:
 
 
 def _csv(file: Path, kinds: dict[str, pa.Table], crs: str | None) -> None:
-    """All kinds in one table, geometry as WKT; what a spreadsheet would run gets a quote before it."""
+    """Write all kinds in one table, geometry as WKT; texts that a spreadsheet would run get a leading quote."""
     rows = _together(kinds)
     wkt = pa.array(shapely.to_wkt(_shapes(rows), rounding_precision=4), pa.string())
     rows = rows.set_column(rows.schema.get_field_index(GEOMETRY), GEOMETRY, wkt)
@@ -128,7 +128,7 @@ def _dxf(file: Path, kinds: dict[str, pa.Table], crs: str | None) -> None:
 
 
 def _together(kinds: dict[str, pa.Table]) -> pa.Table:
-    """All kinds in one table, with their kind; columns that a kind has not are null."""
+    """Returns all kinds in one table with a column for the kind; columns that a kind lacks are null."""
     named = [
         rows.add_column(0, "kind", pa.array([kind] * rows.num_rows, pa.string())).replace_schema_metadata(None)
         for kind, rows in kinds.items()

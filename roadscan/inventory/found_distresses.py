@@ -1,6 +1,6 @@
-"""What a run found of the distresses of the pavement, as rows of their kinds in the inventory.
+"""Distresses of the pavement that a run found, as rows of their kinds in the inventory.
 
-Tables of distresses know no heights: those come from overviews of the tiles, as does what else the inventory asks for.
+Tables of distresses have no heights: those come from overviews of the tiles, as do the inventory's other queries.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from roadscan.tiles.tasks.tiles import summary_of
 from roadscan.tiles.tasks.wanted_products import product_context
 
 _PIXEL_M: Final = 0.04
-"""Edge of the pixels that heights are taken from, about."""
-_HELD_TILES: Final = 256
+"""Approximate edge of the pixels from which heights are taken (m)."""
+_HELD_TILES: Final = 256  # Overviews of tiles kept in memory.
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
 class FoundKind(NamedTuple):
-    """What a run found of a kind of distress."""
+    """Rows that a run found of one kind of distress."""
 
     kind: str
     rows: pa.Table
     """Columns as `asset_schema(kind).arrow()`."""
     records: Sequence[OutputRecord]
-    """Files that it was read from."""
+    """Files from which they were read."""
 
 
 def found_distresses(session: Session) -> Iterator[FoundKind]:
-    """Rows of each kind of distress that the survey was searched for."""
+    """Yields rows of each kind of distress that the survey was searched for."""
     searched = {kind: records for kind in asset_kind_names() if (records := _records(session, asset_schema(kind)))}
     if not searched:
         return
@@ -66,7 +66,7 @@ def found_distresses(session: Session) -> Iterator[FoundKind]:
 
 
 def _records(session: Session, schema: AssetSchema) -> list[OutputRecord]:
-    """Records of the table that a kind is found in, by path; those without a file tell that nothing was found."""
+    """Returns records of the table of a kind, by path; records without a file mean that nothing was found."""
     return sorted(session.manifest.of(schema.found_in).values(), key=lambda r: r.path) if schema.found_in else []
 
 
@@ -98,11 +98,11 @@ class Ground:
 
     @cached_property
     def first_gps_ns(self) -> int:
-        """GPS time at which the survey's first pass began."""
+        """Returns the GPS time (ns) at which the survey's first pass began."""
         return min((one.start_gps_ns for one in plan_of(self._session).passes), default=0)
 
     def summaries(self, places_m: Floats) -> list[TileSummary | None]:
-        """Figures of the tile of each place (n, 2); None where there are no readings."""
+        """Returns the figures of the tile of each place (n, 2); None where there are no readings."""
         found: list[TileSummary | None] = [None] * len(places_m)
         for tile, own, _ in self._by_tile(places_m):
             record = self._records.get(str(tile))
@@ -112,9 +112,9 @@ class Ground:
         return found
 
     def heights_m(self, places_m: Floats) -> Floats:
-        """(n,) heights at places (n, 2) on the map: that of the pixel there, else of the nearest one of the tile.
+        """Returns heights (n,) at places (n, 2) on the map: of the pixel there, else of the nearest one in the tile.
 
-        Where a tile has no readings, the nearest of the other places that has a height gives it.
+        Where a tile has no readings, the height of the nearest other place that has one is used.
         """
         out = np.full(len(places_m), np.nan)
         for tile, own, pixel in self._by_tile(places_m):
@@ -131,7 +131,7 @@ class Ground:
         return np.asarray(np.nan_to_num(out), dtype=np.float64)
 
     def is_surveyed(self, places_m: Floats) -> npt.NDArray[np.bool_]:
-        """(n,) whether there are readings at places (n, 2)."""
+        """Returns a mask (n,) of the places (n, 2) with readings."""
         out = np.zeros(len(places_m), dtype=bool)
         for tile, own, pixel in self._by_tile(places_m):
             level = self._level(tile)
@@ -140,7 +140,7 @@ class Ground:
         return out
 
     def raised(self, shapes_m: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Shapes (n,) at the height of the ground, all in the map (m)."""
+        """Returns shapes (n,) raised to the height of the ground, all in the map (m)."""
         places = shapely.get_coordinates(shapes_m)
         if not len(places):
             return shapes_m
@@ -148,7 +148,7 @@ class Ground:
         return np.asarray(shapely.set_coordinates(shapely.force_3d(shapes_m), raised))
 
     def _by_tile(self, places_m: Floats) -> Iterator[tuple[TileId, Ints, Ints]]:
-        """Each tile with the numbers of its places, and their pixels (n, 2), column and row."""
+        """Yields each tile with the indices of its places and their pixels (n, 2), column and row."""
         grid = self.context.grid
         quanta = np.floor(places_m * QUANTA_PER_M).astype(np.int64)
         tiles, number = np.unique(quanta // grid.size_quanta, axis=0, return_inverse=True)
@@ -161,7 +161,7 @@ class Ground:
 
 
 def _in_level(level: Level, pixel: Ints) -> tuple[Ints, npt.NDArray[np.bool_]]:
-    """Places of pixels (n, 2) in a level, and whether they hold readings."""
+    """Returns positions of pixels (n, 2) in a level, and a mask of those with readings."""
     keys = level.row.astype(np.int64) << 32 | level.column
     wanted = pixel[:, 1] << 32 | pixel[:, 0]
     place = np.minimum(np.searchsorted(keys, wanted), keys.size - 1)
@@ -169,11 +169,11 @@ def _in_level(level: Level, pixel: Ints) -> tuple[Ints, npt.NDArray[np.bool_]]:
 
 
 class SeenByCells:
-    """What a survey tells of places in sight: of distresses whether the ground there was measured, else as it was.
+    """Expected passes of a survey: of distresses by whether the ground there was measured, else by `assets`.
 
     Parameters
     ----------
-    assets : what is told of other kinds.
+    assets : expected passes of other kinds.
     """
 
     def __init__(self, session: Session, assets: Visibility) -> None:
@@ -185,14 +185,14 @@ class SeenByCells:
         return Ground(self._session)
 
     def expected_passes(self, kind: str, places_m: Floats) -> Ints:
-        """(n,) passes that should have seen assets of a kind; of distresses 1 where there are readings."""
+        """Returns the passes (n,) that should have seen assets of a kind; of distresses 1 where there are readings."""
         if not asset_schema(kind).found_in:
             return self._assets.expected_passes(kind, places_m)
         return self._ground.is_surveyed(places_m[:, :2]).astype(np.int64)
 
 
 class _Rows:
-    """Rows of a table of distresses on their way to the columns of their kind."""
+    """Rows of a table of distresses that are converted to the columns of their kind."""
 
     def __init__(self, schema: AssetSchema, rows: pa.Table, shapes_m: npt.NDArray[Any]) -> None:
         self.schema = schema
@@ -200,7 +200,7 @@ class _Rows:
         self.shapes_m = _of_type(shapes_m, schema.geometry)
 
     def table(self, ground: Ground, roads: Any) -> pa.Table:
-        """Columns as `asset_schema(kind).arrow()`."""
+        """Returns columns as `asset_schema(kind).arrow()`."""
         places = reference_points(self.shapes_m) if len(self.shapes_m) else np.empty((0, 3))
         along = along_roads(places[:, :2], roads)
         tiles = ground.summaries(places[:, :2])
@@ -229,7 +229,7 @@ class _Rows:
         return pa.Table.from_arrays(arrays, schema=arrow)
 
     def _own(self, column: AssetColumn) -> Any:
-        """Values of a column of the kind: that of the table, or the class of another one."""
+        """Returns the values of a column of the kind: those of the table, or the class that another column gives."""
         name = column.class_of or column.name
         if name not in self.rows.column_names:
             return [None] * len(self.shapes_m)
@@ -241,7 +241,7 @@ class _Rows:
 
 
 def _of_type(shapes: npt.NDArray[Any], geometry: str) -> npt.NDArray[Any]:
-    """Shapes of the type that a schema names: single ones as one part of several where it says so."""
+    """Returns shapes of the type that a schema names: single ones are made multi-part where it says so."""
     single = geometry.removeprefix("Multi").removesuffix("Z")
     if single == geometry.removesuffix("Z"):
         return shapes

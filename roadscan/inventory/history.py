@@ -1,4 +1,4 @@
-"""All that happened to one asset."""
+"""The history of one asset."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from roadscan.store.asset_truth import AssetTruth, Commit
 
 
 class Event(NamedTuple):
-    """One thing that happened to an asset."""
+    """One event in an asset's history."""
 
     commit: int
     at: str
@@ -21,13 +21,13 @@ class Event(NamedTuple):
     """`found`, `not seen`, `edited`, `drawn`, `withdrawn` or `undone`."""
     attribute: str
     old: str | None
-    """JSON, as is `new`."""
+    """As JSON; so is `new`."""
     new: str | None
     why: str
 
 
 def history_of(truth: AssetTruth, asset_id: str) -> list[Event]:
-    """Events of an asset, in the order of the commits."""
+    """Returns the events of an asset, in the order of the commits."""
     counted = {c.number for c in live_commits(truth.commits)}
     touched: set[int] = set()
     events: list[Event] = []

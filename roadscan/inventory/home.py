@@ -1,4 +1,4 @@
-"""What a home of the inventory is: it shows a state, and is read again with what people changed in it."""
+"""A home of the inventory: a place that shows a state, and from which people's changes are read back."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from roadscan.core.errors import RoadscanError
 
 
 class HomeError(RoadscanError):
-    """A home that cannot be read or written as it is."""
+    """Raised for a home that cannot be read or written as it is."""
 
 
 class EditFault(NamedTuple):
-    """A row of a home that cannot be taken in as it is."""
+    """A row of a home that cannot be accepted as it is."""
 
     table: str
     record: str
     """Its id, or `fid` and the number of a row without one."""
     reason: str
     is_question: bool = False
-    """True where it may be right: it is taken in once a person confirms it."""
+    """True where it may be right: it is accepted once a person confirms it."""
 
     def __str__(self) -> str:
         return f"{self.table}, {self.record}: {self.reason}"
 
 
 class FaultyEditsError(HomeError):
-    """Edits that are not taken in, each with its table, row and reason."""
+    """Raised for edits that are not accepted, each with its table, row and reason."""
 
     faults: Sequence[EditFault] = ()
 
 
 class Mark(NamedTuple):
-    """What a home carries to be known again."""
+    """The mark by which a home is recognised."""
 
     inventory: str
     """Name of the inventory."""
     token: str
-    """Name of the rows that it held when it was published or last read."""
+    """Name of the rows that it had when it was published or last read."""
     pending: str
-    """Token that it gets once what was read from it is in the truth; empty otherwise."""
+    """The token that it gets once the truth has taken in what was read from it; empty otherwise."""
     commit: int
     """Commit whose state was published."""
     at: str
@@ -53,7 +53,7 @@ class Mark(NamedTuple):
 
 
 class Author(NamedTuple):
-    """Who changed a row, when (UTC) and why, as far as the home tells; empty where it does not."""
+    """Who changed a row, when (UTC) and why, as far as the home records it; empty elsewhere."""
 
     who: str
     at: str
@@ -61,33 +61,33 @@ class Author(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """What a person chose of a conflict."""
+    """A person's decision on a conflict."""
 
     asset_id: str
     attribute: str
     edit: str
     choice: str
-    """`edit`: it holds; `evidence`: what was found counts; `other`: the edit that waits."""
+    """`edit`: it holds; `evidence`: what was found counts; `other`: the waiting edit counts."""
 
 
 CHOICES: Final = ("edit", "evidence", "other")
 FID: Final = "fid"
-"""Number of a row in its home; it may be given again."""
+"""Number of a row in its home; numbers may be reused."""
 
 
 @dataclass(frozen=True)
 class Content:
-    """What a home holds."""
+    """The content of a home."""
 
     rows: Mapping[str, pa.Table]
     """By kind: `fid` (int64), then the columns of `asset_table(kind)`."""
     decisions: Sequence[Decision] = ()
     authors: Mapping[tuple[str, str, str], Author] = field(default_factory=dict)
-    """Who changed values last since they were read, by kind, id (or `fid N`) and attribute; without one, of the row."""
+    """Last author of each value since the last read, by kind, id (or `fid N`) and attribute; else of the row."""
     faults: Sequence[EditFault] = ()
-    """What people wrote that no row can hold."""
+    """Entries by people that no row can store."""
     confirmed: Collection[str] = ()
-    """Records whose unlikely places or sizes a person confirmed in the home."""
+    """Records whose unlikely places or sizes a person has confirmed in the home."""
 
 
 class Sheet(NamedTuple):
@@ -100,19 +100,19 @@ class Sheet(NamedTuple):
 
 
 class Home(ABC):
-    """A place that people edit the inventory in."""
+    """A place in which people edit the inventory."""
 
     made_of: Mapping[str, pa.Table] | None = None
-    """Rows by kind that it was made of, where it has them itself; otherwise they are kept under its token."""
+    """Rows by kind from which it was made, if it stores them itself; otherwise they are stored under its token."""
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """How errors and edits name it; without a password."""
+        """Returns its name in errors and edits; without a password."""
 
     @abstractmethod
     def mark(self) -> Mark | None:
-        """What it carries; None where nothing was published there yet.
+        """Returns its mark; None where nothing was published there yet.
 
         Raises
         ------
@@ -122,7 +122,7 @@ class Home(ABC):
 
     @abstractmethod
     def read(self) -> Content:
-        """All its rows.
+        """Returns all its rows.
 
         Raises
         ------
@@ -132,7 +132,7 @@ class Home(ABC):
 
     @abstractmethod
     def write(self, content: Content, sheets: Sequence[Sheet], mark: Mark) -> None:
-        """Show another state, wholly or not at all.
+        """Show another state, completely or not at all.
 
         Raises
         ------
@@ -142,13 +142,13 @@ class Home(ABC):
 
     @property
     def project_file(self) -> Path | None:
-        """Where the project file of QGIS stands; None where the home has no folder of its own."""
+        """Returns the path of the QGIS project file; None where the home has no folder."""
         return None
 
     def layer_address(self, table: str) -> tuple[str, str]:
-        """Provider and address by which QGIS finds a table."""
+        """Returns the provider and address by which QGIS finds a table."""
         raise NotImplementedError
 
     @abstractmethod
     def note(self, mark: Mark) -> None:
-        """Carry another mark beside the same rows."""
+        """Store another mark beside the same rows."""

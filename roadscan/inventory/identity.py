@@ -1,7 +1,7 @@
-"""Which known asset each newly found object is: one to one, by kind, place, σ and size.
+"""Matching of newly found objects with known assets: one to one, by kind, place, σ and size.
 
-Three rounds, each with what the rounds before left: at the place of the evidence; at the place that a person gave; and
-farther away, where the known asset should have been seen at its place and was not: it was moved.
+Three rounds, each with the leftovers of the last: at the place of the evidence; at the place that a person gave; and
+farther away, if the known asset should have been seen at its place and was not: then it was moved.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from roadscan.store.inventory_schema import GEOMETRY
 from roadscan.store.store import bytes_digest
 
 _SIGMAS: Final = 4.0
-"""Gate of a match, in σ of the difference of two places."""
+"""Gate of a match, in σ of the difference of two positions."""
 _SAMPLES: Final = 16
-"""Points along a line or outline that tell how much of it another one covers."""
+"""Sample points along a line or outline, by which its overlap with another is measured."""
 _LEAST_SHARE: Final = 0.35
-"""Share, the mean of both ways, from which on two lines or outlines are one asset."""
+"""Least overlap, averaged over both directions, at which two lines or outlines are one asset."""
 _SIDE_WEIGHT: Final = 0.5
-"""Cost of running beside at the gate all along: of two that run beside one, the nearer one is it."""
+"""Cost of a lateral offset as large as the gate: of two parallel lines the nearer one matches."""
 _SIZE_WEIGHT: Final = 0.5
-"""Cost of wholly different sizes, where 1 is a distance at the gate."""
+"""Cost of entirely different sizes, where 1 is a distance at the gate."""
 _SIZE_OF_MOVED: Final = 0.25
-"""Mean relative difference of sizes up to which a moved asset is still itself."""
-_DIGITS: Final = "0123456789abcdefghjkmnpqrstvwxyz"  # Crockford's: no i, l, o, u
+"""Greatest mean relative difference of sizes between a moved asset and itself."""
+_DIGITS: Final = "0123456789abcdefghjkmnpqrstvwxyz"  # Crockford's alphabet: no i, l, o, u
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
 class Pairs(NamedTuple):
-    """Candidates: rows of the known and of the found assets, and what taking both for one costs (0 to 1)."""
+    """Candidates: rows of known and found assets, and the cost of matching them (0 to 1)."""
 
     known: Ints
     found: Ints
@@ -49,17 +49,17 @@ class Pairs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What the inventory knows of a kind, by ascending id."""
+    """Known assets of a kind, by ascending id."""
 
     evidence: pa.Table
     rows: pa.Table
-    """With edits."""
+    """With edits applied."""
     is_visible: npt.NDArray[np.bool_]
-    """(n,) whether the newest survey should have seen it at its place."""
+    """Mask (n,) of the assets that the newest survey should have seen at their places."""
 
 
 def matched(kind: str, known: Known, found: pa.Table, settings: Matching, unit_m: float = 1.0) -> Ints:
-    """For each found object the row of the known asset that it is, -1 for none.
+    """Returns for each found object the row of the known asset that it matches, -1 for none.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def matched(kind: str, known: Known, found: pa.Table, settings: Matching, unit_m
 def _find_moved(
     known: Known, there: npt.NDArray[Any], sizes: tuple[Floats, Floats], settings: Matching, unit_m: float, result: Ints
 ) -> None:
-    """Take the nearest object of about the same size for the asset, where that should have been seen and was not."""
+    """Match an asset with the nearest object of about its size if it should have been seen at its place but was not."""
     free_known, free_found = _free(result, known.rows.num_rows)
     here = _shapes(known.evidence, unit_m)
     free_known = free_known[known.is_visible[free_known] & ~shapely.is_missing(here[free_known])]
@@ -122,7 +122,7 @@ def _shapes(table: pa.Table, unit_m: float) -> npt.NDArray[Any]:
 
 
 def _sigmas(table: pa.Table) -> Floats:
-    """(n, 2) σ in the horizontal and in height; 0 where it is not known."""
+    """Returns σ (n, 2), horizontal and in height; 0 where it is not known."""
     columns = [
         np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=float)
         for name in ("sigma_horizontal_m", "sigma_height_m")
@@ -143,7 +143,7 @@ def _near_points(a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Floats, sigm
 def _overlapping(
     a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Floats, sigma_b: Floats, limits_m: tuple[float, float]
 ) -> Pairs:
-    """Lines and outlines that run along one another, within four σ but at least and at most `limits_m`."""
+    """Returns lines and outlines that overlap, within four σ clipped to `limits_m`."""
     lines_a, lines_b = outlines(a), outlines(b)
     widest = np.clip(_SIGMAS * np.hypot(sigma_a[:, 0], sigma_b[:, 0].max()), *limits_m)
     left, right = shapely.STRtree(lines_b).query(lines_a, predicate="dwithin", distance=widest)
@@ -155,7 +155,7 @@ def _overlapping(
 
 
 def outlines(shapes: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Lines as they are, of polygons the outer ring; of façades that is the line on the ground, there and back."""
+    """Returns lines unchanged, of polygons the outer ring; of façades that is the ground line, there and back."""
     flat = shapely.force_2d(shapes)
     rings = shapely.get_exterior_ring(flat)
     lines: npt.NDArray[Any] = np.where(shapely.is_missing(rings), flat, rings)
@@ -165,7 +165,7 @@ def outlines(shapes: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def points_along(lines: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """(n, 16) points evenly along lines, of several parts one part after another."""
+    """Returns (n, 16) evenly spaced points along lines; several parts follow one another."""
     if not len(lines):
         return np.empty((0, _SAMPLES), object)
     parts, number = shapely.get_parts(lines, return_index=True)
@@ -180,20 +180,20 @@ def points_along(lines: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _along(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: Floats) -> tuple[Floats, Floats]:
-    """Share of points along `a` within a distance of `b`, and how near they are: 1 on it, 0 from the distance on."""
+    """Returns the share of points along `a` within a distance of `b`, and their closeness: 1 on it, 0 that far away."""
     ratio = shapely.distance(points_along(a), b[:, np.newaxis]) / within_m[:, np.newaxis]
     return (ratio <= 1.0).sum(axis=1) / _SAMPLES, np.maximum(1.0 - ratio, 0.0).sum(axis=1) / _SAMPLES
 
 
 def _sizes(kind: str, table: pa.Table) -> Floats:
-    """(n, m) lengths of the assets in all their own columns that have the unit m; NaN where not known."""
+    """Returns the sizes (n, m) of the assets in all their columns of unit m; NaN where not known."""
     names = [c.name for c in asset_schema(kind).own if c.unit == "m"]
     columns = [np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=float) for name in names]
     return np.column_stack(columns) if columns else np.empty((table.num_rows, 0))
 
 
 def _size_difference(known: Floats, found: Floats, pairs: Pairs) -> Floats:
-    """Mean relative difference of the lengths that both have, 0 to 1; 0 where they share none."""
+    """Returns the mean relative difference of the lengths that both have, 0 to 1; 0 where they share none."""
     a, b = known[pairs.known], found[pairs.found]
     relative = np.minimum(np.abs(a - b) / np.maximum(np.maximum(np.abs(a), np.abs(b)), 0.1), 1.0)
     count = np.isfinite(relative).sum(axis=1)
@@ -201,7 +201,7 @@ def _size_difference(known: Floats, found: Floats, pairs: Pairs) -> Floats:
 
 
 def _assign(pairs: Pairs, result: Ints) -> None:
-    """Choose pairs so that the sum of their costs is least and as many as can be are made, one to one."""
+    """Choose pairs, one to one: as many as possible, with the least sum of costs."""
     if not pairs.known.size:
         return
     known, a = np.unique(pairs.known, return_inverse=True)
@@ -230,9 +230,9 @@ def _assign_together(pairs: Pairs, result: Ints) -> None:
 
 
 def new_ids(kind: str, names: Sequence[str], taken: frozenset[str] | set[str]) -> list[str]:
-    """Ids of new assets: the kind and eight letters and digits of a digest of what they were first found as.
+    """Returns ids of new assets: the kind and eight letters and digits from a digest of their first finding.
 
-    `taken` are the ids that there are; names that would give one of them, or one id twice, are counted.
+    `taken` are the existing ids; a name whose id exists already gets a counter.
     """
     used = set(taken)
     ids = []

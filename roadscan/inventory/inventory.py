@@ -1,4 +1,4 @@
-"""The inventory as a whole: what the command line and Python do with it."""
+"""The inventory as a whole: the operations of the command line and of Python."""
 
 from __future__ import annotations
 
@@ -43,34 +43,34 @@ When = str | dt.date | int | None
 
 @dataclass(frozen=True)
 class Published:
-    """What a home shows now."""
+    """The state that a home shows now."""
 
     home: str
     commit: int
     assets: int
     conflicts: int
     recorded: Commit | None
-    """The commit that took in what the newest run found; None where that was in already."""
+    """The commit that recorded what the newest run found; None if that was recorded already."""
 
 
 @dataclass(frozen=True)
 class Pulled:
-    """What was taken in from a home."""
+    """The result of a pull from a home."""
 
     home: str
     commit: int | None
     """None where nothing was new."""
     edits: tuple[Edit, ...]
     refused: tuple[EditFault, ...]
-    """Rows that were not taken in, where only sound ones were asked for."""
+    """Rows that were not accepted, if only sound ones were asked for."""
     conflicts: int
     findings: tuple[Finding, ...] = ()
-    """What is doubtful of the edits that were taken in."""
+    """Findings on the accepted edits."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """How the inventory stands."""
+    """The state of the inventory, its home and pending changes."""
 
     commits: int
     assets: Mapping[str, Mapping[str, int]]
@@ -88,25 +88,25 @@ class Status:
 
 @dataclass
 class Inventory:
-    """An inventory in its store, with the home that people edit."""
+    """An inventory in its store, with the home in which people edit it."""
 
     truth: AssetTruth
     home: Home
     name: str
     rules: Rules
     found: Callable[[], Found | None] = field(default=lambda: None)
-    """What the newest run found; None where there is nothing."""
+    """Returns what the newest run found; None where there is nothing."""
     crs: str | None = None
     rasters: Callable[[Path], Sequence[Raster]] = field(default=lambda folder: ())
-    """Products that stand behind the assets in QGIS, for a project file in a folder."""
+    """Products shown behind the assets in QGIS, for a project file in a folder."""
 
     def state(self, as_of: When = None) -> State:
-        """The inventory at a time."""
+        """Returns the state of the inventory at a time."""
         self.truth.renew()
         return state_at(self.truth, commit_at(self.truth, as_of))
 
     def record(self, found: Found | None = None, who: str | None = None, why: str = "") -> Commit | None:
-        """Take in what a run found, the newest where it is left out; None where that is in already."""
+        """Record what a run found, by default the newest; None if that is recorded already."""
         given = found or self.found()
         if given is None:
             return None
@@ -114,7 +114,7 @@ class Inventory:
             return record(self.truth, given, self.rules, who or getpass.getuser(), why)
 
     def publish(self, *, discard: bool = False) -> Published:
-        """Take in what the newest run found, then show today's state in the home.
+        """Record what the newest run found, then show today's state in the home.
 
         Raises
         ------
@@ -140,7 +140,7 @@ class Inventory:
         return Published(self.home.name, state.commit, assets, len(conflicts), recorded)
 
     def _token(self, step: str, commit: int, mark: Mark | None) -> str:
-        """Name of the rows that a home holds after a step: those of a pull that was cut off stay beside others."""
+        """Returns the name of the rows that a home has after a step; those of an interrupted pull keep their name."""
         said = f"{step}/{self.name}/{self.home.name}/{commit}/{mark.token if mark else ''}"
         return f"{commit:06d}-{bytes_digest(said.encode()).rpartition(':')[2][:16]}"
 
@@ -160,8 +160,8 @@ class Inventory:
 
         Parameters
         ----------
-        home : the survey's own where it is left out; a copy of it otherwise.
-        who, why : of edits whose home does not tell.
+        home : by default the survey's home, else a copy of it.
+        who, why : of edits whose home does not record them.
         sound : take in sound rows where others are faulty; else nothing is taken in then.
         confirm : ids of assets (`fid N` of drawn ones) whose unlikely places or sizes are right, and names of layers
             whose deletions are; `all` stands for each.
@@ -205,7 +205,7 @@ class Inventory:
         self, document: PageDocument, *, who: str | None = None, why: str = "", sound: bool = False,
         confirm: Collection[str] = (),
     ) -> tuple[Pulled, list[EditOutcome]]:  # fmt: skip
-        """Take in edits that people made in the page of a survey; beside it, what became of each of them.
+        """Take in edits made in the page of a survey; returns the outcome of each of them as well.
 
         Parameters
         ----------
@@ -232,9 +232,9 @@ class Inventory:
         return pulled, home.outcomes(pulled.edits, pulled.refused, self.conflicts())
 
     def _append(self, place: Home, mark: Mark, edits: list[Edit], rows: Content, why: str) -> int | None:
-        """Commit edits and let the home say so, in steps of which any may be the last one that is done.
+        """Commit edits and mark the home, in steps that may be interrupted after any of them.
 
-        The home first names the token that it will get; once a commit has that token, it counts as given.
+        The home first stores the token that it will get; once a commit has that token, it counts as given.
         """
         if not edits:
             return None
@@ -250,7 +250,7 @@ class Inventory:
         return commit.number
 
     def _changes(self, place: Home) -> tuple[Mark, Changes, Content]:
-        """What a home was made of, and what differs in it."""
+        """Returns the rows from which a home was made, and the differences in it."""
         mark = place.mark()
         if mark is None:
             raise HomeError("nothing was published there yet", change="`roadscan inventory publish`", file=place.name)
@@ -276,7 +276,7 @@ class Inventory:
         return mark, compared(content, rows, mark.token or f"commit {mark.commit}"), content
 
     def _write_project(self) -> None:
-        """Write the project file of QGIS, where there is none yet: people arrange it to their liking."""
+        """Write the QGIS project file if there is none yet: people arrange it to their liking."""
         file = self.home.project_file
         if file is None or file.exists():
             return
@@ -315,7 +315,7 @@ class Inventory:
         return len(edits) + len(undecided) + len(changes.faults) + len(content.faults)
 
     def status(self) -> Status:
-        """How it stands, and what a pull and a publication would do."""
+        """Returns the status, and what a pull and a publication would do."""
         state = self.state()
         mark = self.home.mark()
         assets = {
@@ -329,20 +329,20 @@ class Inventory:
         )  # fmt: skip
 
     def conflicts(self, as_of: When = None) -> list[Conflict]:
-        """Values on which people and evidence, or two persons, disagree."""
+        """Returns the values on which people and evidence, or two persons, disagree."""
         return conflicts_of(self.state(as_of))
 
     def diff(self, before: When, after: When = None) -> Differences:
-        """What differs between two times: assets that came and went, and single values; a sequence of named tuples."""
+        """Returns the differences between two times: assets that came or went, and single values; as named tuples."""
         return differences(self.state(before), self.state(after))
 
     def changes(self, before: str | None = None, after: str | None = None) -> EpochChanges | None:
-        """What changed on the road between two survey epochs, the last two where they are left out."""
+        """Returns the changes on the road between two survey epochs, by default the last two."""
         self.truth.renew()
         return epoch_changes(self.truth, before, after, self.rules.unit_m)
 
     def history(self, asset_id: str) -> list[Event]:
-        """All that was found of an asset and edited, in the order of the commits.
+        """Returns all findings and edits of an asset, in the order of the commits.
 
         Raises
         ------
@@ -368,7 +368,7 @@ class Inventory:
         return result
 
     def undo(self, commit: int, who: str | None = None, why: str = "") -> Commit:
-        """Undo a commit, of a run or of edits, or undo its undoing; the truth keeps both.
+        """Undo a commit of a run or of edits, or undo an undoing; the truth keeps both.
 
         Raises
         ------
@@ -398,7 +398,7 @@ class Inventory:
 
 
 def _undoing(commits: Sequence[Commit]) -> list[Commit]:
-    """Undoings that count."""
+    """Returns the undoings in force."""
     undone: set[int] = set()
     counted = []
     for commit in reversed(commits):
@@ -409,7 +409,7 @@ def _undoing(commits: Sequence[Commit]) -> list[Commit]:
 
 
 def shown_content(state: State) -> Content:
-    """A state as homes show it: without rejected assets, numbered."""
+    """Returns a state as homes show it: without rejected assets, numbered."""
     rows = {}
     for kind, assets in state.assets.items():
         own = assets.rows.filter(pc.not_equal(assets.rows["status"], "rejected"))
@@ -419,7 +419,7 @@ def shown_content(state: State) -> Content:
 
 
 def _without(changes: Changes, faults: Sequence[EditFault]) -> Changes:
-    """Changes of rows without a fault."""
+    """Returns changes without those of faulty rows."""
     bad = _bad(faults)
     return Changes(
         [c for c in changes.changed if (asset_schema(c.kind).table, c.record) not in bad],
@@ -429,7 +429,7 @@ def _without(changes: Changes, faults: Sequence[EditFault]) -> Changes:
 
 
 def _all_deletions_of(kind: str) -> set[tuple[str, str]]:
-    """How a fault names what is missing of a layer: by the layer's own name."""
+    """Returns the record that a fault of a layer's deletions has: the layer's name."""
     table = asset_schema(kind).table
     return {(table, table)}
 
@@ -439,7 +439,7 @@ def _bad(faults: Sequence[EditFault]) -> set[tuple[str, str]]:
 
 
 def _as_read(changes: Changes, faults: Sequence[EditFault]) -> Content:
-    """Rows as they were read, with their ids; of those that were refused as they were before, to be compared anew."""
+    """Returns rows as read, with their ids; refused rows keep their former values, to be compared again."""
     bad = _bad(faults)
     rows = {}
     for kind, own in changes.rows.items():

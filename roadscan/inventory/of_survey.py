@@ -1,4 +1,4 @@
-"""The inventory of a survey: its store, its home, and what was found of assets and distresses."""
+"""The inventory of a survey: its store, its home, and the assets and distresses that were found."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ FOUND: Final = "products/assets"
 """Folder of the tables of found assets, one a kind."""
 ADDRESS: Final = "ROADSCAN_POSTGIS"
 _BEHIND: Final = ("hillshade", "mosaic", "bare_earth")
-"""Products that stand behind the assets in QGIS, the uppermost first."""
+"""Products shown behind the assets in QGIS, the uppermost first."""
 
 
 def open_inventory(session: Session) -> Inventory:
-    """The inventory that a survey belongs to.
+    """Returns the inventory to which a survey belongs.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def open_inventory(session: Session) -> Inventory:
 
 
 def truth_of(session: Session) -> Inventory:
-    """The same to look at alone: its home is a file that is not opened."""
+    """Returns the same read-only: its home is a file that is not opened."""
     return _opened(session, GeoPackage(Path("inventory.gpkg"), None))
 
 
@@ -66,7 +66,7 @@ def _opened(session: Session, home: Home) -> Inventory:
 
 
 def _truth(survey: Survey) -> AssetTruth:
-    """The commits of the inventory that a survey belongs to."""
+    """Returns the commits of the inventory to which a survey belongs."""
     settings, url = InventoryConfig.of(survey), survey.store_url
     if settings.store is not None:
         url = settings.store if "://" in settings.store else str(survey.resolve(Path(settings.store)))
@@ -75,12 +75,12 @@ def _truth(survey: Survey) -> AssetTruth:
 
 
 def inventory_faults(survey: Survey) -> list[str]:
-    """What is wrong with the files of a survey's inventory, each of which is read and named."""
+    """Returns the faults in the files of a survey's inventory, each of which is read."""
     return _truth(survey).faults()
 
 
 def home_of(session: Session, given: str | None = None) -> Home:
-    """The home that the survey file states, or another one: a GeoPackage or the address of a PostGIS database."""
+    """Returns the home that the survey file states, or another one: a GeoPackage or an address of PostGIS."""
     settings, survey = InventoryConfig.of(session.survey), session.survey
     frame = survey.frame()
     crs = frame.crs
@@ -96,7 +96,7 @@ def home_of(session: Session, given: str | None = None) -> Home:
 
 
 def page_document(session: Session, name: str, content: bytes) -> PageDocument:
-    """Edits of the page of a survey.
+    """Returns edits of the page of a survey.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def page_document(session: Session, name: str, content: bytes) -> PageDocument:
 
 
 def edits_of_file(file: Path) -> bytes:
-    """What a file holds that the page of a survey saved.
+    """Returns the content of a file that the page of a survey saved.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def edits_of_file(file: Path) -> bytes:
 
 
 def found_assets(session: Session) -> Found | None:
-    """What the newest run found; None before there is a table of assets or distresses."""
+    """Returns what the newest run found; None before there is a table of assets or distresses."""
     store = session.store
     tables: dict[str, pa.Table] = {}
     digests: list[str] = []
@@ -145,7 +145,7 @@ def found_assets(session: Session) -> Found | None:
 
 
 def _visibility(session: Session) -> Visibility:
-    """What the stage `assets` says of the places that passes had in sight, square by square."""
+    """Returns the passes that had places in sight, as the stage `assets` recorded them, square by square."""
     config, store = AssetsConfig.stated(session.survey), session.store
     records = {} if config is None else session.manifest.of(VISIBILITY)
     if config is None or not records:
@@ -159,7 +159,7 @@ def _visibility(session: Session) -> Visibility:
 
 
 def _rasters(session: Session, folder: Path) -> Sequence[Raster]:
-    """Mosaics of the survey, relative to a folder; none of a store that is no folder."""
+    """Returns paths of the survey's mosaics relative to a folder; none if the store is no folder."""
     if not session.store.is_folder:
         return ()
     found = []

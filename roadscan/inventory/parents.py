@@ -1,4 +1,4 @@
-"""What an asset stands on or hangs from: the nearest asset of the kinds that its schema allows."""
+"""Parents of assets: the nearest asset of the kinds on which the schema lets an asset stand or hang."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ import shapely
 from roadscan.store.asset_schema import asset_schema
 
 _REACH_M: Final = 1.0
-"""From a point or line to its parent, horizontally."""
+"""Greatest horizontal distance (m) of a point or line to its parent."""
 
 
 class Placed(NamedTuple):
-    """Assets of a kind at their places, in metres of the map."""
+    """Assets of a kind with their places, in metres of the map."""
 
     ids: npt.NDArray[Any]
     shapes: npt.NDArray[Any]
 
     def without(self, ids: Sequence[str]) -> Placed:
-        """The same without some of them."""
+        """Returns the same without some of them."""
         keep = ~np.isin(self.ids, ids)
         return Placed(self.ids[keep], self.shapes[keep])
 
 
 def parents_of(kind: str, placed: Mapping[str, Placed]) -> list[str | None]:
-    """Id of the parent of each asset of a kind, None where none is within 1 m of it.
+    """Returns the id of the parent of each asset of a kind, None where none is within 1 m of it.
 
-    Of several kinds the one that the schema names first counts, of several assets the nearest, of two as near the one
+    The kind that the schema names first wins, then the nearest asset, then the lower id.
     with the lower id.
     """
     children = placed[kind]

@@ -1,4 +1,4 @@
-"""Edits of a home's changes: what each value was, what the evidence said, who changed it."""
+"""Conversion of a home's changes to edits: the former value, the evidence at that time, the author."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ CLOCK_OF_EDITS: Final = Witness(
     told=("findings",),
 )
 _CLOCKS: Final = dt.timedelta(minutes=5)
-"""Clocks of computers that ask no time server differ by minutes; what is more confuses the order of edits."""
+"""Greatest difference of unsynchronised clocks: more would confuse the order of edits."""
 
 
 @dataclass(frozen=True)
 class Pulling:
-    """What edits of one pull have in common."""
+    """What the edits of one pull have in common."""
 
     base: State
     """The state that was published."""
@@ -43,7 +43,7 @@ class Pulling:
 
 
 def new_edits(changes: Changes, decisions: Sequence[Decision], pulling: Pulling) -> tuple[list[Edit], list[EditFault]]:
-    """Edits that the truth does not hold yet, one a value; and decisions that cannot be taken: they contradict one
+    """Returns edits that the truth does not have yet, one a value; and decisions refused because they contradict one
     another or a value that was written meanwhile, or nothing is there to choose.
     """
     made = {e.key: e for e in _changed(changes, pulling) if not _is_held(e, pulling)}
@@ -59,7 +59,7 @@ def new_edits(changes: Changes, decisions: Sequence[Decision], pulling: Pulling)
 
 
 def _is_held(edit: Edit, pulling: Pulling) -> bool:
-    """True if the truth says so already, or the edit gives back what was found before another's edit."""
+    """Returns True if the truth says so already, or the edit restores what was found before another's edit."""
     edits: Folded = pulling.now.edits
     return edits.holds(edit)
 
@@ -92,7 +92,7 @@ def _edit(
 
 
 def _open(decisions: Sequence[Decision], pulling: Pulling) -> dict[tuple[str, str], list[Decision]]:
-    """Decisions by asset and attribute; those that were settled since are left out."""
+    """Returns decisions by asset and attribute, without those that were settled since."""
     found: dict[tuple[str, str], list[Decision]] = {}
     standing: set[tuple[str, str, str]] | None = None
     for one in decisions:
@@ -112,7 +112,7 @@ def _open(decisions: Sequence[Decision], pulling: Pulling) -> dict[tuple[str, st
 
 
 def _decided(key: tuple[str, str], decisions: Sequence[Decision], written: Edit | None, pulling: Pulling) -> Edit:
-    """The edit that settles conflicts of a value; it knows all that is in the truth today.
+    """Returns the edit that settles conflicts of a value; it has seen all that is in the truth today.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def _decided(key: tuple[str, str], decisions: Sequence[Decision], written: Edit 
 
 
 def _rejection(key: tuple[str, str], known: Edit | None, pulling: Pulling) -> Edit | None:
-    """The edit in force that rejected an asset, or the parent that a person gave it; None where neither was."""
+    """Returns the edit in force that rejected an asset, or its assigned parent; None where neither was rejected."""
     in_force = pulling.now.edits.in_force
     ids = [key[0]]
     if known is not None and known.attribute == "parent":
@@ -163,12 +163,12 @@ def _rejection(key: tuple[str, str], known: Edit | None, pulling: Pulling) -> Ed
 
 
 def now_utc() -> str:
-    """Today's instant (UTC), ISO 8601 to the second."""
+    """Returns the current instant (UTC), ISO 8601 to the second."""
     return dt.datetime.now(dt.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
 def refuse(faults: Sequence[EditFault], home: str) -> FaultyEditsError:
-    """The error that names all faulty rows of a home."""
+    """Returns the error that names all faulty rows of a home."""
     listed = "; ".join(str(fault) for fault in faults[:20])
     more = f"; and {len(faults) - 20} more" if len(faults) > 20 else ""
     asked = [fault.record for fault in faults if fault.is_question]
@@ -184,7 +184,7 @@ def refuse(faults: Sequence[EditFault], home: str) -> FaultyEditsError:
 def clocked(
     authors: Mapping[tuple[str, str, str], Author], shown_at: str, now: str
 ) -> tuple[dict[tuple[str, str, str], Author], list[Finding]]:
-    """Authors without instants that cannot be: before the commit that was shown, or after now; and what that says.
+    """Returns authors without impossible instants (before the commit that was shown, or after now), and findings.
 
     Parameters
     ----------

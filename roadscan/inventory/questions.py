@@ -1,4 +1,4 @@
-"""What people changed and is asked about before it is in force: far moves, odd heights and sizes, emptied layers."""
+"""Changes that are confirmed before they are in force: far moves, odd heights and sizes, emptied layers."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ SIZES_OF_EDITS: Final = Witness(
     told=("error",),
 )
 _MOST_AND: Final = ((0.5, 3), (0.1, 20))
-"""Shares of a layer, and numbers of assets, from which on deletions are asked about: persons delete one by one."""
+"""Shares of a layer, and numbers of assets, from which deletions are questioned: persons delete one by one."""
 _TIMES: Final = 2.5
-"""Less than the least factor between units of length that are mistaken for one another: 2.54 cm are an inch."""
+"""Ratio of sizes that is questioned: below the least factor between confused units (2.54 cm are an inch)."""
 _SIZE_M: Final = 0.5
-"""Sizes that differ by less are corrected every day: a kerb, a diameter, the height of a bush."""
-_SIGMAS: Final = 5.0
-_UNIT_FACTORS: Final = {
+"""Smaller differences of sizes (m) are everyday corrections: a kerb, a diameter, the height of a bush."""
+_SIGMAS: Final = 5.0  # Sizes within this many σ of what was found are not questioned.
+_UNIT_FACTORS: Final = {  # new value over former one: the unit that the new value is in
     3.28084: "feet",
     0.3048: "metres out of feet",
     39.3701: "inches",
@@ -59,30 +59,30 @@ _UNIT_FACTORS: Final = {
     0.001: "metres out of millimetres",
 }
 _SAME_FACTOR: Final = 0.01
-"""Share by which a factor may differ from that of a unit: values have few digits."""
-_SEVERAL: Final = 3
+"""Relative tolerance of a factor between units: values have few digits."""
+_SEVERAL: Final = 3  # Values of a kind from which a unit or a usual size is derived.
 _MOVED_M: Final = 100.0
-"""Farther than any sensor of a survey sees: the evidence of an asset does not lie where it was moved to."""
+"""Moves farther than this (m) are questioned: no sensor of a survey sees as far."""
 _DRAWN_M: Final = 1000.0
-"""Roads of a survey hang together; a place as far from all known assets was not driven past."""
-_AROUND_M: Final = 100.0
+"""A place farther than this (m) from all known assets is questioned: roads of a survey are connected."""
+_AROUND_M: Final = 100.0  # Radius (m) within which known assets show the usual height.
 _RISE_M: Final = 10.0
-"""From the foot of a mast to the sign on its gantry, or from a road to the one on the bridge over it."""
+"""Allowed rise (m): from the foot of a mast to the sign on its gantry, or from a road to one on the bridge over it."""
 _SLOPE: Final = 0.15
-"""Of the steepest public roads, from one asset to the next."""
+"""Slope of the steepest public roads (m/m), from one asset to the next."""
 _FACADE_RISE_M: Final = 100.0
-"""Height of the tallest façades along a road."""
+"""Height of the tallest façades along a road (m)."""
 
 
 def questions_of(changes: Changes, state: State) -> Iterator[EditFault]:
-    """Changes that are possible and unlikely, against the inventory that they are to be taken into."""
+    """Yields possible but unlikely changes, compared with the inventory that they are to be taken into."""
     yield from _emptied(changes, state)
     yield from _sizes(changes, state)
     yield from _places(changes, state)
 
 
 def _emptied(changes: Changes, state: State) -> Iterator[EditFault]:
-    """Layers of which all or many rows are missing; their record is the name of the layer."""
+    """Yields questions for layers of which all or many rows are missing; their record is the name of the layer."""
     for kind, count in Counter(kind for kind, one in changes.deleted if _stands(state, one)).items():
         held = sum(_stands(state, one) for one in changes.before[kind]["asset_id"].to_pylist())
         if any(count > share * held and count >= least for share, least in _MOST_AND):
@@ -97,7 +97,7 @@ def _stands(state: State, asset_id: str) -> bool:
 
 
 def _sizes(changes: Changes, state: State) -> Iterator[EditFault]:
-    """Lengths and heights that are unlike what was found."""
+    """Yields questions for lengths and heights that are unlike what was found."""
     drawn = {change.asset_id for change in changes.drawn}
     reshaped = drawn | {change.asset_id for change in changes.changed if change.attribute == GEOMETRY}
     given = [
@@ -121,13 +121,13 @@ def _sizes(changes: Changes, state: State) -> Iterator[EditFault]:
 
 
 def _lengths(kind: str) -> Collection[str]:
-    """Columns of a kind that hold a size in metres and that people may change."""
+    """Returns the columns of a kind that are sizes in metres and that people may change."""
     own = {column.name for column in asset_schema(kind).own if column.unit == "m" and column.type == "float64"}
     return own & editable_columns(kind)
 
 
 def _unit_between(change: Change) -> str:
-    """Unit whose factor lies between the former value and the new one; "" for none."""
+    """Returns the unit whose factor lies between the former value and the new one; "" for none."""
     if not change.old or not change.new:
         return ""
     ratio = change.new / change.old
@@ -135,7 +135,7 @@ def _unit_between(change: Change) -> str:
 
 
 def _other_size(change: Change, state: State, *, is_new: bool) -> str | None:
-    """Why a size is unlike what was found of the asset and what stood there; of a new one, unlike all of its kind."""
+    """Returns why a size is unlike the found and the former one; for a new asset, unlike all of its kind."""
     if is_new:
         assets = state.assets.get(change.kind)
         known = [] if assets is None else assets.rows[change.attribute].drop_null().to_pylist()
@@ -166,10 +166,10 @@ def _places(changes: Changes, state: State) -> Iterator[EditFault]:
         try:
             shape = shapely.from_wkb(change.new)
         except shapely.errors.ShapelyError:
-            continue  # a fault, which is named as one
+            continue  # a fault, which is reported as one
         places = shapely.get_coordinates(shape, include_z=True) * (units_m[0], *units_m)
         if not places.size or not np.isfinite(places).all():
-            continue  # so is this
+            continue  # a fault as well
         former = None if change.old is None else shapely.from_wkb(change.old)
         reason = _far(places, former, known_m, units_m[0]) or _other_height(change.kind, places, known_m)
         if reason is not None:
@@ -177,7 +177,7 @@ def _places(changes: Changes, state: State) -> Iterator[EditFault]:
 
 
 def _known_places(state: State) -> npt.NDArray[np.float64]:
-    """Reference points (n, 3) of all assets (m)."""
+    """Returns reference points (n, 3) of all assets (m)."""
     names = ("easting_m", "northing_m", "height_m")
     parts = [
         np.column_stack([np.asarray(own.rows[n].to_numpy(zero_copy_only=False), dtype=np.float64) for n in names])
@@ -211,14 +211,14 @@ def _distances(places: npt.NDArray[np.float64], former: Any, unit_m: float) -> n
 
 
 def _to_nearest(places: npt.NDArray[np.float64], known: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Distance (m) from each of few places to the nearest known one."""
+    """Returns the distance (m) from each of a few places to the nearest known one."""
     return np.array([np.hypot(known[:, 0] - x, known[:, 1] - y).min() for x, y, _ in places])
 
 
 def _other_height(kind: str, places: npt.NDArray[np.float64], known_m: npt.NDArray[np.float64]) -> str | None:
-    """Why the heights of a shape are like those of no asset around it, itself included; None where they are.
+    """Returns why the heights of a shape are like those of no asset around it, itself included; None where they are.
 
-    Where no asset stands near, the nearest one is asked.
+    Where no asset stands near, the nearest one is compared.
     """
     if not len(known_m):
         return None

@@ -1,4 +1,4 @@
-"""Taking what a run found into the inventory: who is who, what was not seen, and what stands on what."""
+"""Recording of what a run found: which assets are known, which were not seen, and what stands on what."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ _EPOCH: Final = "first_epoch_gps_ns"
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a run found."""
+    """The findings of a run."""
 
     tables: Mapping[str, pa.Table]
-    """By kind, columns as `asset_schema(kind).arrow()`; a kind that is absent was not looked for."""
+    """By kind, columns as `asset_schema(kind).arrow()`; an absent kind was not searched for."""
     key: str
-    """Digest of the tables: what was taken in once is not taken in again."""
+    """Digest of the tables, so that they are recorded once."""
     source: str
     """Survey and stage."""
     epoch: str | None = None
     """Name of the survey's epoch; the day (UTC) of the first return where it is None."""
     began_gps_ns: int = 0
-    """GPS time at which the survey began, which counts where it found nothing at all; 0 where it is not known."""
+    """GPS time at which the survey began, used if it found nothing at all; 0 where it is not known."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What assets are known again by."""
+    """Rules for recognising assets."""
 
     visibility: Visibility
     matching: Matching = field(default_factory=Matching)
@@ -54,7 +54,7 @@ class Rules:
 
 
 def record(truth: AssetTruth, found: Found, rules: Rules, who: str = "roadscan", why: str = "") -> Commit | None:
-    """The commit that takes in what a run found, None where that is in already; to be called within `truth.alone()`.
+    """Returns the commit that records what a run found, None if recorded already; call it within `truth.alone()`.
 
     Raises
     ------
@@ -103,7 +103,7 @@ class _Recording:
         self.is_again = is_again
 
     def rows(self) -> pa.Table:
-        """Rows of all kinds, in the order of the table."""
+        """Returns the rows of all kinds, in the order of the table."""
         seen: dict[str, pa.Table] = {}
         unseen: list[pa.Table] = []
         taken = set(self.state.kind_of)
@@ -130,7 +130,7 @@ class _Recording:
         return pa.concat_tables(parts).sort_by([("kind", "ascending"), ("asset_id", "ascending")])
 
     def _expected(self, kind: str, assets: Assets) -> npt.NDArray[np.int64]:
-        """Passes that should have seen each known asset; of an epoch processed again at least those that did."""
+        """Returns passes that should have seen each known asset; of a reprocessed epoch at least those that did."""
         table = assets.evidence
         count = table.num_rows
         columns = [
@@ -175,7 +175,7 @@ class _Recording:
         return pa.table(dict(zip(schema.names, arrays, strict=True))).cast(schema)
 
     def _placed(self, seen: Mapping[str, pa.Table]) -> dict[str, Placed]:
-        """Assets of all kinds: those that were just found first, then those that are known besides."""
+        """Returns assets of all kinds: those that were just found first, then the other known ones."""
         placed: dict[str, Placed] = {}
         for kind in {*seen, *self.state.assets}:
             ids: list[Any] = []
@@ -197,7 +197,7 @@ class _Recording:
 
 
 def _days(epoch_gps_ns: npt.NDArray[np.int64]) -> list[dt.date]:
-    """Days (UTC) of epochs."""
+    """Returns the days (UTC) of epochs."""
     gps_s = epoch_gps_ns // NS_PER_S
     unix_s = gps_s + GPS_EPOCH_UNIX_S - leap_seconds_at_gps(gps_s)
     days: list[dt.date] = unix_s.astype("datetime64[s]").astype("datetime64[D]").tolist()
@@ -209,7 +209,7 @@ def _none(kind: str) -> Assets:
 
 
 def _wide(kind: str, rows: pa.Table, seen: int) -> pa.Table:
-    """Rows of a kind as rows of the table `assets_found`."""
+    """Returns rows of a kind as rows of the table `assets_found`."""
     schema, count = evidence_table(), rows.num_rows
     own: dict[str, Any] = {name: rows[name] for name in rows.column_names}
     own |= {
@@ -222,7 +222,7 @@ def _wide(kind: str, rows: pa.Table, seen: int) -> pa.Table:
 
 
 def _unseen(kind: str, ids: npt.NDArray[Any], expected: npt.NDArray[np.int64]) -> pa.Table:
-    """Rows of assets that the run did not find; without a status where it is not known that it should have."""
+    """Returns rows of assets that the run did not find; without a status unless it should have seen them."""
     rows = pa.table(
         {
             "asset_id": pa.array([str(one) for one in ids], pa.string()),

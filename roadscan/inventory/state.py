@@ -1,4 +1,4 @@
-"""The inventory as it was after any commit: found ⊕ edited.
+"""The inventory as it was after any commit: evidence with edits applied.
 
 Of each asset the evidence of the newest survey epoch that saw it counts, of an epoch that was processed several times
 the newest processing. Then edits in force replace single values.
@@ -27,7 +27,7 @@ from roadscan.store.asset_truth import AssetTruth, Commit
 from roadscan.store.inventory_schema import GEOMETRY, asset_table
 
 _OF_THE_PLACE: Final = ("station_m", "offset_m", "lane")
-"""Columns that the evidence measured at its own place; unknown where a person moved the asset."""
+"""Columns that were measured at the place of the evidence; unknown if a person moved the asset."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,23 +36,23 @@ class Assets:
 
     kind: str
     rows: pa.Table
-    """As people see them, with edits."""
+    """With edits, as people see them."""
     evidence: pa.Table
-    """As they were found: the same assets in the same order; all but the id is null where there is no evidence."""
+    """As found: the same assets in the same order; all but the id is null where there is no evidence."""
 
     @cached_property
     def ids(self) -> npt.NDArray[Any]:
-        """Ids of the assets, ascending."""
+        """Returns ids of the assets, ascending."""
         return np.asarray(self.rows["asset_id"].to_numpy(zero_copy_only=False), dtype=str)
 
     def place(self, asset_id: str) -> int | None:
-        """Row of an asset; None where there is none."""
+        """Returns the row of an asset; None where there is none."""
         at = int(np.searchsorted(self.ids, asset_id))
         return at if at < self.ids.size and self.ids[at] == asset_id else None
 
     @cached_property
     def shapes(self) -> npt.NDArray[Any]:
-        """Geometries as people see them, in the map's own unit."""
+        """Returns geometries as people see them, in the map's own unit."""
         return np.asarray(shapely.from_wkb(self.rows[GEOMETRY].to_numpy(zero_copy_only=False)))
 
 
@@ -62,20 +62,20 @@ class State:
 
     commit: int
     assets: Mapping[str, Assets]
-    """By kind; only kinds that have any."""
+    """By kind; only kinds with assets."""
     edits: Folded
     orphans: frozenset[str]
-    """Edited assets whose evidence or drawing was undone; they keep it, and are said to be missing."""
+    """Edited assets whose evidence or drawing was undone; they keep their evidence and have status missing."""
     units_m: tuple[float, float] = (1.0, 1.0)
-    """Metres of a unit of the map: of its coordinates, and of its heights."""
+    """Metres in a unit of the map: of its coordinates, and of its heights."""
 
     @cached_property
     def kind_of(self) -> dict[str, str]:
-        """Kind of each asset."""
+        """Returns the kind of each asset."""
         return {str(one): kind for kind, assets in self.assets.items() for one in assets.ids}
 
     def row(self, asset_id: str, *, evidence: bool = False) -> dict[str, Any] | None:
-        """An asset as people see it, or as it was found; None where there is none."""
+        """Returns an asset as people see it, or as it was found; None where there is none."""
         kind = self.kind_of.get(asset_id)
         at = None if kind is None else self.assets[kind].place(asset_id)
         if kind is None or at is None:
@@ -86,7 +86,7 @@ class State:
 
 
 def live_commits(commits: Sequence[Commit]) -> list[Commit]:
-    """Commits that are not undone; an undoing that was undone itself does not count."""
+    """Returns commits that are not undone; an undoing that was undone itself does not count."""
     undone: set[int] = set()
     for commit in reversed(commits):
         if commit.kind == "undo" and commit.number not in undone:
@@ -95,11 +95,11 @@ def live_commits(commits: Sequence[Commit]) -> list[Commit]:
 
 
 def state_at(truth: AssetTruth, number: int | None = None, *, with_undone: bool = False) -> State:
-    """The inventory after commit `number`, today's where it is left out.
+    """Returns the inventory after commit `number`, by default today's.
 
     Parameters
     ----------
-    with_undone : whether assets count that only undone runs have found. They are known again when they are found again.
+    with_undone : whether assets count that only undone runs have found. They are recognised when found again.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def state_at(truth: AssetTruth, number: int | None = None, *, with_undone: bool 
 
 
 def commit_at(truth: AssetTruth, when: str | dt.date | int | None) -> int:
-    """Number of the last commit at an instant, a day (UTC, its end) or by its own number; 0 before the first.
+    """Returns the number of the last commit at an instant, a day (UTC, its end) or by its number; 0 before the first.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def commit_at(truth: AssetTruth, when: str | dt.date | int | None) -> int:
 
 
 def _newest_first(found: Sequence[Commit]) -> list[Commit]:
-    """Commits of evidence by the epoch of their survey, then by their own order, the newest first."""
+    """Returns commits of evidence by the epoch of their survey, then by their order, the newest first."""
     began: dict[str, int] = {}
     for commit in found:
         began.setdefault(commit.epoch, commit.epoch_gps_ns)
@@ -163,7 +163,7 @@ def _newest_first(found: Sequence[Commit]) -> list[Commit]:
 
 
 def _evidence(truth: AssetTruth, commits: Sequence[Commit]) -> tuple[pa.Table | None, dict[str, Any]]:
-    """Rows of evidence that count, and of assets that newer evidence did not see: status and passes expected."""
+    """Returns the evidence that counts; for assets that newer evidence did not see, status and passes expected."""
     parts: list[pa.Table] = []
     status: dict[str, tuple[str, int | None]] = {}
     for commit in commits:
@@ -184,7 +184,7 @@ def _evidence(truth: AssetTruth, commits: Sequence[Commit]) -> tuple[pa.Table | 
 
 
 def _fresh(truth: AssetTruth, commit: Commit, parts: Sequence[pa.Table]) -> bool:
-    """True if a commit tells of an asset that the newer ones did not see."""
+    """Returns True if a commit mentions an asset that the newer ones did not see."""
     ids = truth.rows(commit, ["asset_id"])["asset_id"]
     return not pc.all(pc.is_in(ids, value_set=_id_array(parts))).as_py()
 
@@ -202,7 +202,7 @@ def _ids(parts: Sequence[pa.Table]) -> set[str]:
 def _with_lost(
     truth: AssetTruth, undone: Sequence[Commit], found: pa.Table | None, wanted: set[str] | None
 ) -> tuple[pa.Table | None, set[str]]:
-    """Evidence with that of assets which only undone commits saw, of all or of wanted ones; and which these are."""
+    """Returns evidence with that of assets which only undone commits saw (all, or wanted ones); and which these are."""
     kept: set[str] = set()
     for commit in undone:
         rows = truth.rows(commit)
@@ -249,7 +249,7 @@ def _by_kind(
 
 
 def _without_rejected_parents(assets: dict[str, Assets], edits: Folded) -> dict[str, Assets]:
-    """Assets whose parents are not those that people rejected; a parent that a person gave stays."""
+    """Returns assets without parents that people rejected; a parent that a person assigned stays."""
     rejected = pa.array(edits.rejected, pa.string())
     if not len(rejected):
         return assets
@@ -270,7 +270,7 @@ def _with_status(rows: pa.Table, status: Mapping[str, tuple[str, int | None]]) -
 
 
 def _edited(kind: str, evidence: pa.Table, edits: Iterable[Edit], units_m: tuple[float, float]) -> pa.Table:
-    """Rows with the values that people gave."""
+    """Returns rows with the values that people gave."""
     by_attribute: dict[str, list[Edit]] = defaultdict(list)
     for edit in edits:
         by_attribute[edit.attribute].append(edit)
@@ -289,7 +289,7 @@ def _edited(kind: str, evidence: pa.Table, edits: Iterable[Edit], units_m: tuple
 
 
 def _drawn_again(evidence: pa.Table, edits: Folded, drawn: Sequence[str]) -> list[Edit]:
-    """Edits that drew assets, of which neither a later edit nor evidence says where they are."""
+    """Returns edits that drew assets whose place neither a later edit nor evidence gives."""
     if not drawn:
         return []
     placed = set(evidence.filter(pc.is_valid(evidence[GEOMETRY]))["asset_id"].to_pylist())
@@ -297,7 +297,7 @@ def _drawn_again(evidence: pa.Table, edits: Folded, drawn: Sequence[str]) -> lis
 
 
 def _as_drawn(rows: pa.Table, drawn: Sequence[Edit]) -> pa.Table:
-    """Rows in which assets that a person drew are confirmed and say who drew them, where nothing else does."""
+    """Returns rows in which drawn assets are confirmed and name who drew them, where nothing else does."""
     if not drawn:
         return rows
     ids = np.asarray(rows["asset_id"].to_numpy(zero_copy_only=False), dtype=str)
@@ -311,7 +311,7 @@ def _as_drawn(rows: pa.Table, drawn: Sequence[Edit]) -> pa.Table:
 
 
 def _at_their_places(rows: pa.Table, moved: Sequence[int], units_m: tuple[float, float]) -> pa.Table:
-    """Reference points of moved assets, from their geometry."""
+    """Returns reference points of moved assets, from their geometry."""
     if not moved:
         return rows
     shapes = shapely.from_wkb(rows[GEOMETRY].take(pa.array(moved)).to_numpy(zero_copy_only=False))
@@ -322,7 +322,7 @@ def _at_their_places(rows: pa.Table, moved: Sequence[int], units_m: tuple[float,
 
 
 def reference_points(shapes: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """(n, 3) reference points: a point itself, the middle of a line, else a point on or in it at its mean height."""
+    """Returns reference points (n, 3): a point, the middle of a line, else a point on or in it at its mean height."""
     is_line = shapely.get_type_id(shapes) == shapely.GeometryType.LINESTRING
     points = shapely.point_on_surface(shapely.force_2d(shapes))
     points[is_line] = shapely.line_interpolate_point(shapes[is_line], 0.5, normalized=True)
@@ -343,7 +343,7 @@ def _places(ids: npt.NDArray[Any], edits: Iterable[Edit]) -> list[int]:
 
 
 def _replaced(rows: pa.Table, name: str, places: Sequence[int], values: Sequence[Any]) -> pa.Table:
-    """Rows with other values of a column at some places, which ascend."""
+    """Returns rows with other values of a column at some positions, which ascend."""
     if not places:
         return rows
     at = rows.schema.get_field_index(name)

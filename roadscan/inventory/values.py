@@ -1,4 +1,4 @@
-"""Values of assets as edits hold them, and how many σ two of them differ by."""
+"""Values of assets as edits encode them, and their differences in σ."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ import shapely
 from roadscan.store.inventory_schema import GEOMETRY, asset_columns, asset_table
 
 SIGMA_LEAST_M: Final = 0.005
-"""No evidence is taken as better than that."""
-_SIGMA_DEG: Final = 2.0
-_SIGMA_SLOPE: Final = 0.005
-_SIGMA_RATIO: Final = 0.1
+"""Least σ that is assumed of any evidence (m)."""
+_SIGMA_DEG: Final = 2.0  # σ of a measured angle (degrees).
+_SIGMA_SLOPE: Final = 0.005  # σ of a measured slope (m/m).
+_SIGMA_RATIO: Final = 0.1  # σ of a measured ratio.
 
 
 def encoded(value: Any) -> str:
-    """A value as JSON: dates as ISO 8601, geometries (bytes) as hexadecimal WKB."""
+    """Returns a value as JSON: dates as ISO 8601, geometries (bytes) as hexadecimal WKB."""
     if isinstance(value, bytes):
         value = value.hex()
     elif isinstance(value, dt.date):
@@ -35,18 +35,18 @@ def encoded(value: Any) -> str:
 
 
 def encoded_column(values: list[Any]) -> list[str | None]:
-    """Values of a column as :func:`encoded` writes them, None where there is none."""
+    """Returns values of a column as :func:`encoded` writes them, None where there is none."""
     kinds = {type(v) for v in values} - {type(None)}
     if kinds == {bytes}:
         return [None if v is None else f'"{v.hex()}"' for v in values]
-    if kinds == {float}:  # as JSON has them: all but infinities, which repr writes otherwise
+    if kinds == {float}:  # as in JSON but for infinities, which repr writes otherwise
         return [None if v is None else repr(v) if math.isfinite(v) else encoded(v) for v in values]
     told: dict[Any, str | None] = {v: encoded(v) for v in set(values)} | {None: None}
     return [told[v] for v in values]
 
 
 def decoded(kind: str, attribute: str, text: str | None) -> Any:
-    """The value that :func:`encoded` wrote, as the column of the kind holds it."""
+    """Returns the value that :func:`encoded` wrote, in the type of the kind's column."""
     value = None if text is None else json.loads(text)
     if value is None:
         return None
@@ -56,19 +56,19 @@ def decoded(kind: str, attribute: str, text: str | None) -> Any:
 
 
 def iso_wkb(geometries: npt.NDArray[Any]) -> list[bytes | None]:
-    """Geometries as ISO WKB, little-endian, with heights where they have them: same place, same bytes."""
+    """Returns geometries as ISO WKB, little-endian, with heights where they have them: same place, same bytes."""
     return list(shapely.to_wkb(geometries, flavor="iso", byte_order=1))
 
 
 def iso_column(column: pa.ChunkedArray) -> pa.Array:
-    """A column of WKB of any flavour as ISO WKB."""
+    """Returns a column of WKB of any flavour as ISO WKB."""
     return pa.array(iso_wkb(shapely.from_wkb(column.to_numpy(zero_copy_only=False))), pa.binary())
 
 
 def sigmas_apart(
     kind: str, attribute: str, one: Any, other: Any, row: Mapping[str, Any], units_m: tuple[float, float] = (1.0, 1.0)
 ) -> float:
-    """By how many σ two values of an attribute differ; infinity where they differ and have no σ.
+    """Returns the difference of two values of an attribute in σ; infinity where they differ and have no σ.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def sigmas_apart(
 
 
 def geometries_apart(one: bytes, other: bytes, horizontal: float, height: float) -> float:
-    """By how many σ, in units of the map, two places differ: of points in both ways, else by Hausdorff distance."""
+    """Returns the difference of two places in σ (map units): of points horizontally and in height, else Hausdorff."""
     first, second = shapely.from_wkb(one), shapely.from_wkb(other)
     if first.geom_type == second.geom_type == "Point":
         rise = abs(first.z - second.z) if first.has_z and second.has_z else 0.0
@@ -100,12 +100,12 @@ def geometries_apart(one: bytes, other: bytes, horizontal: float, height: float)
 
 
 Sigma: TypeAlias = Callable[[Any, Any, Any], Any]
-"""σ of an attribute from σ in the horizontal, σ in height and the value, each a number or an array."""
+"""Function from σ horizontal, σ in height and the value to the σ of an attribute, each a number or an array."""
 
 
 @functools.cache
 def sigma_of(kind: str, attribute: str) -> Sigma | None:
-    """How σ of a number follows from those of the place; None for texts, and where any difference counts."""
+    """Returns how σ of a number follows from those of the place; None for texts, and where any difference counts."""
     column = next((c for c in asset_columns(kind) if c.name == attribute and c.type == "float64"), None)
     if column is None:
         return None

@@ -1,4 +1,4 @@
-"""How many passes should have seen a place."""
+"""Number of passes that should have seen a place."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from roadscan.core.errors import SchemaError
 from roadscan.core.ids import TileId
 from roadscan.store.asset_schema import asset_schema
 
-NOT_KNOWN: Final = -1
+NOT_KNOWN: Final = -1  # Passes where it is not known how many there were.
 _HELD_SQUARES: Final = 4096
-"""Squares that are kept in memory, some 50 kB each."""
+"""Squares kept in memory, some 50 kB each."""
 _EDGE: Final = b"edge_m"
 
 
 class Visibility(Protocol):
-    """What a survey tells of the passes that had a place in sight."""
+    """Passes of a survey that had places in sight."""
 
     def expected_passes(self, kind: str, places_m: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-        """(n,) passes that should have seen assets of a kind, -1 where that is not known.
+        """Returns the passes (n,) that should have seen assets of a kind, -1 where that is not known.
 
         Parameters
         ----------
@@ -34,17 +34,17 @@ class Visibility(Protocol):
 
 
 class Unknown:
-    """A survey that does not tell."""
+    """A survey without such figures."""
 
     def expected_passes(self, kind: str, places_m: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-        """-1 everywhere."""
+        """Returns -1 everywhere."""
         return np.full(len(places_m), NOT_KNOWN, dtype=np.int64)
 
 
 class VisibilityGrid:
     """Passes by cell of a grid of the map and height above the ground; places in no cell were seen by none.
 
-    What stands at a point reaches upwards: it counts as in sight where its place is, or the band above that. Of lines
+    A point asset reaches upwards: it was in sight if the band of its place was, or the band above. Of lines
     and areas the place itself counts.
 
     Parameters
@@ -73,7 +73,7 @@ class VisibilityGrid:
         self._passes = passes[order]
 
     def expected_passes(self, kind: str, places_m: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-        """Passes of the cells that the places lie in."""
+        """Returns the passes of the cells in which the places lie."""
         out = np.zeros(len(places_m), dtype=np.int64)
         cell = np.floor(places_m[:, :2] / self.edge_m).astype(np.int64)
         keys = _keys(cell[:, 0], cell[:, 1])
@@ -90,12 +90,12 @@ class VisibilityGrid:
 
 
 class VisibilityOfSquares:
-    """The same of a survey whose squares are read one by one, when they are asked for.
+    """Passes of a survey whose squares are read one by one, on demand.
 
     Parameters
     ----------
     edge_m : edge of the squares (m).
-    read : cells of a square; None where no sensor looked there.
+    read : returns the cells of a square; None where no sensor looked there.
     """
 
     def __init__(self, edge_m: float, read: Callable[[TileId], pa.Table | None]) -> None:
@@ -109,7 +109,7 @@ class VisibilityOfSquares:
         self._grid = grid
 
     def expected_passes(self, kind: str, places_m: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-        """Passes of the cells that the places lie in; none where no sensor looked."""
+        """Returns the passes of the cells in which the places lie; none where no sensor looked."""
         out = np.zeros(len(places_m), dtype=np.int64)
         of_place = np.floor(places_m[:, :2] / self._edge_m).astype(np.int64)
         squares, number = np.unique(of_place, axis=0, return_inverse=True)
@@ -124,5 +124,5 @@ class VisibilityOfSquares:
 
 
 def _keys(column: npt.NDArray[np.int64], row: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """One number a cell."""
+    """Returns one number for each cell."""
     return np.asarray((row << 32) + column)

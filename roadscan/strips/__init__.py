@@ -1,1 +1,1 @@
-"""Strips of road as each sensor of each run saw them: sensors that see no road, or another road than the others."""
+"""Strips of road as each sensor of each run saw them: finds sensors that see no road, or contradict the others."""

@@ -1,4 +1,4 @@
-"""What strips say of sensors: those that see no road, whose readings contradict the others, or lie along the travel."""
+"""Findings from strips: sensors that see no road, contradict the others, or are shifted along the travel."""
 
 from __future__ import annotations
 
@@ -47,25 +47,25 @@ ALONG_TRAVEL: Final = Witness(
 )
 
 _LEAST_READINGS: Final = 1000
-"""Of fewer readings nothing is said."""
+"""With fewer readings nothing is reported."""
 _LEAST_PLACED: Final = 0.05
-"""A profiler of which fewer readings have a return within its range looks elsewhere, or is covered."""
+"""A profiler with a smaller share of readings that have a return within range looks elsewhere, or is covered."""
 _LEAST_ON_ROAD: Final = 0.05
-"""Readings beside the way of which fewer lie at heights of a road are of no road."""
+"""If a smaller share of the readings beside the way lies at heights of a road, the sensor sees no road."""
 _LEVEL_M: Final = 0.3
-"""Levels of the road differ by less between sensors of one vehicle: crowns, kerbs, springs."""
+"""Road levels of sensors on one vehicle differ by less than this (m): crowns, kerbs, springs."""
 _LEVEL_SHARE: Final = 0.2
-"""A lidar of whose readings beside the way fewer lie at one level sees no ground at all."""
+"""A lidar with a smaller share of its readings beside the way at one level sees no ground at all."""
 _ASTRAY: Final = 0.02
-"""Share of a profiler's readings that lie more than 0.1 m off their cell: spray and dust are fewer. A lidar also sees
+"""Greatest share of a profiler's readings more than 0.1 m off their cell: spray and dust are fewer. A lidar also sees
 parts of the vehicle, and people beside it."""
 _HEIGHT_M: Final = 0.1
-"""Median heights of two sensors differ by less."""
-_HEIGHT_SIGMA_M: Final = 0.02
+"""Median heights of two sound sensors differ by less than this (m)."""
+_HEIGHT_SIGMA_M: Final = 0.02  # Standard deviation of a difference of heights, before its spread is added (m).
 _SPREAD_M: Final = 0.05
-"""Heights of two sensors scatter by less about their median difference, cell by cell."""
+"""Heights of two sound sensors scatter by less than this (m) about their median difference, cell by cell."""
 _SHIFT_M: Final = 0.06
-"""Shifts along the travel below this are not told from a lever arm measured on the vehicle."""
+"""Smaller shifts along the travel (m) cannot be distinguished from an error of a hand-measured lever arm."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class _Stretch:
 
 
 class _Names:
-    """How logs are called in findings."""
+    """Names of logs as findings print them."""
 
     def __init__(self, records: Sequence[LogRecord], stretches: Sequence[_Stretch]) -> None:
         by_key = {record.key: record.path for record in records}
@@ -97,7 +97,7 @@ class _Names:
 
 
 def strip_findings(records: Sequence[LogRecord], manifest: Manifest) -> list[Finding]:
-    """Sensors that see no road, and those that contradict the others."""
+    """Returns the findings on sensors that see no road, and on those that contradict the others."""
     stretches = [_stretch(record.figures()) for _, record in sorted(manifest.of(PRODUCT).items())]
     names = _Names(records, stretches)
     seen: dict[tuple[str, str], list[SeenBy]] = defaultdict(list)
@@ -156,7 +156,7 @@ def _road_of(levels_m: Sequence[float]) -> str:
 
 
 def _no_road(own: Sequence[SeenBy], levels_m: Sequence[float], others_m: Sequence[float], road: str) -> str:
-    """Why a sensor sees no road, "" where it does; `others_m` : levels of several others, which agree on the road's."""
+    """Returns why a sensor sees no road, "" if it does; `others_m` : levels of several others, which agree."""
     given, placed = sum(s.given for s in own), sum(s.placed for s in own)
     beside, readings = sum(s.beside for s in own), sum(s.readings for s in own)
     is_profiler = own[0].is_profiler
@@ -205,7 +205,7 @@ def _ends(stretch: _Stretch, pair: Pair, *, by_way: bool) -> tuple[End, End]:
 
 
 def _of_poses(stretches: Sequence[_Stretch], ends: tuple[End, End], component: int) -> float:
-    """σ (m) of the difference of the poses of two runs, horizontal (0) or down (1); 0 within a run."""
+    """Returns σ (m) of the difference of the poses of two runs, horizontal (0) or down (1); 0 within a run."""
     if ends[0].run == ends[1].run:
         return 0.0
     known = {one.run: one.sigma_m[component] for one in stretches}
@@ -230,7 +230,7 @@ def _heights(stretches: Sequence[_Stretch], blind: set[tuple[str, str]]) -> Iter
 
 
 def _scattered(stretches: Sequence[_Stretch], blind: set[tuple[str, str]], names: _Names) -> list[Finding]:
-    """Sensors whose heights scatter against most others, or pairs that scatter against one another."""
+    """Returns sensors whose heights scatter against most others, or pairs that scatter against one another."""
     pairs: dict[frozenset[tuple[str, str]], list[float]] = defaultdict(list)
     for one, pair in _of_seeing(stretches, blind):
         ends = _ends(one, pair, by_way=False)

@@ -1,4 +1,4 @@
-"""How far one sensor's picture of a strip lies ahead of another's, by likeness of heights or of intensities."""
+"""Lag of one sensor's strip behind another's along the way, from the correlation of heights or intensities."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from roadscan.strips.strip import ALONG_M
 Float64 = npt.NDArray[np.float64]
 
 FARTHEST_M: Final = 15.0
-"""Lags are sought so far to both sides: 0.9 s at 60 km/h."""
+"""Lags are searched this far (m) to both sides: 0.9 s at 60 km/h."""
 _SMOOTH_M: Final = 5.0
-"""What is longer than this is taken out of a picture: grades and bends are alike at every lag."""
+"""Features longer than this (m) are removed from a strip: grades and bends are alike at every lag."""
 _BLOCKS: Final = 6
-"""Pieces of the strip, each left out in turn: their agreement is the σ."""
-_LEAST_CELLS: Final = 200
+"""Blocks of the strip, each left out in turn: their agreement gives σ."""
+_LEAST_CELLS: Final = 200  # With fewer cells in common (of 0.1 m by 0.5 m) no lag is computed.
 _LEAST_LIKENESS: Final = 0.3
-"""Pictures that are less alike at their best show nothing of where they lie."""
+"""Strips whose best correlation is lower show no lag."""
 _LEAST_SIGMA_M: Final = ALONG_M / 5
-"""A summit is found no better than to this share of a cell."""
+"""A peak is located no better than this share of a cell (m)."""
 _EQUAL: Final = 0.9
-"""Summits of this share of the highest are as good: dashes of paint repeat, and the least shift is taken."""
+"""Peaks of at least this share of the highest are as good: dashes of paint repeat, and the least shift is taken."""
 _SIGMAS: Final = 3.0
-"""Likeness at the summit is above that without a lag by so many σ, or nothing is off."""
+"""A lag is reported only if its correlation exceeds that at lag 0 by this many σ."""
 
 
 class Lag(NamedTuple):
-    """A picture lies `lag_m` farther along the way than another."""
+    """One strip lies `lag_m` farther along the way than another."""
 
     lag_m: float
     sigma_m: float
@@ -40,10 +40,10 @@ class Lag(NamedTuple):
 
 
 def lag_of(one: Float64, other: Float64) -> Lag | None:
-    """How far `other` lies ahead of `one`; both (n, q) cells along and across the way, NaN where nothing was seen.
+    """Returns how far `other` lies ahead of `one`; both (n, q) cells along and across the way, NaN where unseen.
 
-    The σ is that of the jackknife over six pieces of the strip (Efron and Stein 1981). None where they have too little
-    in common, or where their likeness tells no place.
+    The σ is that of the jackknife over six blocks of the strip (Efron and Stein 1981). None where they have too little
+    in common, or where their correlation shows no lag.
     """
     width = round(_SMOOTH_M / ALONG_M)
     first, second = _sharp(one, width), _sharp(other, width)
@@ -60,13 +60,13 @@ def lag_of(one: Float64, other: Float64) -> Lag | None:
     rises = np.array([one[round(at / ALONG_M) + middle] - one[middle] for one in without])
     scale = (_BLOCKS - 1) / np.sqrt(_BLOCKS)
     if abs(at) > ALONG_M and rises.mean() < _SIGMAS * scale * rises.std():
-        return None  # as alike where it is as elsewhere
+        return None  # the peak is no higher than its surroundings
     sigma_m = float(np.hypot(scale * places.std(), _LEAST_SIGMA_M))
     return Lag(at, sigma_m, float(np.nanmax(whole)), _summits(whole).size > 1)
 
 
 def _sharp(picture: Float64, width: int) -> Float64:
-    """A picture without what is longer than so many cells along the way."""
+    """Returns a strip without features longer than so many cells along the way."""
     seen = np.isfinite(picture)
     base = np.nanmean(picture) if seen.any() else 0.0
     sums, counts = (_running(values, width) for values in (np.where(seen, picture - base, 0.0), seen.astype(float)))
@@ -81,7 +81,7 @@ def _running(values: Float64, width: int) -> Float64:
 
 
 def _sums(one: Float64, other: Float64, step: int) -> Float64:
-    """(blocks, 6) sums over the cells that both have, `other` moved back by so many cells."""
+    """Returns sums (blocks, 6) over the cells that both strips have, with `other` moved back by so many cells."""
     rows = len(one)
     low, high = max(0, -step), rows - max(0, step)
     a, b = one[low:high], other[low + step : high + step]
@@ -95,7 +95,7 @@ def _sums(one: Float64, other: Float64, step: int) -> Float64:
 
 
 def _likeness(sums: Float64) -> Float64:
-    """Correlation (k,) from sums (k, 6); NaN of too few cells."""
+    """Returns correlations (k,) from sums (k, 6); NaN with too few cells."""
     n, a, b, aa, bb, ab = sums.T
     n = np.maximum(n, 1.0)
     spread = np.sqrt(np.maximum((aa - a * a / n) * (bb - b * b / n), 1e-30))
@@ -103,7 +103,7 @@ def _likeness(sums: Float64) -> Float64:
 
 
 def _summits(likeness: Float64) -> npt.NDArray[np.int64]:
-    """Places of the summits that are about as high as the highest."""
+    """Returns the indices of the peaks that are about as high as the highest."""
     padded = np.pad(np.nan_to_num(likeness, nan=-1.0), 1, constant_values=-1.0)
     is_top = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
     highest = float(padded.max())
@@ -111,7 +111,7 @@ def _summits(likeness: Float64) -> npt.NDArray[np.int64]:
 
 
 def _summit(likeness: Float64) -> float:
-    """The least lag (m) of the summits that are about the highest, between the cells by a parabola."""
+    """Returns the least lag (m) of the peaks about as high as the highest, interpolated by a parabola."""
     middle = likeness.size // 2
     k = min(_summits(likeness).tolist(), key=lambda step: abs(step - middle))
     if not 0 < k < likeness.size - 1:

@@ -1,4 +1,4 @@
-"""Stage `strips`: strips of road as each sensor of each run saw them, held against one another."""
+"""Stage `strips`: strips of road as each sensor of each run saw them are compared."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from roadscan.strips.work import PRODUCT, compare_strips, strip_tasks
 
 
 class Strips(Stage):
-    """It makes no product: what it finds is a doubt about a sensor, or nothing."""
+    """The stage that makes no product: its findings name suspect sensors."""
 
     name = "strips"
     title = "what sensors saw of the same strips of road, held against one another"
@@ -24,7 +24,7 @@ class Strips(Stage):
     reads = ("scans", "returns", "cloud", "trajectory", "trajectory_accuracy", "clocks", "mountings", "footprints")
 
     def run(self, session: Session) -> None:
-        """Compare the strips that are not compared yet."""
+        """Compare the strips that have not been compared yet."""
         session.failed(self.name, compare_strips(session, session.manifest))
 
     def state(self, session: Session) -> StageState:
@@ -33,5 +33,5 @@ class Strips(Stage):
         return StageState.of(session.manifest, [(PRODUCT, one.unit, one.key) for one in tasks])
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """Sensors that the others contradict, and those that see no road."""
+        """Returns findings on sensors that the others contradict, and on those that see no road."""
         return strip_findings(records, manifest)

@@ -16,40 +16,40 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 ALONG_M: Final = 0.1
-"""Length of a cell: a clock that is 5 ms off moves readings by as much at 20 m/s."""
-ACROSS_M: Final = 0.5
+"""Length of a cell (m): a clock that is 5 ms off moves readings by as much at 20 m/s."""
+ACROSS_M: Final = 0.5  # Width of a cell (m).
 HALF_WIDTH_M: Final = 5.0
-"""The strip ends so far to both sides of the way: the lane driven and half of the next."""
-COLUMNS: Final = round(2 * HALF_WIDTH_M / ACROSS_M)
+"""The strip ends this far (m) to both sides of the way: the lane driven and half of the next."""
+COLUMNS: Final = round(2 * HALF_WIDTH_M / ACROSS_M)  # Cells across the strip.
 _VERTEX_M: Final = 0.5
-"""Vertices of the way: within them a bend of 10 m leaves the chord by 3 mm."""
-_BELOW_M: Final = 5.0
+"""Spacing of the way's vertices (m): on a bend of 10 m radius the chord misses the arc by 3 mm."""
+_BELOW_M: Final = 5.0  # Readings farther below the body's origin than this (m) are not on the road.
 _ABOVE_M: Final = 1.0
-"""Readings that lie farther below the body's origin, or above it, are of no road on which the vehicle drives; the
+"""Readings that lie farther above the body's origin than this (m) are not on the road that the vehicle drives; the
 origin may be at the height of the road."""
 _LEAST_READINGS: Final = 2
-"""Fewer make no cell."""
+"""Cells with fewer readings are empty."""
 ASTRAY_M: Final = 0.1
-"""A reading that lies farther from the median height of its cell is astray: potholes and kerbs are lower."""
-_OWN_LANE_M: Final = 1.75
+"""A reading farther (m) from the median height of its cell is an outlier: potholes and kerbs are lower."""
+_OWN_LANE_M: Final = 1.75  # The driven lane ends this far (m) to both sides of the way.
 _BESIDE_M: Final = 5.0
-"""So far to both sides of the way, and so far ahead and behind, there is the vehicle itself and nothing else."""
-_LEVEL_STEP_M: Final = 0.1
+"""The vehicle fills the way this far (m) to both sides, ahead and behind."""
+_LEVEL_STEP_M: Final = 0.1  # Height step (m) of the histogram that finds the level of most readings.
 
 
 @dataclass(frozen=True)
 class Way:
-    """Where the body's origin went over a stretch, as even vertices (n,)."""
+    """The path of the body's origin over a stretch, as evenly spaced vertices (n,)."""
 
     easting_m: Float64
     northing_m: Float64
     height_m: Float64
     epoch_gps_ns: Float64
-    """When it was there."""
+    """Time of passage at each vertex."""
 
     @classmethod
     def of(cls, body_m: Float64, epochs_gps_ns: Int64) -> Self:
-        """The way through places (p, 3) of the body's origin, easting, northing, height, at ascending epochs (p,)."""
+        """Returns the way through the body's origins (p, 3), easting, northing, height (m), at ascending epochs."""
         station = way_along(body_m)
         goes_on = np.append(True, np.diff(station) > 0.0)
         at = np.arange(0.0, station[-1], _VERTEX_M)
@@ -57,12 +57,12 @@ class Way:
 
     @property
     def length_m(self) -> float:
-        """Length."""
+        """Returns its length (m)."""
         return self.easting_m.size * _VERTEX_M
 
     @property
     def cells(self) -> int:
-        """Cells along the whole way."""
+        """Returns the number of cells along the whole way."""
         return int(self.easting_m.size * _VERTEX_M / ALONG_M)
 
     @cached_property
@@ -71,17 +71,17 @@ class Way:
 
     @cached_property
     def heading_rad(self) -> Float64:
-        """(n,) clockwise from grid north."""
+        """Returns headings (n,) clockwise from grid north (rad)."""
         return np.arctan2(np.gradient(self.easting_m), np.gradient(self.northing_m))
 
     def near(self, points_m: Float64, within_m: float) -> tuple[npt.NDArray[np.bool_], Int64]:
-        """Points (m, ≥ 2) within a distance of the way, and the vertex nearest to each."""
+        """Returns a mask of the points (m, ≥ 2) within a distance of the way, and the vertex nearest to each."""
         away, vertex = self._tree.query(points_m[:, :2], distance_upper_bound=within_m)
         found = np.isfinite(away)
         return found, np.where(found, vertex, 0)
 
     def strip(self, points_m: Float64, intensity: npt.NDArray[np.uint16], epochs_gps_ns: Int64) -> Strip:
-        """What readings at points (m, 3), of intensities (m,) and at epochs (m,), say of the strip."""
+        """Returns the strip made of points (m, 3), with intensities (m,) and epochs (m,)."""
         found, vertex = self.near(points_m, HALF_WIDTH_M + _VERTEX_M)
         points, vertex, light = points_m[found], vertex[found], intensity[found].astype(np.float64)
         east, north = points[:, 0] - self.easting_m[vertex], points[:, 1] - self.northing_m[vertex]
@@ -109,24 +109,24 @@ class Way:
 
 @dataclass(frozen=True)
 class Strip:
-    """What one sensor saw of a strip; cells are (n, COLUMNS), NaN where it saw nothing."""
+    """A strip as one sensor saw it; cells are (n, COLUMNS), NaN where it saw nothing."""
 
     height_m: Float64
     intensity: Float64
     below_m: float
     """Depth below the body's origin at which most readings lie, negative above it; NaN without a reading."""
     level_share: float
-    """Share of the readings within the strip that lie there."""
+    """Share of the readings within the strip at that depth."""
     readings: int
     """Readings on the strip, at heights where a road can be."""
     own_lane: int
-    """Those of them below the vehicle and close to it, as it drove the way itself."""
+    """Those below the vehicle and close to it, taken while it drove the way."""
     astray: int
-    """Those that lie far from the others of their cell there."""
+    """Those far from the other readings of their cell."""
 
 
 def _level(below_m: Float64) -> tuple[float, float]:
-    """The depth near which most readings lie, and the share of them that do."""
+    """Returns the depth near which most readings lie, and their share."""
     if not below_m.size:
         return float("nan"), 0.0
     step = np.floor(below_m / _LEVEL_STEP_M).astype(np.int64)
@@ -136,7 +136,7 @@ def _level(below_m: Float64) -> tuple[float, float]:
 
 
 def _cells(cell: Int64, height_m: Float64, light: Float64, size: int) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:
-    """Mean height and intensity of each of `size` cells, without readings that lie astray, and which these are."""
+    """Returns mean height and intensity of each of `size` cells without outliers, and a mask of the outliers."""
     order = np.lexsort((height_m, cell))
     count = np.bincount(cell, minlength=size)
     first = np.cumsum(count) - count

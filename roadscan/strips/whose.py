@@ -1,4 +1,4 @@
-"""Whose fault it is where sensors disagree: the fewest sensors or runs that explain all differences between pairs."""
+"""Attribution of disagreements: the fewest sensors or runs whose errors explain all differences between pairs."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 MOST_FAULTS: Final = 3
-"""So many are looked for, the largest first."""
+"""At most this many errors are sought, the largest first."""
 _MOST_SIGMAS: Final = 10.0
-"""A difference counts as if it were no larger: single ones may be wrong by far."""
+"""Larger differences count as this many σ: single ones may be wrong by far."""
 _LEAST_GAIN: Final = 40.0
-"""A fault explains at least so much of the sum of squares (in σ²), and at least two differences."""
-_LEAST_SUPPORT: Final = 2
+"""An error explains at least this much of the sum of squares (in σ²), and at least two differences."""
+_LEAST_SUPPORT: Final = 2  # A reported error explains at least this many differences.
 _SAME_GAIN: Final = 10.0
-"""Explanations whose gains differ by less are as good as one another."""
-_POSE_SIGMAS: Final = 5.0
+"""Explanations whose gains differ by less (σ²) are equally good."""
+_POSE_SIGMAS: Final = 5.0  # An error common to poses of two runs counts from this many σ on.
 _WITHIN: Final = 3.0
-"""A difference of so many σ is explained."""
+"""A difference within this many σ is explained."""
 
 
 class End(NamedTuple):
-    """One of the two that are compared."""
+    """One of the two ends of a comparison."""
 
     run: str
     sensor: str
     epoch_gps_ns: int
-    """When it saw the place."""
+    """Time at which it saw the place."""
     sign: int
-    """How its own error enters the difference: −1 where its direction is against that of the difference."""
+    """Sign with which its error enters the difference: −1 where its direction opposes that of the difference."""
 
 
 class Difference(NamedTuple):
@@ -44,7 +44,7 @@ class Difference(NamedTuple):
     value: float
     sigma: float
     pose_sigma: float
-    """What errors of the poses of two runs may add, which all differences between these share; 0 within a run."""
+    """σ of the poses of two runs, shared by all differences between them; 0 within a run."""
 
 
 @dataclass(frozen=True)
@@ -55,24 +55,24 @@ class Suspect:
     run: str
     sensor: str
     since_gps_ns: int
-    """0: all the time."""
+    """Time from which it is wrong; 0: all the time."""
 
     def factor(self, end: End) -> int:
-        """How its error enters the value at an end."""
+        """Returns the factor with which its error enters the value at an end."""
         own = self.run in ("", end.run) and self.sensor in ("", end.sensor) and end.epoch_gps_ns >= self.since_gps_ns
         return end.sign if own else 0
 
 
 @dataclass(frozen=True)
 class Blamed:
-    """An error that explains differences, and who may have it: one of these."""
+    """An error that explains differences, and the suspects that may have it: one of them."""
 
     suspects: tuple[Suspect, ...]
     value: float
-    """Of the first; another's may have the other sign."""
+    """Error of the first suspect; that of another may have the other sign."""
     sigma: float
     support: int
-    """Differences that it explains."""
+    """Mask of the differences that it explains."""
 
 
 class _Fit(NamedTuple):
@@ -81,22 +81,22 @@ class _Fit(NamedTuple):
     sigma: float
     gain: float
     near: Bool
-    """Differences that it explains."""
+    """Mask of the differences that it explains."""
     factors: Float64
 
     @property
     def support(self) -> int:
-        """How many these are."""
+        """Returns how many differences it explains."""
         return int(np.count_nonzero(self.near))
 
     @property
     def is_held(self) -> bool:
-        """True where it explains two differences, and most of those that it enters."""
+        """Returns True if it explains two differences, and most of those that it enters."""
         return self.support >= _LEAST_SUPPORT and 2 * self.support > int(np.count_nonzero(self.factors))
 
 
 def whose(differences: Sequence[Difference], least: float) -> list[Blamed]:
-    """Errors of at least `least` that explain the differences, the one that explains most first."""
+    """Returns errors of at least `least` that explain the differences, the one that explains most first."""
     values = np.array([one.value for one in differences])
     of_poses = np.array([one.pose_sigma for one in differences])
     sigmas = np.hypot([one.sigma for one in differences], of_poses)
@@ -118,19 +118,19 @@ def whose(differences: Sequence[Difference], least: float) -> list[Blamed]:
 
 
 def _bound(fit: _Fit, least: float, of_poses: Float64) -> float:
-    """The least error that counts: poses of two runs may differ by some σ where nothing within a run shows it."""
+    """Returns the least error that counts: poses of two runs may differ by some σ if nothing within a run shows it."""
     shared = float(of_poses[fit.near].min())
     return max(least, _POSE_SIGMAS * shared)
 
 
 def _plain(fit: _Fit) -> tuple[int, int, float]:
-    """Sorts what is wrong all the time first, then single logs."""
+    """Returns a sort key: errors that last all the time first, then those of single logs."""
     order = ("log", "run", "sensor").index(fit.suspect.kind)
     return int(fit.suspect.since_gps_ns > 0), order, -fit.gain
 
 
 def _apart(fits: Sequence[_Fit]) -> list[_Fit]:
-    """Those that differ in more than their name."""
+    """Returns the suspects that differ in more than their name."""
     kept: list[_Fit] = []
     for one in fits:
         same = (np.array_equal(one.factors, other.factors) for other in kept if one.suspect.kind == "sensor")
@@ -154,7 +154,7 @@ def _suspects(differences: Sequence[Difference]) -> list[Suspect]:
 
 
 def _fit(suspect: Suspect, factors: Float64, values: Float64, sigmas: Float64) -> _Fit:
-    """The error of a suspect that explains most, with what it explains."""
+    """Returns the error of a suspect that explains most, with the differences that it explains."""
     own = factors != 0.0
     tried = np.unique(values[own] / factors[own])
     best = min(tried.tolist(), key=lambda value: _cost(values - factors * value, sigmas))

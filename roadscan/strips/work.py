@@ -1,4 +1,4 @@
-"""Strips of a survey: some stretches of each run, seen by its own sensors and by those of other runs; a record each."""
+"""Strips of a survey: some stretches of each run, seen by its sensors and by those of other runs; one record each."""
 
 from __future__ import annotations
 
@@ -40,31 +40,31 @@ from roadscan.tiles.tasks.tile_plan import tiles_of
 Float64 = npt.NDArray[np.float64]
 
 PRODUCT: Final = "strips"
-"""Name in the manifest of what the sensors say of a stretch; it has no file of its own."""
+"""Name in the manifest of a stretch's comparisons; there is no file."""
 _STRETCHES: Final = 6
-"""Stretches of a run, at most: they are spread over its time."""
+"""Stretches of a run, at most, spread over its time."""
 _LEAST_NS: Final = 4 * NS_PER_S
-"""A shorter run has one."""
-_LONGEST_NS: Final = 30 * NS_PER_S
-_LENGTH_M: Final = 100.0
-_LEAST_LENGTH_M: Final = 20.0
+"""A shorter run has one stretch (ns)."""
+_LONGEST_NS: Final = 30 * NS_PER_S  # A stretch lasts no longer than this (ns).
+_LENGTH_M: Final = 100.0  # A stretch is no longer than this (m).
+_LEAST_LENGTH_M: Final = 20.0  # A shorter way is not compared (m).
 _PAD_NS: Final = NS_PER_S
-"""Readings are taken so much before and after the stretch: a sensor looks ahead, or its clock is off."""
+"""Readings are taken this long (ns) before and after the stretch: a sensor looks ahead, or its clock is off."""
 _STEP_NS: Final = 20_000_000
-"""Poses of the way, about."""
+"""Approximate spacing of the way's poses (ns)."""
 _OTHER_RUNS: Final = 3
 """Later runs that are compared on a stretch, at most."""
-_PROFILES_PER_M: Final = 20.0
+_PROFILES_PER_M: Final = 20.0  # Profiles of a profiler on a stretch are thinned to about this many a metre.
 _READINGS: Final = 400_000
 """Readings of a sensor on a stretch, at most."""
-_BESIDE: Final = (-1, 0, 1)
+_BESIDE: Final = (-1, 0, 1)  # Offsets of a tile's neighbours, in columns and rows.
 _LEAST_CELLS: Final = 50
-"""Of fewer cells in common two sensors say nothing of one another."""
+"""With fewer cells in common two sensors are not compared."""
 
 
 @dataclass(frozen=True)
 class StripTask:
-    """One stretch of a run, and the row groups that may have seen it; it holds no data."""
+    """One stretch of a run, and the row groups that may have seen it; it carries no data."""
 
     store: Store
     ground: MapSettings
@@ -76,14 +76,14 @@ class StripTask:
     first_gps_ns: int
     last_gps_ns: int
     slices: tuple[RawSlice, ...]
-    """Of the run's own sensors, then of those of later runs."""
+    """Row groups of the run's sensors, then of those of later runs."""
     rows: tuple[int, ...]
-    """In the row groups of each."""
+    """Number of rows in each of them."""
     key: str
 
     @property
     def unit(self) -> str:
-        """Its name in the manifest."""
+        """Returns its name in the manifest."""
         return f"{self.run}/{self.number}"
 
 
@@ -130,7 +130,7 @@ def _tasks(session: Session) -> Iterator[StripTask]:
 
 
 def _sigma(plan: SurveyPlan, poses: TrajectorySource) -> tuple[float, float]:
-    """Usual 1 σ (m) of a run's poses, horizontal and down, as its logs state it, else as the adjustment assumes."""
+    """Returns the usual 1 σ (m) of a run's poses, horizontal and down, from its logs, else the adjustment's priors."""
     assumed = AdjustConfig.of(plan.survey).priors
     north, east, down, *_ = median_pose_sigma(plan.store, plan.records, poses).tolist()
     horizontal = float(np.hypot(north, east))
@@ -141,7 +141,7 @@ def _sigma(plan: SurveyPlan, poses: TrajectorySource) -> tuple[float, float]:
 
 
 def _stretches(own: Sequence[RawSlice]) -> list[tuple[int, int]]:
-    """Spans of time (GPS ns) that are spread over those of a run's readings; the ways may be shorter."""
+    """Returns time spans (GPS ns) spread over those of a run's readings; the ways may be shorter."""
     ends: dict[str, list[int]] = defaultdict(list)
     for one in own:
         ends[one.source.sensor] += [epoch for span in one.spans for epoch in span]
@@ -153,7 +153,7 @@ def _stretches(own: Sequence[RawSlice]) -> list[tuple[int, int]]:
 
 
 def _way(store: Store, ground: MapSettings, poses: TrajectorySource, span: tuple[int, int]) -> Way | None:
-    """The way within a span of time, or its beginning; None where the vehicle stands or there are no poses."""
+    """Returns the way within a time span, or its beginning; None where the vehicle stands or there are no poses."""
     recorded = load_recorded(store, poses, [span], ground.max_gap_s)
     knots = recorded.epochs_gps_ns
     knots = knots[(knots >= span[0]) & (knots <= span[1])]
@@ -168,14 +168,14 @@ def _way(store: Store, ground: MapSettings, poses: TrajectorySource, span: tuple
 
 
 def _within(one: RawSlice, file: DataFile, span: tuple[int, int]) -> RawSlice | None:
-    """The row groups of a data file that hold readings of a span; None where none does."""
+    """Returns the row groups of a data file with readings of a time span; None if there are none."""
     own = one.source.spans(file.group_spans)
     near = [g for g, (first, last) in enumerate(own) if first <= span[1] and last >= span[0]]
     return RawSlice(one.source, one.file, near, tuple(own[g] for g in near), 0) if near else None
 
 
 def _others(session: Session, way: Way, runs: Sequence[str]) -> list[RawSlice]:
-    """Row groups of some runs that may touch the tiles along a way."""
+    """Returns row groups of some runs that may touch the tiles along a way."""
     if not runs:
         return []
     tiles, size_m = tiles_of(session), session.survey.config.tiles.size_m
@@ -199,16 +199,16 @@ def _others(session: Session, way: Way, runs: Sequence[str]) -> list[RawSlice]:
 
 @dataclass(frozen=True)
 class SeenBy:
-    """What one sensor of one run says of a stretch."""
+    """Figures of what one sensor of one run saw of a stretch."""
 
     run: str
     sensor: str
     is_profiler: bool
     file: str
     epoch_gps_ns: int
-    """Middle one of its readings within the strip, 0 without any."""
+    """Median epoch of its readings within the strip, 0 without any."""
     given: int
-    """Readings that were looked at."""
+    """Readings that were examined."""
     placed: int
     """Those that have a return, a pose and a range within the limits."""
     beside: int
@@ -225,7 +225,7 @@ class SeenBy:
 
 @dataclass(frozen=True)
 class Pair:
-    """What two sensors say of a stretch where both saw it; numbers count the sensors."""
+    """Comparison of two sensors on a stretch that both saw; numbers count the sensors."""
 
     first: int
     second: int
@@ -239,7 +239,7 @@ class Pair:
 
 
 def compare_strip(task: StripTask) -> OutputRecord:
-    """What the sensors that saw a stretch say of one another."""
+    """Returns the comparison of the sensors that saw a stretch."""
     way = _way(task.store, task.ground, task.poses, (task.first_gps_ns, task.last_gps_ns))
     seen: list[tuple[SeenBy, Strip]] = []
     if way is not None:
@@ -287,7 +287,7 @@ def _seen_by(task: StripTask, placer: Georeferencer, way: Way, slices: Sequence[
 def _placed(
     task: StripTask, placer: Georeferencer, way: Way, slices: Sequence[RawSlice]
 ) -> Iterator[tuple[int, PlacedReadings]]:  # fmt: skip
-    """Readings of the row groups, thinned, and how many there were before any was left out."""
+    """Yields thinned readings of the row groups, and their number before thinning."""
     geometry = geometry_of(slices[0].source)
     rows = sum(rows for one, rows in zip(task.slices, task.rows, strict=True) if one in slices)
     wanted = _READINGS if geometry is None else _PROFILES_PER_M * way.length_m

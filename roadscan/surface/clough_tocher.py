@@ -1,4 +1,4 @@
-"""Cubic triangles that meet smoothly: Clough–Tocher with cubic precision.
+"""Piecewise cubic surface over triangles with continuous slopes: Clough–Tocher with cubic precision.
 
 Each triangle is split at its centroid into three cubic Bézier triangles (Clough & Tocher 1965; Farin 1986). The paper
 (section 3.2.3) gives heights of control points on the edges from slopes at the ends: a third of the way along an edge
@@ -23,7 +23,7 @@ Where a corner lies much nearer to the edge than the other (four times), its r i
 noise in heights would be multiplied by 1 / 2y, and by the wide triangle's y once more. There M is solved, by least
 squares, from two equations that a cubic through the wide triangle's corner meets exactly: the slope across the edge
 given at the thin corner, and the condition above times the small y. Where the thin corner lies over an end of the edge
-(on random points, beside one node in some hundred or fewer), it tells nothing of the middle, and M is the mean of the
+(on random points, beside one node in some hundred or fewer), it does not determine M, which is the mean of the
 ends, exact for quadratics only.
 
 An edge on the rim
@@ -51,17 +51,17 @@ NOWHERE: Final = np.nan
 
 @dataclass(frozen=True)
 class CubicSurface:
-    """A surface of cubic triangles."""
+    """A C¹ surface of cubic triangles."""
 
     sites: Sites
     mesh: Triangulation
     patches: npt.NDArray[np.float64]
-    """(n, 19) heights of control points (m); their order stands in ``kernels.surface.clough_tocher``."""
+    """(n, 19) heights of control points (m); ``kernels.surface.clough_tocher`` defines their order."""
 
     def heights(self, window: GridWindow) -> npt.NDArray[np.float64]:
-        """(rows, columns) heights (m) at the nodes of a window, south row first, NaN where no triangle lies.
+        """Returns heights (rows, columns) (m) at the nodes of a window, south row first, NaN outside all triangles.
 
-        A node on an edge belongs to the last triangle in the order of the sites, whatever else the region holds.
+        A node on an edge belongs to the last triangle in the order of the sites, whatever else the region contains.
         """
         found = np.full((window.rows, window.columns), NOWHERE)
         if not found.size or not len(self.mesh):
@@ -76,7 +76,7 @@ class CubicSurface:
 
 
 def cubic_surface(sites: Sites, mesh: Triangulation, slopes: npt.NDArray[np.float64]) -> CubicSurface:
-    """The surface through sites with given slopes.
+    """Returns the surface through sites with given slopes.
 
     Parameters
     ----------

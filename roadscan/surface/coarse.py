@@ -1,4 +1,4 @@
-"""Coarse reconstruction: profiles of one stretch of road become an even grid, profile by profile.
+"""Coarse reconstruction: the profiles of a stretch of road are resampled to an even grid, profile by profile.
 
 Along each profile a cubic spline runs through its road readings and is read off at even steps across the road; holes
 up to a stated width are filled; a 3 × 3 median removes impulses (Yu and others 2007, 3.2.3). "Gridding and
@@ -67,7 +67,7 @@ class Stretch:
     height_m: Float64
     """(n, m) in the map frame."""
     classes: UInt8
-    """(n, m), 0 the road (``points.classes``); only these count."""
+    """(n, m), 0 the road (``points.classes``); other readings are ignored."""
     zero_m: Float64
     """(n, 2) easting and northing of each profile's offset 0."""
     right: Float64
@@ -77,7 +77,7 @@ class Stretch:
     def of_points(
         cls, easting_m: Float64, northing_m: Float64, height_m: Float64, classes: UInt8, path_m: Float64
     ) -> Stretch:
-        """Profiles from places on the map.
+        """Returns profiles from positions on the map.
 
         Each profile is a straight line on the map: the least-squares line of its road readings; offset 0 is the foot
         of the sensor on it, so that neighbouring profiles of a straight drive share their offsets.
@@ -121,21 +121,21 @@ class CoarseModel:
     right: Float64
     """(n, 2) unit vector to the right."""
     first_node: int
-    """Node k lies at the offset (first_node + k) · spacing_m."""
+    """Number of the first node: node k lies at the offset (first_node + k) · spacing_m."""
     spline_m: Float64
-    """(n, K) heights as interpolated, NaN where there is nothing."""
+    """(n, K) heights as interpolated, NaN where there is none."""
     height_m: Float64
-    """(n, K) heights after the median."""
+    """(n, K) heights after the median filter."""
     origin: UInt8
     """(n, K), of :data:`ORIGINS`."""
 
     @property
     def across_m(self) -> Float64:
-        """(K,) offsets of the nodes."""
+        """Returns offsets (K,) of the nodes (m)."""
         return np.asarray((self.first_node + np.arange(self.height_m.shape[1])) * self.settings.spacing_m)
 
     def places_m(self) -> tuple[Float64, Float64]:
-        """Easting and northing of the nodes, (n, K) each."""
+        """Returns easting and northing of the nodes, (n, K) each."""
         across = self.across_m
         return (
             self.zero_m[:, :1] + across * self.right[:, :1],
@@ -143,9 +143,9 @@ class CoarseModel:
         )
 
     def tile_cells(self, tile: TileId, grid: TileGrid) -> TileSurface:
-        """The surface on the cells of a tile of the map: the mean of the nodes in each.
+        """Returns the surface on the cells of a tile of the map: the mean of the nodes in each.
 
-        Between two profiles it is linear along the road, so cells that lie between profiles are not left out. Heights
+        Between two profiles it is linear along the road, so cells that lie between profiles are filled. Heights
         are summed as whole 10 µm: a cell has the same bits whatever stretch of road is given with it, if the profiles
         that touch it and their neighbours are.
         """
@@ -170,7 +170,7 @@ class CoarseModel:
         return TileSurface(tile, height, origin, counts)
 
     def _near(self, west_m: float, south_m: float, size_m: float) -> slice:
-        """Profiles from the first to the last whose line may touch a square, with a neighbour on each side."""
+        """Returns the profiles, first to last, whose line may touch a square, with a neighbour on each side."""
         across = self.across_m
         if not across.size or not self.along_m.size:
             return slice(0, 0)
@@ -187,15 +187,15 @@ class TileSurface:
 
     tile: TileId
     height_m: Float64
-    """NaN where there is nothing."""
+    """NaN where there is none."""
     origin: UInt8
     """The best origin of the nodes in a cell, of :data:`ORIGINS`."""
     count: npt.NDArray[np.int32]
-    """Nodes in a cell."""
+    """Number of nodes in a cell."""
 
 
 def coarse_model(stretch: Stretch, settings: CoarseSettings) -> CoarseModel:
-    """The coarse surface of a stretch; a node depends on its own profile and the two beside it only."""
+    """Returns the coarse surface of a stretch; a node depends only on its profile and the two beside it."""
     road = stretch.classes == 0
     across = stretch.across_m[road]
     first, end = 0, 0

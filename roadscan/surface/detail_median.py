@@ -1,4 +1,4 @@
-"""The median that a surface is drawn to: wide on level ground, along the line where there is a crack or an edge.
+"""Detail-preserving median of a surface: wide on level ground, along the line on a crack or an edge.
 
 A square median of the size that quiets noise erases a crack narrower than half its side, and with λ_M = 30 the
 smoothed surface would follow it. The paper asks for "a detail-preserving median filter"; here it is one of directed
@@ -14,7 +14,7 @@ lines, as in Nieminen, Heinonen and Neuvo (1987), "A new class of detail-preserv
 4. *Direction*: the one whose medians have the least risk at the 49 cells around. Risk is Stein's (1981) unbiased
    estimate of the squared error: misfit² + 2 σ² for each cell that is its own median. Without the second term lines
    across a wall would win: their median is the cell in the middle, noise and all. A misfit is cut off at
-   `outlier_sigmas`, so that an outlier has no say.
+   `outlier_sigmas`, so that outliers have little weight.
 5. *Support*: a crack 20 cells wide could be smoothed more than by a line of seven, one cell wide at a bend less. So
    on detail there are means of 3 and of 13 cells along the line and paraboloids over 7 × 7 and 9 × 9 besides
    (outliers replaced by the line's median), and of all that of least risk (``surface/kernels/supports.py``).
@@ -24,8 +24,8 @@ lines, as in Nieminen, Heinonen and Neuvo (1987), "A new class of detail-preserv
    every second one (a median of medians smooths no more: it keeps whatever rises or falls steadily). Cells with
    detail are left out.
 
-What is not measured counts nowhere, and places beyond the grid are like that. In means and fits a cell counts only
-together with its mirror image, so that a slope has no say at borders and holes.
+Cells without a measurement or beyond the grid count nowhere. In means and fits a cell counts only
+together with its mirror image, so that a slope has no effect at borders and holes.
 """
 
 from __future__ import annotations
@@ -54,34 +54,34 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _ABSENT = np.inf
-_HALF = CELLS // 2
-_GROUND_STEP = 3
-_LEVEL_STEP = 2
-_GROWTHS = 2
+_HALF = CELLS // 2  # Cells of a line to either side of its middle.
+_GROUND_STEP = 3  # Spacing (cells) of the medians that make the ground.
+_LEVEL_STEP = 2  # Spacing (cells) of the mean over level ground.
+_GROWTHS = 2  # Times that detail grows to neighbours above `edge_sigmas`.
 _STRONG_CELLS = 7
-"""Of the 49 around a cell."""
+"""Least number of the 49 cells around a cell on detail that exceed `detail_sigmas`."""
 _LEAST_CELLS = 5
-"""Of fewer cells, two outliers move the median."""
+"""With fewer cells, two outliers move the median."""
 MEDIAN_SIGMA = 1.25
 """σ of the median of n normal values, times √n (its limit for large n; 1.21 for seven)."""
 
 _ACROSS_ROWS = 4
-"""Which of the directions runs along a column."""
-_FIT_REACH = 6
+"""Index of the direction that runs along a column."""
+_FIT_REACH = 6  # The fits on detail reach this many cells to each side.
 _CHOICE = 0.12
-"""How much a cell has more part in what lies along its line, because eight directions were tried on its height (of pure
+"""Added share of a cell in supports along its line, because eight directions were tried on its height (of pure
 noise: covariance 0.23 with the median along the line of least risk, 0.12 of it the median's own)."""
 
 _FAVOUR = 0.5
-"""A strip that stands out so far is left for another support where that is better by 1 σ² a cell or more: where risks
-alone decide, a third of what strips show is smoothed away again."""
+"""A significant strip is replaced by another support only where that is better by this much a cell (σ²): if risks
+alone decided, a third of what strips show would be smoothed away again."""
 
 _GROUND_REACH = _HALF * _GROUND_STEP + _HALF
-"""Every third cell, and the columns that borders are mirrored about."""
+"""Cells that the ground reaches: every third cell, and the columns about which borders are mirrored."""
 _DETAIL_REACH = _GROUND_REACH + max(_HALF + _GROWTHS + 1, STRIP_REACH)
-"""Ground, then its count, growth and foot, or the strips."""
+"""Cells that detail reaches: ground, then count, growth and foot, or the strips."""
 REACH = _DETAIL_REACH + _HALF * (1 + _LEVEL_STEP)
-"""Cells to each side that the median of a cell depends on: detail, and level ground. A height on detail reaches no
+"""Cells to each side on which the median of a cell depends: detail, and level ground. A height on detail reaches no
 farther: its risk, detail there or the fit and the outliers in it."""
 
 
@@ -94,11 +94,11 @@ class DetailMedian:
     detail: Bool
     """(rows, columns), True on a crack, an edge or a stone."""
     drawn: Bool
-    """(rows, columns), True on a crack that only a long strip shows."""
+    """(rows, columns), True on a crack that is seen only in a long strip."""
 
 
 def directions() -> Int64:
-    """(8, 7, 2) rows and columns of the cells of each line, from its middle; halves are rounded to the middle."""
+    """Returns (8, 7, 2) rows and columns of the cells of each line from its middle; halves round to the middle."""
     return _lines(_HALF)
 
 
@@ -111,18 +111,18 @@ def _lines(half: int) -> Int64:
 
 
 def lines_onward() -> Int64:
-    """(8, 6, 2) one half of the same lines, farther."""
+    """Returns (8, 6, 2) the continuation of one half of the same lines."""
     return np.ascontiguousarray(_lines(_FIT_REACH)[:, _FIT_REACH + 1 :])
 
 
 def detail_pairs() -> Int64:
-    """(40, 2) one cell of each pair about the middle of 9 × 9, those of smaller squares first."""
+    """Returns (40, 2) one cell of each pair about the middle of 9 × 9, those of smaller squares first."""
     away = [(i, j) for i in range(5) for j in range(-4, 5) if i > 0 or j > 0]
     return np.array(sorted(away, key=lambda cell: (max(cell[0], abs(cell[1])), cell)), dtype=np.int64)
 
 
 def detail_median(height_m: Float64, config: SurfaceSmoothing) -> DetailMedian:
-    """The median of a grid.
+    """Returns the detail-preserving median of a grid.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def detail_median(height_m: Float64, config: SurfaceSmoothing) -> DetailMedian:
 
 
 class _Lines:
-    """What the lines of all directions say about each cell."""
+    """Medians along lines of all directions, and their risk, at each cell."""
 
     def __init__(self, heights: Float64, measured: Bool, config: SurfaceSmoothing) -> None:
         self.measured, self.config = measured, config
@@ -171,7 +171,7 @@ class _Lines:
         self.strips = no_strips(heights) if chains is None else chains.strips(heights, self.contrast, sigma_m)
 
     def supported(self, heights: Float64, detail: Bool) -> Float64:
-        """Heights (n,) of the cells on detail, each over the support of least risk."""
+        """Returns heights (n,) of the cells on detail, each over the support of least risk."""
         row, column = np.nonzero(detail)
         middle, sigma_m = self.median_m[detail], self.config.sigma_m
         with np.errstate(invalid="ignore"):
@@ -193,7 +193,7 @@ class _Lines:
         return np.asarray(middle + chosen)
 
     def detail(self) -> Bool:
-        """Cells on a crack, an edge or a stone, with the foot of its walls."""
+        """Returns a mask of cells on a crack, an edge or a stone, with the foot of its walls."""
         strong = self.contrast > self.config.detail_sigmas
         weak = self.contrast > min(self.config.edge_sigmas, self.config.detail_sigmas)
         found = strong & (_sums(strong.astype(np.float32), _HALF) >= _STRONG_CELLS)
@@ -207,7 +207,7 @@ def _beside(cells: Bool) -> Bool:
 
 
 def _square_median(heights: Float64) -> Float64:
-    """Median of seven in a row, of seven of these in a column, side by side."""
+    """Returns the median of seven in a row, of seven of these in a column, side by side."""
     across, down, margin = _cross(1)
     first, second, count = np.empty(heights.shape), np.empty(heights.shape), np.empty(heights.shape)
     own = np.empty(heights.shape, np.float32)
@@ -217,7 +217,7 @@ def _square_median(heights: Float64) -> Float64:
 
 
 def _ground(heights: Float64, column_median: Float64) -> Float64:
-    """Median of seven in a row, of seven of these in a column, every third; what is missing is mirrored.
+    """Returns the median of seven in a row, of seven of these in a column, every third; missing ones are mirrored.
 
     A row is mirrored about the median of seven in the column, which has no slope across.
     """
@@ -229,7 +229,7 @@ def _ground(heights: Float64, column_median: Float64) -> Float64:
 
 
 def _square_mean(heights: Float64, step: int) -> Float64:
-    """Mean of seven in a row, of seven of these in a column, `step` cells apart, each with its mirror image."""
+    """Returns the mean of seven in a row, of seven of these in a column, `step` cells apart, in mirrored pairs."""
     across, down, margin = _cross(step)
     first, second = np.empty(heights.shape), np.empty(heights.shape)
     line_means(_padded(heights, margin), margin, across, _ABSENT, first)
@@ -238,7 +238,7 @@ def _square_mean(heights: Float64, step: int) -> Float64:
 
 
 def _cross(step: int) -> tuple[Int64, Int64, int]:
-    """Seven cells in a row, seven in a column, and how far they reach."""
+    """Returns seven cells in a row, seven in a column, and their reach."""
     away = np.arange(-_HALF, _HALF + 1, dtype=np.int64) * step
     return np.stack([0 * away, away], axis=-1), np.stack([away, 0 * away], axis=-1), _HALF * step
 
@@ -248,7 +248,7 @@ def _padded(heights: Float64, margin: int) -> Float64:
 
 
 def _sums(values: npt.NDArray[np.float32], half: int) -> npt.NDArray[np.float32]:
-    """Sums over (2 half + 1)² cells."""
+    """Returns sums over (2 half + 1)² cells."""
     padded = np.pad(values, half)
     total = np.zeros(values.shape, np.float32)
     window_sums(padded, half, np.zeros((padded.shape[0], values.shape[1]), np.float32), total)

@@ -1,4 +1,4 @@
-"""The detailed model: a smooth surface through every point of a region, asked on a fine grid.
+"""Detailed model: a smooth surface through every point of a region, evaluated on a fine grid.
 
 Stages, each a module: ``sites`` (order, duplicates), ``triangulation`` (Delaunay, holes left open), ``normals``
 (slopes), ``clough_tocher`` (cubic triangles, and their heights on a grid).
@@ -32,7 +32,7 @@ class DetailedSettings(Strict):
 
     @property
     def halo_m(self) -> float:
-        """Distance within which all points have to be given for a height to be final.
+        """Returns the distance within which all points must be given for a height to be final (m).
 
         A node's triangle and those beside it reach 2 gaps from it, the neighbours of their corners a gap a ring, and
         the circles that decide about the last ring are counted in that ring.
@@ -41,9 +41,9 @@ class DetailedSettings(Strict):
 
 
 def surface_through(points_m: npt.NDArray[np.float64], settings: DetailedSettings) -> CubicSurface:
-    """The surface through points: (n, 3) easting, northing, height (m, map frame), in any order.
+    """Returns the surface through points (n, 3): easting, northing, height (m, map frame), in any order.
 
-    Points at one place (to 10 µm) are one, of their mean height. Without three points that are not on a line the
+    Points at one place (to 10 µm) are merged to their mean height. Without three points that are not on a line the
     surface has no triangles.
 
     Raises

@@ -1,4 +1,4 @@
-"""Cracks too shallow for lines of seven cells: strips of 21 cells, to a fraction of a cell.
+"""Detection of cracks too shallow for lines of seven cells: strips of 21 cells, located to a fraction of a cell.
 
 A crack that is 1.3 σ deep in two cells of each row stands out of seven rows by 3 to 5 σ, and so do lines of pure noise
 where eight directions are tried at each cell. Over 21 rows it stands out by 8 σ, and pure noise hardly by 6. So:
@@ -10,9 +10,9 @@ where eight directions are tried at each cell. Over 21 rows it stands out by 8 �
 3. *Strip*: along the best of these a strip of some width is fitted to 21 × 7 cells: volume and level by least squares,
    axis in quarters of a cell, slope and width tried. A mean along the line would be 20 to 25 % too shallow: a slanting
    axis lies now in the middle of a cell, now between two, and the mean along it is that of all these places.
-4. *Confirmed* is what gains `_GAIN_ALONE` σ, or `_GAIN_TOGETHER` where another strip that does goes on 11 to 18 cells
-   further. In twelve million cells of noise with 2 % wrong readings that is three strips; 5.5 σ alone would be 22.
-   Where lines beside a strip vary more than those of independent cells, it counts for less by as much.
+4. *Confirmed* are strips that gain `_GAIN_ALONE` σ, or `_GAIN_TOGETHER` if another such strip continues them 11 to 18
+   cells further. In twelve million cells of noise with 2 % wrong readings three strips do; 5.5 σ alone would give 22.
+   Where lines beside a strip vary more than those of independent cells, its gain is reduced by as much.
    It is drawn, as one more support that the risk decides about (``surface/detail_median.py``).
 """
 
@@ -45,39 +45,39 @@ Int64 = npt.NDArray[np.int64]
 UInt8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 
-_CHAIN_SIGMAS = 4.0
-_LEAST_CELLS = 3
-_MARGIN = CELLS + 1
-_STRONGEST = 10.0
-_OUTLIER_SIGMAS = 5.0
-_AXIS_SIGMAS = 4.0
-_GAIN_ALONE, _GAIN_TOGETHER = 6.0, 5.0
+_CHAIN_SIGMAS = 4.0  # Least depth of a candidate chain (σ).
+_LEAST_CELLS = 3  # A median of fewer cells shows no depth.
+_MARGIN = CELLS + 1  # Margin of the depth's grid (cells).
+_STRONGEST = 10.0  # From this contrast of a line of seven (σ) strips are not needed.
+_OUTLIER_SIGMAS = 5.0  # Heights farther from the ground (σ) are outliers and left out.
+_AXIS_SIGMAS = 4.0  # Axes less low than this (σ of their mean) are not fitted.
+_GAIN_ALONE, _GAIN_TOGETHER = 6.0, 5.0  # Gains (σ) of a strip that suffice alone, and with another strip.
 _ALLOWED_VARIANCE = 1.5
-"""Of the mean of two lines beside a strip; of 168 independent cells it is 1.0, give or take 0.3."""
-_WIDTHS = np.array([1.3, 0.5, 2.2])
+"""Allowed variance of the mean of two lines beside a strip; for 168 independent cells it is 1.0 ± 0.3."""
+_WIDTHS = np.array([1.3, 0.5, 2.2])  # Widths that are tried (cells), the first to find slope and axis.
 _MEDIAN_SIGMA = 1.21 / np.sqrt(CELLS)
-"""σ of a median of seven cells, over that of a cell."""
+"""σ of a median of seven cells, relative to that of a cell."""
 
 _FIT_REACH = HALF_CUT
-_DRAWN_REACH = int(np.ceil(STEEPEST * HALF_DRAWN)) + HALF_BREADTH + 3
+_DRAWN_REACH = int(np.ceil(STEEPEST * HALF_DRAWN)) + HALF_BREADTH + 3  # Cells that a drawn strip reaches from its peak.
 REACH = max(_MARGIN + 2, _FIT_REACH) + NEXT_ASIDE + _DRAWN_REACH
-"""Cells from one that is drawn to those whose height and ground it depends on."""
+"""Distance (cells) from a drawn cell to those whose height and ground it depends on."""
 
 
 @dataclass(frozen=True)
 class Strips:
-    """What is drawn; all (rows, columns)."""
+    """Confirmed strips, drawn on the grid; all (rows, columns)."""
 
     gain: Float32
-    """Of the strip at a cell, 0 where there is none."""
+    """Significance of the strip at a cell, 0 where there is none."""
     height_m: Float64
-    """Its height."""
+    """Height of the strip."""
     own: Float32
-    """Share of the cell itself in it."""
+    """Share of the cell itself in that height."""
 
 
 def no_strips(heights: Float64) -> Strips:
-    """Where none are looked for; heights (rows, columns)."""
+    """Returns empty strips; heights (rows, columns)."""
     nothing = np.zeros(heights.shape, np.float32)
     return Strips(nothing, heights, nothing)
 
@@ -105,7 +105,7 @@ class Chains:
         )  # fmt: skip
 
     def strips(self, heights: Float64, contrast: Float32, sigma_m: float) -> Strips:
-        """Fit strips about the deepest chains; heights (rows, columns), contrast of the strongest line of seven."""
+        """Strips fitted about the deepest chains; heights (rows, columns), contrast of the strongest line of seven."""
         shape = heights.shape
         row, column = np.nonzero(self.depth >= _CHAIN_SIGMAS)
         peak = np.zeros(row.size, np.bool_)
@@ -132,7 +132,7 @@ class Chains:
 
 
 def confirmed_strips(row: Int64, column: Int64, strips: Float64, shape: tuple[int, int]) -> Bool:
-    """Which strips are drawn; (n,)."""
+    """Returns a mask (n,) of the strips that are drawn."""
     number = np.full((shape[0] + 2 * NEXT_ASIDE, shape[1] + 2 * NEXT_ASIDE), -1, np.int32)
     together = np.flatnonzero(strips[:, 0] >= _GAIN_TOGETHER)
     number[row[together] + NEXT_ASIDE, column[together] + NEXT_ASIDE] = together

@@ -1,4 +1,4 @@
-"""A window of a gridded surface, as the detection of cracks and potholes takes it."""
+"""A window of a gridded surface, the input of the detection of cracks and potholes."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 HEIGHT_STEP_M = 1e-5
-"""Heights are whole multiples of this, so that sums do not depend on their order."""
-_OUTLIER_SIGMAS = 6.0
+"""Heights are whole multiples of this (m), so that sums do not depend on their order."""
+_OUTLIER_SIGMAS = 6.0  # Raw heights farther than this from smoothed ones (σ) are impulses.
 _SURE_READINGS = 5
-"""Of so many readings half are hardly wrong."""
+"""With this many readings a cell's median is hardly wrong."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class HeightWindow:
     """Row on the map of the window's first row."""
     first_column: int = 0
     halo: int = 0
-    """Cells along each border that belong to the neighbours: they are looked at, and nothing is reported of them."""
+    """Cells along each border that belong to the neighbours: they are read, and nothing is reported in them."""
     cut_off: tuple[tuple[int, int], tuple[int, int]] = ((0, 0), (0, 0))
-    """Cells that were cut off at the south and north, and at the west and east, the halo's first."""
+    """Numbers of cells cut off at the south and north, and at the west and east, the halo first."""
     lowest: LowestReadings | None = None
-    """Of the same cells; None where they are not known."""
+    """Lowest readings of the same cells; None where they are not known."""
 
     def __post_init__(self) -> None:
         if self.raw_m.ndim != 2 or self.raw_m.shape != self.height_m.shape:
@@ -58,7 +58,7 @@ class HeightWindow:
             )
 
     def inner(self) -> tuple[slice, slice]:
-        """Rows and columns of the cells that are not halo."""
+        """Returns row and column slices of the cells that are not halo."""
         rows, columns = (
             slice(min(max(self.halo - low, 0), n), max(n - max(self.halo - high, 0), 0))
             for n, (low, high) in zip(self.raw_m.shape, self.cut_off, strict=True)
@@ -66,7 +66,7 @@ class HeightWindow:
         return rows, columns
 
     def part(self, rows: tuple[int, int], columns: tuple[int, int]) -> HeightWindow:
-        """Its cells from one row and column up to others, as far as it has them."""
+        """Returns the cells from one row and column up to others, clipped to the window."""
         spans, cut_off = [], []
         for n, span, gone in zip(self.raw_m.shape, (rows, columns), self.cut_off, strict=True):
             low = min(max(span[0], 0), n)
@@ -85,14 +85,14 @@ class HeightWindow:
         )
 
     def is_inner(self, row: npt.NDArray[np.int64], column: npt.NDArray[np.int64]) -> Bool:
-        """Which cells (n,), counted within the window, are not halo."""
+        """Returns a mask of the cells (n,), counted within the window, that are not halo."""
         rows, columns = self.inner()
         return np.asarray((row >= rows.start) & (row < rows.stop) & (column >= columns.start) & (column < columns.stop))
 
     def cleaned_m(self) -> Float64:
-        """Raw heights without those that the smoothing left out as impulses.
+        """Returns raw heights without those that the smoothing left out as impulses.
 
-        The robust height of several readings that lies below is none: it is a crack's, of which little is in the cells
+        A low robust height of several readings is no impulse: it is a crack's, which fills little of the cells
         around. One above may be that of what lies on the road.
         """
         off = self.raw_m - self.height_m
@@ -103,7 +103,7 @@ class HeightWindow:
         return np.where(kept, self.raw_m, np.nan)
 
     def lowered_m(self, most_m: float) -> Float64:
-        """The same, lowered to the lowest reading of a cell where it is known, but by `most_m` at most.
+        """Returns the same, lowered to the lowest reading of a cell where it is known, but by at most `most_m` (m).
 
         A crack that takes in less than half of a cell is not in its height, but in its lowest reading. A single wrong
         reading decides that: it must not outweigh the cells around. Nor must cells with many times the readings of
@@ -116,7 +116,7 @@ class HeightWindow:
         return np.asarray(heights - np.where(np.isnan(drop) | self.lowest.crowded(), np.float32(0.0), drop))
 
     def map_m(self, row: npt.ArrayLike, column: npt.ArrayLike) -> Float64:
-        """Easting and northing (n, 2) of places in cells within the window; .5 is a cell's middle."""
+        """Returns easting and northing (n, 2) of positions in cells of the window; .5 is a cell's middle."""
         east = (np.asarray(column, np.float64) + self.first_column) * self.cell_m
         north = (np.asarray(row, np.float64) + self.first_row) * self.cell_m
         return np.stack([east, north], axis=-1)

@@ -1,4 +1,4 @@
-"""Holes of a gridded surface, filled up to a stated width.
+"""Filling of holes in a gridded surface, up to a stated width.
 
 A hole is a run of empty cells between two known ones, along a row or a column, of at most that width. It is filled as
 the coarse model fills one (``surface/coarse.py``): by the straight line between the mean heights of the last three
@@ -20,17 +20,17 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 RIM: Final = 3
-"""Known cells on each side that a line begins with."""
+"""Known cells on each side to which a line is fitted."""
 
 
 def cells_across(fill_m: float, cell_m: float) -> int:
-    """Empty cells in the widest hole that is filled."""
+    """Returns the number of empty cells in the widest hole that is filled."""
     return math.floor(fill_m / cell_m + 1e-9)
 
 
 @dataclass(frozen=True)
 class Holes:
-    """The cells that are filled: (n,) places in the flat grid, by the runs they lie in."""
+    """The filled cells: (n,) places in the flat grid, by the runs in which they lie."""
 
     shape: tuple[int, int]
     rows: _Runs
@@ -38,25 +38,25 @@ class Holes:
 
     @classmethod
     def of(cls, known: Bool, most: tuple[int, int]) -> Holes:
-        """Holes of a grid.
+        """Returns the holes of a grid.
 
         Parameters
         ----------
-        known : (rows, columns), where it holds a height.
+        known : (rows, columns), True where the grid has a height.
         most : cells in the widest hole along a column (northwards), and along a row (eastwards).
         """
         rows, columns = known.shape
         return cls((rows, columns), _Runs.of(known, most[1], columns, 1), _Runs.of(known.T, most[0], 1, columns))
 
     def filled(self) -> Bool:
-        """(rows, columns) cells that lie in a hole."""
+        """Returns a mask (rows, columns) of the cells in a hole."""
         found = np.zeros(self.shape, bool)
         for runs in (self.rows, self.columns):
             found.flat[runs.cell] = True
         return found
 
     def fill(self, values: Float64) -> Float64:
-        """Values (rows, columns) with the holes filled.
+        """Returns values (rows, columns) with the holes filled.
 
         A cell farther than the widest hole and its rim from the window's border has the same bits in every window.
         """
@@ -80,25 +80,25 @@ class _Runs:
     """(k,) place of the known cell before each run; `last` the one after it."""
     last: Int64
     beside: Int64
-    """(k,) known cells before the run without a gap, that its rim takes; `beyond` those after it."""
+    """(k,) number of known cells before the run without a gap, as its rim uses them; `beyond` those after it."""
     beyond: Int64
     step: int
-    """From cell to cell of a line."""
+    """Step in the flat grid from cell to cell of a line."""
     cell: Int64
     """(n,) cells of all runs, and the run of each."""
     run: Int64
     share: Float64
-    """(n,) how far each cell is from the one rim to the other."""
+    """(n,) relative position of each cell between the rims, 0 to 1."""
 
     @property
     def width(self) -> Int64:
-        """(n,) cells in the run of each cell."""
+        """Returns (n,) the number of cells in the run of each cell."""
         width: Int64 = ((self.last - self.first) // self.step - 1)[self.run]
         return width
 
     @classmethod
     def of(cls, known: Bool, most: int, line_step: int, step: int) -> _Runs:
-        """Runs along the rows of `known`, whose cells lie `line_step` and `step` apart in the flat grid."""
+        """Returns the runs along the rows of `known`, whose cells lie `line_step` and `step` apart in the flat grid."""
         lines, cells = known.shape
         flat = np.zeros((lines, cells + 1), bool)  # a gap after each line
         flat[:, :-1] = known
@@ -115,7 +115,7 @@ class _Runs:
         return cls(first, last, beside, beyond, step, first[run] + place * step, run, place / (size + 1)[run])
 
     def line(self, values: Float64) -> Float64:
-        """(n,) the straight line between the means of both rims, of a flat grid of values."""
+        """Returns (n,) the straight line between the means of both rims, from a flat grid of values."""
         before = _rim(values, self.first, self.beside, -self.step)
         after = _rim(values, self.last, self.beyond, self.step)
         found: Float64 = before[self.run] + self.share * (after - before)[self.run]
@@ -123,7 +123,7 @@ class _Runs:
 
 
 def _known_from(flat: Bool, at: Int64, away: int) -> Int64:
-    """(k,) known cells from a place on without a gap, at most :data:`RIM`."""
+    """Returns (k,) the number of known cells from a place on without a gap, at most :data:`RIM`."""
     count, goes_on = np.ones(at.size, np.int64), np.ones(at.size, bool)
     for k in range(1, RIM):
         there = at + away * k

@@ -11,7 +11,7 @@ Neighbours are sites joined by edges of kept triangles, so a slope never looks a
     *Spline models for observational data*, SIAM 1990, chapters 1 and 4). Heights are z = p + s + noise, with p a
     quadratic polynomial that is not penalised, and s of a covariance that falls with distance⁵, as that of a quintic
     spline (r⁵; Duchon 1977), written as Wendland's C⁴ function of a reach of 12 units, which is positive definite.
-    How much is noise the heights say themselves: of two variances, one all but nothing (0.001) and one that leaves
+    The heights determine the share of noise: of two variances, one almost zero (0.001) and one that leaves
     little more than the polynomial (3), each counts by the restricted likelihood that it gives the heights of the
     neighbourhood (generalised maximum likelihood, Wahba 1985, Annals of Statistics 13, 1378-1402).
 
@@ -52,9 +52,9 @@ from roadscan.surface.sites import Sites
 from roadscan.surface.triangulation import Triangulation
 
 RINGS: Final = MOST_RINGS
-"""Farthest neighbours that a slope depends on, in edges."""
+"""Greatest distance of a neighbour on which a slope depends, in edges."""
 _TOGETHER: Final = 4096
-"""Sites whose neighbourhoods are held at a time."""
+"""Sites whose neighbourhoods are in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Slopes:
 
 
 def slopes_at(sites: Sites, mesh: Triangulation, kind: SlopeKind) -> Slopes:
-    """Slopes at all sites; zero at those without a triangle."""
+    """Returns slopes at all sites; zero at those without a triangle."""
     starts, neighbours = mesh.neighbours(len(sites))
     slopes, sources = np.zeros((len(sites), 2)), np.full(len(sites), LEVEL, np.uint8)
     if kind == "cubic":
@@ -85,10 +85,10 @@ def _splines(
     slopes: npt.NDArray[np.float64],
     sources: npt.NDArray[np.uint8],
 ) -> None:
-    """Slopes of splines where the neighbours bear one."""
+    """Compute slopes of splines where the neighbours determine one."""
     x, y = sites.local_m()
     ring, seen = np.empty(len(sites) + 1, np.int64), np.full(len(sites), -1)
-    work = np.empty(math.prod(WORK) + 8)  # from a multiple of 64 bytes on: a register's load is one line of the cache
+    work = np.empty(math.prod(WORK) + 8)  # aligned to 64 bytes, so that one register is one cache line
     work = work[-work.ctypes.data % 64 // 8 :][: math.prod(WORK)].reshape(WORK)
     for first in range(0, len(sites), _TOGETHER):
         many = min(_TOGETHER, len(sites) - first)

@@ -1,6 +1,6 @@
-"""The surface of a tile, from the tiles' cells or from points: what is needed around it, raw heights, smoothing.
+"""The surface of a tile, from the tiles' cells or from points: the margin it needs, raw heights, smoothing.
 
-A tile is computed on a window that reaches beyond it: by the cells that products see of the neighbours
+A tile is computed on a window that reaches beyond it: by the cells of the neighbours that products read
 (:data:`SHOWN_M`; before smoothing, where they ask for more, farther), by those that smoothing depends on, and, for
 points, by those that triangles depend on. The outer ones are cut off again, so all that is left has the same bits in
 every tile that sees it.
@@ -38,62 +38,62 @@ Float32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
 
 SHOWN_M: Final = 1.15
-"""What products see of the neighbouring tiles, at least (m)."""
+"""Least margin of the neighbouring tiles that products read (m)."""
 
-_BRIGHTEST: Final = 65_535.0
-_MOST_COUNTED: Final = 65_535
+_BRIGHTEST: Final = 65_535.0  # Intensities are clipped to 16 bits.
+_MOST_COUNTED: Final = 65_535  # Numbers of readings are clipped to 16 bits.
 _CELLS_SMOOTHED: Final = 2_000_000
-"""Cells that are smoothed at once, about: smoothing needs 100 bytes of memory a cell."""
+"""Approximate number of cells smoothed at once: smoothing needs 100 bytes of memory a cell."""
 
 
 @dataclass(frozen=True)
 class SurfaceGrid:
-    """The cells of a survey's surface, and how far a tile has to look around itself."""
+    """The cells of a survey's surface, and the margins that a tile needs."""
 
     tiles: TileGrid
     config: SurfaceConfig
     around_m: float = 0.0
-    """What products see of the neighbours before smoothing, at least (m)."""
+    """Margin before smoothing that products read, at least (m)."""
 
     @property
     def cell_m(self) -> tuple[float, float]:
-        """Edges of a cell (m): east, north."""
+        """Returns the edges of a cell: east, north (m)."""
         return self.config.cell_m or (self.tiles.cell_m, self.tiles.cell_m)
 
     @property
     def shown(self) -> int:
-        """Cells of the neighbours that products see, on each side."""
+        """Returns the cells of the neighbours that products read, on each side."""
         return math.ceil(SHOWN_M / min(self.cell_m) - 1e-9)
 
     @property
     def around(self) -> int:
-        """Cells of the neighbours that products see before smoothing, on each side."""
+        """Returns the cells of the neighbours that products read before smoothing, on each side."""
         return max(self.shown, math.ceil(self.around_m / min(self.cell_m) - 1e-9))
 
     @property
     def smoothed(self) -> int:
-        """Cells beyond those that smoothing depends on."""
+        """Returns the cells beyond those on which smoothing depends."""
         settings = self.config.smoothing_settings()
         return 0 if settings is None else halo_cells(settings)
 
     @property
     def holes(self) -> tuple[int, int]:
-        """Empty cells in the widest hole that is filled: northwards, eastwards."""
+        """Returns the number of empty cells in the widest hole that is filled: northwards, eastwards."""
         east, north = self.cell_m
         return cells_across(self.config.fill_m, north), cells_across(self.config.fill_m, east)
 
     @property
     def filled(self) -> int:
-        """Cells beyond those that are shown, that filling depends on."""
+        """Returns the cells beyond those that are shown on which filling depends."""
         return max(self.holes) + RIM if max(self.holes) else 0
 
     def window(self, tile: TileId) -> GridWindow:
-        """Cells that are computed for a tile."""
+        """Returns the cells that are computed for a tile."""
         beyond = max(self.shown + self.filled + self.smoothed, self.around)
         return GridWindow.over(self.tiles.bounds(tile), *self.cell_m).grown(beyond)
 
     def reach(self, tile: TileId) -> Bounds:
-        """Box (m) of all cells or points that a tile's surface depends on."""
+        """Returns the box (m) of all cells or points on which a tile's surface depends."""
         box, margin = self.window(tile).bounds(), 0.0
         if self.config.method == "points":
             margin = self.detailed.halo_m + max(self.cell_m)
@@ -105,7 +105,7 @@ class SurfaceGrid:
         )
 
     def rings(self) -> int:
-        """Rings of tiles around a tile that :meth:`reach` touches."""
+        """Returns the number of rings of tiles around a tile that :meth:`reach` touches."""
         tile = TileId(0, 0)
         own, box = self.tiles.bounds(tile), self.reach(tile)
         beyond = max(box.easting_max_m - own.easting_max_m, box.northing_max_m - own.northing_max_m)
@@ -113,7 +113,7 @@ class SurfaceGrid:
 
     @property
     def detailed(self) -> DetailedSettings:
-        """Settings of the detailed model."""
+        """Returns the settings of the detailed model."""
         return DetailedSettings(max_gap_m=self.config.max_gap_m, slopes=self.config.slopes)
 
 
@@ -129,7 +129,7 @@ class Patch:
 
 
 def patch_of_cells(window: GridWindow, tiles: Iterable[TileCells]) -> Patch:
-    """What tiles' cells say of a window: robust heights, mean intensities, and lowest readings where they are stored.
+    """Returns a window of tiles' cells: robust heights, mean intensities, and lowest readings where they are stored.
 
     Parameters
     ----------
@@ -155,15 +155,15 @@ def patch_of_cells(window: GridWindow, tiles: Iterable[TileCells]) -> Patch:
 def patch_of_points(
     window: GridWindow, tiles: Iterable[TilePoints], grid: SurfaceGrid, wanted: Bool | None = None
 ) -> Patch:
-    """The detailed model through points, at the nodes of a window.
+    """Returns the detailed model through points, at the nodes of a window.
 
-    A cell with a point in it is measured, the others that hold a height are interpolated. Intensities are a smooth
+    A cell with a point in it is measured, the other cells with a height are interpolated. Intensities are a smooth
     surface over the same triangles.
 
     Parameters
     ----------
     tiles : those that :meth:`SurfaceGrid.reach` touches, in any order.
-    wanted : (rows, columns) cells whose surface is wanted; None for all. What these do not depend on may be left out.
+    wanted : (rows, columns) cells whose surface is wanted; None for all. What does not affect these may be omitted.
     """
     if wanted is None:
         return _detailed(window, tiles, grid)
@@ -186,7 +186,7 @@ def patch_of_points(
 
 
 def _needed(wanted: Bool, beyond: int) -> slice:
-    """From the first to the last that is wanted, and so many more on both sides."""
+    """Returns the slice from the first to the last wanted one, with a margin on both sides."""
     at = np.flatnonzero(wanted)
     return slice(max(int(at[0]) - beyond, 0), min(int(at[-1]) + 1 + beyond, wanted.size))
 
@@ -206,7 +206,7 @@ def _detailed(window: GridWindow, tiles: Iterable[TilePoints], grid: SurfaceGrid
 
 
 def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | None = None) -> SurfaceTile:
-    """Smooth a window's heights, fill its holes, and cut off what was needed for that alone.
+    """Returns the surface of a window: smoothed, with holes filled, and without the margins that only these needed.
 
     Parameters
     ----------
@@ -240,12 +240,12 @@ def surface_of(tile: TileId, patch: Patch, grid: SurfaceGrid, wanted: Bool | Non
 
 
 def _around(raw_m: Float64, grid: SurfaceGrid) -> Float64:
-    """Heights before smoothing of what products see, of those of a tile's window."""
+    """Returns heights before smoothing that products read, from those of a tile's window."""
     return _cut(raw_m, max(grid.shown + grid.filled + grid.smoothed - grid.around, 0))
 
 
 def _for_smoothing(patch: Patch, grid: SurfaceGrid) -> Patch:
-    """The part of a window's patch that smoothing and filling look at."""
+    """Returns the part of a window's patch that smoothing and filling use."""
     margin = _beyond_smoothing(grid)
     rows, columns = (slice(margin, n - margin) for n in patch.raw_m.shape)
     lowest = None if patch.lowest is None else patch.lowest.part(rows, columns)
@@ -253,25 +253,25 @@ def _for_smoothing(patch: Patch, grid: SurfaceGrid) -> Patch:
 
 
 def _beyond_smoothing(grid: SurfaceGrid) -> int:
-    """Cells along each border of a tile's window that are seen as they were measured alone."""
+    """Returns the number of cells along each border of a tile's window that are used before smoothing only."""
     return max(grid.around - grid.shown - grid.filled - grid.smoothed, 0)
 
 
 def _cut(cells: npt.NDArray[Any], margin: int) -> npt.NDArray[Any]:
-    """An array (rows, columns) without so many cells along each border."""
+    """Returns an array (rows, columns) without so many cells along each border."""
     return cells[margin : cells.shape[0] - margin, margin : cells.shape[1] - margin]
 
 
 def _filled(height_m: Float64, intensity: Float32, grid: SurfaceGrid) -> tuple[Float64, Float32, Bool]:
-    """Heights and intensities of a window with holes filled, and which cells were."""
+    """Returns heights and intensities of a window with holes filled, and a mask of the filled cells."""
     found = Holes.of(~np.isnan(height_m), grid.holes)
     return found.fill(height_m), found.fill(intensity.astype(np.float64)).astype(np.float32), found.filled()
 
 
 def smoothed_where_known(raw_m: Float64, settings: SurfaceSmoothing) -> Float64:
-    """Smoothed heights (rows, columns), computed on the smallest box of known cells: a grid ends like a hole.
+    """Returns smoothed heights (rows, columns), computed on the smallest box of known cells: a border acts as a hole.
 
-    Strip by strip, to save memory: a strip reaches beyond its own rows by the halo of the smoothing.
+    It works in strips, to save memory: a strip reaches beyond its rows by the halo of the smoothing.
     """
     known = ~np.isnan(raw_m)
     if not known.any():
@@ -289,7 +289,7 @@ def smoothed_where_known(raw_m: Float64, settings: SurfaceSmoothing) -> Float64:
 
 
 def _near(points: TilePoints, tiles: TileGrid, box: Bounds, margin_m: float) -> tuple[Float64, Float64]:
-    """Places (n, 3) and intensities (n,) of a tile's points within `margin_m` of a box."""
+    """Returns positions (n, 3) and intensities (n,) of a tile's points within `margin_m` of a box."""
     corner = tiles.bounds(points.tile)
     easting = corner.easting_min_m + points.x_quanta * QUANTUM_M
     northing = corner.northing_min_m + points.y_quanta * QUANTUM_M
@@ -300,7 +300,7 @@ def _near(points: TilePoints, tiles: TileGrid, box: Bounds, margin_m: float) -> 
 
 
 def _held(window: GridWindow, places_m: Float64) -> Bool:
-    """(rows, columns) cells with a place in them."""
+    """Returns a mask (rows, columns) of the cells that contain a position."""
     column = np.floor(places_m[:, 0] / window.cell_east_m).astype(np.int64) - window.first_column
     row = np.floor(places_m[:, 1] / window.cell_north_m).astype(np.int64) - window.first_row
     own = (row >= 0) & (row < window.rows) & (column >= 0) & (column < window.columns)

@@ -1,4 +1,4 @@
-"""Regions of interest: where a coarse model varies in depth more than its street does, and where the user says so.
+"""Regions of interest: where a coarse model varies in depth more than its street does, and where the user states one.
 
 "By observing the coarse models, and looking at the variation of 3D depth measurements, cracks in smaller regions can be
 identified" (Yu and others 2007, 3.2.3). Here that is a rule. The stretch is cut into square patches. A patch's
@@ -34,14 +34,14 @@ FOUND: Final = "found"
 STATED: Final = "stated"
 
 _FEWEST: Final = 12
-"""Nodes that a patch needs."""
+"""Least number of nodes in a patch."""
 _BESIDE: Final = 4
-"""Patches to either side that have about the same offset: a crack along the road is far narrower."""
+"""Patches to either side with about the same offset: a crack along the road is far narrower."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A piece of road that is reconstructed in detail."""
+    """A part of the road that is reconstructed in detail."""
 
     outline_m: Float64
     """(k, 2) corners, easting and northing, not closed."""
@@ -54,11 +54,11 @@ class Region:
 
     @property
     def polygon(self) -> shapely.Polygon:
-        """The outline as a polygon."""
+        """Returns the outline as a polygon."""
         return shapely.Polygon(self.outline_m)
 
     def holds(self, easting_m: Float64, northing_m: Float64) -> Bool:
-        """Which places (any shape) lie in it."""
+        """Returns a mask of the places (any shape) within it."""
         polygon = self.polygon
         shapely.prepare(polygon)
         inside: Bool = shapely.intersects_xy(polygon, easting_m, northing_m)
@@ -66,14 +66,14 @@ class Region:
 
 
 def stated_regions(polygons: Iterable[npt.ArrayLike]) -> list[Region]:
-    """Regions that the user states: corners (k, 2) of each, easting and northing in the survey's map (m)."""
+    """Returns regions that the user states: corners (k, 2) of each, easting and northing in the survey's map (m)."""
     return [Region(np.asarray(one, np.float64), STATED) for one in polygons]
 
 
 def find_regions(model: CoarseModel, settings: RegionSettings) -> list[Region]:
-    """Regions where the coarse model varies in depth, in the order of the drive."""
+    """Returns regions where the coarse model varies in depth, in the order of the drive."""
     if not model.height_m.size or model.along_m[0] == model.along_m[-1]:
-        return []  # a vehicle that stood still showed a line
+        return []  # a vehicle that stood still gives one line
     patches = _Patches.of(model, settings.patch_m)
     interesting = np.zeros(patches.shape, bool)
     most = np.zeros(patches.shape)
@@ -100,7 +100,7 @@ class _Patches:
 
     model: CoarseModel
     nodes: int
-    """Steps across in a patch."""
+    """Number of steps across in a patch."""
     first_row: int
     first_column: int
     shape: tuple[int, int]
@@ -115,11 +115,11 @@ class _Patches:
 
     @property
     def edge_m(self) -> float:
-        """Edge of a patch."""
+        """Returns the edge of a patch (m)."""
         return self.nodes * self.model.settings.spacing_m
 
     def roughness_m(self, surface_m: Float64, level_patches: int) -> Float64:
-        """Root mean square (rows, columns) of a surface's heights about the plane around each patch (m), or NaN."""
+        """Returns the RMS (rows, columns) of a surface's heights about the plane around each patch (m), or NaN."""
         sums = np.zeros((*self.shape, PATCH_SUMS))
         sum_patches(
             self.model.along_m, surface_m, self.model.first_node, self.model.settings.spacing_m, self.edge_m,
@@ -138,7 +138,7 @@ class _Patches:
         return rough
 
     def street_m(self, rough_m: Float64, section_m: float) -> Float64:
-        """Roughness (rows, columns) of the street around each patch; 0 where there is none.
+        """Returns the roughness (rows, columns) of the street around each patch (m); 0 where there is none.
 
         The median of the section, or, where that is more, of the patches at about the same offset: a scanner's noise in
         height is largest below it, and far aside its readings are few.
@@ -152,7 +152,7 @@ class _Patches:
         return own
 
     def box_m(self, where: tuple[slice, slice], pad_m: float, roughness_m: float) -> tuple[float, ...]:
-        """First and end along, first and end across, roughness."""
+        """Returns first and end along, first and end across, roughness."""
         rows, columns = where
         return (
             (self.first_row + rows.start) * self.edge_m - pad_m, (self.first_row + rows.stop) * self.edge_m + pad_m,
@@ -162,13 +162,13 @@ class _Patches:
 
 
 def _median(values: Float64) -> float:
-    """Median of the numbers there are, 0 without any."""
+    """Returns the median of the numbers that are not NaN, 0 without any."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else 0.0
 
 
 def _planes(sums: Float64) -> Float64:
-    """Least-squares planes (…, 3), z = a + b x + c y, of sums (…, 10); level where the nodes lie on a line."""
+    """Returns least-squares planes (…, 3), z = a + b x + c y, of sums (…, 10); level where the nodes are collinear."""
     n = np.maximum(sums[..., 0], 1.0)
     _, x, y, z, xx, xy, yy, xz, yz, _ = np.moveaxis(sums / n[..., None], -1, 0)
     vxx, vxy, vyy = xx - x * x, xy - x * y, yy - y * y
@@ -182,7 +182,7 @@ def _planes(sums: Float64) -> Float64:
 
 
 def _merged(boxes: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
-    """Boxes of which none overlap, each the hull of those that did."""
+    """Returns boxes that do not overlap, each the hull of overlapping ones."""
     left, done = list(boxes), []
     while left:
         one = left.pop()
@@ -200,7 +200,7 @@ def _merged(boxes: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
 
 
 def _region(model: CoarseModel, box: tuple[float, ...]) -> Region:
-    """A box along and across the road as an outline on the map; it bends with the road."""
+    """Returns a box along and across the road as an outline on the map; it bends with the road."""
     start, end, left, right, roughness = box
     along = model.along_m
     inside = np.flatnonzero((along > start) & (along < end))

@@ -73,7 +73,7 @@ class SurfaceConfig(SurveySection):
         return self
 
     def smoothing_settings(self) -> SurfaceSmoothing | None:
-        """The smoothing with its noise; None where it is off."""
+        """Returns the smoothing with its noise; None where it is off."""
         if not self.smooth:
             return None
         weights = self.smoothing.model_dump()

@@ -19,14 +19,14 @@ from roadscan.core.grid import QUANTUM_M
 STEPS_PER_M: Final = 2.0**36
 """Steps of the lattice in a metre."""
 FARTHEST_M: Final = 2.0**26
-"""Farthest from the map's origin (67,000 km): the lattice in 64 bits."""
+"""Greatest distance from the map's origin (67,000 km): the lattice in 64 bits."""
 WIDEST_M: Final = 2.0**16
-"""Widest region (65 km): floats of 53 bits hold every difference exactly."""
+"""Width of the widest region (65 km): floats of 53 bits represent every difference exactly."""
 
 
 @dataclass(frozen=True)
 class Sites:
-    """Points that are triangulated, by northing and easting (to 10 µm)."""
+    """Points to be triangulated, by northing and easting (to 10 µm)."""
 
     x_steps: npt.NDArray[np.int64]
     """(m,) easting, lattice steps from the map's origin."""
@@ -41,7 +41,7 @@ class Sites:
         return int(self.height_m.size)
 
     def local_m(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Eastings and northings (m) from the anchor, exact."""
+        """Returns eastings and northings from the anchor (m), exact."""
         return (
             from_steps(self.x_steps - self.anchor_steps[0]),
             from_steps(self.y_steps - self.anchor_steps[1]),
@@ -49,7 +49,7 @@ class Sites:
 
 
 def sites(points_m: npt.NDArray[np.float64]) -> Sites:
-    """Order points, and merge those that are at one place.
+    """Returns ordered points, with those at one place merged.
 
     Points whose coordinates round to the same multiples of 10 µm (:data:`roadscan.core.grid.QUANTUM_M`) are one
     site, at the mean of their positions and of their heights. The result does not depend on the points' order.
@@ -82,19 +82,19 @@ def sites(points_m: npt.NDArray[np.float64]) -> Sites:
 
 
 def steps(coordinate_m: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """Coordinates (m) as lattice steps."""
+    """Returns coordinates (m) as lattice steps."""
     return np.rint(coordinate_m * STEPS_PER_M).astype(np.int64)
 
 
 def from_steps(difference: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-    """Differences of lattice steps in metres."""
+    """Returns differences of lattice steps in metres."""
     return difference / STEPS_PER_M
 
 
 def _merged(
     x: npt.NDArray[np.int64], y: npt.NDArray[np.int64], height: npt.NDArray[np.float64], first: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-    """Means of runs that begin at `first`."""
+    """Returns means of runs that begin at `first`."""
     count = np.diff(first, append=x.size)
     spread = np.repeat(first, count)
     middle = (v[first] + np.add.reduceat(v - v[spread], first) // count for v in (x, y))

@@ -68,12 +68,12 @@ UInt8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 
 FILTER_BOUND = 38.0 / 21.0
-"""Upper bound of the spectral norm of SᵀS, one filter a cell, any cells missing."""
-_FILTER_REACH = 2
+"""Upper bound of the spectral norm of SᵀS for one filter a cell, any cells missing."""
+_FILTER_REACH = 2  # Reach of a filter (cells).
 
 
 def smooth_surface(height_m: npt.ArrayLike, config: SurfaceSmoothing | None = None) -> Float64:
-    """Smoothed heights of a grid.
+    """Returns smoothed heights of a grid.
 
     Parameters
     ----------
@@ -87,19 +87,19 @@ def smooth_surface(height_m: npt.ArrayLike, config: SurfaceSmoothing | None = No
 
 
 def halo_cells(config: SurfaceSmoothing) -> int:
-    """Cells that a window needs beyond the cells that shall not depend on it."""
+    """Returns the margin (cells) beyond which a cell does not depend on the window."""
     return STEP_REACH * steps(config) + MEDIAN_REACH + _FILTER_REACH
 
 
 def steps(config: SurfaceSmoothing) -> int:
-    """Steps after which at most `tolerance` of the distance from the minimum is left."""
+    """Returns the number of steps after which at most `tolerance` of the distance from the minimum is left."""
     low, high = _bounds(config)
     share = (high - low) / (high + low)
     return max(1, math.ceil(math.log(config.tolerance) / math.log(share)))
 
 
 def _bounds(config: SurfaceSmoothing) -> tuple[float, float]:
-    """Least and greatest curvature of the energy, halved."""
+    """Returns half the least and half the greatest curvature of the energy."""
     return config.median_weight, 1.0 + config.median_weight + config.curvature_weight * FILTER_BOUND
 
 
@@ -114,7 +114,7 @@ class Smoothing:
     weight: Float32
     """Diagonal of W: 1, or 0 where nothing was measured and on outliers."""
     chosen: UInt8
-    """Filter that acts: 1 to 5, 0 for none."""
+    """Active filter: 1 to 5, 0 for none."""
     own: Float32
     """Weight of the cell itself in that filter: 1/2 where all neighbours are measured."""
     residual_m: Float32
@@ -139,13 +139,13 @@ class Smoothing:
         return cls(heights, median, weight.astype(np.float32), chosen, own, residual, config)
 
     def minimum(self) -> Float64:
-        """The surface after :func:`steps` steps (m)."""
+        """Returns the surface after :func:`steps` steps (m)."""
         for correction in self.corrections(steps(self.config)):  # noqa: B007 - the last one is wanted
             pass
         return self.median_m + correction
 
     def corrections(self, count: int) -> Iterator[Float32]:
-        """F − P_M (m) at the start and after each of `count` steps; each array is overwritten two steps later.
+        """Yields F − P_M (m) at the start and after each of `count` steps; each array is overwritten two steps later.
 
         Float32 holds these millimetres to a nanometre; P_M stays in float64.
         """

@@ -1,4 +1,4 @@
-"""Stage `surfaces`: cells or points into the reconstructed surface and its products."""
+"""Stage `surfaces`: cells or points are turned into the reconstructed surface and its products."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from roadscan.tiles.tasks.tiles import run_tasks
 
 
 class Surfaces(Stage):
-    """The road's surface, where the survey file has a section `[surface]`."""
+    """The stage of the road's surface; it runs where the survey file has a section `[surface]`."""
 
     name = "surfaces"
     title = "cells or points into the reconstructed surface and its files"
@@ -55,7 +55,7 @@ class Surfaces(Stage):
         session.failed(self.name, failures)
 
     def state(self, session: Session) -> StageState:
-        """Tiles whose surface is missing or stale, of those that hold cells by now."""
+        """Returns tiles whose surface is missing or stale, of those that have cells by now."""
         work = plan_surface_work(session)
         if work.planned is None:
             return StageState()
@@ -69,5 +69,5 @@ class Surfaces(Stage):
         )
 
     def folders(self) -> Sequence[str]:
-        """Outlines of the regions; files of surfaces lie beside those of tiles."""
+        """Returns folders: outlines of the regions; files of surfaces are beside those of tiles."""
         return ("tables/regions",)

@@ -1,4 +1,4 @@
-"""The reconstructed surface of one tile, as products get it."""
+"""The reconstructed surface of one tile, as products receive it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class NodeColours:
     """Colours of some of a surface's cells, as the survey's pictures show them at their centres."""
 
     colour: npt.NDArray[np.uint8]
-    """(rows, columns, 3) red, green, blue (sRGB) of the rows and columns that were asked for."""
+    """(rows, columns, 3) red, green, blue (sRGB) of the requested rows and columns."""
     seen: npt.NDArray[np.bool_]
     """(rows, columns) False where no picture shows a cell, or it has no height: no colour."""
 
@@ -64,22 +64,22 @@ class SurfaceTile:
 
     @property
     def around(self) -> tuple[npt.NDArray[np.float64], int]:
-        """Heights before smoothing (m), and how many of the neighbours' cells they hold on each side."""
+        """Returns heights before smoothing (m), and the number of the neighbours' cells in them on each side."""
         wide = self.raw_m if self.around_m is None else self.around_m
         return wide, self.halo + (wide.shape[0] - self.raw_m.shape[0]) // 2
 
     @property
     def cell_m(self) -> tuple[float, float]:
-        """Edges of a cell (m): east, north."""
+        """Returns the edges of a cell: east, north (m)."""
         return self.window.cell_east_m, self.window.cell_north_m
 
     @property
     def corner_m(self) -> tuple[float, float]:
-        """Easting and northing (m) of the arrays' south-western corner, halo included."""
+        """Returns easting and northing (m) of the arrays' south-western corner, halo included."""
         return self.window.first_column * self.window.cell_east_m, self.window.first_row * self.window.cell_north_m
 
     @property
     def inner(self) -> tuple[slice, slice]:
-        """Rows and columns of the tile itself: the cells whose centre lies in it."""
+        """Returns row and column slices of the tile itself: the cells whose centre lies in it."""
         rows, columns = self.height_m.shape
         return slice(self.halo, rows - self.halo), slice(self.halo, columns - self.halo)

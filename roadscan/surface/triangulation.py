@@ -1,9 +1,9 @@
 """Delaunay triangulation of a region that agrees, triangle by triangle, with that of its neighbours.
 
 Qhull triangulates. Its answer depends on tolerances of the whole region and, where four points lie on a circle (every
-mesh of gridded points), on chance. So its edges are then asked again in exact arithmetic and flipped where they are
-not Delaunay's; of four points on a circle, the diagonal of the first point (by northing, then easting) is taken. What
-comes out is the one Delaunay triangulation of the points, with ties broken as if the points had been moved by
+mesh of gridded points), on chance. So its edges are then tested in exact arithmetic and flipped where they are
+not Delaunay's; of four points on a circle, the diagonal of the first point (by northing, then easting) is taken. The
+result is the one Delaunay triangulation of the points, with ties broken as if the points had been moved by
 infinitely little, in the order of their absolute place (Lawson 1977; Edelsbrunner & Mücke 1990).
 
 Cut: a triangle is kept if the circle through its corners is at most ``max_gap_m`` wide. That circle holds no point, so
@@ -25,7 +25,7 @@ from roadscan.surface.kernels.delaunay import flip_edges
 from roadscan.surface.sites import Sites
 
 NUDGE_M: Final = 2.0**-24
-"""Qhull sees positions moved by up to this (60 nm), after a hash of the place: it is twice as fast without ties."""
+"""Qhull gets positions moved by up to this (60 nm), by a hash of the position: it is twice as fast without ties."""
 
 
 @dataclass(frozen=True)
@@ -41,21 +41,21 @@ class Triangulation:
         return int(self.triangles.shape[0])
 
     def neighbours(self, sites: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Sites joined to each site by an edge: those of i from ``starts[i]`` to ``starts[i + 1]``, ascending.
+        """Returns sites joined to each site by an edge: those of i from ``starts[i]`` to ``starts[i + 1]``, ascending.
 
         Returns
         -------
         starts : (sites + 1,); neighbours : (``starts[-1]``,).
         """
         start, end = np.roll(self.triangles, -1, axis=1), np.roll(self.triangles, 1, axis=1)
-        rim = self.opposite < 0  # the other way of an edge comes from the other triangle, if there is one
+        rim = self.opposite < 0  # the other direction of an edge comes from the other triangle, if there is one
         ways = np.sort(np.concatenate([(start * sites + end).ravel(), end[rim] * sites + start[rim]]))
         starts = np.searchsorted(ways, np.arange(sites + 1) * sites)
         return starts, ways % max(sites, 1)
 
 
 def triangulate(sites: Sites, max_gap_m: float) -> Triangulation:
-    """Triangulate sites, and leave holes wider than `max_gap_m` (m) open.
+    """Returns the triangulation of sites, with holes wider than `max_gap_m` (m) open.
 
     Fewer than three sites, or sites on a line, give no triangle.
     """
@@ -68,13 +68,13 @@ def triangulate(sites: Sites, max_gap_m: float) -> Triangulation:
     triangles, across = (np.take_along_axis(v, (first + np.arange(3)) % 3, axis=1) for v in (triangles, across))
     kept = np.flatnonzero(_circle_at_most(max_gap_m, sites, triangles))
     order = kept[np.argsort(triangles[kept, 0] * len(sites) + triangles[kept, 1])]  # an edge has one triangle
-    renumbered = np.full(len(triangles) + 1, -1)  # one more: no neighbour stays none
+    renumbered = np.full(len(triangles) + 1, -1)  # one more row, so that index -1 means no neighbour
     renumbered[order] = np.arange(order.size)
     return _paired(triangles[order], renumbered[across[order]])
 
 
 def _circle_at_most(widest_m: float, sites: Sites, triangles: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """(n,) whether the circle through the corners is at most so wide; a triangle without area has none."""
+    """Returns a mask (n,) of circles through the corners of at most this width; a degenerate triangle has none."""
     x, y = (v[triangles.T] for v in sites.local_m())
     dx, dy = (np.roll(v, -1, axis=0) - v for v in (x, y))
     twice_area = dx[0] * dy[1] - dy[0] * dx[1]
@@ -84,7 +84,7 @@ def _circle_at_most(widest_m: float, sites: Sites, triangles: npt.NDArray[np.int
 
 
 def _paired(triangles: npt.NDArray[np.int64], across: npt.NDArray[np.int64]) -> Triangulation:
-    """Find, in the triangle across each edge, the corner opposite it: the one before the edge's end over there."""
+    """Returns, in the triangle across each edge, the corner opposite it: the one before the edge's end there."""
     end = np.roll(triangles, 1, axis=1)
     same = triangles[across] == end[:, :, None]
     opposite = 3 * across + (np.argmax(same, axis=2) + 2) % 3
@@ -92,7 +92,7 @@ def _paired(triangles: npt.NDArray[np.int64], across: npt.NDArray[np.int64]) -> 
 
 
 def _qhull(sites: Sites) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
-    """Triangles and neighbours as Qhull finds them; None where it finds no area."""
+    """Returns triangles and neighbours from Qhull; None where all points are collinear."""
     if len(sites) < 3:
         return None
     places = np.stack(sites.local_m(), axis=1) + _nudges(sites)
@@ -105,7 +105,7 @@ def _qhull(sites: Sites) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] 
 
 
 def _nudges(sites: Sites) -> npt.NDArray[np.float64]:
-    """(m, 2) moves (m) within ± NUDGE_M that depend on the place alone."""
+    """Returns moves (m, 2) (m) within ± NUDGE_M that depend on the position alone."""
     with np.errstate(over="ignore"):
         word = sites.x_steps.view(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
         word = (word ^ (word >> np.uint64(29)) ^ sites.y_steps.view(np.uint64)) * np.uint64(0xBF58476D1CE4E5B9)

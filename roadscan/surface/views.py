@@ -1,4 +1,4 @@
-"""Pictures as they look at points: which of them shows a point best, and where in it."""
+"""Views of pictures: which picture shows a point best, and where in it."""
 
 from __future__ import annotations
 
@@ -22,41 +22,41 @@ UInt8 = npt.NDArray[np.uint8]
 __all__ = ["AROUND", "HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Sights", "Views",
            "best_views", "sampled", "sights"]  # fmt: skip
 
-NO_VIEW: Final = -1
+NO_VIEW: Final = -1  # Number that stands for no picture.
 _LEAST_TURNED: Final = float(np.sin(np.radians(10.0)))
-"""Least cosine between the ray and the direction that a front looks to."""
+"""Least cosine between the ray and the direction in which a front faces."""
 
 
 @dataclass(frozen=True)
 class PictureRule:
-    """Which pictures may give a point its colour."""
+    """Rule for the pictures that may give a point its colour."""
 
     cameras: tuple[str, ...]
-    """Names in the rig; all of them where empty."""
+    """Names in the rig; empty: all of them."""
     reach_m: float
     """Farthest distance from camera to point."""
     least_angle_deg: float
     """Least angle between the ray and the horizon at the camera, downwards."""
     border_px: int
-    """Pixels along the picture's border that give none; at least 1."""
+    """Width (pixels) of the picture's border that is not used; at least 1."""
 
     def limits(self) -> Float64:
-        """As the kernel takes them."""
+        """Returns the limits as the kernel takes them."""
         return np.array([self.reach_m**2, np.sin(np.radians(self.least_angle_deg)), float(self.border_px)])
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Interior orientation of a camera, and what its pictures show of its own vehicle."""
+    """Interior orientation of a camera, and the parts of its pictures that show the vehicle."""
 
     parameters: Float64
     """(13,) as the kernel takes them."""
     own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
-    """Polygons of pixels (u, v) that show the own vehicle."""
+    """Polygons of pixels (u, v) that show the survey vehicle."""
 
     @classmethod
     def of(cls, interior: Interior, own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()) -> Self:
-        """From the rig's values."""
+        """Returns the lens from the rig's values."""
         k1, k2, p1, p2, k3 = interior.distortion
         size = float(interior.width_px), float(interior.height_px)
         around = float(interior.model == "equirectangular")
@@ -65,12 +65,12 @@ class Lens:
 
     @property
     def is_around(self) -> bool:
-        """True for pictures of 360°."""
+        """Returns True for pictures of 360°."""
         return bool(self.parameters[AROUND])
 
     @functools.cached_property
     def hidden(self) -> Bool:
-        """(height, width) pixels that show the own vehicle; (0, 0) where none does. Drawn where it is needed."""
+        """Mask (height, width) of pixels that show the vehicle; (0, 0) where none does. Computed on demand."""
         if not self.own_vehicle_px:
             return np.zeros((0, 0), np.bool_)
         drawn = np.zeros((round(self.parameters[HEIGHT]), round(self.parameters[WIDTH])), np.uint8)
@@ -80,7 +80,7 @@ class Lens:
 
 
 def _fold(k1: float, k2: float, k3: float) -> float:
-    """Square of the tangent at which the distorted radius stops to grow: beyond it the model shows things twice."""
+    """Returns the square of the tangent at which the distorted radius stops growing: the model is ambiguous beyond."""
     roots = np.polynomial.Polynomial([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3]).trim().roots()
     real = roots[np.abs(roots.imag) < 1e-9].real
     return float(min(real[real > 0.0], default=np.inf))
@@ -88,7 +88,7 @@ def _fold(k1: float, k2: float, k3: float) -> float:
 
 @dataclass(frozen=True)
 class Views:
-    """Where n pictures were taken from and how, in the order in which equals are preferred."""
+    """Poses of n pictures, in the order in which equals are preferred."""
 
     eye_world_m: Float64
     """(n, 3) projection centres."""
@@ -97,17 +97,17 @@ class Views:
     up_world: Float64
     """(n, 3) upwards at the camera."""
     world: Int64
-    """(n,) number of the world frame that these are in."""
+    """(n,) number of the world frame."""
     lens: Int64
     """(n,) number of the lens."""
     lenses: tuple[Lens, ...]
 
     def __len__(self) -> int:
-        """Pictures."""
+        """Returns the number of pictures."""
         return len(self.lens)
 
     def picked(self, index: Int64) -> Views:
-        """Some of them."""
+        """Returns a subset."""
         return Views(
             self.eye_world_m[index], self.opencv_from_world[index], self.up_world[index], self.world[index],
             self.lens[index], self.lenses,
@@ -116,7 +116,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Shown:
-    """Which picture gives each of m points its colour, and where."""
+    """The picture that gives each of m points its colour, and the position in it."""
 
     view: npt.NDArray[np.int32]
     """(m,) number of the picture; NO_VIEW where none shows the point."""
@@ -127,11 +127,11 @@ class Shown:
 def best_views(
     point_world_m: Sequence[Float64], views: Views, rule: PictureRule, without: Collection[int] = ()
 ) -> Shown:
-    """The picture with the finest resolution (distance over focal length) of those that may show a point.
+    """Returns the picture with the finest resolution (distance over focal length) of those that may show a point.
 
     Parameters
     ----------
-    point_world_m : (m, 3) the points in each of the world frames that the views count.
+    point_world_m : (m, 3) the points in each of the world frames to which the views refer.
     without : numbers of pictures that cannot be read.
     """
     count, limits = len(point_world_m[0]) if point_world_m else 0, rule.limits()
@@ -150,7 +150,7 @@ def best_views(
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """Pictures that may show objects: n pairs, object by object, that with the finest look at it first."""
+    """Pictures that may show objects: n pairs, object by object, the one with the finest resolution first."""
 
     item: Int64
     """(n,) number of the object."""
@@ -161,14 +161,14 @@ class Sights:
     distance_m: Float64
     """(n,) from the camera to that place."""
     resolution_m: Float64
-    """(n,) what a pixel spans there, across the ray (m)."""
+    """(n,) size of a pixel there, across the ray (m)."""
 
     def __len__(self) -> int:
-        """Pairs."""
+        """Returns the number of pairs."""
         return len(self.item)
 
     def at(self, rows: Int64 | Bool) -> Sights:
-        """Some of them."""
+        """Returns a subset."""
         return Sights(
             self.item[rows], self.view[rows], self.pixel[rows], self.distance_m[rows], self.resolution_m[rows]
         )
@@ -181,17 +181,17 @@ def sights(
     rule: PictureRule,
     near: Iterable[tuple[int, Int64]],
 ) -> Sights:
-    """Which pictures show objects, each object's best first.
+    """Returns the pictures that show objects, each object's best first.
 
     A picture shows an object where all its places lie in it, within the rule's reach, and where its front is turned
     to the camera by 10 degrees or more. Best is what spans the least of the object with a pixel: distance over focal
-    length, over the cosine of the angle between ray and front; of equals the earlier picture. Whether something
-    stands between is not looked at.
+    length, over the cosine of the angle between ray and front; of equals the earlier picture. Occlusion by other
+    objects is not checked.
 
     Parameters
     ----------
     places_world_m : (m, k, 3) places of the objects in each of the world frames that the views count.
-    facing_world : (m, 3) unit vectors that their fronts look to, likewise; NaN where an object has no front.
+    facing_world : (m, 3) unit vectors in which their fronts face, likewise; NaN where an object has no front.
     near : pictures, and the objects that each may show.
     """
     found: list[tuple[Int64, Int64, Float64, Float64, Float64, Float64]] = []
@@ -224,7 +224,7 @@ def sights(
 
 
 def sampled(picture: UInt8, pixel: Float64) -> UInt8:
-    """Colours (m, 3) at places (m, 2: u, v) of a picture (height, width, 3), bilinear."""
+    """Returns colours (m, 3) at positions (m, 2: u, v) of a picture (height, width, 3), bilinear."""
     colour = np.empty((len(pixel), 3), np.uint8)
     sample(picture, np.ascontiguousarray(pixel), colour)
     return colour

@@ -1,4 +1,4 @@
-"""A window of a grid of the map: cells that need not be square nor divide a tile."""
+"""A window of a grid of the map, whose cells need not be square nor divide a tile."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from roadscan.core.grid import Bounds
 
 @dataclass(frozen=True)
 class GridWindow:
-    """Cells of the grid that starts at the map's origin; heights are asked at their centres, the nodes.
+    """Cells of the grid that starts at the map's origin; heights are evaluated at their centres, the nodes.
 
     A node's place follows from its number alone, so windows that share nodes ask at the same floats.
     """
@@ -39,7 +39,7 @@ class GridWindow:
 
     @classmethod
     def over(cls, box: Bounds, cell_east_m: float, cell_north_m: float) -> Self:
-        """Cells whose centre lies in a box (lower edges inclusive): boxes side by side share none and leave none."""
+        """Cells whose centre lies in a box (lower edges inclusive): adjacent boxes neither share nor omit any."""
         spans = (
             (box.easting_min_m, box.easting_max_m, cell_east_m),
             (box.northing_min_m, box.northing_max_m, cell_north_m),
@@ -48,14 +48,14 @@ class GridWindow:
         return cls(column, row, end_column - column, end_row - row, cell_east_m, cell_north_m)
 
     def grown(self, cells: int) -> GridWindow:
-        """The window with `cells` more on each of the four sides."""
+        """Returns the window with `cells` more on each of the four sides."""
         return GridWindow(
             self.first_column - cells, self.first_row - cells, self.columns + 2 * cells, self.rows + 2 * cells,
             self.cell_east_m, self.cell_north_m,
         )  # fmt: skip
 
     def bounds(self) -> Bounds:
-        """Box on the map (m) of the cells."""
+        """Returns the box of the cells on the map (m)."""
         east, north = self.cell_east_m, self.cell_north_m
         return Bounds(
             self.first_column * east, self.first_row * north,
@@ -63,7 +63,7 @@ class GridWindow:
         )  # fmt: skip
 
     def nodes_m(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """(columns,) eastings and (rows,) northings of the nodes (m)."""
+        """Returns eastings (columns,) and northings (rows,) of the nodes (m)."""
         return (
             _centres(self.first_column, self.columns, self.cell_east_m),
             _centres(self.first_row, self.rows, self.cell_north_m),
@@ -75,7 +75,7 @@ def _centres(first: int, count: int, edge_m: float) -> npt.NDArray[np.float64]:
 
 
 def _first(at_least_m: float, edge_m: float) -> int:
-    """First cell whose centre is not below a coordinate."""
+    """Returns the first cell whose centre is not below a coordinate."""
     guess = math.ceil(at_least_m / edge_m - 0.5)
     while (guess + 0.5) * edge_m < at_least_m:
         guess += 1

@@ -1,1 +1,1 @@
-"""Control points as passes saw them, what is wrong with them, and whether they are right as a whole."""
+"""Control points as passes saw them, faults of single points, and tests of the control as a whole."""

@@ -1,4 +1,4 @@
-"""Control points as passes saw them: when each pass came by, what it saw, and the observations that follow."""
+"""Control points as passes saw them: times of passage, sightings, and the observations that follow."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ SightStatus = Literal["found", "missed", "doubled", "moved", "picked", "height",
 """`height`: no target is looked for, the height alone was measured; `unseen`: not even that, or the pass did not see
 the road where the target is looked for."""
 
-_NEAR_M: Final = 3.0
-_LONGEST_NS: Final = 20 * NS_PER_S
+_NEAR_M: Final = 3.0  # Longer steps of a track count as this long (m).
+_LONGEST_NS: Final = 20 * NS_PER_S  # longest part of a traverse to either side of its nearest time (ns)
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class ControlPoint:
     sigma_horizontal_m: float
     sigma_height_m: float
     shape: Shape | SurveyedLine | None
-    """None: no target is looked for."""
+    """None: no target is searched."""
 
     @property
     def is_of_line(self) -> bool:
@@ -58,7 +58,7 @@ class ControlPoint:
 
 @dataclass(frozen=True)
 class PickedPlace:
-    """Where the user sees a point's target in the recorded poses of a run (map, m)."""
+    """Place of a point's target that the user picked in the recorded poses of a run (map, m)."""
 
     easting_m: float
     northing_m: float
@@ -67,7 +67,7 @@ class PickedPlace:
 
 @dataclass(frozen=True)
 class Sighting:
-    """What one pass saw of a point; what was not measured is NaN."""
+    """What one pass saw of a point; NaN where not measured."""
 
     point: ControlPoint
     run: int
@@ -106,14 +106,14 @@ class Sighting:
 
     @property
     def observed(self) -> int:
-        """Number of observations that it makes."""
+        """Returns the number of observations that it gives."""
         return int(np.isfinite(self.height_m)) + 2 * self.is_placed
 
 
 def passes_by(track: Track, easting_m: float, northing_m: float, radius_m: float, apart_s: float) -> list[Traverse]:
-    """When a sensor saw a circle of the road, one each time that it came by.
+    """Returns spans in which a sensor saw a circle of the road, one for each passage.
 
-    apart_s : a vehicle that is back after this time or more comes by anew.
+    apart_s : a vehicle that returns after this time or more passes again.
     """
     east, north = easting_m - track.easting_m, northing_m - track.northing_m
     sine, cosine = np.sin(track.heading_rad), np.cos(track.heading_rad)
@@ -134,7 +134,7 @@ def passes_by(track: Track, easting_m: float, northing_m: float, radius_m: float
 
 
 def _step_m(track: Track) -> float:
-    """Longest way from one position of a track to the next, but no gap."""
+    """Returns the longest step between positions of a track (m); gaps count as 3 m."""
     steps = np.hypot(np.diff(track.easting_m), np.diff(track.northing_m))
     return float(min(steps.max(initial=0.0), _NEAR_M))
 
@@ -146,7 +146,7 @@ def sight(
     sigma_pose_m: float,
     picked: PickedPlace | None = None,
 ) -> Sighting:
-    """What one pass saw of a point.
+    """Returns what one pass saw of a point.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def sight_shifted(
     picked: PickedPlace | None,
     shift_level_m: Float64,
 ) -> Sighting:
-    """The same of a pass whose readings were shifted (3,; north, east, down), told as the recorded poses show it."""
+    """Returns the same for a pass whose readings were shifted (3,; north, east, down), in the recorded poses."""
     east, north, up = map_from_level(shift_level_m[None], heads[0].convergence_rad)[0].tolist()
     if picked is not None:
         picked = replace(picked, easting_m=picked.easting_m + east, northing_m=picked.northing_m + north)
@@ -210,7 +210,7 @@ def sight_shifted(
     if one.is_placed or not np.isfinite(one.slope_east):
         height = one.height_m - up
     else:
-        # At the surveyed place: the shift moves it along a road that slopes.
+        # At the surveyed place the shift moves it along a road that slopes.
         height = one.height_m - up + one.slope_east * east + one.slope_north * north
     return replace(one, easting_m=one.easting_m - east, northing_m=one.northing_m - north, height_m=height)
 
@@ -251,7 +251,7 @@ def _unseen(point: ControlPoint, head: PassReadings) -> Sighting:
 def moved_m(
     one: Sighting, corrections: Corrections | None, mounting: tuple[MountingChange, Seat] | None = None
 ) -> Float64:
-    """How corrections move what a sighting saw: easting, northing, height (3,) (m); of a point that was not placed the
+    """Movement of a sighting by corrections: easting, northing, height (3,) (m); without a place that of the
     height at its surveyed place, on a road that slopes.
 
     mounting : change of that of the sensor that saw it, and its seat.
@@ -276,18 +276,18 @@ class SeenBy:
     """The sensor that saw a point."""
 
     number: int
-    """Among those whose mounting is estimated; −1: it is not."""
+    """Number among those whose mounting is estimated; −1: none."""
     seat: Seat
     """Its lever arm, and the direction of its beams, (3,) each."""
 
 
 def observations_of(sightings: Sequence[Sighting], seen_by: Sequence[SeenBy] | None = None) -> Observations:
-    """Height of each sighting, and two components of those that were placed, in order of the sightings.
+    """Returns height of each sighting, and two components of those with a place, in order of the sightings.
 
     The height is that along the normal of the road at a point without a target, whose place on the road is known by the
     poses alone. The components of a place are along the axes of its covariance, so that they are independent.
 
-    seen_by : of each sighting; mountings are not asked for where it is left out.
+    seen_by : sensor of each sighting; without it, mountings are not estimated.
     """
     parts = [part for number, one in enumerate(sightings) for part in _of_one(number, one)]
     groups = np.array([int(part.group[0]) for part in parts], np.int64)
@@ -316,7 +316,7 @@ def _of_one(number: int, one: Sighting) -> list[Observations]:
             lift = float(1.0 / np.linalg.norm(normal))
         direction = level_from_map(normal * lift, one.convergence_rad)
         value, sigma = lift * (point.height_m - one.height_m), lift * one.sigma_height_m
-        # On a road that slopes, the height at a place that is surveyed wrong is another one.
+        # On a road that slopes, a wrong surveyed place has another height.
         misplaced = 0.0 if one.is_placed else point.sigma_horizontal_m * float(np.hypot(*normal[0, :2]))
         surveyed = float(np.hypot(point.sigma_height_m, misplaced))
         parts.append(_observation("control_height", one, direction, value, (sigma, surveyed), 2 * number))

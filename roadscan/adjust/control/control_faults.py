@@ -1,4 +1,4 @@
-"""What is wrong with control: points in another CRS or height datum, wrong ones, two that were swapped."""
+"""Faults of control: points in another CRS or height datum, wrong points, two that were swapped."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from roadscan.compute.robust import scatter_about
 Float64 = npt.NDArray[np.float64]
 
 _NAMED: Final = 8
-"""So many points are named; of more their number is told."""
-_SIGMAS: Final = 4.0
+"""At most this many points are named; of the rest the number is reported."""
+_SIGMAS: Final = 4.0  # Heights agree after an exchange within this many σ.
 
 
 @dataclass(frozen=True)
 class WrongPoint:
-    """A control point whose survey the others contradict."""
+    """A control point whose survey the other evidence contradicts."""
 
     name: str
     height_m: float
-    """Surveyed minus what all others say; NaN where the height is right."""
+    """Surveyed minus predicted height; NaN where the height is right."""
     horizontal_m: float
-    """Distance of the surveyed place from where all others say; NaN where the place is right."""
+    """Distance of the surveyed place from the predicted one; NaN where the place is right."""
     sigma_m: float
     """1 σ of the height's difference."""
     surveyed_height_m: float
     sigmas: float = float("nan")
     """Length of the normalised residual; NaN where it is not known."""
     limit: float = float("nan")
-    """That from which on a point is wrong."""
+    """Length of the normalised residual from which a point is wrong."""
     alternatives: tuple[str, ...] = ()
-    """Points that may be the wrong ones in its stead."""
+    """Points that may be wrong instead."""
 
     def told(self) -> str:
-        """In words."""
+        """Returns the fault in words."""
         parts, what = [], []
         if np.isfinite(self.height_m):
             parts.append(f"its surveyed height lies {self.height_m * 1e3:+.1f} mm")
@@ -57,9 +57,9 @@ class WrongPoint:
 
 
 def datum_fault(sightings: Sequence[Sighting], largest_m: float) -> str:
-    """Why no point can be used: their heights are in another datum than the map's; "" where they fit.
+    """Returns why no point can be used: their heights are in another datum than the map's; "" where they fit.
 
-    largest_m : a median difference up to this is a matter of the poses.
+    largest_m : a median difference up to this is attributed to the poses.
     """
     away = np.array([one.point.height_m - one.height_m for one in sightings if np.isfinite(one.height_m)])
     if away.size == 0 or abs(float(np.median(away))) <= largest_m:
@@ -74,7 +74,7 @@ def datum_fault(sightings: Sequence[Sighting], largest_m: float) -> str:
 
 
 def far_in_height(sightings: Sequence[Sighting], largest_m: float) -> dict[str, float]:
-    """Points, by name, whose height differs from what most passes measured by more than that: surveyed minus measured
+    """Returns points, by name, whose height differs by more than that from what most passes measured: surveyed minus
     (m).
     """
     found: dict[str, list[float]] = {}
@@ -86,7 +86,7 @@ def far_in_height(sightings: Sequence[Sighting], largest_m: float) -> dict[str, 
 
 
 def swapped(wrong: Sequence[WrongPoint]) -> list[tuple[str, str]]:
-    """Pairs of wrong points whose heights would be right if they were exchanged."""
+    """Returns pairs of wrong points whose heights would be right if they were exchanged."""
     found: list[tuple[str, str]] = []
     for k, one in enumerate(wrong):
         for other in wrong[k + 1 :]:
@@ -99,6 +99,6 @@ def swapped(wrong: Sequence[WrongPoint]) -> list[tuple[str, str]]:
 
 
 def listed(words: Sequence[str]) -> str:
-    """Some of many, and how many more there are."""
+    """Returns some of many items, and the number of the others."""
     more = f" and {len(words) - _NAMED} more" if len(words) > _NAMED else ""
     return ", ".join(words[:_NAMED]) + more

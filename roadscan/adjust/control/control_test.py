@@ -1,8 +1,8 @@
-"""Is the control right? Each surveyed coordinate against what poses, ties and the other control say of it.
+"""Test of the control: each surveyed coordinate against its prediction from poses, ties and the other control.
 
-The adjustment first leaves the surveys aside. What it then says of each point, with the covariance of all of them, is
-all that is needed: a point that is wrong is found by its normalised leave-one-out residual (data snooping, Baarda
-1968), an offset that all points share by its least-squares estimate over its σ. Both are held against quantiles of the
+The adjustment first leaves the surveys aside. Its prediction of each point, with the covariance of all of them, is
+all that is needed: a wrong point is found by its normalised leave-one-out residual (data snooping, Baarda
+1968), an offset that all points share by its least-squares estimate over its σ. Both are tested by quantiles of the
 normal distribution that right control passes with a stated chance, all tests together.
 """
 
@@ -24,52 +24,52 @@ Bool = npt.NDArray[np.bool_]
 
 HEIGHT, PLACE = "height", "place"
 COMPONENTS: Final = {HEIGHT: (2,), PLACE: (0, 1)}
-"""Axes (north, east, down) of what may be wrong by itself: the height of a point, or its place."""
+"""Axes (north, east, down) that may be wrong separately: the height of a point, or its place."""
 _POWER: Final = 0.8416
-"""Standard normal quantile of 80 %: an offset so many σ above the limit is found so often."""
+"""Standard normal quantile of 80 %: an offset this many σ above the limit is found in 80 % of cases."""
 APART: Final = 9.21
-"""Two points of which one is wrong are told apart where one explains this much more of the squared residuals:
+"""Two points of which one is wrong are distinguished if one explains this much more of the squared residuals:
 a hundred times as likely (2 ln 100)."""
 _MANY: Final = 8
-"""Heights and places from which on the stated σ of all surveys can be told from single wrong points."""
+"""With at least this many heights and places, the σ of all surveys can be distinguished from single wrong points."""
 _FEW: Final = 0.25
 """Share of the heights and places that may be wrong one by one."""
 _UNDERSTATED: Final = 9.0
-"""A median of the squared residuals that is so many times the usual one shows that the stated σ is too small: with
+"""Ratio of the median squared residual to its usual value that shows a stated σ that is too small: with
 eight right points two surveys in 10,000 have it."""
-_LARGEST_FACTOR: Final = 1e6
-_BISECTIONS: Final = 12
+_LARGEST_FACTOR: Final = 1e6  # Largest factor of the surveys' variances that is tried.
+_BISECTIONS: Final = 12  # Bisections of the logarithm of that factor.
 _LEAST_CONTRADICTED_M: Final = 0.03
-"""Poses of a vehicle, whatever σ they state, do not know the mean height of a drive so well that they would contradict
-control that is off by less."""
+"""Least offset of control (m) that poses of a vehicle, whatever σ they state, contradict: they do not know the mean
+height of a drive better."""
 _SLOPES: Final = 5
-"""Heights from which on a shift in the plane is sought: it and an offset are three numbers."""
+"""Least number of heights for a shift in the plane: it and an offset are three numbers."""
 _LARGEST_SHIFT_M: Final = 3.0
-"""1 σ of a shift of the control in the plane before anything is known of it (m): antennas, epochs of a datum."""
+"""Prior 1 σ of a shift of the control in the plane (m): antennas, epochs of a datum."""
 _KNOWN: Final = 1e-9
-"""Share of its variance that a residual has to keep to say anything of its observation."""
+"""Least share of its variance that a residual retains if it is to test its observation."""
 
 
 @dataclass(frozen=True)
 class SurveyErrors:
-    """What poses and ties alone say of m surveyed coordinates."""
+    """Errors of m surveyed coordinates as poses and ties alone show them."""
 
     point: Int64
     """(m,) row of the control point."""
     axis: Int64
     """(m,) 0 north, 1 east, 2 down."""
     away_m: Float64
-    """(m,) surveyed minus what poses and ties say."""
+    """(m,) surveyed minus predicted from poses and ties."""
     covariance_m2: Float64
-    """(m, m) of what poses and ties say, without that of the survey."""
+    """(m, m) of that prediction, without that of the survey."""
     survey_m2: Float64
     """(m,) stated variance of the survey."""
     lean: Float64
-    """(m, 2) by how much `away_m` is off for a metre by which the point lies north, and east, of where it was surveyed:
+    """(m, 2) derivatives of `away_m` by a shift of the point, north and east, from where it was surveyed:
     of heights alone the slope of the road, else 0."""
 
     def parts(self) -> list[tuple[int, str, Int64]]:
-        """Point, component, and rows of each height and each place."""
+        """Returns point, component, and rows of each height and each place."""
         found = []
         for point in np.unique(self.point).tolist():
             for name, axes in COMPONENTS.items():
@@ -81,7 +81,7 @@ class SurveyErrors:
 
 @dataclass(frozen=True)
 class WrongSurvey:
-    """A point whose height or place is contradicted by all else."""
+    """A point whose height or place is contradicted by all other evidence."""
 
     point: int
     component: str
@@ -89,9 +89,9 @@ class WrongSurvey:
     sigmas: float
     """Length of its normalised leave-one-out residual."""
     limit: float
-    """Length from which on a point is wrong."""
+    """Length from which a point is wrong."""
     alternatives: tuple[int, ...] = ()
-    """Points that may be the wrong ones in its stead: what is known does not tell which of them is."""
+    """Points that may be wrong instead: the evidence does not distinguish them."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +103,10 @@ class CommonOffset:
     covariance_m2: Float64
     """(3, 3)"""
     observed: Bool
-    """(3,) axes that a point was observed along."""
+    """(3,) axes along which a point was observed."""
 
     def sigmas(self, component: str) -> float:
-        """The offset over its σ, as a standard normal number would be as rare; 0: not observed."""
+        """Returns the significance of the offset as that of a standard normal number; 0: not observed."""
         axes = [a for a in COMPONENTS[component] if self.observed[a]]
         if not axes:
             return 0.0
@@ -114,35 +114,35 @@ class CommonOffset:
         return float(np.sqrt(own @ np.linalg.solve(self.covariance_m2[np.ix_(axes, axes)], own)))
 
     def sigma_m(self, component: str) -> float:
-        """1 σ of the component, the larger one of a place; NaN: not observed."""
+        """Returns 1 σ of the component, the larger one of a place; NaN: not observed."""
         axes = [a for a in COMPONENTS[component] if self.observed[a]]
         return float(np.sqrt(np.diag(self.covariance_m2)[axes].max())) if axes else float("nan")
 
 
 @dataclass(frozen=True)
 class PlaneShift:
-    """How far all points of which heights alone are compared lie from where they were surveyed."""
+    """Common horizontal shift of all points of which only heights are compared, from their surveyed places."""
 
     shift_m: Float64
-    """(2,) surveyed minus true, north and east; 0 where nothing tells of one."""
+    """(2,) surveyed minus true, north and east; 0 where nothing shows one."""
     covariance_m2: Float64
     """(2, 2)"""
     sigmas: float = 0.0
-    """Length of the shift in its σ, as a standard normal number would be as rare."""
+    """Significance of the shift, as that of a standard normal number."""
 
     def taken_from(self, errors: SurveyErrors) -> SurveyErrors:
-        """What the surveys' heights are off by without it."""
+        """Returns the errors of the surveys' heights without it."""
         more = errors.lean @ self.covariance_m2 @ errors.lean.T
         away = errors.away_m - errors.lean @ self.shift_m
         return replace(errors, away_m=away, covariance_m2=errors.covariance_m2 + more)
 
 
-NOT_SHIFTED: Final = PlaneShift(np.zeros(2), np.zeros((2, 2)))
+NOT_SHIFTED: Final = PlaneShift(np.zeros(2), np.zeros((2, 2)))  # No shift.
 
 
 @dataclass(frozen=True)
 class ControlVerdict:
-    """What the control's surveys are worth."""
+    """Verdict on the control's surveys."""
 
     wrong: tuple[WrongSurvey, ...]
     offset: CommonOffset
@@ -150,35 +150,35 @@ class ControlVerdict:
     doubted: tuple[str, ...]
     """Components whose common offset the poses exclude with the stated chance of error."""
     detectable_m: dict[str, float]
-    """By component: a common offset of this size is found four times of five."""
+    """By component: a common offset of this size is found in 80 % of cases."""
     limit_point: float
-    """Normalised leave-one-out residual of a height from which on a point is wrong."""
+    """Normalised leave-one-out residual of a height from which a point is wrong."""
     survey_factor: float
     """Of the stated variances of all surveys."""
     shift: PlaneShift = NOT_SHIFTED
-    """That is told by the heights of points on slopes."""
+    """The shift that the heights of points on slopes show."""
 
     @property
     def faults(self) -> int:
-        """Number of points that are wrong, and of components that are doubted."""
+        """Returns the number of wrong points and of doubted components."""
         return len(self.wrong) + len(self.doubted)
 
     @property
     def left_out(self) -> set[tuple[int, str]]:
-        """Row of the point and component of all that does not count."""
+        """Returns row of the point and component of all that is left out."""
         return {(p, one.component) for one in self.wrong for p in (one.point, *one.alternatives)}
 
 
 @dataclass(frozen=True)
 class AppliedOffset:
-    """The offset that surveys are taken to have in common."""
+    """The offset that is attributed to the surveys."""
 
     offset_m: Float64
     """(3,) north, east, down: subtracted from all surveys."""
     covariance_m2: Float64
-    """(3, 3) that it adds to what follows from the control."""
+    """(3, 3) that it adds to the results that depend on the control."""
     estimated: tuple[str, ...]
-    """Components in which the poses, and not the control, say where the survey lies."""
+    """Components in which the poses, and not the control, define the datum."""
     refused: tuple[str, ...]
     """Components of which no survey counts."""
 
@@ -191,17 +191,17 @@ def quantile(chance: float, tests: int, numbers: int = 1) -> float:
 
 
 def judged(groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: AdjustmentSettings) -> ControlVerdict:
-    """Which points are wrong, and whether all of them are off together.
+    """Returns the verdict: which points are wrong, and whether all of them share an offset.
 
     Parameters
     ----------
-    groups : of neighbours, which single points are held against; together all points.
-    spread : points that an offset of all is told by; those of the only group, or some of each.
+    groups : of neighbours, by which single points are tested; together all points.
+    spread : points that show an offset of all; those of the only group, or some of each.
 
-    Two explanations are compared, single wrong points and a common offset with what is wrong beside it; the one with
-    fewer faults holds, that of single points where both have as many. Right control is found wrong with the chance of
-    `rules.false_alarm`, and doubted as a whole with that of `rules.datum_false_alarm`. Where many points are found
-    wrong, the stated σ of the survey is asked as well.
+    Two explanations are compared: single wrong points, and a common offset with further wrong points. The one with
+    fewer faults is accepted, or that of single points if both have as many. Right control is found wrong by chance
+    `rules.false_alarm`, and doubted as a whole by chance `rules.datum_false_alarm`. Where many points are found
+    wrong, the stated σ of the survey is tested as well.
     """
     groups, spread = [_in_datum(own, rules) for own in groups], _in_datum(spread, rules)
     found, shift = _with_shift(groups, spread, rules)
@@ -217,7 +217,7 @@ def judged(groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: Adjustme
 def _with_shift(
     groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: AdjustmentSettings
 ) -> tuple[ControlVerdict, PlaneShift]:
-    """The verdict, and a shift of all heights' places.
+    """Returns the verdict with a shift of all heights' places.
 
     It holds where it explains what is doubted, with the chance of `rules.datum_false_alarm`, and leaves fewer faults;
     where nothing else is doubted, right control has it with the chance of `rules.false_alarm`.
@@ -235,7 +235,7 @@ def _with_shift(
 
 
 def plane_shift(errors: SurveyErrors, kept: Bool) -> PlaneShift:
-    """The shift in the plane that explains heights on slopes best, beside an offset of all of them."""
+    """Returns the shift in the plane that explains heights on slopes best, beside an offset of all of them."""
     rows = kept & (errors.axis == COMPONENTS[HEIGHT][0])
     if rows.sum() < _SLOPES or not errors.lean[rows].any():
         return NOT_SHIFTED
@@ -247,26 +247,26 @@ def plane_shift(errors: SurveyErrors, kept: Bool) -> PlaneShift:
     covariance = np.linalg.inv(normal)
     shift = (covariance @ weighed.T @ errors.away_m[rows])[:2]
     own = covariance[:2, :2]
-    # Its own variance by right control: that of the prior is not among it.
+    # Its variance with right control: that of the prior is not included.
     right = own - own @ own / _LARGEST_SHIFT_M**2
     return PlaneShift(shift, own, float(np.sqrt(max(shift @ np.linalg.solve(right, shift), 0.0))))
 
 
 def _in_datum(errors: SurveyErrors, rules: ControlRules) -> SurveyErrors:
-    """With what the datum of the control may be off by."""
+    """Returns the surveys with the uncertainty of the control's datum."""
     datum = rules.sigma_datum_m**2 * (errors.axis[:, None] == errors.axis)
     return replace(errors, covariance_m2=errors.covariance_m2 + datum)
 
 
 def _surveyed(errors: SurveyErrors, factor: float) -> SurveyErrors:
-    """With a factor of the surveys' stated variances."""
+    """Returns the surveys with a factor of their stated variances."""
     return replace(errors, covariance_m2=errors.covariance_m2 + factor * np.diag(errors.survey_m2))
 
 
 def _with_factor(
     groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: ControlRules, factor: float
 ) -> ControlVerdict:
-    """The verdict with a factor of the surveys' stated variances."""
+    """Returns the verdict with a factor of the surveys' stated variances."""
     groups, spread = [_surveyed(own, factor) for own in groups], _surveyed(spread, factor)
     tests = max(sum(len(own.parts()) for own in groups), 1)
     lengths = {len(axes): quantile(rules.false_alarm, tests, len(axes)) for axes in COMPONENTS.values()}
@@ -286,7 +286,7 @@ def _with_factor(
 
 
 def _survey_factor(groups: Sequence[SurveyErrors]) -> float:
-    """Factor of the stated variances of all surveys: 1, or more where most points contradict one another.
+    """Returns a factor of the stated variances of all surveys: 1, or more where most points contradict one another.
 
     Wrong points are few. Where the median of all normalised leave-one-out residuals is far too large, it is the σ of
     the survey that is wrong.
@@ -310,7 +310,7 @@ def _survey_factor(groups: Sequence[SurveyErrors]) -> float:
 
 
 def common_offset(errors: SurveyErrors, kept: Bool) -> CommonOffset:
-    """The offset that surveys have in common, from some of the coordinates."""
+    """Returns the offset that surveys have in common, from some of the coordinates."""
     axes = np.unique(errors.axis[kept])
     offset, covariance, observed = np.zeros(3), np.zeros((3, 3)), np.zeros(3, bool)
     if axes.size:
@@ -331,7 +331,7 @@ def _kept(errors: SurveyErrors, wrong: list[WrongSurvey]) -> Bool:
 
 
 def _snooped(errors: SurveyErrors, lengths: Mapping[int, float], *, free: bool) -> list[WrongSurvey]:
-    """Wrong points, the worst first: each is left out before the others are judged.
+    """Returns wrong points, the worst first: each is left out before the others are judged.
 
     Parameters
     ----------
@@ -357,7 +357,7 @@ def _snooped(errors: SurveyErrors, lengths: Mapping[int, float], *, free: bool) 
 
 
 def _explained(errors: SurveyErrors, parts: list[tuple[int, str, Int64]], kept: Bool, *, free: bool) -> Float64:
-    """By how much the weighted squared residuals fall where a part is left out: the square of its normalised
+    """Returns how much the weighted squared residuals fall where a part is left out: the square of its normalised
     leave-one-out residual; 0 of those that are left out, or that the others say nothing of.
     """
     squares = np.zeros(len(parts))
@@ -388,8 +388,8 @@ def _without_the_right(
     *,
     free: bool,
 ) -> list[WrongSurvey]:
-    """Points that fit once the worse ones are left out count again: a wrong neighbour had spoiled what they are held
-    against. Each gets its normalised residual against all that counts.
+    """Wrong points without those that fit once the worse ones are left out: a wrong neighbour had spoiled their
+    prediction. Each gets its normalised residual against all that counts.
     """
     found = list(wrong)
     for one in sorted(wrong, key=lambda w: w.sigmas):
@@ -407,7 +407,7 @@ def _without_the_right(
 
 
 def applied_offset(verdict: ControlVerdict, rules: ControlRules, contradicted_from: float) -> AppliedOffset:
-    """What is made of an offset of the control as a whole.
+    """Returns how an offset of the control as a whole is treated.
 
     contradicted_from : σ from which on poses contradict control, and do not merely cast doubt on it.
     """

@@ -1,1 +1,1 @@
-"""Loops of the adjustment: normal equations and the inverse, targets, places, patches, shifts and planes."""
+"""Kernels of the adjustment: normal equations and the inverse, targets, places, patches, shifts and planes."""

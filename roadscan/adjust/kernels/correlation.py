@@ -1,4 +1,4 @@
-"""Two pictures of one place shifted against each other: their correlation, and what differs when they lie together.
+"""Two images of one place shifted against each other: their correlation, and their difference when aligned.
 
 Pictures are arrays (rows, columns) with NaN where nothing was seen. A cell (r, c) of the first lies at (r + dr, c + dc)
 of the second.
@@ -18,7 +18,7 @@ from roadscan.compute.kernel_options import kernel
 
 @kernel
 def correlate(first, second, every, row, column, least, out):
-    """Write normalised correlations of two pictures over a grid of shifts.
+    """Write normalised correlations of two images over a grid of shifts.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def correlate(first, second, every, row, column, least, out):
 
 
 class Laid(NamedTuple):
-    """What is known cell by cell when the second picture lies on the first, written by `lay_upon`."""
+    """Cell-by-cell figures of the second image aligned with the first, written by `lay_upon`."""
 
     left: npt.NDArray[np.float64]
     """(rows, columns) first − second; NaN where either was not seen."""
@@ -66,7 +66,7 @@ class Laid(NamedTuple):
 
 @kernel
 def lay_upon(first, second, down, right, out):
-    """Write differences and slopes of two pictures, the second moved back by (down, right) cells.
+    """Write differences and slopes of two images, the second moved back by (down, right) cells.
 
     Parameters
     ----------

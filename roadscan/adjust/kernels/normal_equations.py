@@ -12,7 +12,7 @@ from roadscan.compute.kernel_options import inlined, kernel
 
 @inlined
 def place_of(rows, low, high, wanted):
-    """Place of a row among the ascending ones from `low` to below `high`; −1 where it is not there."""
+    """Returns the index of a row among the ascending ones from `low` to below `high`; −1 where it is absent."""
     end = high
     while low < high:
         middle = (low + high) // 2

@@ -1,4 +1,4 @@
-"""Readings near a place as cells in the axes of the road: heights that outliers do not move, and their spread."""
+"""Readings near a place as cells in the axes of the road: robust heights, and their spread."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from roadscan.compute.kernel_options import kernel
 
 MOST = 32
-"""Readings of a cell that its height comes from; an even choice where there are more."""
+"""Readings of a cell from which its height is computed; an even choice where there are more."""
 QUARTILES_OF_SIGMA = 1.349
 """Distance of the quartiles of a normal distribution, in σ."""
 
@@ -23,7 +23,7 @@ class Frame(NamedTuple):
     """Centre, map."""
     northing_m: float
     sine: float
-    """Of the heading of the axis along, clockwise from grid north."""
+    """Sine of the heading of the axis along, clockwise from grid north."""
     cosine: float
 
 
@@ -35,7 +35,7 @@ class Cells(NamedTuple):
     spread_m: npt.NDArray[np.float64]
     """1 σ of one reading about it, from the quartiles."""
     used: npt.NDArray[np.int32]
-    """Readings that the height comes from."""
+    """Number of readings in the height."""
     intensity: npt.NDArray[np.float64]
     """Mean of the same readings; NaN as the height."""
 
@@ -107,7 +107,7 @@ def fill_cells(number, height_m, intensity, count, least, cells):
 
 
 class Splat(NamedTuple):
-    """Sums of readings over the cells of a picture, (rows, columns), in/out of `splat`."""
+    """Sums of readings over the cells of an image, (rows, columns), in/out of `splat`."""
 
     mass: npt.NDArray[np.float64]
     """Sum of weights."""
@@ -118,7 +118,7 @@ class Splat(NamedTuple):
 
 @kernel
 def splat(along_m, across_m, height_m, intensity, number, road_m, deepest_m, level_m, cell_m, out):
-    """Add readings to the four cells around each, by their nearness; those far from the height of their cell are not.
+    """Add readings to the four cells around each, by nearness; those far from the height of their cell are skipped.
 
     Parameters
     ----------

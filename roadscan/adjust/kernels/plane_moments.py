@@ -1,4 +1,4 @@
-"""Moments of points by group, and which points lie too far from the plane of their group."""
+"""Moments of points by group, and rejection of points too far from the plane of their group."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def add_moments(point_m, group, kept, count, total_m, squares_m2):
 
 @bare
 def leave_out_far(point_m, group, mean_m, normal, limit_m, kept):
-    """Leave out points that lie farther than a limit from the plane of their group.
+    """Reject points that lie farther than a limit from the plane of their group.
 
     Parameters
     ----------

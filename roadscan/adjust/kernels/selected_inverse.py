@@ -1,4 +1,4 @@
-"""Entries of the inverse of a sparse symmetric matrix, at the places of its factor alone.
+"""Entries of the inverse of a sparse symmetric matrix in the pattern of its factor.
 
 With A = P L D Lᵀ Pᵀ, L unit lower triangular, the inverse Z of L D Lᵀ follows from the last column to the first
 (Takahashi, Fagan & Chen 1973; Erisman & Tinney 1975):
@@ -50,7 +50,7 @@ def selected_inverse(starts, rows, lower, pivots, diagonal, below):
                 k = rows[p]
                 own = place[k]
                 full[own, own] = diagonal[k]
-                # Column k holds Z_ik of all i > k, and by symmetry Z_ki.
+                # Column k contains Z_ik of all i > k, and by symmetry Z_ki.
                 for q in range(starts[k], starts[k + 1]):
                     other = place[rows[q]]
                     if other >= 0:
@@ -72,7 +72,7 @@ def selected_inverse(starts, rows, lower, pivots, diagonal, below):
 
 @kernel
 def entries(first, second, starts, rows, diagonal, below, found):
-    """Entries of the inverse at pairs (n,) of permuted places; NaN where the pattern of L does not hold the pair."""
+    """Look up entries of the inverse at pairs (n,) of permuted places; NaN where the pattern of L lacks the pair."""
     for n in range(first.size):
         i, j = max(first[n], second[n]), min(first[n], second[n])
         if i == j:
@@ -84,7 +84,7 @@ def entries(first, second, starts, rows, diagonal, below, found):
 
 @kernel
 def variances(first, unknown, derivative, starts, rows, diagonal, below, found):
-    """Variance derivative · Z · derivativeᵀ of each observation's prediction (n,).
+    """Compute the variance derivative · Z · derivativeᵀ of each observation's prediction (n,).
 
     Parameters
     ----------

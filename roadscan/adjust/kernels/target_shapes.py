@@ -18,14 +18,14 @@ DISC, CHEQUERED = 0, 1
 """Kinds of shapes."""
 EAST, NORTH, SIZE, TURN = range(4)
 """Unknowns: centre (m), logarithm of the size over the stated one, turn (rad, east to north)."""
-UNKNOWNS = 4
-_ROOT_HALF = math.sqrt(0.5)
-_DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
-_FAR = 6.0
+UNKNOWNS = 4  # Number of unknowns.
+_ROOT_HALF = math.sqrt(0.5)  # Scale of the argument of erfc.
+_DENSITY = 1.0 / math.sqrt(2.0 * math.pi)  # Density of the standard normal distribution at 0.
+_FAR = 6.0  # Beyond this many blurs from an edge the share of paint is 0 or 1.
 
 
 class Drawn(NamedTuple):
-    """The shape as it is stated."""
+    """A shape as stated."""
 
     kind: int
     """`DISC` or `CHEQUERED`."""
@@ -36,7 +36,7 @@ class Drawn(NamedTuple):
 
 
 class Paint(NamedTuple):
-    """How paint shows."""
+    """Appearance of the paint."""
 
     blur_m: float
     """Standard deviation of an edge."""
@@ -57,7 +57,7 @@ class Fitted(NamedTuple):
 
 @inlined
 def _step(t):
-    """Share of paint at a distance of `t` blurs inside an edge, and its derivative."""
+    """Returns the share of paint at a distance of `t` blurs inside an edge, and its derivative."""
     if t > _FAR:
         return 1.0, 0.0
     if t < -_FAR:
@@ -67,7 +67,7 @@ def _step(t):
 
 @inlined
 def _disc(x, y, half, centre, blur):
-    """White share of a disc, and its derivatives by the unknowns."""
+    """Returns the white share of a disc, and its derivatives by the unknowns."""
     r = math.sqrt(x * x + y * y) + 1e-12
     white, outer = _step((half - r) / blur)
     inner = 0.0
@@ -80,7 +80,7 @@ def _disc(x, y, half, centre, blur):
 
 @inlined
 def _halves(u, half, blur):
-    """Share within (0, half) and within (−half, 0), each with its derivatives by u and log size."""
+    """Returns the shares within (0, half) and within (−half, 0), each with its derivatives by u and log size."""
     middle, a = _step(u / blur)
     right, b = _step((u - half) / blur)
     left, c = _step((u + half) / blur)
@@ -90,7 +90,7 @@ def _halves(u, half, blur):
 
 @inlined
 def _chequered(x, y, half, turn, blur):
-    """White share of a square of four, and its derivatives by the unknowns."""
+    """Returns the white share of a square of four, and its derivatives by the unknowns."""
     cos, sin = math.cos(turn), math.sin(turn)
     u, v = cos * x + sin * y, cos * y - sin * x
     p, pu, pk, n, nu, nk = _halves(u, half, blur)
@@ -102,7 +102,7 @@ def _chequered(x, y, half, turn, blur):
 
 @kernel
 def fit_equations(place, label, group, drawn, state, paint, out):
-    """Log-likelihood of labels under a shape, and the equations of one step towards the likeliest (Fisher scoring).
+    """Compute the log-likelihood of labels under a shape, and the equations of one step of Fisher scoring.
 
     A label is Bernoulli's with the chance ``stray + (1 − lost − stray) · white``, or a share between.
 
@@ -141,7 +141,7 @@ def fit_equations(place, label, group, drawn, state, paint, out):
 
 @kernel
 def draw_white(place, drawn, state, blur_m, out):
-    """White share (n,) of a shape at places (n, 2).
+    """Compute the white share (n,) of a shape at places (n, 2).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Where the swaths of tracks meet: for each lead sample of a track, the other visits of the road beside it."""
+"""Meetings of the swaths of tracks: for each lead sample of a track, the other visits of the road beside it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy.typing as npt
 from roadscan.compute.kernel_options import inlined, kernel
 
 SLACK_M = 0.25
-"""Segments reach this far beyond their ends: in a bend the strips beside two of them leave a wedge."""
+"""Overlap of segments beyond their ends (m): in a bend the strips beside two of them leave a wedge."""
 
 
 class Samples(NamedTuple):
-    """Even samples of all tracks, one track after another."""
+    """Evenly spaced samples of all tracks, one track after another."""
 
     easting_m: npt.NDArray[np.float64]
     """(n,) map."""
@@ -24,14 +24,14 @@ class Samples(NamedTuple):
     heading_rad: npt.NDArray[np.float64]
     """(n,) clockwise from grid north."""
     since_s: npt.NDArray[np.float64]
-    """(n,) time since an epoch that all tracks have in common."""
+    """(n,) time since an epoch common to all tracks."""
     left_m: npt.NDArray[np.float64]
-    """(n,) reach to the left; negative where a sensor sees nothing but the right."""
+    """(n,) reach to the left; negative where a sensor sees only the right."""
     right_m: npt.NDArray[np.float64]
     track: npt.NDArray[np.int32]
     """(n,) number of the track."""
     joined: npt.NDArray[np.bool_]
-    """(n,) whether the track goes on to the next sample."""
+    """(n,) whether the track continues to the next sample."""
 
 
 class Bins(NamedTuple):
@@ -50,10 +50,10 @@ class Bins(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What counts as a visit."""
+    """Criteria of a visit."""
 
     return_s: float
-    """A track that is back within this time has not returned."""
+    """A track that returns within this time does not count as another visit."""
     height_apart_m: float
     """Tracks farther apart in height lie on different levels of a junction."""
 
@@ -73,7 +73,7 @@ class Visits(NamedTuple):
 
 @inlined
 def _clipped(low, high, at_zero, slope, least, most):
-    """The part of [low, high] where least ≤ at_zero + slope · u ≤ most."""
+    """Returns the part of [low, high] where least ≤ at_zero + slope · u ≤ most."""
     if abs(slope) < 1e-12:
         if at_zero < least or at_zero > most:
             return 1.0, 0.0
@@ -84,7 +84,7 @@ def _clipped(low, high, at_zero, slope, least, most):
 
 @inlined
 def _seen(samples, i, j):
-    """Part (low, high) of the cross-line of sample `i` that the segment from `j` to `j + 1` sees."""
+    """Returns the part (low, high) of the cross-line of sample `i` that the segment from `j` to `j + 1` sees."""
     x, y = samples.easting_m, samples.northing_m
     along_x, along_y = x[j + 1] - x[j], y[j + 1] - y[j]
     length = math.hypot(along_x, along_y)
@@ -106,7 +106,7 @@ def _seen(samples, i, j):
 
 @inlined
 def _meets(samples, i, j, limits):
-    """Whether the segment from sample `j` can be a visit beside sample `i` at all."""
+    """Returns whether the segment from sample `j` can be a visit beside sample `i` at all."""
     if not samples.joined[j] or abs(samples.height_m[j] - samples.height_m[i]) > limits.height_apart_m:
         return False
     return samples.track[j] != samples.track[i] or abs(samples.since_s[j] - samples.since_s[i]) >= limits.return_s
@@ -114,7 +114,7 @@ def _meets(samples, i, j, limits):
 
 @kernel
 def _near(samples, bins, i, limits, out, low, high):
-    """Number of segments that see part of the cross-line of sample `i`; the parts go to `low` and `high`, ascending."""
+    """Number of segments that see part of the cross-line of sample `i`; parts go to `low` and `high`, ascending."""
     column = math.floor((samples.easting_m[i] - bins.easting_m) / bins.edge_m)
     row = math.floor((samples.northing_m[i] - bins.northing_m) / bins.edge_m)
     count = 0
@@ -177,7 +177,7 @@ def visits(samples, bins, lead, limits, found):
 
 
 class Spread(NamedTuple):
-    """How places are laid out across the road."""
+    """Layout of places across the road."""
 
     overlap_m: float
     """Narrowest strip that counts."""
@@ -199,7 +199,7 @@ class Meetings(NamedTuple):
 
 @inlined
 def _is_later(samples, visit_sample, lead_sample):
-    """Whether a visit comes after the lead in the order of tracks and time."""
+    """Returns whether a visit comes after the lead in the order of tracks and time."""
     a, b = samples.track[visit_sample], samples.track[lead_sample]
     return a > b or (a == b and samples.since_s[visit_sample] > samples.since_s[lead_sample])
 
@@ -211,7 +211,7 @@ def _covers(found, v, offset, margin):
 
 @kernel
 def meetings(samples, found, lead, spread, aside, alone, out):
-    """Write where the fewest places meet all visits of each lead; returns the numbers of places and memberships.
+    """Write the fewest places that meet all visits of each lead; returns the numbers of places and memberships.
 
     Visits are intervals of the cross-line; the greedy choice by their right ends meets all of them with the fewest
     places. A place that a track before the lead's sees is left to that one.
@@ -274,7 +274,7 @@ def meetings(samples, found, lead, spread, aside, alone, out):
 
 @kernel
 def feet(samples, place_x, place_y, first, last, out):
-    """Where on its own track each visit is beside a place: sample and part of its segment, as one number.
+    """Compute the position of each visit beside a place, on its track: sample and part of its segment, as one number.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""Places that look like a target: normalised correlation of a grid of intensities with the shape.
+"""Candidates for a target: places where a grid of intensities correlates with the shape.
 
-Mean and contrast are those of each place's own surroundings, and cells without a reading do not count (Padfield 2012,
+Mean and contrast are those of each place's surroundings, and cells without a reading do not count (Padfield 2012,
 masked normalised cross-correlation). A chequered target may be turned in any way: its picture is correlated with the
 second harmonic of the direction from the middle, whose phase is twice the turn.
 """
@@ -19,11 +19,11 @@ from roadscan.adjust.targets.shapes import Disc, Shape
 Float64 = npt.NDArray[np.float64]
 
 _SURROUNDINGS = 1.4
-"""Radius of what a disc is correlated with, in radii of the disc."""
+"""Radius of the area that is correlated with a disc, in radii of the disc."""
 _LEAST_SEEN = 0.6
-"""Share of the cells under the shape that have to hold readings."""
+"""Share of the cells under the shape that must have readings."""
 _APART = 0.4
-"""Candidates nearer to a likelier one than this share of the size are the same."""
+"""Candidates nearer to a likelier one than this share of the size are dropped."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Candidate:
 
 
 def candidates(cells: Cells, cell_m: float, shape: Shape, radius_m: float, least: float, most: int) -> list[Candidate]:
-    """Places within a radius of the origin that look like the shape, the likeliest first.
+    """Returns places within a radius of the origin that look like the shape, the likeliest first.
 
     cells : means by the cells of an even grid of `cell_m` through the origin.
     """
@@ -62,7 +62,7 @@ def candidates(cells: Cells, cell_m: float, shape: Shape, radius_m: float, least
 
 
 def _grid(cells: Cells, cell_m: float, reach: int) -> tuple[Float64, Float64]:
-    """Intensities (2 reach, 2 reach) less their mean, and 1 where there are any; rows to the north."""
+    """Returns intensities (2 reach, 2 reach) less their mean, and 1 where there are any; rows to the north."""
     index = np.floor(cells.place_m / cell_m).astype(np.int64) + reach
     inside = np.all((index >= 0) & (index < 2 * reach), axis=1)
     column, row = index[inside].T
@@ -74,7 +74,7 @@ def _grid(cells: Cells, cell_m: float, reach: int) -> tuple[Float64, Float64]:
 
 
 def _likeness(value: Float64, seen: Float64, shape: Shape, cell_m: float) -> tuple[Float64, Float64]:
-    """Correlation of each place's surroundings with the shape, and the turn."""
+    """Returns the correlation of each place's surroundings with the shape, and the turn."""
     half = shape.half_m * (_SURROUNDINGS if isinstance(shape, Disc) else 1.0)
     steps = int(np.ceil(half / cell_m))
     axis = np.arange(-steps, steps + 1) * cell_m

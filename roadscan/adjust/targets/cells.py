@@ -13,7 +13,7 @@ Int64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Cells:
-    """c cells that hold readings; places count from a middle that the caller knows (m)."""
+    """c cells with readings; coordinates are from a centre known to the caller (m)."""
 
     place_m: Float64
     """(c, 2) mean place of the readings, east and north."""
@@ -23,13 +23,13 @@ class Cells:
     """(c,) readings."""
 
     def within(self, centre_m: Float64, radius_m: float) -> Cells:
-        """The cells within a distance of a place."""
+        """Returns the cells within a distance of a place."""
         near = np.hypot(*(self.place_m - centre_m).T) <= radius_m
         return Cells(self.place_m[near], self.value[near], self.count[near])
 
 
 def cells_of(place_m: Float64, value: Float64, cell_m: float) -> Cells:
-    """Means of readings (n, 2), (n,) in the cells of an even grid through the origin, by row and column."""
+    """Returns means of readings (n, 2), (n,) in the cells of an even grid through the origin, by row and column."""
     if not value.size:
         return Cells(np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
     number = _numbers(place_m, cell_m)
@@ -41,14 +41,14 @@ def cells_of(place_m: Float64, value: Float64, cell_m: float) -> Cells:
 
 
 def _numbers(place_m: Float64, cell_m: float) -> Int64:
-    """Number (n,) of each reading's cell, by row and column."""
+    """Returns the number (n,) of each reading's cell, by row and column."""
     column, row = (np.floor(axis / cell_m).astype(np.int64) for axis in place_m.T)
     numbers: Int64 = (row - row.min()) * (int(np.ptp(column)) + 1) + column - column.min()
     return numbers
 
 
 def spacing_m(place_m: Float64, block_m: float) -> float:
-    """Mean distance (m) between readings (n, 2) where there are any, from their number in blocks of a size.
+    """Returns the mean distance between readings (n, 2) (m), from their number in non-empty blocks of a size.
 
     Blocks with less than a third of the median's readings lie at a border and do not count.
     """

@@ -1,7 +1,7 @@
-"""Whether a place shows the shape: shares of paint, outline and clear road that it should have.
+"""Evidence that a place shows the shape: shares of paint, outline and clear road.
 
-A value is paint where it lies above the middle between road and paint. Shares, and not sums of residuals, tell worn
-paint from no paint: wear takes a part of each share, while another thing misses one of them altogether.
+A value is paint where it lies above the middle between road and paint. Shares, and not sums of residuals, distinguish
+worn paint from no paint: wear reduces each share by a part, while another thing lacks one of them altogether.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from roadscan.adjust.targets.shapes import Chequered, Disc, Shape
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
-_SECTORS = 24
+_SECTORS = 24  # Sectors around the centre in which an outline is sought.
 _TOLERANCE = 0.05
-"""An outline may miss its place by this share of the radius, besides half of the readings' distance."""
-_LEAST_PER_SECTOR = 4
-_LEAST_IN_CENTRE = 4
+"""Tolerance of an outline's place, as a share of the radius, besides half of the readings' distance."""
+_LEAST_PER_SECTOR = 4  # A sector needs this many readings.
+_LEAST_IN_CENTRE = 4  # The centre needs this many readings.
 _WORN = 0.35
 """Weight of road within the outline against white beyond it, and share of paint that still makes a block white."""
 _BLOCKS = 3
-"""Along an edge of a quadrant."""
+"""Number of blocks along an edge of a quadrant."""
 _OF_PAINT = 0.75
-"""The outline shows at least this part of the share of paint: what is not worn has its whole outline."""
+"""Least ratio of the outline's share to the share of paint: where paint is not worn, the whole outline shows."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Shares from 0 to 1."""
+    """Shares of the shape that are seen, 0 to 1."""
 
     paint: float
     """Of the area that should be white."""
@@ -45,11 +45,11 @@ class Evidence:
 
     @property
     def score(self) -> float:
-        """The least share."""
+        """Returns the least share."""
         return min(self.paint, self.outline, self.clear)
 
     def fault(self, settings: TargetSettings, *, slack: float = 1.0) -> str:
-        """What is wanting, "" if nothing; slack : share of the limits that suffices."""
+        """Returns what is missing, "" if nothing; slack : share of the limits that suffices."""
         limits = (
             (self.paint, settings.least_paint, "of the painted area shows paint"),
             (
@@ -68,7 +68,7 @@ class Evidence:
 def evidence(
     cells: Cells, shape: Shape, centre_m: Float64, turn_rad: float, threshold: float, slack_m: float
 ) -> Evidence:
-    """Shares of a shape with its middle at a place.
+    """Returns the shares of a shape with its middle at a place.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def _of_disc(away: Float64, white: Bool, shape: Disc, slack_m: float) -> Evidenc
 
 
 def _edge_near(r: Float64, white: Bool, half_m: float, tolerance_m: float) -> bool:
-    """Whether the radius that parts white from other values best lies where the outline is; radii ascend.
+    """Returns whether the radius that best separates white from other values is that of the outline; radii ascend.
 
     White beyond it counts more than road within it, which may be worn paint.
     """

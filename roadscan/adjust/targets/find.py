@@ -1,8 +1,8 @@
-"""Finding a painted control target in the intensities of one pass.
+"""Search of a painted control target in the intensities of one pass.
 
-Places that look like the target (:mod:`candidates`) are held against the shares of paint, outline and clear road that
-it should have (:mod:`evidence`), its shape is fitted to the readings (:mod:`fit`), and the shares are asked again where
-the fit puts it. One place that holds is the target, two are too many. Its height is that of a surface through the
+Places that look like the target (:mod:`candidates`) are tested by the shares of paint, outline and clear road that
+it should have (:mod:`evidence`), its shape is fitted to the readings (:mod:`fit`), and the shares are tested again at
+the fitted place. One place that passes is the target; two are ambiguous. Its height is that of a surface through the
 readings at its centre (:mod:`heights`).
 """
 
@@ -31,30 +31,30 @@ _GRID_CELLS = 24
 _FIT_CELLS = 75
 """Cells of the fit along the size."""
 _LEAST_READINGS = 8
-"""Readings along the size: with fewer there is no outline."""
+"""Least number of readings along the size: with fewer there is no outline."""
 _OVERLAP = 0.9
-"""Two targets do not lie nearer than this share of the size."""
+"""Two targets are at least this share of the size apart."""
 _WANDERS = 0.25
-"""A fit ends no farther than this share of the size from where it began."""
+"""Farthest that a fit may end from its start, as a share of the size."""
 _EASED = 0.6
-"""Share of the limits that a candidate has to reach before the fit."""
+"""Share of the limits that a candidate must reach before the fit."""
 
 
 @dataclass(frozen=True)
 class _Held:
-    """A place that holds as the target."""
+    """A place that passes as the target."""
 
     fit: ShapeFit
     evidence: Evidence
 
 
 def find_target(points: TargetReadings, expected: ExpectedTarget, settings: TargetSettings) -> TargetFind:
-    """The target near its stated place, or why it is not found."""
+    """Returns the target near its stated place, or why it is not found."""
     return _Search(points, expected, settings).find()
 
 
 class _Search:
-    """Readings around the stated place, and what is asked of them."""
+    """Readings around the stated place, and the criteria of the search."""
 
     def __init__(self, points: TargetReadings, expected: ExpectedTarget, settings: TargetSettings) -> None:
         self.points, self.expected, self.settings, self.shape = points, expected, settings, expected.shape
@@ -66,7 +66,7 @@ class _Search:
         self.size_m = 2.0 * self.shape.half_m
 
     def find(self) -> TargetFind:
-        """The target, or why not."""
+        """Returns the target, or why there is none."""
         spacing = spacing_m(self.place_m, self.size_m / 4) if self.value.size else float("inf")
         if self.value.size < _LEAST_READINGS**2:
             return self._not("missed", f"{self.value.size} readings near its stated place")
@@ -81,7 +81,7 @@ class _Search:
         return self._found(held, *self._moved(held[0].fit))
 
     def _held(self, spacing: float) -> tuple[list[_Held], str]:
-        """Places that hold, the best first; why the likeliest one did not."""
+        """Returns places that pass, the best first, and why the likeliest one did not."""
         settings, cell = self.settings, max(1.25 * spacing, self.size_m / _GRID_CELLS)
         coarse = cells_of(self.place_m, self.value, cell)
         likely = candidates(
@@ -100,11 +100,11 @@ class _Search:
         return held, faults[0] if faults else "nothing near its stated place looks like it"
 
     def _overlap(self, first_m: Float64, second_m: Float64) -> bool:
-        """Whether two places cannot both be targets."""
+        """Returns whether two places are too close to be two targets."""
         return bool(np.hypot(*(first_m - second_m)) < _OVERLAP * self.size_m)
 
     def _examined(self, candidate: Candidate, spacing: float, cell: float) -> tuple[_Held | None, str]:
-        """A candidate as it fits, or its fault."""
+        """Returns a fitted candidate, or its fault."""
         settings, shape, fine_m = self.settings, self.shape, self.size_m / _FIT_CELLS
         fine = self._cells_around(candidate.centre_m, fine_m)
         near = fine.within(candidate.centre_m, fit_radius_m(shape))
@@ -126,13 +126,13 @@ class _Search:
         return (None, fault) if fault else (_Held(fit, shown), "")
 
     def _cells_around(self, centre_m: Float64, cell_m: float) -> Cells:
-        """Small cells of all that a fit that begins at a place can ask for."""
+        """Returns small cells of all that a fit from a place can need."""
         reach = fit_radius_m(self.shape) + _WANDERS * self.size_m
         near = np.all(np.abs(self.place_m - centre_m) <= reach, axis=1)
         return cells_of(self.place_m[near], self.value[near], cell_m)
 
     def _wandered(self, fit: ShapeFit, candidate: Candidate) -> bool:
-        """Whether a fit left its candidate, or the ground that is searched."""
+        """Returns whether a fit left its candidate, or the searched area."""
         away = np.hypot(*(fit.centre_m - candidate.centre_m))
         return bool(away > _WANDERS * self.size_m or np.hypot(*fit.centre_m) > self.settings.search_radius_m)
 
@@ -179,7 +179,7 @@ class _Search:
         )  # fmt: skip
 
     def _picture(self, held: Sequence[_Held]) -> TargetPicture:
-        """The target's surroundings; where it is missed or doubled, all that was searched."""
+        """Returns an image of the target's surroundings; where it is missed or doubled, of the whole search."""
         wide = self.settings.search_radius_m + self.shape.reach_m
         middle, half = np.zeros(2), wide
         if len(held) == 1:

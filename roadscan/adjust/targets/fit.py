@@ -1,10 +1,10 @@
-"""Centre of a target by a fit of its shape to the intensities, and how well it is known.
+"""Centre of a target, with its covariance, from a fit of its shape to the intensities.
 
 Each intensity becomes a label from 0, the road around, to 1, paint. The shape gives the chance of paint at each place;
 its centre, size and turn are those under which the labels are likeliest. Paint may be worn off, and there may be some
-beside the shape; how often, the labels themselves say. So the fit knows that missing paint says little and that paint
-outside the shape says much: a worn edge does not pull the centre away from it. The chance passes from paint to road
-over a blur that begins wide, so that the search finds its way, and ends at the distance between readings.
+beside the shape; both chances are estimated from the labels. So missing paint has little weight, and paint outside the
+shape has much: a worn edge does not pull the centre away from it. The chance changes from paint to road
+over a blur that is wide at first, so that the search converges, and at last as wide as the distance of readings.
 """
 
 from __future__ import annotations
@@ -26,42 +26,42 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _SECTORS: Final = 36
-"""Around the centre; what labels of one sector say is one piece of evidence."""
+"""Sectors around the centre; labels of one sector are one piece of evidence."""
 _ALIKE: Final = 3
 """Sectors nearer than this many share their wear."""
 _SURROUNDINGS: Final = 1.5
-"""Radius of what is fitted, in radii of a disc or half diagonals of a square."""
+"""Radius of the fitted area, in radii of a disc or half diagonals of a square."""
 _LAST_BLUR: Final = 0.15
-"""Of the distance between cells: the narrower, the less a worn edge pulls."""
+"""Last blur, as a share of the distance between cells: the narrower, the less a worn edge shifts the centre."""
 _CURVATURE_BLUR: Final = 0.4
-"""The same, for the curvature of the likelihood; narrower, it would be that of chance between few readings."""
-_PARTED: Final = 1.2
-_STAGES: Final = 5
-_ROUNDS: Final = 12
-_DONE_M: Final = 1e-6
-_LEAST_CELLS: Final = 60
-_LEAST_CHANCE: Final = 0.02
-_MOST_LOST: Final = 0.6
-_MOST_STRAY: Final = 0.2
+"""Blur for the curvature of the likelihood; with a narrower one, chance positions of few readings would show."""
+_PARTED: Final = 1.2  # Radius, in half sizes, of the cells from which paint and road are separated.
+_STAGES: Final = 5  # Stages of the fit, each with a narrower blur.
+_ROUNDS: Final = 12  # Steps of Fisher scoring, at most.
+_DONE_M: Final = 1e-6  # Steps below this end the fit (m).
+_LEAST_CELLS: Final = 60  # With fewer cells there is no fit.
+_LEAST_CHANCE: Final = 0.02  # Least chance of worn paint, and of paint beside the shape.
+_MOST_LOST: Final = 0.6  # Greatest chance of worn paint.
+_MOST_STRAY: Final = 0.2  # Greatest chance of paint beside the shape.
 _SIGMA_LOG_SIZE: Final = 0.05
-"""1 σ of a target's size as a share of that stated."""
+"""1 σ of a target's size, as a share of the stated one."""
 _SAME_SIZE: Final = 0.03
-"""A target that differs from the stated size by less is of that size, and all of its outline tells of its centre."""
+"""A target that differs from the stated size by less (share) has that size, and its whole outline fixes its centre."""
 _SIGMA_SAME_SIZE: Final = 0.003
-"""1 σ of such a size: 1 %, where ten labels say as much as one, since paint wears off in patches. Without it, a patch
+"""1 σ of such a size: 1 %, where ten labels count as one, since paint wears off in patches. Without it, a patch
 that is lost at the edge makes the target smaller and moves its centre."""
 
 
 @dataclass(frozen=True)
 class ShapeFit:
-    """A shape as it fits; places count from the caller's middle."""
+    """A fitted shape; coordinates are from the caller's centre."""
 
     centre_m: Float64
     """(2,) east and north."""
     covariance_m2: Float64
     """(2, 2) of the centre."""
     scale: float
-    """Size over the stated size, as the labels alone tell it."""
+    """Size over the stated size, from the labels alone."""
     turn_rad: float
     """Of a chequered target, east to north."""
     levels: Levels
@@ -70,7 +70,7 @@ class ShapeFit:
 
 
 class Levels(NamedTuple):
-    """Intensities of a place."""
+    """Intensity levels of a place."""
 
     road: float
     contrast: float
@@ -80,19 +80,19 @@ class Levels(NamedTuple):
 
     @property
     def threshold(self) -> float:
-        """Halfway between road and paint."""
+        """Returns the value halfway between road and paint."""
         return self.road + 0.5 * self.contrast
 
 
 def fit_radius_m(shape: Shape) -> float:
-    """Cells within this of the centre are fitted (m)."""
+    """Returns the radius around the centre of the cells that are fitted (m)."""
     return shape.reach_m * _SURROUNDINGS
 
 
 def first_levels(cells: Cells, shape: Shape, centre_m: Float64) -> Levels:
-    """Levels where a shape may be: values parted so that both parts are most even (Otsu 1979).
+    """Returns levels where a shape may be: values are split so that both parts are most even (Otsu 1979).
 
-    Paint makes up a third to two thirds of what is looked at; of less, noise would be parted instead.
+    Paint makes up a third to two thirds of the values; if it were less, the noise would be split.
     """
     value = np.sort(cells.within(centre_m, _PARTED * shape.half_m).value)
     if value.size < 2:
@@ -111,7 +111,7 @@ def _levels(road: Float64, paint: Float64) -> Levels:
 
 
 def fit_shape(cells: Cells, shape: Shape, centre_m: Float64, turn_rad: float, spacing_m: float) -> ShapeFit | None:
-    """The shape under which the labels are likeliest, from a start within a tenth of its size; None: there is none.
+    """Returns the most likely shape, from a start within a tenth of its size; None where there is none.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def fit_shape(cells: Cells, shape: Shape, centre_m: Float64, turn_rad: float, sp
 
 
 class _Fit:
-    """One fit: the labels, and what stays the same from round to round."""
+    """One fit: the labels, and what stays constant over the rounds."""
 
     def __init__(self, cells: Cells, shape: Shape, centre_m: Float64) -> None:
         self.cells, self.shape = cells, shape
@@ -160,7 +160,7 @@ class _Fit:
         self.out = kernels.Fitted(np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((_SECTORS, UNKNOWNS)))
 
     def labelled(self, state: Float64, levels: Levels) -> Levels:
-        """Make the labels, and the chances of worn and stray paint, from the levels within and beside the shape."""
+        """Set the labels, and the chances of worn and stray paint, from the levels within and beside the shape."""
         white = np.zeros(self.cells.value.size)
         kernels.draw_white(self.cells.place_m, self.drawn, state, 0.05 * self.shape.half_m, white)
         away = np.hypot(*(self.cells.place_m - state[[EAST, NORTH]]).T)
@@ -178,7 +178,7 @@ class _Fit:
         return levels
 
     def likeliest(self, state: Float64, blur_m: float) -> Float64:
-        """The likeliest state from a start, by Fisher scoring with steps that are halved until they help."""
+        """Returns the most likely state from a start, by Fisher scoring with steps halved until they help."""
         likelihood, step = self._step(state, blur_m)
         for _ in range(_ROUNDS):
             for _ in range(6):
@@ -196,7 +196,7 @@ class _Fit:
         return state
 
     def _score(self, state: Float64, blur_m: float) -> tuple[float, Float64]:
-        """Log-likelihood with the prior of the size, and its derivatives (4,)."""
+        """Returns the log-likelihood with the prior of the size, and its derivatives (4,)."""
         paint = kernels.Paint(blur_m, *self.chances)
         likelihood = kernels.fit_equations(
             self.cells.place_m, self.label, self.group, self.drawn, state, paint, self.out

@@ -11,19 +11,19 @@ from roadscan.compute.robust import SIGMA_OF_MAD
 
 Float64 = npt.NDArray[np.float64]
 
-_LEAST_COUNT = 12
-_CURVED_COUNT = 60
+_LEAST_COUNT = 12  # With fewer readings there is no height.
+_CURVED_COUNT = 60  # From this many readings on, the surface has terms of second degree.
 _CUT = 4.685
-"""Of Tukey's biweight: 95 % efficient for normal residuals."""
-_ROUNDS = 30
+"""Constant of Tukey's biweight: 95 % efficiency for normal residuals."""
+_ROUNDS = 30  # Rounds of re-weighting.
 _BLOCKS = 6
-"""Blocks along an edge: residuals of one block are taken to be of one piece."""
-_LEAST_USED = 0.5
-_LEAST_SCALE_M = 1e-6
+"""Blocks along an edge: residuals within a block are taken as correlated."""
+_LEAST_USED = 0.5  # A surface must use at least this share of the readings.
+_LEAST_SCALE_M = 1e-6  # Least scale of the residuals (m), against division by zero.
 
 
 def height_at(readings: TargetReadings, easting_m: float, northing_m: float, settings: TargetSettings) -> HeightFind:
-    """Height of the surface at a place of the map, and its σ, from the readings within `height_radius_m`.
+    """Returns the surface's height at a place of the map, and its σ, from the readings within `height_radius_m`.
 
     The surface is a plane, with the three terms of second degree where there are readings enough: a rut bends by a
     millimetre over 0.3 m. It minimises Tukey's biweight of the residuals, begun from their least absolute sum. Its
@@ -58,7 +58,7 @@ def _none(count: int, why_not: str) -> HeightFind:
 
 
 def _surrounds(place: Float64) -> bool:
-    """Whether no half plane through the origin, but for 10°, is free of readings."""
+    """Returns whether every half plane through the origin, narrowed by 10°, contains a reading."""
     azimuth = np.sort(np.arctan2(place[:, 1], place[:, 0]))
     gaps = np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi))
     return bool(gaps.max() < np.radians(190.0))
@@ -84,7 +84,7 @@ def _robust_plane(design: Float64, height: Float64) -> tuple[Float64, Float64]:
 
 
 def _variance(design: Float64, left: Float64, weight: Float64, place: Float64) -> float:
-    """Variance of the surface's height in the middle."""
+    """Returns the variance of the surface's height in the middle."""
     block = np.clip(((place + 1.0) / 2.0 * _BLOCKS).astype(np.int64), 0, _BLOCKS - 1)
     number = block[:, 0] * _BLOCKS + block[:, 1]
     scores = design * (weight * left)[:, None]

@@ -1,4 +1,4 @@
-"""Find a surveyed line in the readings of one pass: paint by its brightness, a kerb by the step of its face."""
+"""Search of a surveyed line in the readings of one pass: paint by its brightness, a kerb by the step of its face."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 _SLICES: Final = 8
-"""Slices along the line that are measured each by itself: their scatter tells the σ of their mean."""
-_LEAST: Final = 4
+"""Slices along the line that are measured separately: their scatter gives the σ of their mean."""
+_LEAST: Final = 4  # With fewer slices the line is not found.
 _CELL_M: Final = 0.02
-"""Cells across the line: four readings of a profiler, and a sixth of the narrowest line."""
+"""Width of a cell across the line (m): four readings of a profiler, and a sixth of the narrowest line."""
 _ALONG_M: Final = 10.0
-"""1 σ of the place along the line: far more than poses err, so that it says nothing."""
+"""1 σ of the place along the line (m): far more than errors of poses, so that it has no effect."""
 _STRAY_M: Final = 0.03
-"""Slices that lie farther than this from the line through all of them show something else."""
+"""Slices farther than this from the line through all of them (m) show something else."""
 _DOUBLED_M: Final = 0.05
-"""Lines that lie farther apart than this are two."""
-_SIGMA_PAINT_M: Final = 0.003
+"""Lines farther apart than this (m) are two."""
+_SIGMA_PAINT_M: Final = 0.003  # 1 σ by which the paint's middle misses the surveyed line (m).
 _SIGMA_KERB_M: Final = 0.005
-"""1 σ by which the paint's middle, or the face, misses the surveyed line: rims of the paint, batter of the face."""
+"""1 σ by which the face of a kerb misses the surveyed line (m): batter of the face."""
 _STEP_M: Final = 0.04
-"""A lower step is no kerb."""
+"""Least step of a kerb (m)."""
 _BESIDE_M: Final = (0.03, 0.15)
-"""Heights so far from the face, on either side, are those of the top and of the foot."""
+"""Heights at these distances (m) from the face, on either side, are those of the top and of the foot."""
 
 
 @dataclass(frozen=True)
 class LineFind:
-    """What one pass shows of a line near one of its points."""
+    """A surveyed line near one of its points, as one pass shows it."""
 
     status: Literal["found", "missed", "doubled"]
     why_not: str
@@ -58,7 +58,7 @@ class LineFind:
 def find_line(
     readings: TargetReadings, easting_m: float, northing_m: float, line: SurveyedLine, settings: TargetSettings
 ) -> LineFind:
-    """The line where it crosses the normal of its surveyed point, within `search_radius_m` of it."""
+    """Returns the line where it crosses the normal of its surveyed point, within `search_radius_m` of it."""
     sine, cosine = np.sin(line.azimuth_rad), np.cos(line.azimuth_rad)
     east, north = readings.easting_m - easting_m, readings.northing_m - northing_m
     along, across = east * sine + north * cosine, east * cosine - north * sine
@@ -88,7 +88,7 @@ def _joined(
     more: tuple[Float64, Float64],
     settings: TargetSettings,
 ) -> LineFind:
-    """The line through the slices that show it."""
+    """Returns the line through the slices that show it."""
     middle = ((np.arange(_SLICES) + 0.5) / _SLICES - 0.5) * 2.0 * line.half_m
     seen = np.isfinite(places)
     if seen.sum() < _LEAST:
@@ -130,7 +130,7 @@ def _missed(why_not: str, status: Literal["missed", "doubled"] = "missed") -> Li
 
 
 def _profile(values: Float64, across_m: Float64, reach_m: float) -> tuple[Float64, Float64]:
-    """Median of the values in cells across, NaN where there are none, and the middles of the cells."""
+    """Returns the median of the values in cells across, NaN where there are none, and the middles of the cells."""
     cells = round(2.0 * reach_m / _CELL_M)
     number = np.clip(((across_m + reach_m) / _CELL_M).astype(np.int64), 0, cells - 1)
     order = np.lexsort((values, number))
@@ -144,7 +144,7 @@ def _profile(values: Float64, across_m: Float64, reach_m: float) -> tuple[Float6
 
 
 def _paint(grey: Float64, at_m: Float64) -> tuple[float, float, float] | str:
-    """Place, no height, and contrast of the one painted line of a profile; why there is none."""
+    """Returns place, no height, and contrast of the one painted line of a profile; why there is none."""
     known = np.isfinite(grey)
     if known.sum() < 10:
         return "missed"
@@ -162,7 +162,7 @@ def _paint(grey: Float64, at_m: Float64) -> tuple[float, float, float] | str:
 
 
 def _kerb(height: Float64, at_m: Float64) -> tuple[float, float, float] | str:
-    """Place of the face, height of the top and height of the face of the one kerb of a profile; why there is none."""
+    """Place of the face, height of the top and height of the face of a profile's one kerb; why there is none."""
     known = np.isfinite(height)
     if known.sum() < 10:
         return "missed"
@@ -186,7 +186,7 @@ def _kerb(height: Float64, at_m: Float64) -> tuple[float, float, float] | str:
 
 
 def _beside(height: Float64, known: Bool, side: int) -> Float64:
-    """Median height beside each cell on one side; NaN where little is known."""
+    """Returns the median height beside each cell on one side; NaN with too few heights."""
     first, last = (round(metres / _CELL_M) for metres in _BESIDE_M)
     steps = np.arange(first, last + 1) * side
     rows = np.arange(height.size)[:, None] + steps

@@ -11,8 +11,8 @@ from roadscan.adjust.targets.values import TargetPicture
 
 Float64 = npt.NDArray[np.float64]
 
-_PIXELS_PER_SIZE = 48
-_MOST_PIXELS = 192
+_PIXELS_PER_SIZE = 48  # Pixels across half the size of a target.
+_MOST_PIXELS = 192  # Largest edge of an image (pixels).
 _DARKEST, _BRIGHTEST = 1.0, 99.5
 """Percentiles of the intensity that become black and white."""
 
@@ -20,7 +20,7 @@ _DARKEST, _BRIGHTEST = 1.0, 99.5
 def picture_of(
     place_m: Float64, value: Float64, half_width_m: float, shape: Shape, outlines: Float64, origin_m: Float64
 ) -> TargetPicture:
-    """Picture of a square around a middle, the outline of a shape drawn dashed in white and black.
+    """Returns the image of a square around a centre, with the outline of a shape dashed in white and black.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def picture_of(
 
 
 def _outline(shape: Shape, outline: Float64) -> Float64:
-    """(m, 2) points along the outline and across the middle."""
+    """Returns (m, 2) points along the outline and across the middle."""
     east, north, turn, scale = outline
     half = shape.half_m * scale
     along = np.linspace(-1.0, 1.0, 8 * _PIXELS_PER_SIZE)
@@ -69,7 +69,7 @@ def _outline(shape: Shape, outline: Float64) -> Float64:
 
 
 def _draw(grey: npt.NDArray[np.uint8], points: Float64, half_width_m: float, cell_m: float) -> None:
-    """Set the pixels along points, white and black in turns."""
+    """Set the pixels along points to white and black in turns."""
     column = np.floor((points[:, 0] + half_width_m) / cell_m).astype(np.int64)
     row = np.floor((half_width_m - points[:, 1]) / cell_m).astype(np.int64)
     inside = (column >= 0) & (row >= 0) & (column < grey.shape[1]) & (row < grey.shape[0])

@@ -1,4 +1,4 @@
-"""What a control target looks like: its shape and size as the survey states them."""
+"""Shape and size of a control target as the survey states them."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Disc:
 
     @property
     def half_m(self) -> float:
-        """Radius (m)."""
+        """Returns the radius (m)."""
         return self.diameter_m / 2
 
     @property
     def reach_m(self) -> float:
-        """Farthest paint from the middle (m)."""
+        """Returns the farthest paint from the middle (m)."""
         return self.diameter_m / 2
 
 
@@ -53,18 +53,18 @@ class Chequered:
 
     @property
     def half_m(self) -> float:
-        """Edge of a quadrant (m)."""
+        """Returns the edge of a quadrant (m)."""
         return self.size_m / 2
 
     @property
     def reach_m(self) -> float:
-        """Farthest paint from the middle (m)."""
+        """Returns the farthest paint from the middle (m)."""
         return self.size_m / 2**0.5
 
 
 @dataclass(frozen=True)
 class SurveyedLine:
-    """A point of a surveyed line: what is there binds across the line, and in height."""
+    """A point of a surveyed line: it binds across the line, and in height."""
 
     kind: Literal["paint", "kerb"]
     line: str
@@ -72,11 +72,11 @@ class SurveyedLine:
     azimuth_rad: float
     """Of the line, clockwise from grid north."""
     half_m: float = 0.5
-    """The line is looked at so far ahead and behind (m)."""
+    """The line is searched this far ahead and behind (m)."""
 
     @property
     def reach_m(self) -> float:
-        """Farthest part from the point (m)."""
+        """Returns the distance of the farthest part from the point (m)."""
         return self.half_m
 
 

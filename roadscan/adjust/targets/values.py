@@ -1,4 +1,4 @@
-"""What is known of a control target, what is seen near it, and what is found: the values that go in and out."""
+"""Input and output of the search for targets: expected target, readings near it, and the find."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Status = Literal["found", "missed", "doubled", "moved"]
 
 @dataclass(frozen=True)
 class TargetReadings:
-    """n readings of one pass near one control point, placed with its recorded poses; axes of the map."""
+    """n readings of one pass near one control point, georeferenced with its recorded poses; axes of the map."""
 
     easting_m: Float64
     """(n,)"""
@@ -29,11 +29,11 @@ class TargetReadings:
     intensity: npt.NDArray[np.generic]
     """(n,) any number type, brighter is more."""
     sigma_horizontal_m: float
-    """1 σ of the pass's place on each horizontal axis (m): how far all readings may lie off together."""
+    """1 σ of the pass's place on each horizontal axis (m): a common error of all readings."""
 
     @property
     def size(self) -> int:
-        """Number of readings."""
+        """Returns the number of readings."""
         return self.easting_m.size
 
 
@@ -66,7 +66,7 @@ class TargetPicture:
 
 @dataclass(frozen=True)
 class TargetFind:
-    """What was found of one target in one pass; of a missed one places and heights are NaN."""
+    """The result for one target in one pass; of a missed one places and heights are NaN."""
 
     name: str
     status: Status
@@ -82,7 +82,7 @@ class TargetFind:
     sigma_height_m: float
     """1 σ, without that of the poses."""
     count: int
-    """Readings that the centre comes from."""
+    """Number of readings from which the centre is computed."""
     contrast: float
     """Paint against road, in units of the intensity."""
     noise: float
@@ -100,7 +100,7 @@ class TargetFind:
 
     @property
     def found(self) -> bool:
-        """Whether its place can enter an adjustment."""
+        """Returns whether its place can enter an adjustment."""
         return self.status == "found"
 
 
@@ -119,11 +119,11 @@ class HeightFind:
     count: int
     """Readings within the radius."""
     used: float
-    """Share of them that the surface goes by."""
+    """Share of them that the surface uses."""
     why_not: str
     """"" where there is a height; else a sentence."""
 
     @property
     def found(self) -> bool:
-        """Whether there is a height."""
+        """Returns whether there is a height."""
         return not self.why_not

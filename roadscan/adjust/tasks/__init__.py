@@ -1,1 +1,1 @@
-"""The adjustment of a survey: evidence from raw readings, its solution, and what it says of accuracy."""
+"""The adjustment of a survey: evidence from raw readings, its solution, and figures of accuracy."""

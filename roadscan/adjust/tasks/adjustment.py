@@ -1,4 +1,4 @@
-"""The adjustment of a survey, from raw readings to the table `corrections` and what it is worth."""
+"""The adjustment of a survey, from raw readings to the table `corrections` and its accuracy."""
 
 from __future__ import annotations
 
@@ -75,13 +75,13 @@ from roadscan.store.store import file_digest
 Float64 = npt.NDArray[np.float64]
 
 _BUNDLE_BYTES: Final = 20_000_000.0
-"""Compressed bytes that a task reads, about."""
-_BUNDLE_POINTS: Final = 8
+"""Approximate compressed bytes that a task reads."""
+_BUNDLE_POINTS: Final = 8  # Control points of a task.
 
 
 @dataclass(frozen=True)
 class Work:
-    """Evidence that is to be collected."""
+    """Evidence to be collected."""
 
     tracks: tuple[Track, ...]
     ties: tuple[TieTask, ...]
@@ -93,22 +93,22 @@ class Work:
 
     @property
     def own_points(self) -> list[ControlPoint]:
-        """Those that do not stand for a surveyed line."""
+        """Returns the points that do not stand for a surveyed line."""
         return [point for point in self.points if not point.is_of_line]
 
 
 class Seen(NamedTuple):
-    """What passes saw."""
+    """What the passes saw of control points and at ties by hand."""
 
     evidence: Evidence
     rows: list[dict[str, Any]]
     """Sightings of control points as rows of their table."""
     unmeasured: list[Finding]
-    """On ties by hand."""
+    """Findings on ties by hand."""
 
 
 def solution_key(plan: SurveyPlan) -> str:
-    """Hash of all that the solution depends on: settings, code, readings, poses, control. No reading is read for it."""
+    """Hash of all that the solution depends on: settings, code, readings, poses, control. It reads no reading."""
     config = AdjustConfig.of(plan.survey)
     picked = None if config.targets.picked is None else plan.survey.resolve(config.targets.picked)
     by_hand = [None if f is None or not f.is_file() else file_digest(f) for f in (picked, hand_file(plan.survey))]
@@ -156,7 +156,7 @@ def _is_drawn(record: OutputRecord) -> bool:
 
 
 def withdraw(session: Session) -> None:
-    """Take away what the stage made: the poses hold as they were recorded."""
+    """Remove the stage's products: the recorded poses are used."""
     manifest, plan = session.manifest, plan_of(session)
     manifest.remove([r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()])
     publish(session.store, {}, AdjustConfig.of(plan.survey))
@@ -165,7 +165,7 @@ def withdraw(session: Session) -> None:
 
 
 class _Collector:
-    """Brings evidence up to date, round by round."""
+    """Updates the evidence, round by round."""
 
     def __init__(self, session: Session, sources: Sources, priors: tuple[RunPrior, ...], mounted: Mounted) -> None:
         self.session, self.sources, self.priors, self.mounted = session, sources, priors, mounted
@@ -179,20 +179,20 @@ class _Collector:
         self.again = first_ties(plan_of(session), sources, self.work.ties, self.work.control, (self.observe, self.load))
 
     def observe(self, tasks: Sequence[TieTask]) -> None:
-        """Bring ties up to date."""
+        """Update ties."""
         self.lacks |= _collect_ties(self.session, tasks)
 
     def load(self, tasks: Sequence[TieTask]) -> KnownTies:
-        """Ties that are up to date."""
+        """Returns ties that are up to date."""
         return self._loaded(tasks).of_seams(self._seams, COMMON_M)
 
     def _loaded(self, tasks: Sequence[TieTask]) -> KnownTies:
         return load_ties(self.session.store, self.session.manifest, tasks, self.runs, self.mounted)
 
     def _heads(self) -> tuple[list[Finding], frozenset[int]]:
-        """Findings on heads of one pass where they meet, and runs whose heads are exchanged.
+        """Returns findings on heads of one pass where they meet, and runs whose heads are exchanged.
 
-        A run in which heads meet otherwise than in the others gets mountings of its own.
+        A run in which heads meet otherwise than in the others gets separate mountings.
         """
         self.observe(self.work.ties)
         steps = steps_of(self._loaded(self.work.ties), AdjustConfig.of(plan_of(self.session).survey).ties.return_s)
@@ -204,7 +204,7 @@ class _Collector:
         return head_findings(swapped, odd), frozenset(map(self.runs.index, useless))
 
     def evidence(self, ties: KnownTies, control: Sequence[ControlTask]) -> Seen:
-        """All that is known, with what passes see of control points and at ends of ties by hand."""
+        """Returns all evidence, with what passes see of control points and at ends of ties by hand."""
         store, manifest, hand = self.session.store, self.session.manifest, self.work.hand
         self.lacks |= _collect_sightings(self.session, [*control, *hand.tasks])
         points, rows = load_sightings(store, manifest, control)
@@ -216,7 +216,7 @@ class _Collector:
         return Seen(evidence, rows, unmeasured)
 
     def solve(self, ties: KnownTies, control: Sequence[ControlTask]) -> Solution:
-        """Corrections of all runs."""
+        """Returns corrections of all runs."""
         return solve(plan_of(self.session), self.evidence(ties, control).evidence)
 
 
@@ -267,7 +267,7 @@ def adjust_survey(session: Session) -> None:
 def _tables(
     evidence: Evidence, solution: Solution, held: Held, added: Float64, tracks: Sequence[Track]
 ) -> dict[str, Rows]:
-    """Rows of the tables of the outcome; added : (s, 6) what is added to the mountings."""
+    """Returns rows of the tables of the outcome; added : (s, 6) corrections of the mountings."""
     points = control_rows(evidence, solution, held, added)
     return {
         "tie_residuals": tie_rows(evidence, solution, held, added),
@@ -279,7 +279,7 @@ def _tables(
 
 
 def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) -> Work:
-    """Where passes overlap and where they come by control points: tasks for both."""
+    """Returns tasks for the places where passes overlap and for the control points that they pass."""
     tracks = tracks_of(plan, sources)
     config = AdjustConfig.of(plan.survey)
     places = _places(tracks, config.places)
@@ -291,7 +291,7 @@ def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) ->
 
 
 def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
-    """Places of dense sensors, those of lidars, which are larger, and the seams of heads: they are numbered through."""
+    """Returns places of dense sensors, those of lidars, which are larger, and the seams of heads, numbered through."""
     dense = places_of_overlap([t for t in tracks if t.ahead_m == 0.0], settings)
     ahead = settings.model_copy(update={"per_km": settings.lidar_per_km})
     sparse = places_of_overlap([t for t in tracks if t.ahead_m > 0.0], ahead)
@@ -300,7 +300,7 @@ def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:
 
 
 def _collect_ties(session: Session, tasks: Sequence[TieTask]) -> bool:
-    """Bring ties up to date; True where some failed."""
+    """Update ties; returns True where some failed."""
     manifest = session.manifest
     due = [t for t in tasks if not manifest.is_current(TIES, t.unit, t.key)]
     ended = run_bundles(
@@ -312,7 +312,7 @@ def _collect_ties(session: Session, tasks: Sequence[TieTask]) -> bool:
 
 
 def _collect_sightings(session: Session, tasks: Sequence[ControlTask]) -> bool:
-    """Bring what was seen of control points, and at ends of ties by hand, up to date; True where some failed."""
+    """Update sightings of control points and of ends of ties by hand; returns True where some failed."""
     manifest = session.manifest
     due = [t for t in tasks if not manifest.is_current(SIGHTINGS, t.unit, t.key)]
     if not due:
@@ -326,13 +326,13 @@ def _collect_sightings(session: Session, tasks: Sequence[ControlTask]) -> bool:
 
 
 def _forget_others(manifest: Manifest, again: Again, work: Work) -> None:
-    """Remove evidence that is no more asked for."""
+    """Remove evidence that is no longer needed."""
     manifest.remove(manifest.beside([TIES], {t.unit for t in again.every}))
     manifest.remove(manifest.beside([SIGHTINGS], {t.unit for t in (*again.control, *work.hand.tasks)}))
 
 
 def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Finding]], *, failed: bool) -> None:
-    """Record the solution and say what it found; one that lacks evidence is made anew by the next run."""
+    """Record the solution and its findings; one that lacks evidence is repeated by the next run."""
     lines, doubts = said
     detail = {
         "runs": sorted(held), "table": digests_of(session.store), "lines": lines,
@@ -345,7 +345,7 @@ def _keep(session: Session, key: str, held: Held, said: tuple[list[str], list[Fi
 
 
 def _no_ties(work: Work) -> str:
-    """Why no tie counts."""
+    """Returns why no tie counts."""
     places = sum(len(task.places) for task in work.ties)
     if not work.tracks:
         return "no readings with poses (points of a cloud are placed already)"
@@ -362,7 +362,7 @@ def _seen(work: Work, sightings: Sequence[Sighting]) -> str:
 
 
 def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[Finding]:
-    """Findings on points that no pass saw, and on targets that are not as they should be."""
+    """Returns findings on points that no pass saw, and on targets that are not as they should be."""
     found: list[Finding] = []
     points = work.own_points
     if points and not any(not task.point.is_of_line for task in work.control):
@@ -378,7 +378,7 @@ def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[Finding]:
 
 
 def _beside(work: Work, sightings: Sequence[Sighting]) -> list[str]:
-    """Points that no pass saw, and how far they lie from where the nearest sensor went."""
+    """Returns points that no pass saw, and their distance from the path of the nearest sensor."""
     seen = {one.point.number for one in sightings if one.status != "unseen"}
     unseen = [one for one in work.own_points if one.number not in seen]
     ways = np.concatenate([np.zeros((0, 2)), *(np.stack([t.easting_m, t.northing_m], axis=-1) for t in work.tracks)])
@@ -423,7 +423,7 @@ def _lines(
 
 
 def _statement(count: int, nssda_95_m: float) -> str:
-    """Accuracy after NSSDA, or that there are too few points for it."""
+    """Returns the accuracy after NSSDA, or that there are too few points for it."""
     if count < NSSDA_CHECK_POINTS:
         return f"of {count_of(count, 'point')} (NSSDA takes {NSSDA_CHECK_POINTS} at least)"
     return f"95 % within {nssda_95_m * 1e3:.2f} mm (NSSDA, {count} points)"

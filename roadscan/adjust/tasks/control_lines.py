@@ -30,11 +30,11 @@ CONTROL_LINE: Final = Witness(
     told=("findings",),
 )
 _LEAST: Final = 3
-"""A line of so many points or more that is found at none of them, though passes saw the road there, is named."""
+"""A line of at least this many points that is found at none of them, though passes saw the road there, is reported."""
 
 
 def line_points(plan: SurveyPlan, first: int) -> list[ControlPoint]:
-    """Points along all surveyed lines, each `adjust.lines.each_m`; first : number of the first of them."""
+    """Returns points along all surveyed lines, each `adjust.lines.each_m`; first : number of the first of them."""
     settings, found = AdjustConfig.of(plan.survey).lines, list[ControlPoint]()
     for record in plan.records:
         for file in record.tables.get(TABLE, ()):
@@ -64,7 +64,7 @@ def _of_line(row: Mapping[str, Any], settings: LineUse, first: int) -> Iterator[
 
 
 def lines_line(sightings: Sequence[Sighting]) -> str:
-    """How many points of lines were found; "" without lines."""
+    """Returns how many points of lines were found; "" without lines."""
     own = [one for one in sightings if one.point.is_of_line]
     found = {one.point.number for one in own if one.is_placed}
     lines = {one.point.shape.line for one in own if isinstance(one.point.shape, SurveyedLine)}
@@ -75,7 +75,7 @@ def lines_line(sightings: Sequence[Sighting]) -> str:
 
 
 def line_findings(wrong: Sequence[WrongPoint], sightings: Sequence[Sighting]) -> list[Finding]:
-    """Findings on lines that are contradicted, and on lines that are nowhere found; wrong : points of lines."""
+    """Returns findings on lines that are contradicted, and on lines that are found nowhere; wrong : points of lines."""
     points, places = defaultdict[str, set[str]](set), dict[str, str]()
     found = set[str]()
     for one in sightings:

@@ -1,4 +1,4 @@
-"""Control points of a survey: a task a point that passes came by, a file of the table `control_sightings` for each."""
+"""Control points of a survey: a task and a file of the table `control_sightings` for each point that passes saw."""
 
 from __future__ import annotations
 
@@ -42,40 +42,40 @@ HAND: Final = "hand"
 
 _PICKED_COLUMNS: Final = ("run", "name", "easting_m", "northing_m")
 _FIT_RADII: Final = 1.5
-"""Readings are kept that far around the search, in radii of the target."""
+"""Readings are taken this far around the search, in radii of the target."""
 
 
 @dataclass(frozen=True)
 class ControlTask:
-    """A point, and the row groups that saw it; it holds no data."""
+    """A point, and the row groups that saw it; it carries no data."""
 
     store: Store
     ground: MapSettings
     settings: TargetSettings
     runs: tuple[str, ...]
     sigma_pose_m: tuple[float, ...]
-    """Of each pass 1 σ of its recorded poses on each horizontal axis."""
+    """1 σ of each pass's recorded poses, on each horizontal axis."""
     point: ControlPoint
     passes: tuple[tuple[Traverse, ...], ...]
-    """Of each pass the traverses of its sensors."""
+    """The traverses of each pass's sensors."""
     picked: tuple[PickedPlace | None, ...]
-    """Of each pass what the user picked."""
+    """The place that the user picked in each pass."""
     files: tuple[NearFile, ...]
     key: str
     round: int = 0
-    """Of the solution that says where the readings lie; 0: the recorded poses do."""
+    """Round whose solution places the readings; 0: the recorded poses do."""
     shifts_m: tuple[Shift, ...] = ()
-    """Of each pass: how far that solution moves it; none in round 0."""
+    """Shift of each pass by that solution; none in round 0."""
 
     @property
     def unit(self) -> str:
-        """Its name in the manifest."""
+        """Returns its name in the manifest."""
         again = f"-round-{self.round}" if self.round else ""
         return f"{'hand' if self.point.role == HAND else 'point'}-{self.point.number:06d}{again}"
 
     @property
     def bytes(self) -> int:
-        """Compressed bytes to read, about."""
+        """Returns the approximate number of compressed bytes to read."""
         return sum(one.bytes for one in self.files)
 
 
@@ -112,7 +112,7 @@ def _shape(target: TargetConfig) -> Shape | None:
 
 
 def picked_places(plan: SurveyPlan, points: Sequence[ControlPoint]) -> dict[tuple[str, str], PickedPlace]:
-    """What the user picked, by run and name of the point.
+    """Returns places that the user picked, by run and name of the point.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def control_tasks(
     points: Sequence[ControlPoint],
     priors: Sequence[RunPrior],
 ) -> list[ControlTask]:
-    """A task for each point that a pass came by, with the key of what is seen of it.
+    """Returns a task for each point that a pass saw, with the key of its sightings.
 
     priors : of each run, in the order of the survey file.
     """
@@ -166,7 +166,7 @@ def control_tasks(
 
 
 def _settings(plan: SurveyPlan) -> TargetSettings:
-    """How targets are looked for."""
+    """Returns the settings of the search for targets."""
     config = AdjustConfig.of(plan.survey)
     return TargetSettings(search_radius_m=config.targets.search_m, height_radius_m=config.control.radius_m)
 
@@ -179,9 +179,9 @@ def sighting_tasks(
     picked: Mapping[tuple[str, str], PickedPlace],
     again: tuple[int, Sequence[tuple[Shift, ...]]] = (0, ()),
 ) -> list[ControlTask]:
-    """A task for each point that the traverses of a pass or more came by.
+    """Returns a task for each point that the traverses of one or more passes saw.
 
-    again : round, and shifts of each point's passes; none where the recorded poses say where readings lie.
+    again : round, and shifts of each point's passes; none where the recorded poses place the readings.
     """
     runs, settings, (number, shifts) = runs_of(plan), _settings(plan), again
     code = code_digest(f"{__name__}:sight_control")
@@ -217,7 +217,7 @@ def _radius_m(point: ControlPoint, settings: TargetSettings) -> float:
 
 
 def passes_of(plan: SurveyPlan, tracks: Sequence[Track], point: ControlPoint) -> list[tuple[Traverse, ...]]:
-    """Traverses by a point, those of one run at one time together."""
+    """Returns traverses by a point, those of one run at one time together."""
     radius_m, apart_s = _radius_m(point, _settings(plan)), AdjustConfig.of(plan.survey).places.return_s
     every = sorted(
         (t for track in tracks for t in passes_by(track, point.easting_m, point.northing_m, radius_m, apart_s)),
@@ -235,7 +235,7 @@ def passes_of(plan: SurveyPlan, tracks: Sequence[Track], point: ControlPoint) ->
 
 
 def sight_control(task: ControlTask) -> OutputRecord:
-    """See what each pass saw of a point and write it (runs on a worker)."""
+    """Determine what each pass saw of a point and write it (runs on a worker)."""
     reader = NearReader(task.store, task.ground, task.files, task.runs)
     found = []
     moved = task.shifts_m or ((0.0, 0.0, 0.0),) * len(task.passes)
@@ -243,7 +243,7 @@ def sight_control(task: ControlTask) -> OutputRecord:
         reach_m = _radius_m(task.point, task.settings) + float(np.hypot(*shift[:2]))
         circle = Circle(task.point.easting_m, task.point.northing_m, reach_m)
         heads = [shifted(reader.of(traverse, circle), np.array(shift)) for traverse in own]
-        # Profiles are dense and returns sparse: where a pass has both, the profiles show the point.
+        # Profiles are dense and returns sparse: of a pass with both, the profiles are used.
         dense = [h for h in heads if not h.returns and h.pose.size] or heads
         found.append(sight_shifted(task.point, dense, task.settings, sigma_pose_m, picked, np.array(shift)))
     schema = table_schema(SIGHTINGS)
@@ -291,7 +291,7 @@ def _row(one: Sighting, runs: Sequence[str], number: int) -> dict[str, Any]:
 def load_sightings(
     store: Store, manifest: Manifest, tasks: Sequence[ControlTask]
 ) -> tuple[list[Sighting], list[dict[str, Any]]]:
-    """Sightings of some points, in order, and their rows of the table."""
+    """Returns sightings of some points, in order, and their rows of the table."""
     sightings, rows = [], []
     last = {task.point.number: task for task in sorted(tasks, key=lambda task: task.round)}
     for task in last.values():

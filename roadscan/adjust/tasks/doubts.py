@@ -1,4 +1,4 @@
-"""What an adjustment doubts: findings on control points, on runs, on stated σ and on the solution itself."""
+"""Findings of an adjustment: on control points, on runs, on stated σ and on the solution itself."""
 
 from __future__ import annotations
 
@@ -102,9 +102,9 @@ HELMERT_TURN: Final = Witness(
 )
 
 _UNDERSTATED: Final = 3.0
-"""A variance factor from which on a stated σ is told to be too small: 1.7 times."""
+"""Variance factor from which a stated σ is reported as too small: 1.7 times."""
 _OPEN_M: Final = 1.0
-"""An offset whose σ is larger is not known: that along surveyed lines, which tell of nothing along them."""
+"""An offset of larger σ (m) is not known: that along surveyed lines, which do not bind along them."""
 _WORDS: Final = {
     "height_tie": "heights of one pass against another",
     "shift_tie": "shifts of one pass against another",
@@ -124,13 +124,13 @@ _WORDS: Final = {
 
 
 def wrong_points(wrong: Sequence[WrongPoint]) -> list[Finding]:
-    """Findings on points that all else contradicts, and on pairs whose heights look exchanged."""
+    """Returns findings on points that all other evidence contradicts, and on pairs whose heights look exchanged."""
     found = [CONTROL_POINT.finds(one.name, one.told(), left_out=1 + len(one.alternatives)) for one in wrong]
     return found + exchanged(wrong)
 
 
 def exchanged(points: Sequence[WrongPoint]) -> list[Finding]:
-    """Findings on pairs of points whose heights look exchanged."""
+    """Returns findings on pairs of points whose heights look exchanged."""
     return [
         CONTROL_POINT.finds(CONTROL, f"the heights of {one} and {other} look exchanged")
         for one, other in swapped(points)
@@ -138,7 +138,7 @@ def exchanged(points: Sequence[WrongPoint]) -> list[Finding]:
 
 
 def far_points(far: Mapping[str, float]) -> list[Finding]:
-    """Findings on points far above or below the road."""
+    """Returns findings on points far above or below the road."""
     return [
         CONTROL_POINT.finds(
             name,
@@ -151,7 +151,7 @@ def far_points(far: Mapping[str, float]) -> list[Finding]:
 
 
 def offset_findings(verdict: ControlVerdict, applied: AppliedOffset, points: int) -> list[Finding]:
-    """Findings on control that is off as a whole, by no more than `largest_m`."""
+    """Returns findings on control with a common offset, of no more than `largest_m`."""
     found = []
     for name in verdict.doubted:
         sigmas, sigma_m = verdict.offset.sigmas(name), verdict.offset.sigma_m(name)
@@ -175,7 +175,7 @@ def offset_findings(verdict: ControlVerdict, applied: AppliedOffset, points: int
 
 
 def shift_findings(shift: PlaneShift) -> list[Finding]:
-    """Findings on control whose heights tell that it lies elsewhere in the plane."""
+    """Returns findings on control whose heights show that it lies elsewhere in the plane."""
     if not shift.sigmas:
         return []
     north, east = 1e3 * shift.shift_m
@@ -190,7 +190,7 @@ def shift_findings(shift: PlaneShift) -> list[Finding]:
 
 
 def run_findings(runs: Sequence[str], factors: Float64) -> list[Finding]:
-    """Findings on runs whose poses are worse than their σ say; factors : (runs, 6) of the stated variances."""
+    """Returns findings on runs whose poses are worse than their σ; factors : (runs, 6) of the stated variances."""
     found = []
     for run, own in zip(runs, factors, strict=True):
         words = [
@@ -209,7 +209,7 @@ def run_findings(runs: Sequence[str], factors: Float64) -> list[Finding]:
 
 
 def offset_line(verdict: ControlVerdict, applied: AppliedOffset) -> str:
-    """How well control and poses agree as a whole, and which offset would have passed unseen; "" without control."""
+    """Returns how well control and poses agree as a whole, and the least detectable offset; "" without control."""
     known = datum_figures(verdict, applied)
     parts = [
         f"{_offset(verdict, name)} ± {1e3 * verdict.offset.sigma_m(name):.1f} mm in {name} (an offset is found four "
@@ -222,10 +222,10 @@ def offset_line(verdict: ControlVerdict, applied: AppliedOffset) -> str:
 
 
 def datum_figures(verdict: ControlVerdict, applied: AppliedOffset) -> dict[str, tuple[float, float]]:
-    """Poses minus control as a whole (m; of a place its length), and 1 σ (m) of the datum, by component that is known.
+    """Returns poses minus control as a whole (m; of a place its length), and 1 σ (m) of the datum, by known component.
 
-    What poses say of an offset that nobody knew before is its size with their σ: its mean square is the sum of both
-    squares. Where the poses are followed, or the control is not used, it is their σ alone.
+    The mean square of an offset that nobody knew before is the sum of the squares of its size and of the poses' σ.
+    Where the poses are followed, or the control is not used, 1 σ is that of the poses alone.
     """
     found = {}
     for name, axes in COMPONENTS.items():
@@ -244,7 +244,7 @@ def _offset(verdict: ControlVerdict, component: str) -> str:
 
 
 def power_line(verdict: ControlVerdict, sigma_m: Sequence[float]) -> str:
-    """From which error of a single point's height on it is named; "" without control."""
+    """Returns the least detectable error of a single point's height; "" without control."""
     known = np.array([s for s in sigma_m if np.isfinite(s)])
     if not known.size or not np.isfinite(verdict.limit_point):
         return ""
@@ -256,7 +256,7 @@ def power_line(verdict: ControlVerdict, sigma_m: Sequence[float]) -> str:
 
 
 def not_held(runs: Sequence[str], moving: Sequence[int], links: Int64, held: set[int]) -> list[Finding]:
-    """Findings on runs that neither control nor ties to a run with control hold.
+    """Returns findings on runs that neither control nor ties to a run with control determine.
 
     Parameters
     ----------
@@ -269,7 +269,7 @@ def not_held(runs: Sequence[str], moving: Sequence[int], links: Int64, held: set
     group = connected_components(graph, directed=False)[1]
     good = {int(group[k]) for k in held}
     if not good:
-        # Without any control the largest group of runs stands for it.
+        # Without any control the largest group of runs is the reference.
         sizes = [(-int(sum(group[k] == g for k in moving)), int(g)) for g in np.unique(group[list(moving)])]
         if len(sizes) < 2 or not len(links):
             return []
@@ -291,7 +291,7 @@ def not_held(runs: Sequence[str], moving: Sequence[int], links: Int64, held: set
 
 
 def solver_findings(factors: Mapping[str, float], rounds: int, *, settled: bool) -> list[Finding]:
-    """Findings on the solution and on stated σ."""
+    """Returns findings on the solution and on stated σ."""
     found = []
     if not settled:
         found.append(
@@ -312,14 +312,14 @@ def solver_findings(factors: Mapping[str, float], rounds: int, *, settled: bool)
 
 
 def solver_line(factors: Mapping[str, float], rounds: int, *, settled: bool) -> str:
-    """Whether the solution settled, and the variance factors that are not 1."""
+    """Returns whether the solution settled, and the variance factors that are not 1."""
     told = [f"{_WORDS[name]} {factor:.2f}" for name, factor in factors.items() if factor != 1.0]
     end = f"settled after {rounds} rounds" if settled else f"not settled after {rounds} rounds"
     return f"solution {end}; variance factors: {', '.join(told) if told else 'as stated'}"
 
 
 def time_line(stated: Sequence[RunPrior], used: Sequence[RunPrior]) -> str:
-    """Correlation times that were taken in place of those of the settings, '' where none was."""
+    """Returns correlation times that replaced those of the settings, '' where none did."""
     words = []
     for name, component in (("position", 0), ("attitude", 3)):
         pairs = {(a.taus_s[component], b.taus_s[component]) for a, b in zip(stated, used, strict=True)}
@@ -329,7 +329,7 @@ def time_line(stated: Sequence[RunPrior], used: Sequence[RunPrior]) -> str:
 
 
 def target_findings(sightings: Sequence[Sighting]) -> list[Finding]:
-    """Findings on targets that are not as they should be."""
+    """Returns findings on targets that are not as they should be."""
     found = []
     for status, words in (
         ("missed", "targets were not found, and the height at the surveyed place is used"),

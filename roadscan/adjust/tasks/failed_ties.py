@@ -1,4 +1,4 @@
-"""Runs over the same road whose ties mostly fail: which, why, and what that is likely to come from."""
+"""Pairs of runs over the same road whose ties mostly fail: reasons and likely causes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ TIES_FAIL: Final = Witness(
     told=("findings",),
 )
 _LEAST: Final = 10
-"""Places, or shifts, of two runs from which on a share of them says something."""
-_MOST: Final = 0.5
+"""Least number of places, or shifts, of two runs for a statement about their share."""
+_MOST: Final = 0.5  # Share of failed places, or of contradicted shifts, from which they are reported.
 _REFUSED: Final = "contradicted by all other evidence"
 _CAUSES: Final = {
     TOO_FAR: "the height of the poses of one of them, its lever arm or its geoid is wrong",
@@ -38,7 +38,7 @@ _CAUSES: Final = {
 
 
 def failed_ties(ties: KnownTies, weight: Float64) -> list[Finding]:
-    """Findings on pairs of runs.
+    """Returns findings on pairs of runs.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def failed_ties(ties: KnownTies, weight: Float64) -> list[Finding]:
 
 
 def _refused(ties: KnownTies, weight: Float64) -> set[tuple[Any, ...]]:
-    """Place, group, kind and sizes of the ties that passed their tests and do not count."""
+    """Returns place, group, kind and sizes of the ties that passed their tests and do not count."""
     rows = np.flatnonzero(ties.accepted & (weight == 0.0))
     columns = ties.columns
     return {(int(columns["place"][k]), columns["kind"][k], float(columns["sigma_m"][k])) for k in rows.tolist()}
@@ -80,7 +80,7 @@ def _number_refused(tried: Any, own: npt.NDArray[np.bool_], refused: set[tuple[A
 
 
 def _reasons(tried: Any, own: npt.NDArray[np.bool_], refused: set[tuple[Any, ...]]) -> dict[int, str]:
-    """Of each place why it gives nothing; "" where one comparison counts."""
+    """Returns for each place why it gives nothing; "" where one comparison counts."""
     found: dict[int, str] = {}
     for k in np.flatnonzero(own).tolist():
         place, why = int(tried["place"][k]), str(tried["why_not"][k])

@@ -1,4 +1,4 @@
-"""What an adjustment says of its evidence and of accuracy, as rows of tables."""
+"""Rows of an adjustment's tables: its evidence and its accuracy."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ Int64 = npt.NDArray[np.int64]
 Rows = list[dict[str, Any]]
 Held = Mapping[str, Corrections]
 _AT_THEIR_PLACE: Final = ("found", "picked")
-"""A check point whose target lies elsewhere than surveyed says nothing of the poses' error in the plane."""
+"""A check point whose target lies elsewhere than surveyed does not show the poses' error in the plane."""
 
 
 def tie_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float64) -> Rows:
-    """Of the table `tie_residuals`; mounted : (s, 7) what is added to the mountings."""
+    """Returns rows of the table `tie_residuals`; mounted : (s, 7) corrections of the mountings."""
     ties = evidence.ties
     after = left_after(ties.observations, held, evidence.runs, mounted)
     names = ("place", "kind", "first_run", "second_run", "easting_m", "northing_m", "accepted", "sigma_m")
@@ -48,7 +48,7 @@ def tie_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float6
 
 
 def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held, mounted: Float64) -> Rows:
-    """Of the table `relative_accuracy`: ties that passed their tests, by section of the first end's run.
+    """Returns rows of the table `relative_accuracy`: ties that passed their tests, by section of the first end's run.
 
     Ties by hand, which are few, are not of them.
     """
@@ -77,14 +77,14 @@ def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held, mount
 
 
 def _station_m(track: Track, epochs_gps_ns: Int64) -> Float64:
-    """How far (n,) along its way a run was at some epochs."""
+    """Returns the stations (n,) of a run along its path at some epochs."""
     station = way_along(np.stack([track.easting_m, track.northing_m], axis=-1))
     since = (epochs_gps_ns - track.epoch_gps_ns[0]).astype(np.float64)
     return np.asarray(np.interp(since, (track.epoch_gps_ns - track.epoch_gps_ns[0]).astype(np.float64), station))
 
 
 def distance_rows(rows: Rows, evidence: Evidence, solution: Solution, tracks: Sequence[Track]) -> Rows:
-    """Of the table `accuracy_by_distance`, from rows of `control_residuals`.
+    """Returns rows of the table `accuracy_by_distance`, from rows of `control_residuals`.
 
     A check point counts once, with the mean of what the passes say of it. Where all runs are adjusted together, a
     control point that is left out counts once, in the first run that saw it.
@@ -122,17 +122,17 @@ def distance_rows(rows: Rows, evidence: Evidence, solution: Solution, tracks: Se
 
 
 def _by_distance(rows: Float64) -> list[DistanceClass]:
-    """Classes of rows (n, 3): distance, error, number of the point."""
+    """Returns classes of rows (n, 3): distance, error, number of the point."""
     return accuracy_by_distance(rows[:, 0], rows[:, 1], rows[:, 2].astype(np.int64))
 
 
 def control_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float64) -> Rows:
-    """Of the table `control_residuals`; mounted : (s, 7) what is added to the mountings."""
+    """Returns rows of the table `control_residuals`; mounted : (s, 7) corrections of the mountings."""
     return [_control_row(one, evidence, solution, held, mounted) for one in evidence.sightings]
 
 
 def of_points(rows: Rows, evidence: Evidence) -> Rows:
-    """Those of `control_residuals` that are of points, and not of surveyed lines."""
+    """Returns rows of `control_residuals` of points, without those of surveyed lines."""
     return [row for row, one in zip(rows, evidence.sightings, strict=True) if not one.point.is_of_line]
 
 
@@ -177,7 +177,7 @@ def _control_row(
 
 
 def accuracy_rows(rows: Rows, evidence: Evidence, solution: Solution) -> Rows:
-    """Of the table `absolute_accuracy`, from rows of `control_residuals`."""
+    """Returns rows of the table `absolute_accuracy`, from rows of `control_residuals`."""
     found: Rows = []
     checks = [(row, one) for row, one in zip(rows, evidence.sightings, strict=True)
               if row["role"] == "check" and not one.point.is_of_line]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What is said of runs that are held fixed (`adjust.fixed`)."""
+"""Findings and lines on runs that are held fixed (`adjust.fixed`)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _WORDS: Final = {
 
 
 def fixed_findings(fixed: Sequence[FixedRun], false_alarm: float) -> list[Finding]:
-    """Findings on runs that are held though other evidence contradicts them."""
+    """Returns findings on runs that are fixed though other evidence contradicts them."""
     found = []
     for one in fixed:
         off = one.contradicted(false_alarm)
@@ -45,6 +45,6 @@ def _size(component: str, value: float) -> str:
 
 
 def fixed_line(fixed: Sequence[FixedRun]) -> str:
-    """Which runs are held; "" where none is."""
+    """Returns which runs are fixed; "" where none is."""
     names = ", ".join(one.run for one in fixed)
     return f"held fixed, with poses as they were recorded: {names}" if fixed else ""

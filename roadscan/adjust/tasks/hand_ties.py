@@ -1,4 +1,4 @@
-"""Ties by hand (`adjust.hand_ties`): what a person found in two passes, as observations beside the ties that are found.
+"""Ties by hand (`adjust.hand_ties`): features that a person found in two passes, as additional observations.
 
 Each end is a place on the road, seen by one pass: height, arm and attitude come from the readings there, as those of a
 control point do. A tie that all other evidence contradicts is named, and does not count.
@@ -57,19 +57,19 @@ _SAYS: Final = {"place": (True, False), "height": (False, True), "both": (True, 
 
 @dataclass(frozen=True)
 class HandEnd:
-    """Where a thing lies in one run."""
+    """The place of a feature in one run."""
 
     run: str
     easting_m: float
     """As the recorded poses show it (map)."""
     northing_m: float
     near_gps_ns: int | None
-    """The run came by about then; None: it came by once."""
+    """Approximate time of the passage; None: the run passed once."""
 
 
 @dataclass(frozen=True)
 class HandTie:
-    """One thing in two passes."""
+    """One feature in two passes."""
 
     name: str
     of_place: bool
@@ -80,18 +80,18 @@ class HandTie:
 
 
 def subject(name: str) -> str:
-    """What findings call a tie."""
+    """Returns the name of a tie in findings."""
     return f"hand tie '{name}'"
 
 
 def hand_file(survey: Survey) -> Path | None:
-    """The file of ties by hand; None where the survey file names none."""
+    """Returns the file of ties by hand; None where the survey file names none."""
     stated = AdjustConfig.of(survey).hand_ties.path
     return None if stated is None else survey.resolve(stated)
 
 
 def read_hand_ties(survey: Survey) -> list[HandTie]:
-    """Ties by hand, in the order of their file.
+    """Returns ties by hand, in the order of their file.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def _tie(row: Mapping[str, str | None], record: int, runs: Sequence[str], stated
 
 @dataclass(frozen=True)
 class HandWork:
-    """Ties by hand that both runs came by, and the tasks that look at their ends."""
+    """Ties by hand that both runs passed, and the tasks that measure at their ends."""
 
     ties: tuple[HandTie, ...]
     tasks: tuple[ControlTask, ...]
@@ -169,7 +169,7 @@ class HandWork:
 def hand_work(
     plan: SurveyPlan, sources: Sources, tracks: Sequence[Track], priors: Sequence[RunPrior], first: int
 ) -> HandWork:
-    """What is to be looked at; first : number of the first end, above those of all control points."""
+    """Returns the work on ties by hand; first : number of the first end, above those of all control points."""
     ties, seen, findings = list[HandTie](), list[tuple[ControlPoint, list[tuple[Traverse, ...]]]](), list[Finding]()
     for tie in read_hand_ties(plan.survey):
         own = [(_point(first + len(seen) + k, tie, end), _passes(plan, tracks, end)) for k, end in enumerate(tie.ends)]
@@ -192,7 +192,7 @@ def _point(number: int, tie: HandTie, end: HandEnd) -> ControlPoint:
 
 
 def _passes(plan: SurveyPlan, tracks: Sequence[Track], end: HandEnd) -> list[tuple[Traverse, ...]]:
-    """Passes of the run by the place; that of the stated time, where there is one."""
+    """Returns passes of the run by the place; that of the stated time, where there is one."""
     number = runs_of(plan).index(end.run)
     probe = ControlPoint(0, "", HAND, "", end.easting_m, end.northing_m, math.nan, 1.0, 1.0, None)
     found = passes_of(plan, [t for t in tracks if t.run == number], probe)
@@ -215,7 +215,7 @@ def _refused(end: HandEnd, found: Sequence[object]) -> str:
 def with_hand_ties(
     ties: KnownTies, work: HandWork, sightings: Sequence[Sighting], mounted: Mounted, runs: Sequence[str]
 ) -> tuple[KnownTies, list[Finding]]:
-    """The ties that were found and those by hand, and findings on the latter that could not be measured."""
+    """Returns found ties together with those by hand, and findings on the latter that could not be measured."""
     seen = {one.point.number: one for one in sightings}
     parts, names, findings = list[Observations](), list[str](), list[Finding]()
     for k, tie in enumerate(work.ties):
@@ -283,7 +283,7 @@ def _observations(
 def _columns(
     added: Observations, names: Sequence[str], seen: Sequence[Sighting], work: HandWork, runs: Sequence[str]
 ) -> dict[str, npt.NDArray[Any]]:
-    """Columns (n,) of the table `ties` that the adjustment goes by, and names."""
+    """Returns columns (n,) of the table `ties` that the adjustment uses, and names."""
     sensors = {(one.run, one.epoch_gps_ns): one.sensor for one in seen}
     at = {tie.name: tie.ends[0] for tie in work.ties}
     columns: dict[str, Any] = {
@@ -302,7 +302,7 @@ def _columns(
 def wrong_hand_ties(
     ties: KnownTies, entering: Bool, adjusted: Adjustment, false_alarm: float
 ) -> tuple[list[str], list[Finding]]:
-    """Names of ties by hand that all other evidence contradicts, and findings on them.
+    """Returns names of ties by hand that all other evidence contradicts, and findings on them.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Heads of one pass where their strips meet: what tells whether each is the head that the survey says, in every run.
+"""Heads of one pass where their strips meet: a test of the mounting of each head in every run.
 
 Poses move both heads alike, so that what their heights differ by where both saw the road is theirs alone: the height,
 the roll or the range scale of one of them, or the log of another one.
@@ -33,18 +33,18 @@ from roadscan.run.engine.fingerprint import key_of
 Float64 = npt.NDArray[np.float64]
 
 _NARROW_M: Final = 0.03
-"""Heads whose strips overlap by so much are held against one another: a cell of 0.025 m, and some of the next."""
+"""Least overlap of the strips of two compared heads (m): a cell of 0.025 m, and some of the next."""
 COMMON_M: Final = 1.5e-4
-"""1 σ of what all steps at a narrow seam have in common (m): its cells are seen to their edge by one head alone, half a
+"""1 σ of the common error of all steps at a narrow seam (m): its cells are seen to their edge by one head alone, half a
 cell of 0.025 m beside the other on a road that falls by 2.5 %, and less where readings are dense."""
 _ODD: Final = 3.0
-"""A step that differs from that of other runs by more than so many σ is another one."""
+"""A step that differs from that of other runs by more than this many σ is reported."""
 _LARGE_M: Final = 0.01
-"""Steps larger than three σ of how heads are mounted (m): whether their logs are exchanged is tried."""
+"""Steps larger than this (m) and three σ of the heads' mountings are tested for exchanged logs."""
 _FALLS: Final = 3.0
-"""Exchanged logs make the step of the right ones so many times as large, at least."""
+"""Exchanged logs enlarge the step at least this many times."""
 _TRIED: Final = 12
-"""Places, spread over the run, at which that is tried."""
+"""Places, spread over the run, at which that is tested."""
 
 HEADS: Final = Witness(
     "heads_of_a_run",
@@ -58,7 +58,7 @@ HEADS: Final = Witness(
 
 
 def seams(tracks: Sequence[Track], dense: Sequence[Place], settings: PlaceSettings) -> list[Place]:
-    """Places where heads of one pass meet in a strip that is too narrow for the other ties, `dense`."""
+    """Returns places where heads of one pass meet in a strip that is too narrow for the other ties, `dense`."""
     known = {_pair(place) for place in dense if place.quality_only(settings.return_s)}
     found: list[Place] = []
     narrow = settings.model_copy(
@@ -74,13 +74,13 @@ def seams(tracks: Sequence[Track], dense: Sequence[Place], settings: PlaceSettin
 
 
 def _pair(place: Place) -> tuple[int, str, str]:
-    """Run and sensors of heads that meet at a place."""
+    """Returns run and sensors of heads that meet at a place."""
     return place.traverses[0].run, place.traverses[0].sensor, place.traverses[-1].sensor
 
 
 @dataclass(frozen=True)
 class Step:
-    """Where two heads of a run meet: the height of the second above the first."""
+    """Step between two heads of a run: the height of the second above the first."""
 
     run: str
     heads: tuple[str, str]
@@ -90,19 +90,19 @@ class Step:
 
     @classmethod
     def of(cls, run: str, heads: tuple[str, str], values_m: Float64) -> Step:
-        """The median of what places say."""
+        """Returns the median over places."""
         middle = float(np.median(values_m))
         scatter = scatter_about(values_m, middle)
         return cls(run, heads, middle, float(np.hypot(COMMON_M, scatter / np.sqrt(values_m.size))), values_m.size)
 
     @property
     def told(self) -> str:
-        """The step in words."""
+        """Returns the step in words."""
         return f"{1e3 * self.step_m:+.2f} mm (σ {1e3 * self.sigma_m:.2f} mm, {self.places} places)"
 
 
 def steps_of(ties: KnownTies, return_s: float) -> list[Step]:
-    """A step for each pair of heads in each run, also from ties that failed a test."""
+    """Returns a step for each pair of heads in each run, also from ties that failed a test."""
     column = ties.columns
     apart_s = np.abs(column["first_epoch_gps_ns"] - column["second_epoch_gps_ns"]) / NS_PER_S
     own = (column["kind"] == HEIGHT) & (column["first_run"] == column["second_run"]) & (apart_s < return_s)
@@ -118,7 +118,7 @@ def steps_of(ties: KnownTies, return_s: float) -> list[Step]:
 
 
 def odd_steps(steps: Sequence[Step]) -> list[tuple[Step, Step]]:
-    """Steps that are not those of the other runs, and the usual one: the median, of two runs the smaller one."""
+    """Steps that differ from those of the other runs, and the usual one: the median, of two runs the smaller one."""
     found = []
     for _, group in groupby(sorted(steps, key=lambda one: (one.heads, one.run)), key=lambda one: one.heads):
         own = sorted(group, key=lambda one: (one.step_m, one.run))
@@ -129,13 +129,13 @@ def odd_steps(steps: Sequence[Step]) -> list[tuple[Step, Step]]:
 
 
 def exchanged(plan: SurveyPlan, sources: Sources, steps: Sequence[Step]) -> list[tuple[Step, Step]]:
-    """Pairs of heads whose logs are exchanged: their step, and what is left of it with each in the other's mounting."""
+    """Returns pairs of heads whose logs are exchanged: their step, and the step left with exchanged mountings."""
     tried = [(one, _tried(plan, sources, one)) for one in steps if abs(one.step_m) > _LARGE_M]
     return [(one, other) for one, other in tried if other is not None]
 
 
 def _tried(plan: SurveyPlan, sources: Sources, step: Step) -> Step | None:
-    """The step with the mountings exchanged; None where it is no smaller."""
+    """Returns the step with the mountings exchanged; None where it is no smaller."""
     config, runs = AdjustConfig.of(plan.survey), runs_of(plan)
     (first, of_first), (second, of_second) = (
         next((s, files) for s, files in sources if (s.run, s.sensor) == (step.run, head)) for head in step.heads
@@ -158,7 +158,7 @@ def _tried(plan: SurveyPlan, sources: Sources, step: Step) -> Step | None:
 
 
 def head_findings(swapped: Iterable[tuple[Step, Step]], odd: Iterable[tuple[Step, Step]]) -> list[Finding]:
-    """Findings on heads that do not meet as they should."""
+    """Returns findings on heads that do not meet as they should."""
     found = [
         HEADS.finds(
             f"run '{one.run}'",

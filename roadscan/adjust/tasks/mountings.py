@@ -1,4 +1,4 @@
-"""Mountings of the sensors in an adjustment: what is known of them before it, and what it adds to them."""
+"""Mountings of the sensors in an adjustment: their priors, and the corrections that it adds."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ _NAMES: Final = (
     "boresight roll", "boresight pitch", "boresight heading", "range scale",
 )  # fmt: skip
 DOUBTED: Final = 3.0
-"""A mounting that is off by more than so many σ of what was stated is named."""
+"""A mounting that is off by more than this many stated σ is reported."""
 _CHANCE: Final = 0.0027
-"""Of evidence that contradicts right mountings: that of 3 σ."""
+"""Chance of the test of stated mountings: that of 3 σ."""
 _MOST_WRONG: Final = 3
-"""Of more sensors that are wrong at once, which they are is not sought: all are estimated."""
+"""If more sensors are wrong at once, all are estimated instead of searching which."""
 _FREE: Final = 100.0
-"""An error within so many prior σ is as good as unknown."""
+"""Prior of a free error in the test, in stated σ."""
 _CALIBRATED_SIGMAS: Final = (
     "sigma_lever_forward_m", "sigma_lever_right_m", "sigma_lever_down_m",
     "sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg",
@@ -61,28 +61,28 @@ MOUNTING: Final = Witness(
 
 @dataclass(frozen=True)
 class Mounted:
-    """Mountings of the sensors that the adjustment may ask about."""
+    """Mountings of the sensors that the adjustment may estimate."""
 
     priors: tuple[MountingPrior, ...]
     """By name; none where mountings are not estimated."""
     stated: Mapping[tuple[str, str], Mountings]
     """By run and sensor."""
     parallel: frozenset[tuple[str, str]]
-    """Run and sensor of heads whose beams are all along their z."""
+    """Run and sensor of heads whose beams are all parallel to their z axis."""
 
     def number(self, run: str, sensor: str) -> int:
-        """Place of a sensor of a run in `priors`, −1: not estimated."""
+        """Returns the index of a run's sensor in `priors`, −1: not estimated."""
         keys = [one.key for one in self.priors]
         return next((keys.index(key) for key in ((run, sensor), ("*", sensor)) if key in keys), -1)
 
     def apart(self, heads: Iterable[tuple[str, str]]) -> Mounted:
-        """The same, and mountings of their own for some sensors (run, name) whose heights tell of another one."""
+        """Same, with separate mountings for some sensors (run, name) whose heights contradict the common one."""
         known = {one.sensor: one for one in self.priors}
         own = [replace(known[sensor], run=run) for run, sensor in sorted(set(heads)) if sensor in known]
         return replace(self, priors=(*self.priors, *own))
 
     def seats(self, run: str, sensor: str, epochs_gps_ns: Int64) -> Seat:
-        """Stated lever arms and directions of the beams (n, 3) at epochs."""
+        """Returns stated lever arms and directions of the beams (n, 3) at epochs."""
         own = self.stated[run, sensor]
         levers = np.array([one.lever_arm_body_m for one in own.mountings])
         beams = np.array([np.array(one.body_from_sensor)[:, 2] for one in own.mountings])
@@ -92,13 +92,13 @@ class Mounted:
         return Seat(levers[at], beams[at])
 
     def seat(self, run: str, sensor: str, epoch_gps_ns: int) -> Seat:
-        """The same at one epoch, (3,)."""
+        """Returns the same at one epoch, (3,)."""
         found = self.seats(run, sensor, np.array([epoch_gps_ns], np.int64))
         return Seat(found.lever_body_m[0], found.beam_body[0])
 
 
 def mounted_of(plan: SurveyPlan, sources: Sources, *, foreign: bool) -> Mounted:
-    """Mountings of the sources that are adjusted.
+    """Returns mountings of the sources that are adjusted.
 
     foreign : another program corrected the poses of a run, with the mountings as they are stated.
     """
@@ -109,7 +109,7 @@ def mounted_of(plan: SurveyPlan, sources: Sources, *, foreign: bool) -> Mounted:
         return Mounted((), stated, parallel)
     calibrated = calibrated_sigma(plan.store)
     priors = []
-    # A run that is held is right as it is, and so are the mountings that place its readings.
+    # A fixed run is right as it is, and so are the mountings of its sensors.
     held = {sensor for run, sensor in stated if run in config.fixed}
     for sensor in sorted({sensor for _, sensor in stated} - held):
         sigma = _sigma(plan, config, sensor, calibrated.get(sensor))
@@ -143,7 +143,7 @@ def _sigma(plan: SurveyPlan, config: AdjustConfig, sensor: str, calibrated: Floa
 
 
 def calibrated_sigma(store: Store) -> dict[str, Float64]:
-    """1 σ (7,) of calibrated mountings by sensor, the largest of all runs and times; NaN where not stated."""
+    """Returns 1 σ (7,) of calibrated mountings by sensor, the largest of all runs and times; NaN where not stated."""
     table = read_small(store, "mountings")
     found: dict[str, Float64] = {}
     for row in [] if table is None else table.to_pylist():
@@ -154,13 +154,13 @@ def calibrated_sigma(store: Store) -> dict[str, Float64]:
 
 
 def held_values(mounted: Mounted, changes: MountingChanges) -> Float64:
-    """(s, 7) what is added now to the mountings of the sensors that `mounted` counts."""
+    """Returns the current corrections (s, 7) of the mountings that `mounted` numbers."""
     own = [changes[one.key].values if one.key in changes else np.zeros(len(MOUNTED)) for one in mounted.priors]
     return np.array(own).reshape(-1, len(MOUNTED))
 
 
 def publish_mountings(store: Store, found: MountingErrors | None, config: AdjustConfig) -> MountingChanges:
-    """Bring the table up to date; what moves a point by no more than `adjust.moved_m` stays as it was, to the bit."""
+    """Update the table; corrections that move a point by no more than `adjust.moved_m` stay bit-identical."""
     table = read_small(store, TABLE)
     before = {key_of_row(row): row for row in ([] if table is None else table.to_pylist())}
     after: dict[tuple[str, str], dict[str, Any]] = {}
@@ -197,7 +197,7 @@ def _row(found: MountingErrors, k: int) -> dict[str, Any]:
 
 
 def disproved(found: MountingErrors) -> npt.NDArray[np.bool_]:
-    """Components (s, 7) whose stated σ is contradicted.
+    """Returns a mask (s, 7) of the components whose stated σ is contradicted.
 
     Were it right, the estimate would have the variance by which evidence lowers that of the prior.
     """
@@ -208,22 +208,22 @@ def disproved(found: MountingErrors) -> npt.NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _Told:
-    """What evidence alone, without the priors, says of the mountings: normal equations in units of the prior σ.
+    """Normal equations of the mountings from evidence alone, without the priors, in units of the prior σ.
 
-    The height that all sensors have in common is left out of them.
+    The height error common to all sensors is eliminated.
     """
 
     matrix: Float64
     """(m, m)"""
     right: Float64
-    """(m,) of errors x of which it says matrix · x = right."""
+    """(m,) right-hand side: matrix · errors = right."""
     sensor: Int64
     """(m,) of each unknown."""
     component: Int64
 
     @classmethod
     def of(cls, found: MountingErrors) -> _Told:
-        """From an adjustment that estimated all of them."""
+        """Returns the equations from an adjustment that estimated all mountings."""
         sensor, component = np.nonzero(found.prior_sigma > 0.0)
         prior = found.prior_sigma[sensor, component]
         rows = sensor * found.prior_sigma.shape[1] + component
@@ -237,7 +237,7 @@ class _Told:
         return cls(free @ (precision - np.eye(len(precision))) @ free.T, right, sensor, component)
 
     def explained(self, rows: Int64, prior: float = 1.0) -> tuple[float, float]:
-        """By how much the weighted squares fall where some errors are free within so many prior σ, and how much of
+        """How much the weighted squares fall where some errors are free within so many prior σ, and the fall to be
         that is to be expected by chance: the number of errors that the evidence determines.
         """
         own = self.matrix[np.ix_(rows, rows)]
@@ -246,10 +246,10 @@ class _Told:
 
 
 def contradicted(found: MountingErrors) -> npt.NDArray[np.bool_]:
-    """Sensors (s,) whose stated mountings evidence contradicts: the fewest that explain all of it.
+    """Returns sensors (s,) whose stated mountings evidence contradicts: the fewest that explain all of it.
 
-    Where two explain it as well, and nothing tells which of them is off, both are among them. Components that evidence
-    does not tell apart, as the height of a head and its range scale, contradict together.
+    Where two explain it equally well, both are among them. Components that evidence
+    does not distinguish, as the height of a head and its range scale, contradict together.
     """
     count = len(found.sensors)
     none = np.zeros(count, bool)
@@ -271,7 +271,7 @@ def contradicted(found: MountingErrors) -> npt.NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Cause:
-    """One error of one mounting that would explain what contradicts the stated ones."""
+    """One error of one mounting that would explain the contradiction of the stated ones."""
 
     sensor: tuple[str, str]
     """Run and name."""
@@ -301,7 +301,7 @@ def causes(found: MountingErrors) -> tuple[Cause, ...]:
 
 
 def cause_line(found: Sequence[Cause]) -> str:
-    """What may be wrong with a mounting, where several errors would explain the same; "" for less than two."""
+    """Returns what may be wrong with a mounting, where several errors would explain the same; "" for less than two."""
     if len(found) < 2:
         return ""
     words = [
@@ -315,7 +315,7 @@ def cause_line(found: Sequence[Cause]) -> str:
 
 
 def mounting_findings(found: MountingErrors | None) -> list[Finding]:
-    """Mountings that are off by more than was stated."""
+    """Returns findings on mountings that are off by more than was stated."""
     said: list[Finding] = []
     if found is None:
         return said
@@ -336,7 +336,7 @@ def mounting_findings(found: MountingErrors | None) -> list[Finding]:
 
 
 def mounting_lines(found: MountingErrors | None) -> list[str]:
-    """What the adjustment says of the mountings, a line a sensor."""
+    """Returns a line for each sensor on the estimate of its mounting."""
     lines: list[str] = []
     if found is None:
         return lines
@@ -356,7 +356,7 @@ def _called(sensor: tuple[str, str]) -> str:
 
 
 _KNOWN: Final = 0.7
-"""A component whose σ fell below this share of the stated one is determined: half of its variance is gone."""
+"""A component whose σ fell below this share of the stated one is determined: its variance is halved."""
 
 
 def _told(value: float, component: int, *, signed: bool = False) -> str:

@@ -1,4 +1,4 @@
-"""Readings near a place: read by row group and span of time, placed with the recorded poses."""
+"""Readings near a place: read by row group and time span, georeferenced with the recorded poses."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _POSE_STEP_NS: Final = 2_000_000
-"""Readings so near in time share a pose: at 30 m/s arms of 60 mm more or less."""
+"""Readings this close in time (ns) share a pose: at 30 m/s that shifts arms by 60 mm."""
 _KEPT_GROUPS: Final = 8
-"""Row groups of profiles, as they are stored."""
+"""Row groups of profiles cached, as they are stored."""
 _KEPT_RETURNS: Final = 6_000_000
-"""Returns of a lidar, placed: those of one place are near the next one, too. They take 34 bytes each."""
+"""Returns of a lidar cached, georeferenced: those of one place are near the next one, too. They take 34 bytes each."""
 
 
 Sources: TypeAlias = Sequence[tuple[ReadingSource, tuple[DataFile, ...]]]
@@ -36,7 +36,7 @@ Sources: TypeAlias = Sequence[tuple[ReadingSource, tuple[DataFile, ...]]]
 
 @dataclass(frozen=True)
 class NearFile:
-    """Row groups of a data file that are needed. Sent to workers: it holds no data."""
+    """Row groups of a data file that are needed. Sent to workers: it carries no data."""
 
     source: ReadingSource
     path: str
@@ -45,11 +45,11 @@ class NearFile:
     spans: tuple[tuple[int, int], ...]
     """First and last epoch (GPS ns), on time, of each of the groups."""
     bytes: int
-    """Compressed bytes of the groups, about."""
+    """Approximate number of compressed bytes of the groups."""
 
     @classmethod
     def of(cls, source: ReadingSource, file: DataFile, spans_gps_ns: Sequence[tuple[int, int]]) -> NearFile | None:
-        """The row groups that hold readings of some spans; None where none does."""
+        """Returns the row groups with readings of some spans; None where there are none."""
         own = np.array(source.spans(file.group_spans), np.int64).reshape(-1, 2)
         wanted = np.array(spans_gps_ns, np.int64).reshape(-1, 1, 2)
         near = np.flatnonzero(((own[:, 0] <= wanted[:, :, 1]) & (own[:, 1] >= wanted[:, :, 0])).any(axis=0))
@@ -61,16 +61,16 @@ class NearFile:
 
     @property
     def slice(self) -> RawSlice:
-        """The same for placing."""
+        """Returns the same for georeferencing."""
         return RawSlice(self.source, self.path, self.groups, self.spans, self.bytes)
 
     def key(self, road: Sequence[object]) -> list[object]:
-        """What of it shapes readings near a place; `road` : how the road is told."""
+        """Returns a key of all that affects readings near a place; `road` : how the road is classified."""
         return [self.source.key, *road, self.digest, list(self.groups)]
 
 
 def near_files(sources: Sources, traverses: Iterable[Traverse], runs: Sequence[str]) -> list[NearFile]:
-    """Row groups of all sources that hold readings of some traverses, which count the runs as in `runs`."""
+    """Returns row groups of all sources with readings of some traverses, which number the runs as in `runs`."""
     spans: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for one in traverses:
         spans.setdefault((runs[one.run], one.sensor), []).append((one.first_gps_ns, one.last_gps_ns))
@@ -86,7 +86,7 @@ def near_files(sources: Sources, traverses: Iterable[Traverse], runs: Sequence[s
 
 @dataclass(frozen=True)
 class Circle:
-    """Where readings are wanted."""
+    """The circle in which readings are wanted."""
 
     easting_m: float
     northing_m: float
@@ -94,14 +94,14 @@ class Circle:
 
 
 class NearReader:
-    """Places readings near places; keeps the row groups that the next place may need as well."""
+    """Georeferences readings near places; caches the row groups that the next place may need as well."""
 
     def __init__(
         self, store: Store, ground: MapSettings, files: Sequence[NearFile], runs: Sequence[str], apart_m: float = 0.0
     ) -> None:
-        """`runs` : all runs of the survey, in the order that traverses count them.
+        """`runs` : all runs of the survey, in the order by which traverses number them.
 
-        apart_m : of profiles that lie closer than this, as many are left out as still keeps them closer.
+        apart_m : profiles are thinned to at most this spacing.
         """
         self._store, self._frame, self._runs = store, ground.map, runs
         self._placer = Georeferencer(store, ground, [one.slice for one in files], recorded=True)
@@ -113,7 +113,7 @@ class NearReader:
         self._returns: dict[tuple[str, int], PlacedReadings] = {}
 
     def of(self, traverse: Traverse, circle: Circle) -> PassReadings:
-        """Readings of one traverse within a circle."""
+        """Returns readings of one traverse within a circle."""
         run = self._runs[traverse.run]
         parts = [
             part
@@ -125,7 +125,7 @@ class NearReader:
         return self._joined(traverse, run, parts)
 
     def _placed(self, file: NearFile, group: int, traverse: Traverse, circle: Circle) -> Iterator[PlacedReadings]:
-        """Readings of a row group within the traverse and the circle."""
+        """Yields readings of a row group within the traverse and the circle."""
         span = traverse.first_gps_ns, traverse.last_gps_ns
         if file.source.table == "returns":
             found = self._placed_returns(file, group)
@@ -142,7 +142,7 @@ class NearReader:
             yield found.chosen(near)
 
     def _placed_returns(self, file: NearFile, group: int) -> PlacedReadings:
-        """Returns of a row group, the row of each its own."""
+        """Returns lidar returns of a row group; each is a separate row."""
         known = self._returns.get((file.path, group))
         if known is None:
             batch = read_rows(self._store, file.source, file.path, [group]).combine_chunks().to_batches()[0]
@@ -153,7 +153,7 @@ class NearReader:
         return known
 
     def _profiles(self, file: NearFile, group: int, span: tuple[int, int]) -> pa.RecordBatch | None:
-        """Rows of a row group within a span of epochs, no closer than is wanted; None where there is none."""
+        """Returns rows of a row group within a span of epochs, no closer than is wanted; None where there are none."""
         batch = self._batch(file, group)
         column = batch.column("epoch_gps_ns").to_numpy()
         rows = np.flatnonzero((column >= span[0]) & (column <= span[1]))
@@ -165,7 +165,7 @@ class NearReader:
         return batch.slice(int(rows[0]), rows.size) if rows[-1] - rows[0] + 1 == rows.size else batch.take(rows)
 
     def _every(self, source: ReadingSource, epochs_gps_ns: Int64) -> int:
-        """Of each so many profiles in a row one is enough."""
+        """Returns the stride by which profiles are thinned."""
         trajectory = self._placer.trajectory(source)
         if not self._apart_m or trajectory is None or epochs_gps_ns.size < 3:
             return 1
@@ -229,7 +229,7 @@ class PlacedReadings:
     """(r,)"""
 
     def chosen(self, which: npt.NDArray[np.bool_]) -> PlacedReadings:
-        """Some of them; of returns, whose rows are their own, those rows alone."""
+        """Returns a subset; of lidar returns also the rows, which are one each."""
         points, intensity, row = self.points_m[which], self.intensity[which], self.row[which]
         if len(which) == self.epoch_gps_ns.size and len(row) < len(which):
             return PlacedReadings(points, intensity, np.arange(row.size), self.epoch_gps_ns[row])
@@ -237,7 +237,7 @@ class PlacedReadings:
 
     @classmethod
     def joined(cls, parts: Sequence[PlacedReadings]) -> PlacedReadings:
-        """All of them, in order."""
+        """Returns all of them, in order."""
         if not parts:
             return cls(np.zeros((0, 3)), np.zeros(0, np.uint16), np.zeros(0, np.int64), np.zeros(0, np.int64))
         first = np.cumsum([0, *(p.epoch_gps_ns.size for p in parts[:-1])])
@@ -250,7 +250,7 @@ class PlacedReadings:
 
 
 def placed_readings(batch: pa.RecordBatch, source: ReadingSource, placement: Placement) -> PlacedReadings:
-    """Readings of rows of a source's table that no filter leaves out."""
+    """Returns readings from rows of a source's table that no filter leaves out."""
     geometry = geometry_of(source)
     if geometry is None:
         placed = placement.returns(batch, EVERYWHERE)
@@ -270,7 +270,7 @@ def placed_readings(batch: pa.RecordBatch, source: ReadingSource, placement: Pla
 
 
 def _ranked(numbers: Int64) -> tuple[Int64, Int64]:
-    """Distinct numbers, ascending, and the rank (n,) of each among them; numbers that ascend need no sorting."""
+    """Returns distinct numbers, ascending, and the rank (n,) of each among them; ascending numbers need no sorting."""
     step = np.diff(numbers)
     if (step < 0).any():
         return np.unique(numbers, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Tables and pictures of an adjustment: written whole, recorded in the manifest with its key."""
+"""Tables and pictures of an adjustment: written as a whole, recorded in the manifest with its key."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from roadscan.store.writer import parquet_bytes
 
 ADJUSTMENT: Final = "adjustment"
 SOLUTION: Final = "solution"
-"""Name and unit in the manifest of the solution; it has no file of its own."""
+"""Name and unit in the manifest of the solution, which has no separate file."""
 TABLES: Final = (
     "tie_residuals", "control_residuals", "relative_accuracy", "absolute_accuracy", "accuracy_by_distance",
 )  # fmt: skip
@@ -39,13 +39,13 @@ _FILES: Final = {_WHOLE: "adjustment", SEAMS: "seams"}
 
 
 def known_lines(manifest: Manifest) -> list[str]:
-    """What the last solution said, in words."""
+    """Returns the lines of the last solution."""
     record = manifest.get(ADJUSTMENT, SOLUTION)
     return [] if record is None else list(record.figures()["lines"])
 
 
 def known_findings(manifest: Manifest) -> list[Finding]:
-    """What it found wrong."""
+    """Returns the findings of the last solution."""
     record = manifest.get(ADJUSTMENT, SOLUTION)
     return [] if record is None else [Finding.of(one) for one in record.figures()["findings"]]
 
@@ -91,7 +91,7 @@ def keep_pictures(
 
 
 def _target_name(row: Mapping[str, Any]) -> str:
-    """Number of the point, run and GPS second: names of points may hold what no file name may."""
+    """Returns number of the point, run and GPS second: names of points may contain characters that no file name may."""
     return f"{row['point']:05d}-{row['run']}-{row['epoch_gps_ns'] // 1_000_000_000}"
 
 

@@ -1,4 +1,4 @@
-"""The table `corrections`: what the stage wrote, what others did, and what of a new solution changes it."""
+"""The table `corrections`: rows of this stage and of other programs, and their update by a new solution."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _WRITER: Final = "adjust"
 
 
 def foreign_runs(store: Store) -> set[str]:
-    """Runs whose corrections another program wrote."""
+    """Returns runs whose corrections another program wrote."""
     table = read_small(store, "corrections")
     if table is None:
         return set()
@@ -31,7 +31,7 @@ def foreign_runs(store: Store) -> set[str]:
 
 
 def publish(store: Store, solved: Mapping[str, Corrections], config: AdjustConfig) -> dict[str, Corrections]:
-    """Bring the table up to date with a solution; returns what holds now of its runs.
+    """Update the table with a solution; returns the current corrections of its runs.
 
     Runs that have no solution any more lose their corrections, those of other programs stay.
     """
@@ -55,7 +55,7 @@ def publish(store: Store, solved: Mapping[str, Corrections], config: AdjustConfi
 
 
 def digests_of(store: Store) -> list[str]:
-    """Digests of the tables `corrections` and `mounting_corrections` as they are; "" without one."""
+    """Returns digests of the tables `corrections` and `mounting_corrections` as they are; "" without one."""
     paths = [small_path(name) for name in ("corrections", "mounting_corrections")]
     return [hashlib.blake2b(store.read_bytes(p), digest_size=8).hexdigest() if store.exists(p) else "" for p in paths]
 

@@ -1,4 +1,4 @@
-"""Seams to look at: the place where two passes differed most before the adjustment, and a typical one."""
+"""Seams that are drawn: the place where two passes differed most before the adjustment, and a typical one."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _CHOSEN: Final = ("the worst seam before", "a typical seam")
 
 @dataclass(frozen=True)
 class SeamTask:
-    """A place and the two passes that are to be seen there."""
+    """A place and the two passes that are compared there."""
 
     chosen: str
     """Why it was chosen."""
@@ -39,7 +39,7 @@ class SeamTask:
     ends: tuple[Traverse, Traverse]
     corrections: tuple[Corrections | None, Corrections | None]
     mountings: tuple[tuple[MountingChange, Seat] | None, tuple[MountingChange, Seat] | None]
-    """Change of the mounting of each sensor, and its lever arm."""
+    """Correction of the mounting of each sensor, and its lever arm."""
 
 
 def shown_seams(
@@ -49,9 +49,9 @@ def shown_seams(
     held: tuple[Held, MountingChanges],
     compute: Compute,
 ) -> tuple[list[ShownSeam], list[str]]:
-    """What is to be drawn of the chosen seams, and why one is missing where its readings could not be read.
+    """Returns the chosen seams, and why one is missing where its readings could not be read.
 
-    held : corrections of runs, and changes of mountings.
+    held : current corrections of runs, and of mountings.
     """
     wanted = list(seam_tasks(tasks, evidence, solution, *held))
     found: dict[str, ShownSeam] = {}
@@ -71,7 +71,7 @@ def seam_tasks(
     held: Held,
     changes: MountingChanges,
 ) -> Iterator[SeamTask]:
-    """The height tie that differed most of those that count, and the one in the middle of them by their size."""
+    """Yields the height tie that differed most of those that count, and the one of median size."""
     observations, columns = evidence.ties.observations, evidence.ties.columns
     counting = (observations.kind == KINDS.index(HEIGHT)) & (solution.tie_weight > 0.0)
     rows = np.flatnonzero(counting)

@@ -1,4 +1,4 @@
-"""From evidence to corrections: what enters, what is solved, what of the control is wrong."""
+"""From evidence to corrections: selection of the evidence, the adjustment, and wrong control."""
 
 from __future__ import annotations
 
@@ -62,25 +62,25 @@ Bool = npt.NDArray[np.bool_]
 
 _WIDENED: Final = 3
 """Adjustments, at most, until no mounting is off by more than its σ allows."""
-_NONE: Final = (GaussMarkov(0.0, 1.0),) * 6
+_NONE: Final = (GaussMarkov(0.0, 1.0),) * 6  # processes of a run without readings
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that the adjustment knows."""
+    """All evidence of the adjustment."""
 
     runs: tuple[str, ...]
-    """Of the survey; observations count them so."""
+    """Runs of the survey, by which observations number them."""
     priors: tuple[RunPrior, ...]
     """Of each of them; without σ where a run is not adjusted."""
     ties: KnownTies
     sightings: tuple[Sighting, ...]
     mounted: Mounted
     useless: frozenset[int] = frozenset()
-    """Runs whose readings are not where they seem: neither their ties nor their control counts."""
+    """Runs whose readings are misplaced: neither their ties nor their control counts."""
 
     def seen_by(self, one: Sighting) -> SeenBy:
-        """The sensor that saw a point."""
+        """Returns the sensor that saw a point."""
         if one.status == "unseen":
             return SeenBy(-1, NO_SEAT)
         seat = self.mounted.seat(self.runs[one.run], one.sensor, one.epoch_gps_ns)
@@ -89,21 +89,21 @@ class Evidence:
 
 @dataclass(frozen=True)
 class PointFigures:
-    """What the adjustment says of a control point, or of one in one run where each run is adjusted alone."""
+    """Figures of a control point, or of one in one run where each run is adjusted alone."""
 
     weight_height: float
     weight_horizontal: float
     left_out_height_m: float
-    """Surveyed height minus what all others say."""
+    """Surveyed height minus its prediction without the point."""
     left_out_horizontal_m: Float64
-    """(2,) surveyed minus the others, north and east."""
+    """(2,) surveyed place minus that prediction, north and east."""
     left_out_sigma_m: Float64
     """(3,) 1 σ, north, east, down."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Corrections, and what they say of the evidence."""
+    """Corrections, and figures of the evidence."""
 
     corrections: Mapping[str, Corrections]
     """Of the runs that evidence reaches."""
@@ -114,22 +114,22 @@ class Solution:
     control: Observations
     """Of all sightings, check points too."""
     findings: tuple[Finding, ...]
-    """What is wrong with control, runs and stated σ."""
+    """Findings on control, runs and stated σ."""
     lines: tuple[str, ...]
-    """What the solution says of itself."""
+    """Lines that describe the solution."""
     left_out: LeaveOneOut | None = None
     datum: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Poses minus control as a whole, and 1 σ of the datum (m): see :func:`datum_figures`."""
     mountings: MountingErrors | None = None
-    """What is wrong with the mountings of the sensors; None where they are not estimated."""
+    """Errors of the sensors' mountings; None where they are not estimated."""
 
     def point(self, number: int, run: int) -> PointFigures | None:
-        """Figures of a point as a run saw it."""
+        """Returns figures of a point as a run saw it."""
         return self.points.get((number, -1)) or self.points.get((number, run))
 
 
 def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[RunPrior, ...]:
-    """Errors of the recorded poses of each run; of a run without readings there are none."""
+    """Returns errors of the recorded poses of each run; of a run without readings there are none."""
     config, found = AdjustConfig.of(plan.survey).priors, []
     for run in runs:
         own = [(s, files) for s, files in sources if s.run == run]
@@ -153,7 +153,7 @@ def _stated(plan: SurveyPlan, trajectory: TrajectorySource) -> StatedSigma | Non
 def _processes(
     config: PosePriors, stated: StatedSigma | None
 ) -> tuple[GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov, GaussMarkov]:
-    """Those of the settings, with the median of the σ that the logs state of a component."""
+    """Returns the processes of the settings, with the median of the σ that the logs state of a component."""
     assumed = np.array(
         [
             config.sigma_horizontal_m,
@@ -173,7 +173,7 @@ def _processes(
 
 
 def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
-    """Corrections of all runs that evidence reaches.
+    """Returns corrections of all runs that evidence reaches.
 
     Raises
     ------
@@ -234,7 +234,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
 
 
 def _left_out(control: ControlErrors, first: int, evidence: Evidence) -> LeaveOneOut | None:
-    """Accuracy at each GCP against all others; a line, which binds across it alone, is none."""
+    """Returns the accuracy at each GCP from all others; a line, which binds across it alone, is no GCP."""
     lines = {one.point.number for one in evidence.sightings if one.point.is_of_line}
     own = control.chosen(~np.isin(control.place - first, list(lines)))
     return leave_one_out(own) if own.place.size else None
@@ -250,7 +250,7 @@ def _entering(evidence: Evidence) -> Bool:
 def _adjusted(
     config: AdjustConfig, evidence: Evidence, control: Observations, mode: Literal["joint", "each_pass", "vertical"]
 ) -> tuple[Adjustment, int, tuple[Cause, ...]]:
-    """The adjustment of ties and control, the place that stands for point 0, and what may be wrong with mountings.
+    """Returns the adjustment of ties and control, the place that stands for point 0, and possible faults of mountings.
 
     A mounting that is off by more than its stated σ allows would be held back by it: such a σ is taken to be as large
     as what was found, and the adjustment is made once more. Control that is off as a whole looks like lever arms of all
@@ -292,19 +292,19 @@ def _adjusted(
 
 
 def _without(sigma: Float64, axes: Sequence[int]) -> Float64:
-    """σ (7,) of a mounting, and 0 for components that are not to be estimated."""
+    """Returns σ (7,) of a mounting, with 0 for components that are not to be estimated."""
     return np.where(np.isin(np.arange(sigma.size), axes), 0.0, sigma)
 
 
 def _counting_points(control: ControlErrors) -> set[int]:
-    """Points of which a survey counts."""
+    """Returns points of which a survey counts."""
     return set(control.place[(control.weight > 0.0).any(axis=1)].tolist())
 
 
 def _not_held(
     evidence: Evidence, links: Int32, control: Observations, points: Mapping[tuple[int, int], PointFigures]
 ) -> list[Finding]:
-    """Runs that nothing holds, by ties that count and by points that do."""
+    """Returns runs that nothing determines, by ties and points that count."""
     right = {number for (number, _), own in points.items() if own.weight_height != 0.0 or own.weight_horizontal != 0.0}
     held = {int(run) for run, point in zip(control.run.max(axis=1), control.place, strict=True) if int(point) in right}
     held |= {number for number, prior in enumerate(evidence.priors) if prior.fixed}
@@ -313,7 +313,7 @@ def _not_held(
 
 
 def _by_observation(sightings: Sequence[Sighting]) -> list[Sighting]:
-    """The sighting of each observation of :func:`observations_of`."""
+    """Returns the sighting of each observation of :func:`observations_of`."""
     return [one for one in sightings for _ in range(one.observed)]
 
 
@@ -327,7 +327,7 @@ def _with_sigma(found: Adjustment, run: int) -> Corrections:
 
 
 def _points(control: ControlErrors, first: int) -> dict[tuple[int, int], PointFigures]:
-    """Figures by number of the point and run; `first` : place that stands for point 0."""
+    """Returns figures by number of the point and run; `first` : place that stands for point 0."""
     points: dict[tuple[int, int], PointFigures] = {}
     for k, (place, run) in enumerate(zip(control.place.tolist(), control.run.tolist(), strict=True)):
         points[place - first, run] = PointFigures(
@@ -349,7 +349,7 @@ def _far_findings(far: Mapping[str, float], evidence: Evidence) -> list[Finding]
 
 
 def _wrong(sightings: Sequence[Sighting], adjusted: Adjustment, first: int) -> list[WrongPoint]:
-    """Points whose height or place is wrong, by name."""
+    """Returns points whose height or place is wrong, by name."""
     by_number, control = {one.point.number: one.point for one in sightings}, adjusted.control
     found: list[WrongPoint] = []
     for one in adjusted.verdict.wrong:
@@ -364,7 +364,7 @@ def _wrong(sightings: Sequence[Sighting], adjusted: Adjustment, first: int) -> l
 
 
 def _aside_m(point: ControlPoint, away_m: Float64) -> float:
-    """How far a surveyed place lies from another (3,; north, east, down): across its line where it stands for one."""
+    """Returns the distance of a surveyed place from another (3,; north, east, down): across its line, if it has one."""
     if isinstance(point.shape, SurveyedLine):
         sine, cosine = np.sin(point.shape.azimuth_rad), np.cos(point.shape.azimuth_rad)
         return abs(float(away_m[1] * cosine - away_m[0] * sine))
@@ -374,12 +374,12 @@ def _aside_m(point: ControlPoint, away_m: Float64) -> float:
 def _rigid_solution(
     plan: SurveyPlan, evidence: Evidence, control: Observations, entering: Bool, found: list[Finding]
 ) -> Solution:
-    """The survey as a whole, shifted and turned onto its control."""
+    """Returns the survey as a whole, shifted and turned onto its control."""
     config = AdjustConfig.of(plan.survey)
     fit = _rigid_fit(evidence, entering, config.control.false_alarm)
     points = _points(fit.control, 0)
     found += wrong_points(_left_out_of(evidence.sightings, points))
-    # What poses and ties say of the control as a whole; a rigid movement follows the control whatever they say.
+    # Poses and ties test the control as a whole; a rigid transformation follows the control in any case.
     following = config.model_copy(update={"control": config.control.model_copy(update={"datum_offset": "follow"})})
     adjusted, _, _ = _adjusted(following, evidence, control.chosen(entering), "joint")
     found += offset_findings(adjusted.verdict, adjusted.applied, len(points))
@@ -400,7 +400,7 @@ def _rigid_solution(
 
 
 def _left_out_of(sightings: Sequence[Sighting], points: Mapping[tuple[int, int], PointFigures]) -> list[WrongPoint]:
-    """Points that a rigid movement leaves out as a whole, by name."""
+    """Returns points that a rigid transformation leaves out as a whole, by name."""
     by_number = {one.point.number: one.point for one in sightings}
     wrong: list[WrongPoint] = []
     for (number, _), own in points.items():
@@ -413,7 +413,7 @@ def _left_out_of(sightings: Sequence[Sighting], points: Mapping[tuple[int, int],
 
 
 def _rigid_fit(evidence: Evidence, entering: Bool, false_alarm: float) -> RigidFit:
-    """The one rigid movement of the survey onto its targets."""
+    """Returns the one rigid transformation of the survey onto its targets."""
     sightings = _by_observation(evidence.sightings)
     own = {id(sightings[k]): sightings[k] for k in np.flatnonzero(entering)}.values()
     seen = [one for one in own if one.is_placed and np.isfinite(one.height_m) and not one.point.is_of_line]
@@ -428,7 +428,7 @@ def _epoch(one: Sighting) -> Int64:
 def _rigid_corrections(
     plan: SurveyPlan, evidence: Evidence, fit: RigidFit
 ) -> tuple[dict[str, Corrections], float]:  # fmt: skip
-    """A rigid movement as corrections of each run, and the largest σ of a height to the side of the vehicles."""
+    """Returns a rigid transformation as corrections of each run, and the largest σ of a height beside the vehicles."""
     corrections: dict[str, Corrections] = {}
     config, largest = AdjustConfig.of(plan.survey), 0.0
     for prior in evidence.priors:

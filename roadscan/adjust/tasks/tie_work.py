@@ -1,4 +1,4 @@
-"""Ties of a survey: tasks over some places each, a file of the table `ties` for each task."""
+"""Ties of a survey: each task covers some places and writes one file of the table `ties`."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ TIES: Final = "ties"
 _PLACES: Final = 50
 """Places of a task: a quarter of a kilometre of one road at the usual spacing."""
 _SEAM_CELLS: Final = 40
-"""A seam is compared where both heads saw so many cells: a strip that is one cell wide holds 160 along 4 m."""
+"""Least number of cells that both heads saw at a seam: a strip that is one cell wide has 160 along 4 m."""
 DIAGONAL: Final = 1.5
-"""Readings are kept within this many radii of a place: the square's corners, and some margin."""
+"""Readings are taken within this many radii of a place: the square's corners, and some margin."""
 _APART: Final = 0.25
-"""Profiles that lie closer than this share of a cell of the pictures say the same; some are left out."""
+"""Profiles are thinned to at most this spacing, as a share of an image's cell."""
 _SHIFTS: Final = tuple(f"{end}_by_{axis}" for end in ("first", "second") for axis in ("forward", "right", "down"))
 _ARMS: Final = ("first_arm_along_m", "second_arm_along_m")
 _TRIED: Final = (
@@ -54,7 +54,7 @@ _TURNS: Final = tuple(
 
 @dataclass(frozen=True)
 class TieTask:
-    """Some places, and the row groups that saw them; it holds no data."""
+    """Some places, and the row groups that saw them; it carries no data."""
 
     store: Store
     ground: MapSettings
@@ -64,19 +64,19 @@ class TieTask:
     files: tuple[NearFile, ...]
     key: str
     round: int = 0
-    """Of the solution that says where the readings lie; 0: the recorded poses do."""
+    """Round whose solution places the readings; 0: the recorded poses do."""
     shifts_m: tuple[tuple[Shift, ...], ...] = ()
-    """Of each place and traverse: how far that solution moves it; none in round 0."""
+    """Shift of each place's traverses by that solution; none in round 0."""
 
     @property
     def unit(self) -> str:
-        """Its name in the manifest: the number of its first place, and the round."""
+        """Returns its name in the manifest: the number of its first place, and the round."""
         again = f"-round-{self.round}" if self.round else ""
         return f"places-{self.places[0].number:07d}{again}"
 
     @property
     def bytes(self) -> int:
-        """Compressed bytes to read, about."""
+        """Returns the approximate number of compressed bytes to read."""
         return sum(one.bytes for one in self.files)
 
 
@@ -88,9 +88,9 @@ def tie_tasks(
     settings: TieSettings,
     again: tuple[int, Sequence[tuple[Shift, ...]]] = (0, ()),
 ) -> list[TieTask]:
-    """Tasks over all places, each with a key of what its ties depend on.
+    """Returns tasks over all places, each with a key of what its ties depend on.
 
-    again : round, and shifts of each place's traverses; none where the recorded poses say where readings lie.
+    again : round, and shifts of each place's traverses; none where the recorded poses place the readings.
     """
     code, (number, shifts) = code_digest(f"{__name__}:collect_ties"), again
     shaping = [code, settings.model_dump(mode="json"), plan.ground.max_gap_s, runs]
@@ -105,7 +105,7 @@ def tie_tasks(
 
 
 def collect_ties(task: TieTask) -> OutputRecord:
-    """Compare the passes at some places and write what was found (runs on a worker)."""
+    """Compare the passes at some places and write the ties (runs on a worker)."""
     reader = NearReader(task.store, task.ground, task.files, task.runs, _APART * task.settings.shift_cell_m)
     moves = zip(task.places, task.shifts_m or [None] * len(task.places), strict=True)
     found = Ties.joined([ties_of(reader, place, task.settings, shifts) for place, shifts in moves])
@@ -119,7 +119,7 @@ def collect_ties(task: TieTask) -> OutputRecord:
 
 
 def ties_of(reader: NearReader, place: Place, settings: TieSettings, shifts_m: Sequence[Shift] | None = None) -> Ties:
-    """Ties of a place, of traverses that may be shifted, told as the recorded poses place them."""
+    """Returns ties of a place, of traverses that may be shifted, expressed in the recorded poses."""
     if place.seam:
         settings = settings.model_copy(update={"least_cells": min(settings.least_cells, _SEAM_CELLS)})
     if shifts_m is None:
@@ -149,7 +149,7 @@ def _shift_at(known: Sequence[tuple[Traverse, npt.NDArray[Any]]], epoch_gps_ns: 
 
 
 def _rows(found: Ties, runs: Sequence[str], number: int) -> pa.Table:
-    """Ties as rows of the table, by place and group; what is not a number is empty."""
+    """Returns ties as rows of the table, by place and group; NaN becomes null."""
     columns: dict[str, npt.NDArray[Any]] = dict(found.columns)
     columns["round"] = np.full(found.observations.size, number, np.uint8)
     named = np.array([*runs, ""], dtype=object)
@@ -172,7 +172,7 @@ def _by_mounting(
     geometry: tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]],
     mounted: Mounted,
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
-    """Number (n,) of the sensor of one end, and derivatives (n, 7) by its mounting.
+    """Returns the number (n,) of the sensor of one end, and derivatives (n, 7) by its mounting.
 
     geometry : derivatives by a shift and by a turn of the pose, body axes, the arm along the direction, and epochs.
     """
@@ -194,19 +194,19 @@ class KnownTies:
 
     observations: Observations
     columns: Mapping[str, npt.NDArray[Any]]
-    """(n,) of the table, those that the quality figures need."""
+    """(n,) columns of the table that the quality figures need."""
     tried: Mapping[str, npt.NDArray[Any]]
-    """(m,) the same of all comparisons, those too that measured nothing."""
+    """(m,) the same of all comparisons, including those that measured nothing."""
 
     @property
     def accepted(self) -> npt.NDArray[np.bool_]:
-        """(n,) ties that passed their tests."""
+        """Returns a mask (n,) of the ties that passed their tests."""
         return np.asarray(self.columns["accepted"] == 1)
 
     def of_seams(self, places: Set[int], sigma_m: float) -> KnownTies:
-        """The same, heights of heads of one pass as ties of a kind of their own.
+        """Returns the same with heights of heads of one pass as a separate kind of ties.
 
-        Those of two heads at some places have an error in common: what they say together is known no better than it.
+        Those of two heads at some places share an error: their mean is known no better than it.
         """
         own = np.isin(self.observations.place, list(places)) & self.of_heads
         names = ("first_run", "first_sensor", "second_sensor", "kind")
@@ -219,7 +219,7 @@ class KnownTies:
         return replace(self, observations=replace(self.observations, sigma_m=sigma, kind=kind))
 
     def with_more(self, other: KnownTies, which: npt.NDArray[np.bool_]) -> KnownTies:
-        """These, and some (n,) ties of another collection of tasks."""
+        """Returns these with some ties (n,) of another collection of tasks."""
         if not which.any():
             return self
         observations = Observations.joined([self.observations, other.observations.chosen(which)])
@@ -227,12 +227,12 @@ class KnownTies:
         return replace(self, observations=observations, columns=columns)
 
     def refused(self, which: npt.NDArray[np.bool_]) -> KnownTies:
-        """The same, where some (n,) do not count."""
+        """Returns the same without some (n,)."""
         return replace(self, columns={**self.columns, "accepted": np.where(which, 0, self.columns["accepted"])})
 
     @property
     def of_heads(self) -> npt.NDArray[np.bool_]:
-        """(n,) ties between heads of one pass: they say nothing of poses, and much of mountings."""
+        """Returns a mask (n,) of ties between heads of one pass: they do not constrain poses, but mountings."""
         apart = self.columns["first_sensor"] != self.columns["second_sensor"]
         return np.asarray((self.columns["why_not"] == SAME_PASS) & apart)
 
@@ -240,7 +240,7 @@ class KnownTies:
 def load_ties(
     store: Store, manifest: Manifest, tasks: Sequence[TieTask], runs: Sequence[str], mounted: Mounted
 ) -> KnownTies:
-    """Ties of some tasks, in order, those of the last round of each place; runs are counted as in `runs`, sensors as in
+    """Ties of some tasks, in order, those of the last round of each place; runs are numbered as in `runs`, sensors
     `mounted`.
     """
     records = [r for task in tasks if (r := manifest.get(TIES, task.unit)) is not None and r.path]

@@ -1,8 +1,8 @@
-"""Ties that are observed again where the solution says that the passes lie, and larger patches before the first one.
+"""Ties that are measured again after the solution moved the passes, and larger patches before the first solution.
 
-Poses of two passes may lie decimetres apart. What is then compared is not one place of the road: shifts are not found,
-and heights are those of neighbouring spots. So the solution of the first ties says where to look again, until no place
-moves by more than a share of its patch. Where too few places match to begin with, larger patches are sought first.
+Poses of two passes may lie decimetres apart. Then the compared patches are not one place of the road: shifts are not
+found, and heights are those of neighbouring spots. So places are measured again where the solution puts them until no
+place moves by more than a share of its patch. Where too few match to begin with, larger patches are sought first.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from roadscan.poses.trajectory import Corrections
 Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]
 
-_STILL: Final[Shift] = (0.0, 0.0, 0.0)
+_STILL: Final[Shift] = (0.0, 0.0, 0.0)  # No shift (m).
 _STEP_M: Final = 0.001
-"""Shifts are rounded to this, so that a solution that changes by less leaves what was observed as it is."""
+"""Step to which shifts are rounded (m), so that smaller changes of a solution keep the evidence."""
 
 
 TIES_SETTLED: Final = Witness(
@@ -57,50 +57,50 @@ RUNS_APART: Final = Witness(
     told=("findings",),
 )
 _APART: Final = 4.0
-"""Two passes that are so many σ apart contradict their σ: one of 16,000 does by chance."""
+"""Two passes this many σ apart contradict their σ: one of 16,000 does by chance."""
 
 Observe = Callable[[Sequence[TieTask]], None]
-"""Brings the ties of some tasks up to date."""
+"""Function that updates the ties of some tasks."""
 Load = Callable[[Sequence[TieTask]], KnownTies]
-"""Ties of tasks that are up to date."""
+"""Function that returns ties of tasks that are up to date."""
 Solve = Callable[[KnownTies, Sequence[ControlTask]], Solution]
-"""The solution of ties and of what passes see of control points, which tasks bring up to date first."""
+"""Function that returns the solution of ties and of sightings of control points, whose tasks it updates first."""
 
 
 @dataclass(frozen=True)
 class Again:
-    """What is observed, and with which shifts it was observed last."""
+    """Tasks of all rounds, and the shifts with which places were measured last."""
 
     tasks: tuple[TieTask, ...]
-    """Of all rounds, in their order."""
+    """Tasks of all rounds, in order."""
     ties: KnownTies
-    """Those that count, with larger patches where these are needed."""
+    """Ties that count, with larger patches where these are needed."""
     larger: tuple[TieTask, ...] = ()
     """Tasks of larger patches."""
     control: tuple[ControlTask, ...] = ()
-    """Tasks that look at control points, of all rounds."""
+    """Tasks of control points, of all rounds."""
     far: KnownTies | None = None
-    """What these found."""
+    """Ties of the larger patches."""
     shifts: Mapping[int, tuple[Shift, ...]] = field(default_factory=dict)
-    """Of the traverses of each place that was observed again, by its number."""
+    """Shifts of the traverses of each place that was measured again, by its number."""
     counts: tuple[int, ...] = ()
-    """Places that were observed again, of each round."""
+    """Number of places that were measured again, for each round."""
     misplaced: Mapping[str, Float64] = field(default_factory=dict)
-    """Runs whose σ do not hold that they lie so far (3,; m) from others."""
+    """Runs that lie so far (3,; m) from others that their σ exclude it."""
     findings: tuple[Finding, ...] = ()
-    """On these."""
+    """Findings on these."""
 
     @property
     def every(self) -> tuple[TieTask, ...]:
-        """All tasks."""
+        """Returns all tasks."""
         return (*self.tasks, *self.larger)
 
     def places(self) -> list[Place]:
-        """Each of them, as it was observed first."""
+        """Returns each place, as it was measured first."""
         return [place for task in self.tasks if task.round == 0 for place in task.places]
 
     def line(self) -> str:
-        """Rounds in words; "" where nothing was observed again."""
+        """Returns the rounds in words; "" where nothing was measured again."""
         told = f"ties observed again where the solution puts the passes: {', then '.join(map(str, self.counts))} places"
         return told if self.counts else ""
 
@@ -112,7 +112,7 @@ def first_ties(
     control: Sequence[ControlTask],
     tools: tuple[Observe, Load],
 ) -> Again:
-    """Ties where the recorded poses say, and of larger patches where these agree that passes lie elsewhere."""
+    """Returns ties in the recorded poses, and of larger patches where these agree that passes lie elsewhere."""
     observe, load = tools
     observe(tasks)
     ties = load(tasks)
@@ -123,7 +123,7 @@ def first_ties(
     far = load(larger)
     kept, apart = _agreed(far, ties, AdjustConfig.of(plan.survey), _sigmas(plan, sources))
     misplaced, findings = _contradicted(plan, sources, ties, apart)
-    # What was matched where two passes lie apart is not one place of the road.
+    # Matches of passes that lie apart are not of one place of the road.
     joined = ties.refused(_of_pairs(ties, apart)).with_more(far, kept)
     return Again(
         tuple(tasks), joined, tuple(larger), tuple(control), far, misplaced=misplaced, findings=tuple(findings)
@@ -133,7 +133,7 @@ def first_ties(
 def settled(
     plan: SurveyPlan, sources: Sources, again: Again, tools: tuple[Observe, Load, Solve]
 ) -> tuple[Again, Solution, list[Finding]]:
-    """The solution whose ties lie where it says, and what was observed for it."""
+    """Returns the solution that agrees with the positions of its ties, and what was measured for it."""
     config, (observe, load, solve) = AdjustConfig.of(plan.survey), tools
     solution = solve(again.ties, again.control)
     tied, findings = config.mode in ("joint", "vertical"), list[Finding]()
@@ -162,7 +162,7 @@ def settled(
 
 
 def _larger_patches(plan: SurveyPlan, sources: Sources, tasks: Sequence[TieTask], ties: KnownTies) -> list[TieTask]:
-    """Tasks for larger patches of all pairs of runs that share places; their places are numbered on."""
+    """Returns tasks for larger patches of all pairs of runs that share places; numbering of their places continues."""
     config, runs = AdjustConfig.of(plan.survey), runs_of(plan)
     known = {place.number: place for task in tasks for place in task.places}
     first, found = 1 + max(known, default=-1), list[Place]()
@@ -179,7 +179,7 @@ def _larger_patches(plan: SurveyPlan, sources: Sources, tasks: Sequence[TieTask]
 
 
 def _larger(config: AdjustConfig) -> TieSettings:
-    """How larger patches are compared: coarser, farther apart, with σ of centimetres."""
+    """Returns settings for larger patches: coarser, farther apart, with σ of centimetres."""
     own = config.again
     return config.ties.model_copy(update={
         "cell_m": own.cell_m, "shift_cell_m": own.cell_m, "search_m": own.search_m, "most_apart_m": own.search_m,
@@ -189,21 +189,21 @@ def _larger(config: AdjustConfig) -> TieSettings:
 
 
 def _spread(places: Sequence[Place], config: AdjustConfig) -> list[Place]:
-    """Some of the places, about evenly along the road."""
+    """Returns some of the places, about evenly along the road."""
     wanted = max(config.again.least, round(len(places) * 1000.0 / config.places.per_km / config.again.each_m))
     rows = np.unique(np.linspace(0, len(places) - 1, min(wanted, len(places))).round().astype(np.int64))
     return [places[k] for k in rows.tolist()]
 
 
 def _of_pair(place: Place, runs: tuple[int, int]) -> list[Traverse]:
-    """A traverse of each of two runs; the first and the last one of a run that comes by again."""
+    """Returns a traverse of each of two runs; the first and the last one of a run that passes again."""
     first = next((t for t in place.traverses if t.run == runs[0]), None)
     last = next((t for t in reversed(place.traverses) if t.run == runs[1]), None)
     return [] if first is None or last is None or first is last else [first, last]
 
 
 def _widened(traverse: Traverse, times: float, config: AdjustConfig) -> Traverse:
-    """The same over so many times its length, and no longer than a place may take."""
+    """Returns the same over so many times its length, and no longer than a place may take."""
     middle = (traverse.first_gps_ns + traverse.last_gps_ns) // 2
     half = 0.5 * min(times * (traverse.last_gps_ns - traverse.first_gps_ns), config.places.longest_s * NS_PER_S)
     return replace(traverse, first_gps_ns=middle - round(half), last_gps_ns=middle + round(half))
@@ -212,7 +212,7 @@ def _widened(traverse: Traverse, times: float, config: AdjustConfig) -> Traverse
 def _contradicted(
     plan: SurveyPlan, sources: Sources, ties: KnownTies, apart: Mapping[tuple[str, str], Float64]
 ) -> tuple[dict[str, Float64], list[Finding]]:
-    """Runs that lie farther from others than their σ allow, by how much (3,), and findings on them."""
+    """Returns runs that lie farther from others than their σ allow, by how much (3,), and findings on them."""
     runs, config = runs_of(plan), AdjustConfig.of(plan.survey)
     sigma = _sigmas(plan, sources)
     found = misplaced(runs, places_of_pairs(ties.tried).keys() - apart.keys(), apart, config.fixed)
@@ -242,12 +242,12 @@ def _apart_finding(runs: tuple[str, ...], told: Sequence[str]) -> Finding:
 
 
 def _sigmas(plan: SurveyPlan, sources: Sources) -> dict[str, Float64]:
-    """Usual 1 σ (3,) of the recorded positions of each run, north, east, down."""
+    """Returns the usual 1 σ (3,) of the recorded positions of each run, north, east, down."""
     return {one.run: one.sigmas[:3] for one in priors_of(plan, sources, runs_of(plan))}
 
 
 def _still_needed(plan: SurveyPlan, sources: Sources, ties: KnownTies, larger: KnownTies) -> KnownTies:
-    """The ties, and those of larger patches of pairs of runs that still do not match."""
+    """Returns the ties, and those of larger patches of pairs of runs that still do not match."""
     kept, apart = _agreed(larger, ties, AdjustConfig.of(plan.survey), _sigmas(plan, sources))
     return ties.with_more(larger, kept & _of_pairs(larger, [p for p in apart if not is_matched(ties.tried, p)]))
 
@@ -255,7 +255,7 @@ def _still_needed(plan: SurveyPlan, sources: Sources, ties: KnownTies, larger: K
 def _agreed(
     larger: KnownTies, ties: KnownTies, config: AdjustConfig, sigmas: Mapping[str, Float64]
 ) -> tuple[Bool, dict[tuple[str, str], Float64]]:
-    """Which ties (n,) of larger patches count, and by pair of runs the shift that they agree on."""
+    """Returns a mask (n,) of the ties of larger patches that count, and by pair of runs their agreed shift."""
     tried, kept, apart = larger.tried, np.zeros(larger.observations.size, np.bool_), dict[tuple[str, str], Float64]()
     measured = np.isfinite(tried["value_m"].astype(np.float64)) & np.isfinite(tried["sigma_m"].astype(np.float64))
     for pair in places_of_pairs(tried):
@@ -272,7 +272,7 @@ def _agreed(
 
 
 def _of_pairs(ties: KnownTies, pairs: Iterable[tuple[str, str]]) -> Bool:
-    """Ties (n,) of some pairs of runs."""
+    """Returns ties (n,) of some pairs of runs."""
     own = np.zeros(ties.observations.size, np.bool_)
     for first, second in pairs:
         own |= (ties.columns["first_run"] == first) & (ties.columns["second_run"] == second)
@@ -282,8 +282,8 @@ def _of_pairs(ties: KnownTies, pairs: Iterable[tuple[str, str]]) -> Bool:
 def _places_again(
     plan: SurveyPlan, sources: Sources, again: Again, corrections: Mapping[str, Corrections]
 ) -> tuple[list[TieTask], dict[int, tuple[Shift, ...]], float]:
-    """Tasks for the places that a solution moves by too much since they were observed, their shifts, and by how much
-    most (m).
+    """Returns tasks for the places that a solution moves by too much since they were measured, their shifts, and the
+    largest move (m).
     """
     config, runs = AdjustConfig.of(plan.survey), runs_of(plan)
     chosen, shifts, largest_m = list[Place](), dict[int, tuple[Shift, ...]](), 0.0
@@ -291,7 +291,7 @@ def _places_again(
         own = tuple(_shift(corrections.get(runs[t.run]), t) for t in place.traverses)
         before = again.shifts.get(place.number, (_STILL,) * len(own))
         moved = np.array(own) - np.array(before)
-        # What lies beside the patch is not compared with it, and what lies far above it is refused.
+        # Only the part along the patch counts: readings beside it are not compared, and those far above are refused.
         aside_m, above_m = _extent(moved[:, :2]), float(np.ptp(moved[:, 2]))
         if aside_m > config.again.share * 2.0 * place.radius_m or above_m > 0.5 * config.ties.most_apart_m:
             largest_m = max(largest_m, aside_m, above_m)
@@ -307,7 +307,7 @@ def _places_again(
 def _points_again(
     plan: SurveyPlan, sources: Sources, again: Again, corrections: Mapping[str, Corrections]
 ) -> tuple[ControlTask, ...]:
-    """Tasks that look at control points, with those of points whose passes a solution moves by too much."""
+    """Returns tasks of control points, with those of points whose passes a solution moves by too much."""
     config, runs = AdjustConfig.of(plan.survey), runs_of(plan)
     least_m, seen, moves = config.again.share * 2.0 * config.places.radius_m, [], []
     last = {task.point.number: task for task in again.control}
@@ -333,5 +333,5 @@ def _shift(corrections: Corrections | None, traverse: Traverse) -> Shift:
 
 
 def _extent(moved: npt.NDArray[np.float64]) -> float:
-    """Largest distance between two of some points (n, 2)."""
+    """Returns the largest distance between two of some points (n, 2)."""
     return float(np.hypot(*(moved[:, None] - moved[None]).T).max())

@@ -1,4 +1,4 @@
-"""The way of each sensor in each run, and the strip of road that it saw: where passes can meet is told from these."""
+"""The path of each sensor in each run, and the strip of road that it saw, which show where passes can meet."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from roadscan.store.logs import DataFile
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_STEP_NS: Final = 50_000_000
+_STEP_NS: Final = 50_000_000  # Spacing of a track's poses (ns).
 _SAMPLES: Final = 6
-"""Row groups of a sensor whose readings show how far it sees."""
-_SAMPLE_ROWS: Final = 64
-_SAMPLE_RETURNS: Final = 20_000
+"""Row groups of a sensor from which its reach is measured."""
+_SAMPLE_ROWS: Final = 64  # Profiles of such a row group that are used.
+_SAMPLE_RETURNS: Final = 20_000  # Lidar returns of such a row group that are used.
 _LIDAR_REACH_M: Final = 12.0
-"""Of a lidar only what lies so near is compared between passes: farther off, returns are sparse."""
+"""Reach of a lidar for ties (m): farther off, returns are sparse."""
 
 
 def adjusted_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
-    """Readings that recorded poses place, by run and sensor.
+    """Returns readings that recorded poses georeference, by run and sensor.
 
-    Of a run with profiles, which are dense, these alone: returns of a lidar are for rigs that have nothing else.
+    Of a run with profiles, which are dense, only these: returns of a lidar are for rigs that have nothing else.
     """
     order = {run: number for number, run in enumerate(runs_of(plan))}
     own = [(s, files) for s, files in plan.sources if s.trajectory is not None and any(f.group_spans for f in files)]
@@ -42,18 +42,18 @@ def adjusted_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFi
 
 
 def runs_of(plan: SurveyPlan) -> tuple[str, ...]:
-    """Runs by name, whatever their order in the survey file; an adjustment counts them so."""
+    """Returns runs by name, whatever their order in the survey file; an adjustment numbers them so."""
     return tuple(sorted(run.id for run in plan.survey.config.runs))
 
 
 def span_of(source: ReadingSource, files: Sequence[DataFile]) -> tuple[int, int]:
-    """First and last epoch (GPS ns), on time, of a source."""
+    """Returns first and last epoch (GPS ns) of a source."""
     spans = source.spans([f.span for f in files if f.span is not None])
     return min(a for a, _ in spans), max(b for _, b in spans)
 
 
 def tracks_of(plan: SurveyPlan, sources: Sources) -> list[Track]:
-    """A track for each source that saw anything, in the order of `sources`."""
+    """Returns a track for each source that saw anything, in the order of `sources`."""
     runs = runs_of(plan)
     return [
         track
@@ -96,7 +96,7 @@ def _track(number: int, source: ReadingSource, swath: Swath, poses: LevelPoses, 
 
 
 def _swath(plan: SurveyPlan, source: ReadingSource, files: Sequence[DataFile]) -> Swath | None:
-    """The strip that some row groups of a source show, spread over its time; None where they show nothing."""
+    """Returns the strip that some row groups of a source show, spread over its time; None where they are empty."""
     groups = [(file, group) for file in files for group in range(len(file.group_rows))]
     chosen = sorted({round(k) for k in np.linspace(0, len(groups) - 1, min(_SAMPLES, len(groups)))})
     slices = [
@@ -122,5 +122,5 @@ def _swath(plan: SurveyPlan, source: ReadingSource, files: Sequence[DataFile]) -
 
 
 def _spread(count: int, most: int) -> Int64:
-    """About so many numbers below `count`, evenly spread."""
+    """Returns about so many numbers below `count`, evenly spread."""
     return np.arange(0, count, max(1, -(-count // most)))

@@ -1,1 +1,1 @@
-"""Ties: what two passes say of one another at a place."""
+"""Ties: measured differences between two passes at a place."""

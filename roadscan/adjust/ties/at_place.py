@@ -23,32 +23,32 @@ from roadscan.core.gpstime import NS_PER_S
 Float64 = npt.NDArray[np.float64]
 
 _PARTNERS: Final = 2
-"""Traverses that each one is tied to: with all their pairs, many passes of a place would say the same many times."""
+"""Number of traverses to which each one is tied: all pairs of many passes would be redundant."""
 _GROUPS: Final = 1 + KINDS_OF_PICTURES
-"""Groups of a pair: its height, and the shift of each kind of picture."""
+"""Groups of a pair: its height, and the shift of each kind of image."""
 
 
 @dataclass(frozen=True)
 class Ties:
-    """Ties of one or many places, those too that do not count."""
+    """Ties of one or many places, including those that do not count."""
 
     observations: Observations
     """(n) of all ties; `observed_m` NaN where nothing could be measured."""
     columns: dict[str, npt.NDArray[Any]]
-    """(n,) columns of the table `ties`; runs are indices here, and what could not be measured is NaN or infinite."""
+    """(n,) columns of the table `ties`; runs are indices here, and unmeasured values are NaN or infinite."""
 
     @property
     def accepted(self) -> npt.NDArray[np.bool_]:
-        """(n,) ties that count."""
+        """Returns a mask (n,) of the ties that count."""
         return np.asarray(self.columns["accepted"] == 1)
 
     def counted(self) -> Observations:
-        """Observations of the ties that count, for the adjustment."""
+        """Returns observations of the ties that count, for the adjustment."""
         return self.observations.chosen(self.accepted)
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """All of them, in order; groups are numbered anew."""
+        """Returns all of them, in order; groups are numbered anew."""
         if not parts:
             return cls(Observations.none(), _columns([], Observations.none(), np.zeros((0, 2, 3)), np.zeros((0, 2))))
         observations = Observations.joined([p.observations for p in parts])
@@ -57,7 +57,7 @@ class Ties:
 
 
 def ties_at(place: Place, readings: Sequence[PassReadings], settings: TieSettings) -> Ties:
-    """Ties between the traverses of a place.
+    """Returns ties between the traverses of a place.
 
     Parameters
     ----------
@@ -87,10 +87,10 @@ def pairs_of(count: int) -> list[tuple[int, int]]:
 
 
 def _of_pair(pictures: Pictures, a: int, b: int) -> list[Tie]:
-    """Ties of two patches; those of heads that passed together do not count for the poses."""
+    """Returns ties of two patches; those of heads that passed together do not count for the poses."""
     first, second = pictures.patches[a], pictures.patches[b]
     height = height_tie(first, second, pictures.settings)
-    # Where not even the heights agree, what would be matched is no road.
+    # Where not even the heights agree, a match would not be of the road.
     found = [height, *(shift_ties(pictures, a, b) if height.counts else ())]
     apart_s = abs(first.epoch_gps_ns - second.epoch_gps_ns) / NS_PER_S
     if first.readings.run == second.readings.run and apart_s < pictures.settings.return_s:
@@ -99,7 +99,7 @@ def _of_pair(pictures: Pictures, a: int, b: int) -> list[Tie]:
 
 
 def shared(ties: Sequence[Tie]) -> list[Tie]:
-    """The ties, those that count weakened where there are more than needed: q ties of m traverses say m − 1 things."""
+    """Ties, with larger σ where there are more than needed: q ties of m traverses have m − 1 independent values."""
     out = list(ties)
     for kind in KINDS:
         counting = [k for k, tie in enumerate(out) if tie.kind == kind and tie.counts]
@@ -112,7 +112,7 @@ def shared(ties: Sequence[Tie]) -> list[Tie]:
 
 
 def as_ties(place: Place, found: Sequence[Tie]) -> Ties:
-    """Observations and columns of ties of one place."""
+    """Returns observations and columns of ties of one place."""
     if not found:
         return Ties.joined([])
     n = len(found)
@@ -147,7 +147,7 @@ def as_ties(place: Place, found: Sequence[Tie]) -> Ties:
 def _columns(
     found: Sequence[Tie], observations: Observations, in_body: Float64, along_m: Float64
 ) -> dict[str, npt.NDArray[Any]]:
-    """Columns of the table, with runs as indices."""
+    """Returns columns of the table, with runs as indices."""
     point = np.array([t.ends[0].point_m for t in found]).reshape(-1, 3)
     direction = np.array([t.direction_level for t in found]).reshape(-1, 3)
     sensors = [[e.readings.sensor for e in t.ends] for t in found]

@@ -1,4 +1,4 @@
-"""Passes that lie farther apart than ties are sought: which they are, and where larger patches agree that they lie.
+"""Passes farther apart than the search of ties: which they are, and the shift on which larger patches agree.
 
 A single larger patch may match at a wrong place. What counts is the shift that most patches of two passes agree on.
 """
@@ -21,18 +21,18 @@ Float64 = npt.NDArray[np.float64]
 Column = Mapping[str, npt.NDArray[Any]]
 
 _LEAST: Final = 3
-"""Patches that have to agree: two agree by chance."""
+"""Least number of patches that must agree: two agree by chance."""
 _MOST: Final = 0.5
 """Share of the heights of two passes, and of the patches, that is most of them."""
-_SIGMAS: Final = 3.0
+_SIGMAS: Final = 3.0  # Differences within this many σ agree.
 _ALIKE_M: Final = 0.02
-"""Ties that agree differ by no more, beside their σ (m): poses wander by so much, and chance matches differ by more."""
+"""Greatest difference of ties that agree, besides their σ (m): poses drift by this much, and chance matches by more."""
 _ALONG: Final = 0.5
-"""Cosine from which on a direction tells of a shift."""
+"""Cosine from which a direction shows a shift."""
 
 
 def places_of_pairs(tried: Column) -> dict[tuple[str, str], list[int]]:
-    """Places that two runs share, or two drives of one run, by the names of both."""
+    """Returns places that two runs share, or two drives of one run, by the names of both."""
     heights = (tried["kind"] == HEIGHT) & ~_of_one_pass(tried)
     pairs = sorted(set(zip(tried["first_run"][heights].tolist(), tried["second_run"][heights].tolist(), strict=True)))
     return {
@@ -42,14 +42,14 @@ def places_of_pairs(tried: Column) -> dict[tuple[str, str], list[int]]:
 
 
 def is_matched(tried: Column, pair: tuple[str, str]) -> bool:
-    """Whether the heights of most places that two runs share could be compared."""
+    """Returns whether the heights of most places that two runs share could be compared."""
     own = (tried["first_run"] == pair[0]) & (tried["second_run"] == pair[1]) & ~_of_one_pass(tried)
     heights = tried["accepted"][own & (tried["kind"] == HEIGHT)]
     return bool(heights.size and (heights == 1).mean() >= _MOST)
 
 
 def _of_one_pass(tried: Column) -> Bool:
-    """Comparisons of heads that passed together."""
+    """Returns a mask of comparisons of heads that passed together."""
     same = tried["first_run"] == tried["second_run"]
     apart = np.abs(tried["first_epoch_gps_ns"] - tried["second_epoch_gps_ns"])
     return np.asarray(same & (apart < 30_000_000_000))
@@ -58,13 +58,13 @@ def _of_one_pass(tried: Column) -> Bool:
 def agreeing(
     tried: Column, near: Column, settings: AgainSettings, fine: TieSettings, most_up_m: float
 ) -> tuple[Bool, Float64]:
-    """Rows of larger patches of one pair of runs that agree with most others on a shift that ties would not find, and
-    that shift (3,): second minus first, north, east, down (m).
+    """Rows of larger patches of one pair of runs that agree with most others on a shift that ties would not find,
+    and that shift (3,): second minus first, north, east, down (m).
 
     Parameters
     ----------
-    near : ties of the same runs. Where passes lie apart, these match at odd places; where they agree on another shift,
-        it is the larger patches that are deceived, by marks that repeat.
+    near : ties of the same runs. Where passes lie apart, these match at odd places; if they agree on another shift,
+        the larger patches are wrong, because of marks that repeat.
     most_up_m : passes that lie farther above one another than this contradict the σ of their poses.
     """
     counts = tried["accepted"] == 1
@@ -88,12 +88,12 @@ def agreeing(
 
 def misplaced(runs: Sequence[str], close: Iterable[tuple[str, str]], far: Mapping[tuple[str, str], Float64],
               held: Sequence[str]) -> dict[str, Float64]:  # fmt: skip
-    """How far (3,) runs lie from those that most agree with, by name; all of them where none are most.
+    """Returns how far (3,) runs lie from those with which most agree, by name; all of them where none are most.
 
     Parameters
     ----------
-    close : pairs of runs that match where they lie. far : shifts of pairs that do not.
-    held : runs that are right, whatever the others say.
+    close : pairs of runs that match. far : shifts of pairs that do not.
+    held : runs that are right in any case.
     """
     number = {run: k for k, run in enumerate(runs)}
     pairs = np.array([(number[a], number[b]) for a, b in close], np.int64).reshape(-1, 2)
@@ -115,7 +115,7 @@ def misplaced(runs: Sequence[str], close: Iterable[tuple[str, str]], far: Mappin
 
 
 def _is_supported(tried: Column, kept: Bool, every: Bool, shift: Float64) -> bool:
-    """Whether enough places tell of the shift along itself: most of a road tells only how far it lies across."""
+    """Returns whether enough places show the shift along itself: most of a road shows only the shift across."""
     length = float(np.hypot(*shift))
     along = np.abs(_directions(tried, np.arange(kept.size)) @ shift) > _ALONG * length
     support, against = (np.unique(tried["place"][own & along]) for own in (kept, every & ~kept))
@@ -123,7 +123,7 @@ def _is_supported(tried: Column, kept: Bool, every: Bool, shift: Float64) -> boo
 
 
 def _is_contradicted(near: Column, shift: Float64, alike_m: float) -> bool:
-    """Whether ties agree on another shift along the same direction."""
+    """Returns whether ties agree on another shift along the same direction."""
     rows = np.flatnonzero((near["accepted"] == 1) & (near["kind"] == SHIFT))
     directions = _directions(near, rows)
     along = directions @ shift / max(float(np.hypot(*shift)), 1e-9)
@@ -138,7 +138,7 @@ def _is_contradicted(near: Column, shift: Float64, alike_m: float) -> bool:
 
 
 def _agreeing_shifts(tried: Column, own: Bool, alike_m: float) -> Bool:
-    """Rows of the places that agree on one shift, none where those are few, or fewer than half of all."""
+    """Returns rows of the places that agree on one shift, none where those are few, or fewer than half of all."""
     places = tried["place"]
     numbers, best = np.unique(places[own]), np.zeros(own.size, np.bool_)
     for number in numbers:
@@ -159,7 +159,7 @@ def _directions(tried: Column, rows: npt.NDArray[np.int64]) -> Float64:
 
 
 def _solved(tried: Column, rows: npt.NDArray[np.int64]) -> Float64:
-    """Shift (2,) north, east of rows that all say the same."""
+    """Returns the shift (2,) north, east of rows that all agree."""
     sigma = tried["sigma_m"][rows]
     design = _directions(tried, rows) / sigma[:, None]
     return np.asarray(np.linalg.lstsq(design, tried["value_m"][rows] / sigma, rcond=None)[0])

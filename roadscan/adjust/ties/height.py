@@ -1,4 +1,4 @@
-"""Height ties: how far the surface of one traverse lies above that of another, along the normal of the road.
+"""Height ties: distance of the surface of one traverse above that of another, along the normal of the road.
 
 A road falls to its side, so passes that lie a centimetre beside each other differ in height by a quarter of a
 millimetre at 2.5 %. So what is tied is the distance along the surface's normal (point to plane; Chen and Medioni 1992),
@@ -24,15 +24,15 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _BLOCKS: Final = 6
-"""Blocks along an edge whose means tell how far a mean over the patch can be trusted."""
-_LEAST_BLOCKS: Final = 6
+"""Blocks along an edge whose means give the σ of a mean over the patch."""
+_LEAST_BLOCKS: Final = 6  # From this many filled blocks on, the scatter of their means gives σ.
 _UNEVEN: Final = 2.0
-"""Slope that a step of unevenness hides from the fitted plane, in RMS of the unevenness over the patch's edge."""
+"""Slope hidden from the fitted plane by a step of unevenness, in RMS of the unevenness over the patch's edge."""
 
 
 @dataclass(frozen=True)
 class _Difference:
-    """Heights of two patches in the cells that both saw and that agree."""
+    """Height differences of two patches in the cells that both saw and that agree."""
 
     used: Bool
     """(k, k)"""
@@ -45,9 +45,9 @@ class _Difference:
 
 
 def height_tie(first: Patch, second: Patch, settings: TieSettings) -> Tie:
-    """The tie of two patches of one place with equal cells; the direction is the normal, upwards.
+    """Returns the tie of two patches of one place with equal cells; the direction is the normal, upwards.
 
-    A tie that does not pass its tests says why: too few common cells, farther apart than the bound, too few cells that
+    A tie that fails its tests states why: too few common cells, farther apart than the bound, too few cells that
     agree, differences that scatter, a surface that is too steep.
     """
     away = second.height_m - first.height_m
@@ -72,7 +72,7 @@ def height_tie(first: Patch, second: Patch, settings: TieSettings) -> Tie:
 
 
 def _difference(away: Float64, common: Bool, settings: TieSettings) -> _Difference:
-    """Robust mean of height differences, with a σ from the means of blocks, which know how far cells are correlated."""
+    """Robust mean of height differences, with a σ from the means of blocks, which shows correlated cells."""
     values = away[common]
     middle = float(np.median(values))
     scatter = scatter_about(values, middle)
@@ -85,20 +85,20 @@ def _difference(away: Float64, common: Bool, settings: TieSettings) -> _Differen
     if filled >= _LEAST_BLOCKS:
         sigma = math.sqrt(float(sums @ sums) * filled / (filled - 1)) / number
     else:
-        # As if the cells of a block knew no more than one of them.
+        # The cells of a block count as one.
         sigma = scatter / math.sqrt(max(filled, 1))
     return _Difference(used, number / int(common.sum()), scatter, mean, sigma)
 
 
 def _blocks(used: Bool) -> Int64:
-    """Block of each used cell."""
+    """Returns the block of each used cell."""
     row, column = np.nonzero(used)
     edge = len(used)
     return np.asarray(row * _BLOCKS // edge * _BLOCKS + column * _BLOCKS // edge)
 
 
 def _plane(patch: Patch, height_m: Float64, used: Bool) -> tuple[Float64, float]:
-    """Level and slopes (3,) along and across of a plane through heights, and what block means leave of it (m, RMS)."""
+    """Level and slopes (3,) along and across of a plane through heights, and its residuals' RMS by blocks (m)."""
     row, column = np.nonzero(used)
     along, across = patch.middle_m[row], patch.middle_m[column]
     design = np.stack([np.ones(row.size), along, across], axis=-1)
@@ -112,7 +112,7 @@ def _plane(patch: Patch, height_m: Float64, used: Bool) -> tuple[Float64, float]
 
 
 def _ends(first: Patch, second: Patch, used: Bool) -> tuple[End, End]:
-    """The middle of the used cells, as each traverse sees it."""
+    """Returns the middle of the used cells, as each traverse sees it."""
     row, column = np.nonzero(used)
     along, across = first.middle_m[row].mean(keepdims=True), first.middle_m[column].mean(keepdims=True)
     one, other = (
@@ -134,7 +134,7 @@ def _why_not(found: _Difference, slope: float, settings: TieSettings) -> str:
 
 
 def _refused(first: Patch, second: Patch, why_not: str, count: int) -> Tie:
-    """A tie of which nothing could be measured."""
+    """Returns a tie without a measurement."""
     nowhere = np.array([first.place.easting_m, first.place.northing_m, math.nan])
     one, other = (End(p.readings, p.pose, nowhere) for p in (first, second))
     return Tie(HEIGHT, (one, other), np.array([0.0, 0.0, -1.0]), math.nan, math.inf, count, math.nan, why_not)

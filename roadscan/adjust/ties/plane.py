@@ -1,4 +1,4 @@
-"""Lidar ties: planes of the ground, of kerbs' faces and of walls that windows of time saw, of one pass or of several.
+"""Lidar ties: planes of the ground, of kerbs' faces and of walls in time windows, of one pass or of several.
 
 Returns of a lidar are too sparse for pictures. In a cube, all windows together know how a plane lies, each window how
 far along the plane's normal (point to plane; Chen and Medioni 1992). The normal is that of the returns about the mean
@@ -27,15 +27,15 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _FLAT: Final = 0.25
-"""A plane's thickness is below this share of its shorter extent."""
+"""Greatest ratio of a plane's thickness to its shorter extent."""
 _WIDE: Final = 0.1
-"""Its returns spread (1 σ) over this share of the cube along both of its axes."""
-_TRIM: Final = 3.0
-_LEAST_VARIANCE_M2: Final = 1e-10
-_FIRST: Final = (0, 0, 0, 1, 1, 2)
-_SECOND: Final = (0, 1, 2, 1, 2, 2)
+"""Least 1 σ of a plane's returns along both of its axes, as a share of the cube."""
+_TRIM: Final = 3.0  # Returns farther from the plane (σ) are left out.
+_LEAST_VARIANCE_M2: Final = 1e-10  # Least variance of a plane (m²).
+_FIRST: Final = (0, 0, 0, 1, 1, 2)  # Rows of the six products of a symmetric 3 × 3 matrix …
+_SECOND: Final = (0, 1, 2, 1, 2, 2)  # … and their columns.
 _SHARE: Final = 6
-"""A plane in so many is kept for each direction, if there are so many of it."""
+"""One in this many planes is kept for each direction, if there are that many."""
 _SPARSE: Final = 16
 """Numbers are looked up in a table where their range is no larger than this many times their count."""
 
@@ -56,7 +56,7 @@ class _Returns:
 
 @dataclass(frozen=True)
 class _Planes:
-    """Cubes that hold a plane, and the means of their windows, g, by cube and time."""
+    """Cubes with a plane, and the means of their g windows, by cube and time."""
 
     cube: Int64
     """(g,) number of the cube of each window."""
@@ -75,9 +75,9 @@ class _Planes:
 
 
 def plane_ties(place: Place, readings: Sequence[PassReadings], settings: TieSettings) -> list[Tie]:
-    """Ties along the normals of planes between windows of `settings.window_s`, those of a cube in a ring.
+    """Returns ties along the normals of planes between windows of `settings.window_s`, those of a cube in a ring.
 
-    Where more ties hold windows together than are needed, their σ are larger: q ties of m windows say m − 1 things.
+    Redundant ties have larger σ: q ties of m windows have m − 1 independent values.
     """
     near = _near(place, readings, settings) if readings else None
     if near is None or near.pose.size == 0:
@@ -88,7 +88,7 @@ def plane_ties(place: Place, readings: Sequence[PassReadings], settings: TieSett
 
 
 def _near(place: Place, readings: Sequence[PassReadings], settings: TieSettings) -> _Returns:
-    """Returns within the square of a place."""
+    """Returns the lidar returns within the square of a place."""
     length = round(settings.window_s * NS_PER_S)
     parts: list[tuple[Float64, Int64, Int64]] = []
     traverse: list[int] = []
@@ -104,7 +104,7 @@ def _near(place: Place, readings: Sequence[PassReadings], settings: TieSettings)
 
 
 def _planes(near: _Returns, settings: TieSettings) -> _Planes:
-    """Cubes in which two windows or more see one plane."""
+    """Returns cubes in which two windows or more see one plane."""
     edge_m, least = settings.plane_cell_m, settings.least_returns
     whole = np.floor(near.point_m / edge_m)
     cubes, cube = _numbered(_packed(whole.astype(np.int64)))
@@ -144,14 +144,14 @@ class _Windows:
 
     @classmethod
     def of(cls, point_m: Float64, group: Int64, kept: Bool, size: int) -> _Windows:
-        """From the kept points (n, 3) of each group."""
+        """Returns moments from the kept points (n, 3) of each group."""
         count, total, squares = np.zeros(size, np.int64), np.zeros((size, 3)), np.zeros((size, 6))
         add_moments(point_m, group, kept, count, total, squares)
         mean = total / np.maximum(count, 1)[:, None]
         return cls(count, mean, squares - total[:, _FIRST] * mean[:, _SECOND])
 
     def scattered(self, cube_of: Int64, cubes: int, least: int) -> tuple[Int64, Float64, Float64]:
-        """Returns (c,), ascending variances (c, 3) and axes (c, 3, 3; columns) of cubes, about their windows' means."""
+        """Counts (c,), ascending variances (c, 3) and axes (c, 3, 3; columns) of cubes, about their windows' means."""
         told = self.count >= least
         number = np.bincount(cube_of[told], self.count[told], cubes).astype(np.int64)
         covariance = np.empty((cubes, 3, 3))
@@ -163,7 +163,7 @@ class _Windows:
 
 
 def _packed(rows: Int64) -> Int64:
-    """One number (n,) for each of n rows (n, k), in the order of the rows."""
+    """Returns one number (n,) for each of n rows (n, k), in the order of the rows."""
     out = np.zeros(len(rows), np.int64)
     for column in (rows - rows.min(axis=0)).T:
         out = out * (int(column.max()) + 1) + column
@@ -171,7 +171,7 @@ def _packed(rows: Int64) -> Int64:
 
 
 def _numbered(key: Int64) -> tuple[Int64, Int64]:
-    """Distinct numbers, ascending, and the rank (n,) of each of n numbers among them; none is negative."""
+    """Returns distinct numbers, ascending, and the rank (n,) of each of n numbers among them; none is negative."""
     size = int(key.max()) + 1
     if size > _SPARSE * key.size:
         return np.unique(key, return_inverse=True)
@@ -181,9 +181,9 @@ def _numbered(key: Int64) -> tuple[Int64, Int64]:
 
 
 def _chosen(place: Place, planes: _Planes, most: int) -> list[int]:
-    """Cubes whose planes make ties, in their own order: those with the most returns along, across and up, then of all.
+    """Returns cubes whose planes make ties, in order: those with the most returns along, across and up, then of all.
 
-    Otherwise the road beside the vehicle would leave no room for the walls, which tell what it cannot.
+    Otherwise the road beside the vehicle would displace the walls, which show other directions.
     """
     total = np.bincount(planes.cube, planes.count.astype(np.float64), len(planes.normal))
     order = np.argsort(-total, kind="stable")
@@ -197,7 +197,7 @@ def _chosen(place: Place, planes: _Planes, most: int) -> list[int]:
 
 
 def _pairs(planes: _Planes, cubes: Sequence[int]) -> tuple[Int64, Int64, Float64]:
-    """Pairs (t,) of windows of each cube, and by what their σ are larger (t,).
+    """Returns pairs (t,) of windows of each cube, and the factors of their σ (t,).
 
     Each window is paired with the next, and with the one half the way through: neighbours, and those long after.
     """
@@ -221,7 +221,7 @@ def _ties(
     weaker: Float64,
     settings: TieSettings,
 ) -> list[Tie]:
-    """The ties of pairs of windows, each of one cube."""
+    """Returns the ties of pairs of windows, each of one cube."""
     a, b = pairs
     cube = planes.cube[a]
     normal = planes.normal[cube]

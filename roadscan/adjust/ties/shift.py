@@ -1,4 +1,4 @@
-"""Horizontal ties: how far the relief or the paint of one traverse lies beside that of another."""
+"""Horizontal ties: shift of the relief or the paint of one traverse against that of another."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.tie import SHIFT, End, Tie
 
 DISAGREE: Final = "relief and paint disagree"
-_DISAGREE_SIGMA: Final = 5.0
+_DISAGREE_SIGMA: Final = 5.0  # Relief and paint contradict one another from this many σ on.
 
 
 KINDS_OF_PICTURES: Final = 2
-"""Relief and paint."""
+"""Number of kinds: relief and paint."""
 
 
 @dataclass
 class Pictures:
-    """Pictures of the patches of a place, those of each made when they are first asked for."""
+    """Images of the patches of a place, each made on first use."""
 
     patches: list[Patch]
     settings: TieSettings
     _made: dict[int, tuple[Picture, Picture]] = field(default_factory=dict)
 
     def of(self, number: int) -> tuple[Picture, Picture]:
-        """Relief and paint of a patch."""
+        """Returns relief and paint of a patch."""
         if number not in self._made:
             self._made[number] = pictures_of(self.patches[number], self.settings.shift_cell_m)
         return self._made[number]
 
 
 def shift_ties(pictures: Pictures, first: int, second: int) -> list[Tie]:
-    """Ties of two patches of one place: of relief and of paint none, one or two directions each.
+    """Returns ties of two patches of one place: of relief and of paint none, one or two directions each.
 
-    Where a picture makes no tie, one row says why.
+    Where an image makes no tie, one row states why.
     """
     settings = pictures.settings
     pairs = zip(pictures.of(first), pictures.of(second), strict=True)
@@ -53,7 +53,7 @@ def shift_ties(pictures: Pictures, first: int, second: int) -> list[Tie]:
 
 
 def _ties(first: Patch, second: Patch, shift: Shift, group: int) -> list[Tie]:
-    """A tie for each direction that is known, or one that says why there is none."""
+    """Returns a tie for each direction that is known, or one that states why there is none."""
     place = first.place
     felt = shift.felt_m
     there = felt + np.nan_to_num(shift.value_m)

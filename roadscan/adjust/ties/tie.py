@@ -1,4 +1,4 @@
-"""One tie: what two traverses say about one direction at one place, and why it does not count if it does not."""
+"""One tie: the difference of two traverses along one direction at one place, and why it does not count, if so."""
 
 from __future__ import annotations
 
@@ -47,15 +47,15 @@ class Tie:
     value_m: float
     sigma_m: float
     count: int
-    """Cells or returns that it comes from."""
+    """Number of cells or returns used."""
     correlation: float
-    """Of the two pictures; NaN where none was compared."""
+    """Correlation of the two images; NaN where none was compared."""
     why_not: str = COUNTS
-    """Empty: it counts."""
+    """Empty if it counts."""
     group: int = 0
     """Ties of one group of a place stand or fall together."""
 
     @property
     def counts(self) -> bool:
-        """Whether it is taken for the adjustment."""
+        """Returns whether the adjustment uses it."""
         return self.why_not == COUNTS

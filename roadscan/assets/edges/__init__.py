@@ -1,1 +1,1 @@
-"""Edges along roads: steps and bends across them, sought along them as paths, and the areas that they bound."""
+"""Edges along roads: steps and bends of the cross-section, traced as paths, and the areas that they bound."""

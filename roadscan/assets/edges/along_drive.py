@@ -21,17 +21,17 @@ from roadscan.compute.edges.across import edge_along
 
 Float64 = npt.NDArray[np.float64]
 
-STATION_M: Final = 0.5
-NEAREST_M: Final = 0.8
+STATION_M: Final = 0.5  # Distance of stations along the drive (m).
+NEAREST_M: Final = 0.8  # Edges are sought from this distance to the drive (m) …
 FARTHEST_M: Final = 14.0
-"""Edges are sought this far beside the drive."""
+"""… to this distance (m)."""
 SAME_ROAD_M: Final = 8.0
-"""A drive this near to an earlier one is on the same road: its edges are found from the earlier."""
-KERB_EVIDENCE: Final = 6.0
-BARRIER_EVIDENCE: Final = 3.0
-LEAST_EVIDENCE: Final = 0.6
+"""A drive this near (m) to an earlier one is on the same road: its edges are found from the earlier."""
+KERB_EVIDENCE: Final = 6.0  # Evidence of a cell at a kerb.
+BARRIER_EVIDENCE: Final = 3.0  # Evidence of a cell where something stands.
+LEAST_EVIDENCE: Final = 0.6  # Least evidence of an edge at a station.
 _INSIDE_M: Final = (0.45, 0.95)
-"""The height of an edge follows from the road this far inside it."""
+"""The height of an edge follows from the road this far inside it (m, from and to)."""
 EDGE_COLUMNS: Final = (*NODE_COLUMNS, "by_kerb", "by_barrier", "right", "evidence")
 
 
@@ -43,7 +43,7 @@ class Track(NamedTuple):
 
 
 def tracks_of(drive_xyh_m: Float64) -> Iterator[Track]:
-    """Stations each half metre of each pass, where no earlier pass drove beside it."""
+    """Yields stations each half metre of each pass, where no earlier pass drove beside it."""
     earlier = np.zeros((0, 2))
     for number in np.unique(drive_xyh_m[:, 3]):
         driven = drive_xyh_m[drive_xyh_m[:, 3] == number, :2]
@@ -51,7 +51,7 @@ def tracks_of(drive_xyh_m: Float64) -> Iterator[Track]:
         driven = driven[np.append(True, step > 0.02)]
         if len(driven) < 2 or float(np.hypot(*np.diff(driven, axis=0).T).sum()) < 2.0 * STATION_M:
             continue
-        # A jump is a way that was driven outside the window.
+        # A jump means that the vehicle left the window between.
         jumps = np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 5.0) + 1
         for part in np.split(driven, jumps):
             if len(part) >= 2:
@@ -93,7 +93,7 @@ def road_edges(scene: Scene) -> list[CutEdge]:
 def _one_side(
     track: Track, right: bool, raster: HeightRaster, beside: Beside, kerbs: list[Float64]
 ) -> Iterator[Float64]:
-    """Runs of nodes of one side's edge."""
+    """Yields runs of nodes of one side's edge."""
     out = np.column_stack([track.heading[:, 1], -track.heading[:, 0]]) * (1.0 if right else -1.0)
     offset = np.arange(NEAREST_M, FARTHEST_M, raster.cell_m)
     x = track.places[:, :1] + offset * out[:, :1]
@@ -105,7 +105,7 @@ def _one_side(
     inside &= y < raster.y_min_m + raster.count.shape[0] * raster.cell_m
     height = np.where(inside, height, np.nan)
     up = np.zeros(height.shape, np.bool_)
-    # Kerbs are a cell wide: at steps of a whole cell a way across would miss some between two of its places.
+    # Kerbs are one cell wide: with steps of a whole cell a transect could miss some between two samples.
     for step in (0.0, raster.cell_m / 2):
         r, c = raster.cells_of(x + step * out[:, :1], y + step * out[:, 1:])
         up |= beside.edge_x[r, c] * out[:, :1] + beside.edge_y[r, c] * out[:, 1:] > 0.5
@@ -140,7 +140,7 @@ def _one_side(
 
 
 def _road_level(line: Float64, out: Float64, beside: Beside, raster: HeightRaster) -> Float64:
-    """Heights (n,) of the road at points (n, 2) of its edge: its surface goes on from inside."""
+    """Returns heights (n,) of the road at points (n, 2) of its edge, extrapolated from inside."""
     near, far = (beside.height_m[raster.cells_of(*(line - away * out).T)] for away in _INSIDE_M)
     level = near + (near - far) * _INSIDE_M[0] / (_INSIDE_M[1] - _INSIDE_M[0])
     for other in (near, beside.height_m[raster.cells_of(*line.T)], np.nanmedian(beside.height_m)):
@@ -149,7 +149,7 @@ def _road_level(line: Float64, out: Float64, beside: Beside, raster: HeightRaste
 
 
 def _snapped(line: Float64, at_kerb: npt.NDArray[np.bool_], kerbs: list[Float64]) -> Float64:
-    """Points (n, 2) of a line, those at a kerb moved onto it."""
+    """Returns points (n, 2) of a line, those at a kerb moved onto it."""
     if not kerbs or not at_kerb.any():
         return line
     points = np.concatenate([np.column_stack(dense(k[:, :2], 0.05)) for k in kerbs])

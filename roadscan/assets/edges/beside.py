@@ -1,4 +1,4 @@
-"""What lies on the higher side of an edge: how wide the surface is there, how it slopes, and what ends it."""
+"""The surface on the higher side of an edge: its width, its slope, and what ends it."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from roadscan.assets.smoothing import gaussian
 Float64 = npt.NDArray[np.float64]
 
 FIRST_M: Final = 0.3
-"""The walk begins this far behind the middle of the edge's face."""
+"""The transect begins this far (m) behind the middle of the edge's face."""
 REACH_M: Final = 7.0
-"""A surface is followed this far from its edge; tiles need a halo of a metre more."""
-HOLE_M: Final = 0.8
-SLOPE: Final = 0.15
-ROUGH_M: Final = 0.03
+"""A surface is followed this far (m) from its edge; tiles need a halo of a metre more."""
+HOLE_M: Final = 0.8  # A surface ends at a hole of this width (m).
+SLOPE: Final = 0.15  # A steeper surface ends (m/m).
+ROUGH_M: Final = 0.03  # A rougher surface ends (m).
 OBSTACLE_M: Final = (0.35, 2.2)
-"""What stands between these heights above the ground ends a surface."""
+"""An object between these heights above the ground (m) ends a surface."""
 TRANSECT_COLUMNS: Final = ("width_m", "ends_down", "ends_known", "outer_height_m", "slope", "middle_height_m")
 BESIDE_PIECES: Final = line_schema((*NODE_COLUMNS, *TRANSECT_COLUMNS))
 """Columns of a line's piece, and at each node the surface behind it: width, whether an edge down ends it and whether
@@ -37,7 +37,7 @@ _OPEN: Final = (classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH
 
 
 class Beside(NamedTuple):
-    """Rasters (rows, columns) that walks go over."""
+    """Rasters (rows, columns) that transects cross."""
 
     height_m: Float64
     rough_m: Float64
@@ -48,7 +48,7 @@ class Beside(NamedTuple):
 
 @once_a_scene
 def pieces_beside(scene: Scene) -> pa.Table:
-    """Rows of `BESIDE_PIECES`: the scene's edges within its tile with the surface on their higher side."""
+    """Returns rows of `BESIDE_PIECES`: the scene's edges within its tile with the surface on their higher side."""
     raster, edges = raster_of(scene), free_edges(scene)
     parts = []
     if edges:
@@ -61,7 +61,7 @@ def pieces_beside(scene: Scene) -> pa.Table:
 
 @once_a_scene
 def beside_of(scene: Scene) -> Beside:
-    """Rasters of a scene for walks that end at its edges."""
+    """Returns rasters of a scene for transects that end at its edges."""
     raster = raster_of(scene)
     known = raster.count > 0
     height = smooth(np.where(known, raster.height_m, 0.0), known, 1.5)
@@ -78,14 +78,14 @@ def beside_of(scene: Scene) -> Beside:
 
 
 def smooth(values: Float64, known: npt.NDArray[np.bool_], sigma_cells: float) -> Float64:
-    """Mean (rows, columns) of known values around each cell; NaN where none is near."""
+    """Returns the mean (rows, columns) of known values around each cell; NaN where none is near."""
     weight = gaussian(known.astype(np.float64), sigma_cells, 2.5)
     total = gaussian(values, sigma_cells, 2.5)
     return np.where(weight > 0.02, total / np.maximum(weight, 0.02), np.nan)
 
 
 def _blocked(scene: Scene, raster: HeightRaster) -> npt.NDArray[np.bool_]:
-    """Cells where two returns or more stand above the ground."""
+    """Returns a mask of cells where two returns or more stand above the ground."""
     above, closed = scene.above_ground_m, np.ones(256, np.bool_)
     closed[list(_OPEN)] = False
     stands = (above > OBSTACLE_M[0]) & (above < OBSTACLE_M[1]) & closed[scene.classes] & (raster.cell >= 0)
@@ -94,7 +94,7 @@ def _blocked(scene: Scene, raster: HeightRaster) -> npt.NDArray[np.bool_]:
 
 
 def _with_transects(nodes: Float64, beside: Beside, raster: HeightRaster) -> Float64:
-    """Nodes (n, columns) with the columns of what lies behind them."""
+    """Returns nodes (n, columns) with the columns of the surface behind them."""
     ux, uy = np.gradient(nodes[:, 0]), np.gradient(nodes[:, 1])
     length = np.maximum(np.hypot(ux, uy), 1e-9)
     start = np.column_stack([nodes[:, :2], uy / length, -ux / length])

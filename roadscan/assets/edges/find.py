@@ -1,4 +1,4 @@
-"""Steps along the road of a scene: paths cut where no step can be told, and bridged where it is hidden or lowered."""
+"""Steps along the road of a scene: paths cut where no step is measurable, and bridged where it is hidden or lowered."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ class EdgeSettings(NamedTuple):
 
     least_step_m: float = 0.015
     greatest_step_m: float = 0.28
-    """What is higher is a wall."""
+    """Higher steps are walls."""
     seen_low: float = 0.75
-    """Share of the lower side that has to be seen: where it is not, rings of a lidar make steps."""
+    """Least share of the lower side that is seen: elsewhere, rings of a lidar look like steps."""
     seen_high_m: float = 0.25
     covered: float = 0.5
-    """Share of a node's window along the edge that has to be seen on both sides."""
+    """Least share of a node's window along the edge that is seen on both sides."""
     ratio: float = 4.0
-    """Least step over the scatter of its sides."""
+    """Least ratio of a step to the scatter of its sides."""
     least_part_m: float = 1.0
     """Shorter parts of a path are left out."""
     least_length_m: float = 2.0
-    """Length that has to be seen of an edge, all its parts together."""
+    """Least seen length of an edge, all its parts together."""
     least_evidence: float = 8.0
     """Least evidence (σ · m) of all parts of an edge."""
     bridge_m: float = 7.0
     """Longest gap between two edges in one line: a car, a driveway."""
     bridge_offset_m: float = 0.25
-    """Farthest that one edge may lie beside the other's line, and 0.04 m more a metre of the gap."""
+    """Farthest that one edge may lie beside the other's line, plus 0.04 m a metre of the gap."""
     bridge_bend_cosine: float = 0.94
 
 
@@ -52,7 +52,7 @@ class Edge(NamedTuple):
 
     nodes: Nodes
     seen: Mask
-    """(n,) nodes whose step was measured; the others bridge what is hidden."""
+    """(n,) nodes whose step was measured; the others bridge hidden parts."""
     evidence: float
     """Evidence (σ · m) of its places."""
 
@@ -62,14 +62,14 @@ DEFAULT: Final = EdgeSettings()
 
 @once_a_scene
 def edges_of(scene: Scene) -> list[Edge]:
-    """Edges in the window of a scene, the best seen first."""
+    """Returns the edges in the window of a scene, the best seen first."""
     raster, returns = raster_of(scene), scene.returns
     ground = [column[raster.used] for column in (returns.x_m, returns.y_m, returns.height_m)]
     return found_edges(raster, profiles.sorted_heights(*ground))
 
 
 def edges_of_raster(raster: HeightRaster) -> list[Edge]:
-    """Edges of a raster of cells alone: each cell counts as one height at its middle."""
+    """Returns the edges of a raster of cells alone: each cell counts as one height at its middle."""
     row, column = np.nonzero(raster.count > 0)
     x = raster.x_min_m + (column.astype(np.float64) + 0.5) * raster.cell_m
     y = raster.y_min_m + (row.astype(np.float64) + 0.5) * raster.cell_m
@@ -77,7 +77,7 @@ def edges_of_raster(raster: HeightRaster) -> list[Edge]:
 
 
 def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings = DEFAULT) -> list[Edge]:
-    """Edges of a raster, with the heights that their places and steps are measured from."""
+    """Returns the edges of a raster, with heights from which their places and steps are measured."""
     if not (raster.count > 0).any():
         return []
     slopes = raster.slopes
@@ -89,7 +89,7 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
 
 
 def _told(nodes: Nodes, evidence: float, settings: EdgeSettings) -> list[Edge]:
-    """Runs of nodes whose step can be told; two nodes that cannot be are left inside a run."""
+    """Returns runs of nodes with a measurable step; up to two nodes without are left inside a run."""
     known = np.isfinite(nodes.sigma_step_m)
     low, high, scatter = (_running(c, known) for c in (nodes.seen_low, nodes.seen_high_m, nodes.scatter_m))
     good = known & (nodes.step_m >= settings.least_step_m) & (low >= settings.seen_low)
@@ -107,7 +107,7 @@ def _told(nodes: Nodes, evidence: float, settings: EdgeSettings) -> list[Edge]:
 
 
 def _running(values: Float64, known: Mask) -> Float64:
-    """Median (n,) of five known neighbours; 0 where nothing is known."""
+    """Returns the median (n,) of five known neighbours; 0 where nothing is known."""
     at = np.flatnonzero(known)
     if at.size == 0:
         return np.zeros_like(values)
@@ -117,7 +117,7 @@ def _running(values: Float64, known: Mask) -> Float64:
 def _bridged(
     parts: list[Edge], heights: Heights, raster: HeightRaster, slopes: tuple[Float64, Float64], settings: EdgeSettings
 ) -> list[Edge]:
-    """Parts joined over gaps, the shortest gaps first."""
+    """Returns parts joined over gaps, the shortest gaps first."""
     gaps = sorted(
         (gap, i, j)
         for i, j in _near_pairs(parts, settings.bridge_m)
@@ -143,7 +143,7 @@ def _bridged(
 
 
 def _near_pairs(parts: list[Edge], reach_m: float) -> list[tuple[int, int]]:
-    """Pairs of parts of which the first ends near where the second begins."""
+    """Returns pairs of parts of which the first ends near where the second begins."""
     if not parts:
         return []
     ends = np.array([[p.nodes.x_m[-1], p.nodes.y_m[-1]] for p in parts])
@@ -161,7 +161,7 @@ def _leads_to(after: dict[int, int], start: int, end: int) -> bool:
 
 
 def _gap_m(a: Nodes, b: Nodes, settings: EdgeSettings) -> float | None:
-    """Distance from the end of an edge to the beginning of another, where the one goes on as the other."""
+    """Returns the distance from the end of an edge to the beginning of another that continues it."""
     ex, ey = b.x_m[0] - a.x_m[-1], b.y_m[0] - a.y_m[-1]
     gap = float(np.hypot(ex, ey))
     if not 0.0 < gap <= settings.bridge_m:
@@ -180,7 +180,7 @@ def _gap_m(a: Nodes, b: Nodes, settings: EdgeSettings) -> float | None:
 def _joined(
     a: Edge, b: Edge, heights: Heights, raster: HeightRaster, slopes: tuple[Float64, Float64], settings: EdgeSettings
 ) -> Edge:
-    """One edge of two and the straight way between them, whose steps are measured where they are seen."""
+    """Returns one edge of two and the straight way between them, whose steps are measured where they are seen."""
     ends = np.array([[a.nodes.x_m[-1], a.nodes.y_m[-1]], [b.nodes.x_m[0], b.nodes.y_m[0]]])
     pieces = max(round(float(np.hypot(*(ends[1] - ends[0]))) / NODE_M), 1)
     share = (np.arange(1, pieces) / pieces)[:, None]

@@ -1,4 +1,4 @@
-"""Edges that may be kerbs: heights differ as at a step also along a fence, a rut under the vehicle, and plants."""
+"""Edges that may be kerbs: steps also occur along a fence, a rut under the vehicle, and plants."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from roadscan.assets.scene import Scene
 from roadscan.core.extras import cv2
 
 _FENCE_M: Final = (0.35, 1.2)
-"""Heights above the ground at which every fence and wall is seen."""
-_LEAST_RETURNS: Final = 2
-_MOST: Final = 0.5
-_VEHICLE_M: Final = 0.9
+"""Heights above the ground at which every fence and wall is seen (m)."""
+_LEAST_RETURNS: Final = 2  # An object has at least this many returns in a cell.
+_MOST: Final = 0.5  # Share of an edge from which it counts as taken.
+_VEHICLE_M: Final = 0.9  # Half of a vehicle's width (m).
 _BEHIND_M: Final = (0.1, 0.2, 0.3, 0.4)
-"""A kerb's upper side is seen this far behind its face."""
+"""Distances (m) behind a kerb's face at which its upper side is seen."""
 _SCATTER_M: Final = 0.015
-"""Heights of plants in a cell scatter by more beyond the noise of the data: even ground does not."""
+"""Excess scatter (m) of heights in a cell with plants, beyond the noise of the data: even ground has less."""
 _OTHERS: Final = (
     classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
     classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
 )  # fmt: skip
-"""What stands at kerbs and is no fence."""
+"""Classes that stand at kerbs and are no fence."""
 
 
 @once_a_scene
 def free_edges(scene: Scene) -> list[Edge]:
-    """The scene's edges without those that lie, at most of their nodes, where something stands, a drive went, or plants
-    grow on the higher side.
+    """Scene's edges without those that lie, at most of their nodes, at an object, on a drive, or before plants
+    on the higher side.
     """
     raster, taken = raster_of(scene), _standing(scene) | _driven(scene)
     plants = _plants(scene)
@@ -49,14 +49,14 @@ def free_edges(scene: Scene) -> list[Edge]:
 
 
 def _plants(scene: Scene) -> npt.NDArray[np.int64]:
-    """Returns of low plants among those that count as ground, in each cell (rows, columns) of the raster."""
+    """Returns the number of returns of low plants among the ground returns in each cell (rows, columns)."""
     raster = raster_of(scene)
     cells = raster.cell[raster.used & (scene.classes == classes.LOW_VEGETATION)]
     return np.bincount(cells, minlength=raster.count.size).reshape(raster.count.shape)
 
 
 def _is_grown_over(edge: Edge, plants: npt.NDArray[np.int64], raster: HeightRaster) -> bool:
-    """Whether plants are seen close behind most of an edge, on its higher side: by class or by scatter."""
+    """Returns whether plants are seen close behind most of an edge, on its higher side: by class or by scatter."""
     nodes = edge.nodes.at(edge.seen)
     x = nodes.x_m[:, None] + np.array(_BEHIND_M) * nodes.heading_y[:, None]
     y = nodes.y_m[:, None] - np.array(_BEHIND_M) * nodes.heading_x[:, None]
@@ -71,7 +71,7 @@ def _is_grown_over(edge: Edge, plants: npt.NDArray[np.int64], raster: HeightRast
 
 
 def _driven(scene: Scene) -> npt.NDArray[np.bool_]:
-    """Cells (rows, columns) of the raster within half a vehicle's width of a drive."""
+    """Returns a mask (rows, columns) of the cells within half a vehicle's width of a drive."""
     raster, drive = raster_of(scene), scene.drive_xyh_m
     inside = np.zeros(raster.count.shape, np.bool_)
     corner = np.array([raster.x_min_m, raster.y_min_m])
@@ -82,7 +82,7 @@ def _driven(scene: Scene) -> npt.NDArray[np.bool_]:
 
 
 def _standing(scene: Scene) -> npt.NDArray[np.bool_]:
-    """Cells (rows, columns) of the raster at which two returns or more are as high as a fence."""
+    """Returns a mask (rows, columns) of the cells at which two returns or more are as high as a fence."""
     raster, above = raster_of(scene), scene.above_ground_m
     counted = np.ones(256, np.bool_)
     counted[list(_OTHERS)] = False

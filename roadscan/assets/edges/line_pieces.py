@@ -1,4 +1,4 @@
-"""Lines cut at the border of a tile with exact end points, as rows of a table, and joined again across tiles."""
+"""Pieces of lines, cut at the border of a tile with exact end points, as rows of a table, and joined across tiles."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NODE_COLUMNS: Final = (
 
 
 def line_schema(columns: Sequence[str]) -> pa.Schema:
-    """Columns of a piece of a line: a value a node of each of `columns`, and what saw it."""
+    """Returns the columns of a piece of a line: a value a node of each of `columns`, and its returns and passes."""
     return pa.schema(
         [pa.field(name, pa.list_(pa.float64()), nullable=False) for name in columns]
         + [
@@ -45,13 +45,13 @@ LINE_PIECES: Final = line_schema(NODE_COLUMNS)
 """Columns of a piece: a value a node in the direction of the line (higher side to the right), what saw it, and whether
 its ends lie on the tile's border. `seen` is 1 for nodes whose step was measured."""
 JOIN_M: Final = 0.5
-"""Farthest apart that the ends of two tiles may lie on their border."""
+"""Greatest distance (m) between the ends of two tiles' lines on their border."""
 NEAR_M: Final = 0.25
-"""Returns this near to a line count as those that show it."""
+"""Returns this near to a line (m) show it."""
 
 
 class Seen(NamedTuple):
-    """What saw something."""
+    """Returns, passes and epochs that saw an object."""
 
     returns: int
     passes: tuple[int, ...]
@@ -59,7 +59,7 @@ class Seen(NamedTuple):
     last_epoch_gps_ns: int
 
     def with_other(self, other: Seen) -> Seen:
-        """What saw one or the other."""
+        """Returns the union with another one."""
         if self.returns == 0 or other.returns == 0:
             return self if other.returns == 0 else other
         return Seen(
@@ -78,12 +78,12 @@ class Line(NamedTuple):
     """Names of the columns."""
 
     def column(self, name: str) -> Float64:
-        """A column (n,) of its nodes."""
+        """Returns a column (n,) of its nodes."""
         return np.asarray(self.nodes[:, self.names.index(name)])
 
     @property
     def length_m(self) -> float:
-        """Length in the map."""
+        """Returns its length in the map (m)."""
         return float(np.hypot(*np.diff(self.nodes[:, :2], axis=0).T).sum())
 
 
@@ -96,7 +96,7 @@ class CutEdge(NamedTuple):
 
 
 def columns_of(edge: Edge) -> Float64:
-    """Nodes (n, columns as `NODE_COLUMNS`) of an edge, coordinates as the scene's returns."""
+    """Returns nodes (n, columns as `NODE_COLUMNS`) of an edge, coordinates as the scene's returns."""
     n: Nodes = edge.nodes
     return np.column_stack([
         n.x_m, n.y_m, n.top_m, n.step_m, n.sigma_step_m, n.face_m, n.scatter_m, n.sigma_m, n.seen_low, n.seen_high_m,
@@ -105,7 +105,7 @@ def columns_of(edge: Edge) -> Float64:
 
 
 def cut_at(nodes: Float64, tile: Box) -> list[CutEdge]:
-    """Parts of a line (n, columns) within a tile; ends on its border are interpolated between nodes."""
+    """Returns parts of a line (n, columns) within a tile; ends on its border are interpolated between nodes."""
     parts: list[list[Float64]] = []
     cuts: list[list[bool]] = []
     for a, b in itertools.pairwise(nodes):
@@ -122,7 +122,7 @@ def cut_at(nodes: Float64, tile: Box) -> list[CutEdge]:
 
 
 def _inside(a: Float64, b: Float64, tile: Box) -> tuple[float, float] | None:
-    """Beginning and end, as shares, of what of a segment lies in a tile (Liang and Barsky 1984)."""
+    """Returns beginning and end, as shares, of the part of a segment in a tile (Liang and Barsky 1984)."""
     t0, t1 = 0.0, 1.0
     for axis, low, high in ((0, tile.x_min_m, tile.x_max_m), (1, tile.y_min_m, tile.y_max_m)):
         step = float(b[axis] - a[axis])
@@ -136,7 +136,7 @@ def _inside(a: Float64, b: Float64, tile: Box) -> tuple[float, float] | None:
 
 
 def _between(a: Float64, b: Float64, share: float) -> Float64:
-    """Node at a share of the way; what only one of both knows is taken from it."""
+    """Returns a node at a share of the way; a value that only one of both has is taken from it."""
     if share in {0.0, 1.0}:
         return a if share == 0.0 else b
     mixed = a + share * (b - a)
@@ -146,7 +146,7 @@ def _between(a: Float64, b: Float64, share: float) -> Float64:
 def pieces_table(
     parts: Sequence[CutEdge], scene: Scene, raster: HeightRaster, schema: pa.Schema = LINE_PIECES
 ) -> pa.Table:
-    """Rows of a schema of :func:`line_schema`: parts of lines in the map, with what saw them."""
+    """Returns rows of a schema of :func:`line_schema`: parts of lines in the map, with what saw them."""
     corner = scene.returns.corner_m
     seen = seen_by([p.nodes[:, :2] for p in parts], scene, raster)
     columns: dict[str, list[Any]] = {name: [] for name in schema.names}
@@ -166,7 +166,7 @@ def pieces_table(
 
 
 def node_names(schema: pa.Schema) -> tuple[str, ...]:
-    """Names of the columns that hold a value a node."""
+    """Returns names of the columns that have a value a node."""
     return tuple(f.name for f in schema if f.type == pa.list_(pa.float64()))
 
 
@@ -190,7 +190,7 @@ def seen_by(lines: Sequence[Float64], scene: Scene, raster: HeightRaster) -> lis
 
 
 def gathered(owner: Int64, number: int, pass_id: npt.NDArray[np.uint16], epoch_gps_ns: Int64) -> list[Seen]:
-    """What saw each of `number` things: returns (n,) with their owner (n,)."""
+    """Returns what saw each of `number` things: returns (n,) with their owner (n,)."""
     count = np.bincount(owner, minlength=number)
     first, last = np.full(number, np.iinfo(np.int64).max), np.full(number, np.iinfo(np.int64).min)
     np.minimum.at(first, owner, epoch_gps_ns)
@@ -205,14 +205,14 @@ def gathered(owner: Int64, number: int, pass_id: npt.NDArray[np.uint16], epoch_g
 
 
 def dense(line: Float64, every_m: float) -> tuple[Float64, Float64]:
-    """Coordinates x and y (k,) of points at even distances along a line (n, 2), with both ends."""
+    """Returns coordinates x and y (k,) of points at even distances along a line (n, 2), with both ends."""
     length = way_along(line)
     at = np.linspace(0.0, length[-1], max(int(np.ceil(length[-1] / every_m)), 1) + 1)
     return np.interp(at, length, line[:, 0]), np.interp(at, length, line[:, 1])
 
 
 def joined_lines(pieces: pa.Table) -> list[Line]:
-    """Lines of the pieces of all tiles: ends on a border meet the nearest end from the other side that goes on."""
+    """Returns lines of the pieces of all tiles: ends on a border meet the nearest end from the other side."""
     names = node_names(pieces.schema)
     lines = [_line(row, names) for row in pieces.to_pylist()]
     cut_first, cut_last = pieces["cut_first"].to_pylist(), pieces["cut_last"].to_pylist()
@@ -240,7 +240,7 @@ def _line(row: dict[str, Any], names: tuple[str, ...]) -> Line:
 
 
 def _partners(lines: Sequence[Line], lasts: Sequence[int], firsts: Sequence[int]) -> dict[int, int]:
-    """For each line that ends on a border, the one that goes on there, nearest first."""
+    """Returns for each line that ends on a border the one that continues it, nearest first."""
     if not lasts or not firsts:
         return {}
     ends = np.array([lines[i].nodes[-1, :2] for i in lasts])
@@ -268,7 +268,7 @@ def _direction(line: Line, end: int) -> Float64:
 
 
 def _end_to_end(a: Line, b: Line) -> Line:
-    """Both lines as one; their ends on the border become one node in the middle."""
+    """Returns both lines as one; their ends on the border become one node in the middle."""
     both = np.stack([a.nodes[-1], b.nodes[0]])
     known = np.isfinite(both)
     middle = np.where(known, both, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)

@@ -17,7 +17,7 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 FREE_M: Final = 0.3
-"""Distance of places that is no gap."""
+"""Distance of consecutive places (m) that is no gap."""
 
 
 class PathSettings(NamedTuple):
@@ -51,15 +51,15 @@ DEFAULT: Final = PathSettings()
 
 
 class Chain(NamedTuple):
-    """A path of places, in their direction."""
+    """A chain of places, in their direction."""
 
     places: Places
     evidence: float
-    """Evidence (σ · m) of its own places."""
+    """Evidence (σ · m) of the places that belong to it alone."""
 
 
 def paths_of(places: Places, settings: PathSettings = DEFAULT) -> list[Chain]:
-    """Paths through places, the strongest first.
+    """Returns paths through places, the strongest first.
 
     Each place has links to those that may follow it; the best way on from every place and to it is found by dynamic
     programming, with evidence that fades with distance. From the strongest place on the best ways are followed.
@@ -92,7 +92,7 @@ def paths_of(places: Places, settings: PathSettings = DEFAULT) -> list[Chain]:
 
 
 def _own_evidence(place: Float64, quality: Float64, settings: PathSettings) -> float:
-    """Evidence (σ · m) of a chain's own places: those of a stronger one that it leads to do not count."""
+    """Evidence (σ · m) of the places that belong to a chain alone, not to a stronger one that it leads to."""
     length = np.hypot(*np.diff(place[:, :2], axis=0).T)
     free = np.minimum(length, FREE_M)
     return float(np.sum(free * 0.5 * (quality[1:] + quality[:-1]) - (length - free) * settings.gap_cost))

@@ -9,7 +9,7 @@ import numpy as np
 
 from roadscan.assets.edges.line_pieces import Line
 
-_BEHIND_M: Final = 0.5
+_BEHIND_M: Final = 0.5  # Width of the surface behind a kerb that is used (m).
 
 
 class Weights(NamedTuple):
@@ -17,7 +17,7 @@ class Weights(NamedTuple):
 
     constant: float = -2.2
     evidence: float = 0.9
-    """Of the logarithm of the evidence (σ, added up in squares over independent metres)."""
+    """Of the logarithm of the evidence (σ, squares summed over independent metres)."""
     ratio: float = 1.0
     """Of the logarithm of the step over the scatter of its sides, less that of 4."""
     low: float = 3.0
@@ -37,7 +37,7 @@ def features(line: Line) -> tuple[float, float, float, float]:
     known = seen & np.isfinite(step) & np.isfinite(sigma)
     if not known.any():
         return 0.0, -2.0, -0.9, -_BEHIND_M
-    # 4 mm for what the lines of both sides do not show; neighbours share half of their returns.
+    # 4 mm for errors that the lines of both sides do not show; neighbours share half of their returns
     score = np.minimum(step[known] / np.hypot(sigma[known], 0.004), 8.0)
     evidence = math.sqrt(float(np.sum(score**2)) / 2.0)
     scatter = float(np.median(line.column("scatter_m")[known]))
@@ -48,7 +48,7 @@ def features(line: Line) -> tuple[float, float, float, float]:
 
 
 def kerb_probability(line: Line, weights: Weights = WEIGHTS) -> float:
-    """Probability of a line, between 0.01 and 0.995."""
+    """Returns the probability of a line, between 0.01 and 0.995."""
     evidence, ratio, low, behind = features(line)
     value = weights.constant + weights.evidence * evidence + weights.ratio * ratio + weights.low * low
     value += weights.behind * behind

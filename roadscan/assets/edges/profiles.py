@@ -1,4 +1,4 @@
-"""Chains of places made exact: at even nodes along them, the step's place, height and face from all heights near."""
+"""Exact chains of places: at even nodes along them, the step's place, height and face from all heights near."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 NODE_M: Final = 0.5
-"""Distance of nodes along an edge."""
+"""Distance of nodes along an edge (m)."""
 ALONG_M: Final = 0.5
-"""Half the length of a node's window: neighbours share half of their heights."""
+"""Half the length of a node's window (m): neighbours share half of their heights."""
 SEARCH: Final = (0.2, 0.02, 0.24, 0.35)
 """Farthest offset from the chain, least and greatest face, depth of a side (m)."""
 PRIOR: Final = (0.05, 0.015)
 """Standard deviation of a side's slope about the ground's (m/m), and of a height (m)."""
-ROUNDS: Final = 2
+ROUNDS: Final = 2  # Times that the line is moved to the steps and smoothed.
 STIFFNESS: Final = 4.0
 """Weight of a bend against that of a place."""
 BEND_M: Final = 0.04
-"""A bend of this (second difference of nodes) counts half."""
+"""A bend of this size (second difference of nodes, m) has half weight."""
 AWAY_M: Final = 0.04
-"""A node this far off its line counts half."""
+"""A node this far off its line (m) has half weight."""
 PLACE_BLUR_M: Final = 0.02
-"""Standard deviation of the place of a return, across an edge: it makes a face look wider."""
-_BIN_M: Final = 0.5
+"""Standard deviation of the place of a return, across an edge (m): it makes a face look wider."""
+_BIN_M: Final = 0.5  # Edge of the bins of heights (m).
 
 
 class Heights(NamedTuple):
-    """Heights of the ground, sorted by place for the kernel: by bins of half a metre."""
+    """Heights of the ground, sorted by bins of half a metre for the kernel."""
 
     x_m: Float64
     y_m: Float64
     height_m: Float64
     starts: Int64
-    """First height of each bin, and last where all end."""
+    """First height of each bin, and the end of the last."""
     bins: tuple[float, float, float, float, float]
     """Corner of the first bin, edge of a bin (m), rows and columns."""
 
@@ -62,28 +62,28 @@ class Nodes(NamedTuple):
     heading_y: Float64
     step_m: Float64
     sigma_step_m: Float64
-    """NaN where no step could be told."""
+    """NaN where no step is measurable."""
     face_m: Float64
     """Width of the face, seen from above."""
     scatter_m: Float64
-    """Of both sides about their lines, strip by strip."""
+    """Scatter of both sides about their lines, strip by strip."""
     returns: Float64
     seen_low: Float64
-    """Share of the lower side that was seen, up to the farthest height of at most 1.2 m."""
+    """Seen share of the lower side, up to the farthest height of at most 1.2 m."""
     seen_high_m: Float64
-    """Width that was seen of the higher side, of at most 1.2 m."""
+    """Seen width of the higher side, of at most 1.2 m."""
     sigma_m: Float64
     """Of the place, across the edge."""
     covered: Float64
     """Share of the window along the edge that was seen on both sides."""
 
     def at(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice) -> Nodes:
-        """The nodes at `rows`."""
+        """Returns the nodes at `rows`."""
         return Nodes(*(column[rows] for column in self))
 
 
 def sorted_heights(x_m: Float64, y_m: Float64, height_m: Float64) -> Heights:
-    """Heights (n,) at places (n,), sorted by bins of half a metre; the order of equal bins is that given."""
+    """Returns heights (n,) at places (n,), sorted by bins of half a metre; equal bins keep their order."""
     if x_m.size == 0:
         return Heights(x_m, y_m, height_m, np.zeros(2, np.int64), (0.0, 0.0, _BIN_M, 1.0, 1.0))
     x_min, y_min = _BIN_M * np.floor(x_m.min() / _BIN_M), _BIN_M * np.floor(y_m.min() / _BIN_M)
@@ -95,14 +95,14 @@ def sorted_heights(x_m: Float64, y_m: Float64, height_m: Float64) -> Heights:
 
 
 def chain_line(chain: Chain) -> Float64:
-    """Points (k, 2) at even distances along a chain of places."""
+    """Returns points (k, 2) at even distances along a chain of places."""
     return even_nodes(np.column_stack(chain.places[:2]), NODE_M)
 
 
 def nodes_of(line: Float64, heights: Heights, raster: HeightRaster, slopes: tuple[Float64, Float64]) -> Nodes:
-    """Nodes of a line (k, 2), each with the step that its surroundings show; the higher side is the right one.
+    """Returns nodes of a line (k, 2), each with the step that its surroundings show; the higher side is the right one.
 
-    The line is moved to the steps and smoothed twice, since the steps are told best where it runs along the edge.
+    The line is moved to the steps and smoothed twice, since steps are measured best where it runs along the edge.
     slopes : of the ground at large, see :meth:`HeightRaster.slopes`.
     """
     for _ in range(ROUNDS):
@@ -128,7 +128,7 @@ def _fitted(
     raster: HeightRaster,
     slopes: tuple[Float64, Float64],
 ) -> tuple[Float64, Float64]:
-    """Steps (n, RESULTS) at the nodes of a line, and the heights (n,) that they count from."""
+    """Returns steps (n, RESULTS) at the nodes of a line, and the heights (n,) from which they count."""
     ux, uy = heading
     row, column = raster.cells_of(line[:, 0], line[:, 1])
     gx, gy = slopes[0][row, column], slopes[1][row, column]
@@ -140,7 +140,7 @@ def _fitted(
 
 
 def smooth_line(points: Float64, weight: Float64) -> Float64:
-    """Points (n, 2) of a smooth line near points (n, 2) with weights (n,).
+    """Returns points (n, 2) of a smooth line near points (n, 2) with weights (n,).
 
     The sum of squared distances and of squared second differences is least; points that lie far off, and bends, count
     less each time that it is solved, so that a wrong node is left aside and a corner stays one.
@@ -168,12 +168,12 @@ def smooth_line(points: Float64, weight: Float64) -> Float64:
 
 
 def even_nodes(places: Float64, distance_m: float) -> Float64:
-    """Points (k, 2) at even distances along places (n, 2), which are smoothed over 0.6 m first."""
+    """Returns points (k, 2) at even distances along places (n, 2), which are smoothed over 0.6 m first."""
     length = way_along(places)
     fine = np.arange(0.0, length[-1] + 0.05, 0.1)
     path = np.column_stack([np.interp(fine, length, places[:, i]) for i in range(2)])
     if len(path) >= 3:
-        # Mirrored at its ends through the end points, which so stay where they are.
+        # Mirrored about the end points, which so stay fixed.
         more = min(len(path) - 1, 12)
         before, behind = 2.0 * path[:1] - path[more:0:-1], 2.0 * path[-1:] - path[-2 : -2 - more : -1]
         path = scipy.ndimage.gaussian_filter1d(np.concatenate([before, path, behind]), 3.0, axis=0)[more:-more]
@@ -184,14 +184,14 @@ def even_nodes(places: Float64, distance_m: float) -> Float64:
 
 
 def headings(x_m: Float64, y_m: Float64) -> tuple[Float64, Float64]:
-    """Unit vectors (n,) along a line of two points or more, at its points."""
+    """Returns unit vectors (n,) along a line of two points or more, at its points."""
     ex, ey = np.gradient(x_m), np.gradient(y_m)
     length = np.maximum(np.hypot(ex, ey), 1e-9)
     return ex / length, ey / length
 
 
 def smooth_offsets(offset_m: Float64, known: npt.NDArray[np.bool_]) -> Float64:
-    """Offsets (n,) of nodes, the median of three known neighbours, and 0 far from known ones."""
+    """Returns offsets (n,) of nodes, the median of three known neighbours, and 0 far from known ones."""
     if not known.any():
         return np.zeros_like(offset_m)
     at = np.flatnonzero(known)

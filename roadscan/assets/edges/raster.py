@@ -1,4 +1,4 @@
-"""The ground of a scene as a fine raster of robust low heights, what edges are sought in."""
+"""The ground of a scene as a fine raster of robust low heights, in which edges are sought."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from roadscan.core.extras import cv2
 
 Float64 = npt.NDArray[np.float64]
 
-CELL_M: Final = 0.1
+CELL_M: Final = 0.1  # Edge of a cell (m).
 DEPTH_M: Final = 0.12
-"""Returns up to this above the lowest one of a cell count as its ground."""
+"""Returns up to this height above the lowest one of a cell (m) count as its ground."""
 REACH_M: Final = 0.45
-"""Returns up to this above bare earth may be ground: the top of a kerb that the filter has taken for an object too."""
-BESIDE_VEHICLE_M: Final = 0.15
+"""Returns up to this above bare earth (m) may be ground: the filter may take the top of a kerb for an object."""
+BESIDE_VEHICLE_M: Final = 0.15  # Ground this near to a vehicle is left out (m).
 UNEVENNESS_M: Final = 0.004
-"""Standard deviation of a cell's true height about a smooth surface; no number of returns takes it away."""
+"""Standard deviation of a cell's true height about a smooth surface (m), whatever the number of returns."""
 COARSE_M: Final = 1.5
-"""Standard deviation of the window that the slope of the ground at large is taken from."""
+"""Standard deviation of the window from which the slope of the ground at large is computed (m)."""
 NOT_GROUND: Final = (
     classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION, classes.BUILDING, classes.LOW_NOISE, classes.HIGH_NOISE,
     classes.WIRE, classes.VEHICLE, classes.PERSON, classes.POLE, classes.SIGN, classes.FENCE,
@@ -60,18 +60,18 @@ class HeightRaster:
 
     @property
     def weight(self) -> Float64:
-        """(rows, columns) one over the variance of a height (1/m²), 0 where there is none."""
+        """Returns one over the variance of a height (1/m²) (rows, columns), 0 where there is none."""
         return np.where(self.count > 0, 1.0 / np.square(np.where(self.count > 0, self.sigma_m, 1.0)), 0.0)
 
     @cached_property
     def level_m(self) -> float:
-        """Median height of its cells; 0 where none has one."""
+        """Returns the median height of its cells; 0 where none has one."""
         known = self.count > 0
         return float(np.median(self.height_m[known])) if known.any() else 0.0
 
     @cached_property
     def slopes(self) -> tuple[Float64, Float64]:
-        """Slope (rows, columns) of the ground at large along x and y (m/m)."""
+        """Returns the slope (rows, columns) of the ground at large along x and y (m/m)."""
         sigma = COARSE_M / self.cell_m
         known = (self.count > 0).astype(np.float64)
         level = self.level_m
@@ -83,7 +83,7 @@ class HeightRaster:
         return np.where(near, np.clip(right, -0.3, 0.3), 0.0), np.where(near, np.clip(down, -0.3, 0.3), 0.0)
 
     def cells_of(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Row and column of places (any shape), held inside the raster."""
+        """Returns row and column of places (any shape), clipped to the raster."""
         rows, columns = self.count.shape
         x_m, y_m = np.broadcast_arrays(x_m, y_m)
         row = np.floor((np.asarray(y_m) - self.y_min_m) / self.cell_m).astype(np.int64)
@@ -92,7 +92,7 @@ class HeightRaster:
 
 
 def may_be_ground(scene: Scene) -> npt.NDArray[np.bool_]:
-    """Returns (n,) of the scene that edges of the ground may be made of."""
+    """Returns a mask (n,) of the scene's returns that may be ground with edges."""
     above, looked_at = scene.above_ground_m, np.ones(256, np.bool_)
     looked_at[list(NOT_GROUND)] = False
     return (np.isnan(above) | (np.abs(above) <= REACH_M)) & looked_at[scene.classes]
@@ -100,7 +100,7 @@ def may_be_ground(scene: Scene) -> npt.NDArray[np.bool_]:
 
 @once_a_scene
 def raster_of(scene: Scene) -> HeightRaster:
-    """The raster of a scene's extent; its cells are those of a grid that all tiles share."""
+    """Returns the raster of a scene's extent; its cells are those of a grid that all tiles share."""
     window, used, returns = scene.extent, may_be_ground(scene), scene.returns
     x_min, y_min = (CELL_M * math.floor(v / CELL_M + 1e-6) for v in window[:2])
     columns = max(math.ceil((window.x_max_m - x_min) / CELL_M - 1e-6), 8)
@@ -117,7 +117,7 @@ def raster_of(scene: Scene) -> HeightRaster:
 
 
 def _beside_vehicles(scene: Scene, cell: npt.NDArray[np.int32], shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """Returns (n,) at vehicles: what is seen of the ground there ends at their outline, and steps go along it."""
+    """Returns a mask (n,) of returns at vehicles: the seen ground ends at their outline, which looks like a step."""
     vehicle = cell[scene.classes == classes.VEHICLE]
     number = np.bincount(vehicle[vehicle >= 0], minlength=shape[0] * shape[1]).reshape(shape)
     cells = math.ceil(BESIDE_VEHICLE_M / CELL_M)
@@ -135,7 +135,7 @@ def of_cells(
     mean_m: Float64,
     spread_m: Float64,
 ) -> HeightRaster:
-    """Raster of cells whose mean height and spread are known.
+    """Returns a raster of cells whose mean height and spread are known.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Steps of the ground in every direction: how high, how sure, and where exactly, as places of possible edges."""
+"""Steps of the ground in every direction: height, significance, and exact place of possible edges."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class StepSettings(NamedTuple):
     slope_sigma: float = 0.05
     """Standard deviation of the slope of a side about that of the ground at large (m/m)."""
     floor_m: float = 0.005
-    """Standard deviation of a step that no number of returns takes away: unevenness as long as the window."""
+    """Standard deviation of a step however many returns it has: unevenness as long as the window."""
     around_m: float = 5.0
-    """Width of the surroundings whose steps of the same direction tell the scatter that the lines do not show."""
+    """Width of the surroundings whose steps of the same direction show the scatter beyond that of the lines."""
     least_evidence: float = 2.0
-    """Least step over its σ for a place to be looked at."""
+    """Least significance (step over its σ) of a place."""
     least_m: float = 0.015
     greatest_m: float = 0.32
 
@@ -63,24 +63,24 @@ class Places(NamedTuple):
     """Height of the step."""
 
     def at(self, rows: npt.NDArray[np.int64]) -> Places:
-        """The places at `rows`, indices (m,)."""
+        """Returns the places at `rows`, indices (m,)."""
         return Places(*(column[rows] for column in self))
 
 
 DEFAULT: Final = StepSettings()
-_CLIPPED: Final = 4.0
-_STILL: Final = 0.5
-_PRIOR: Final = 0.06
+_CLIPPED: Final = 4.0  # Greatest significance that counts in the scatter.
+_STILL: Final = 0.5  # Significance that counts for a cell without steps.
+_PRIOR: Final = 0.06  # Weight of the prior scatter, as a share of the cells.
 _MEAN_SIZE: Final = math.sqrt(2.0 / math.pi)
 """Mean of the absolute value of a normal variable."""
 
 
 def step_places(raster: HeightRaster, settings: StepSettings = DEFAULT) -> Places:
-    """Places where the ground steps, in the order of rows and columns: a matched filter in every direction.
+    """Returns places where the ground steps, in the order of rows and columns: a matched filter in every direction.
 
     Each side of the edge gets a line across it, of cells within `half_along_m` along and `across_m` across; the step is
     the difference of both lines at the edge, and its evidence the step over its σ, which grows with the scatter of the
-    cells about the lines. A place is kept for the direction that tells most, where no neighbour across tells more.
+    cells about the lines. A place is kept for its most significant direction, unless a neighbour across exceeds it.
     """
     whole, part = raster, _part(raster, settings)
     raster = replace(raster, **{name: getattr(raster, name)[part] for name in ("count", "height_m", "sigma_m")})
@@ -113,7 +113,7 @@ def step_places(raster: HeightRaster, settings: StepSettings = DEFAULT) -> Place
 
 
 def _part(raster: HeightRaster, settings: StepSettings) -> tuple[slice, slice]:
-    """Rows and columns of the raster around which, as far as a step's surroundings reach, no cell has a height."""
+    """Returns rows and columns of the raster whose surroundings, as far as a step reaches, contain a height."""
     margin, known = round(settings.around_m / raster.cell_m) + 1, raster.count > 0
     parts = []
     for axis, size in enumerate(known.shape):
@@ -124,7 +124,7 @@ def _part(raster: HeightRaster, settings: StepSettings) -> tuple[slice, slice]:
 
 
 class _Field(NamedTuple):
-    """Rasters with a frame, and columns up to a whole number of chunks, as the kernels want them."""
+    """Rasters with a frame, padded to a whole number of chunks of columns, as the kernels need them."""
 
     weight: Float64
     height_m: Float64
@@ -132,7 +132,7 @@ class _Field(NamedTuple):
     slope_y: Float64
 
     def inner(self, raster: Any) -> Any:
-        """A raster without a frame (rows, columns up to a whole number of chunks); what is added is 0 or False."""
+        """Returns a raster without a frame (rows, columns padded to whole chunks); the padding is 0 or False."""
         columns = self.weight.shape[1] - 2 * FRAME
         return np.pad(raster, ((0, 0), (0, columns - raster.shape[1])))
 
@@ -145,12 +145,12 @@ def _framed(raster: HeightRaster, level_m: float, slopes: Sequence[Float64]) -> 
 
 
 class _Surroundings(NamedTuple):
-    """Room for the means of what lies around cells."""
+    """Buffers for the means of the surroundings of cells."""
 
     size: int
     """Width of the surroundings (cells)."""
     wanted: tuple[int, int]
-    """First of the rows in which steps are looked for, and the one after the last."""
+    """First of the rows in which steps are sought, and the one after the last."""
     counted: Float64
     sizes: Float64
     means: Float64
@@ -159,7 +159,7 @@ class _Surroundings(NamedTuple):
 
     @classmethod
     def of(cls, active: npt.NDArray[np.bool_], size: int) -> Self:
-        """For steps that are looked for in some cells (rows, columns)."""
+        """Returns the buffers for steps that are sought in some cells (rows, columns)."""
         rows, columns = active.shape
         looked_at = np.flatnonzero(active.any(axis=1))
         wanted = (int(looked_at[0]), int(looked_at[-1]) + 1) if looked_at.size else (0, 0)
@@ -168,9 +168,9 @@ class _Surroundings(NamedTuple):
         return cls(size, wanted, counted, sizes, np.empty((2, rows, columns)), between, line)
 
     def take_excess(self, evidence: Float64, still: npt.NDArray[np.bool_]) -> None:
-        """Divide steps over their σ by how much more than by chance steps of one direction scatter around each cell.
+        """Divide steps over their σ by the excess scatter of steps of one direction around each cell over chance.
 
-        Rings of a lidar whose lasers or sweeps disagree make steps along themselves everywhere around; a kerb is alone.
+        Rings of a lidar whose lasers or sweeps disagree look like steps everywhere around; a kerb is alone.
         still : cells without a step of any kind near.
         """
         sizes_of(evidence, still, (_STILL, _CLIPPED), self.counted, self.sizes)
@@ -180,7 +180,7 @@ class _Surroundings(NamedTuple):
 
 
 def _along(u: tuple[float, float], settings: StepSettings, cell_m: float) -> Float64:
-    """(k, 4) cells of a strip along u, as :func:`strips` wants them."""
+    """Returns (k, 4) cells of a strip along u, as :func:`strips` needs them."""
     half = round(settings.half_along_m / cell_m)
     k = np.arange(-half, half + 1)
     cells = np.unique(np.column_stack([np.rint(k * u[0]), np.rint(k * u[1])]), axis=0)
@@ -188,20 +188,20 @@ def _along(u: tuple[float, float], settings: StepSettings, cell_m: float) -> Flo
 
 
 def _across(v: tuple[float, float], settings: StepSettings, cell_m: float) -> Float64:
-    """(s, 3) strips of the right side, as :func:`step_response` wants them."""
+    """Returns (s, 3) strips of the right side, as :func:`step_response` needs them."""
     j = np.arange(1, round(settings.across_m / cell_m) + 1)
     return np.column_stack([np.rint(j * v[0]), np.rint(j * v[1]), j * cell_m])
 
 
 def _freedom(raster: HeightRaster, settings: StepSettings) -> Float64:
-    """(rows, columns) cells with a height in the window around each cell, any direction of it."""
+    """Returns the number (rows, columns) of cells with a height in the window around each cell, in any direction."""
     wide = round((settings.half_along_m + settings.across_m) / raster.cell_m) + 1
     share = scipy.ndimage.uniform_filter((raster.count > 0).astype(np.float64), wide, mode="constant")
     return np.asarray(share * 4.0 * settings.half_along_m * settings.across_m / raster.cell_m**2)
 
 
 def _active(raster: HeightRaster, settings: StepSettings) -> npt.NDArray[np.bool_]:
-    """Cells near which heights differ by as much as the least step."""
+    """Returns a mask of cells near which heights differ by as much as the least step."""
     wide, known = round(2.0 * settings.across_m / raster.cell_m) + 1, raster.count > 0
     window = np.ones((wide, wide), np.uint8)
     top = cv2.dilate(np.where(known, raster.height_m, -np.inf), window, borderType=cv2.BORDER_REPLICATE)
@@ -210,7 +210,7 @@ def _active(raster: HeightRaster, settings: StepSettings) -> npt.NDArray[np.bool
 
 
 def _places(raster: HeightRaster, best: Float64, first: tuple[int, int], settings: StepSettings) -> Places:
-    """Places of the cells with a step; first : row and column of the raster that `best` begins at."""
+    """Returns the places of the cells with a step; first : row and column of the raster at which `best` begins."""
     row, column = np.nonzero(best[0] > 0.0)
     evidence, step, direction, offset = best[:, row, column]
     row, column = row + first[0], column + first[1]

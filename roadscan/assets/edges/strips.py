@@ -21,7 +21,7 @@ Float64 = npt.NDArray[np.float64]
 MEDIAN_NODES: Final = 5
 """A width is the median of this many nodes, so that a pole or a tree does not end a strip."""
 HOLE_NODES: Final = 14
-"""So many nodes without a width within a strip are bridged: a car stands there, say."""
+"""Longest run of nodes without a width that is bridged within a strip: a car may stand there."""
 
 
 class Strip(NamedTuple):
@@ -34,21 +34,21 @@ class Strip(NamedTuple):
 
     @property
     def length_m(self) -> float:
-        """Length along the line."""
+        """Returns the length along the line."""
         return self.line.length_m
 
     def column(self, name: str) -> Float64:
-        """A column (n,) of its nodes."""
+        """Returns a column (n,) of its nodes."""
         return self.line.column(name)
 
     def mean(self, values: Float64) -> float | None:
-        """Median of known values (n,); None where there is none."""
+        """Returns the mean of known values (n,); None where there is none."""
         good = self.known & np.isfinite(values)
         return float(np.median(values[good])) if good.any() else None
 
 
 def strips_of(line: Line, usable: npt.NDArray[np.bool_], least_m: float, shortest_m: float) -> Iterator[Strip]:
-    """Runs of the usable nodes (n,) of a line with columns of `BESIDE_PIECES`, at least `shortest_m` long.
+    """Yields runs of the usable nodes (n,) of a line with columns of `BESIDE_PIECES`, at least `shortest_m` long.
 
     least_m : least width of the surface behind the line (m).
     """
@@ -72,7 +72,7 @@ def strips_of(line: Line, usable: npt.NDArray[np.bool_], least_m: float, shortes
 
 
 def polygon_of(strip: Strip) -> shapely.Polygon | None:
-    """Polygon with heights between the line and the end of the surface behind it; None where nothing is left of it."""
+    """Returns the polygon between the line and the end of the surface behind it, with heights; None if empty."""
     nodes = strip.line.nodes
     inner = nodes[:, :3]
     ux, uy = np.gradient(nodes[:, 0]), np.gradient(nodes[:, 1])
@@ -84,13 +84,13 @@ def polygon_of(strip: Strip) -> shapely.Polygon | None:
 
 
 def ribbon(inner: Float64, outer: Float64) -> shapely.Polygon | None:
-    """Polygon with heights between two lines (n, 3) of points that face each other; None where it has no area.
+    """Returns the polygon with heights between two lines (n, 3) of facing points; None where it has no area.
 
     It is the union of the quadrilaterals between neighbouring points, so that it does not fold at an inner corner.
     """
     corners = np.stack([inner[:-1, :2], inner[1:, :2], outer[1:, :2], outer[:-1, :2]], axis=1)
     pieces = shapely.convex_hull(shapely.multipoints(list(corners)))
-    # 5 mm more, so that neighbours meet in spite of rounding.
+    # 5 mm more, so that neighbours meet in spite of rounding
     whole = shapely.union_all(shapely.buffer(pieces, 0.005, join_style="mitre"))
     parts = [g for g in getattr(whole, "geoms", [whole]) if g.geom_type == "Polygon" and g.area > 0.0]
     if not parts:
@@ -102,7 +102,7 @@ def ribbon(inner: Float64, outer: Float64) -> shapely.Polygon | None:
 
 
 def running_slope(strip: Strip, over_m: float = 2.0) -> float | None:
-    """Greatest slope (m/m, up or down) along the middle of a strip over 2 m, of its heights smoothed over as much."""
+    """Returns the greatest slope (m/m, up or down) along the middle of a strip over 2 m, of smoothed heights."""
     height = strip.column("middle_height_m")
     length = way_along(strip.line.nodes)
     good = strip.known & np.isfinite(height)
@@ -117,9 +117,9 @@ def running_slope(strip: Strip, over_m: float = 2.0) -> float | None:
 
 
 def sigma_width_m(strip: Strip) -> float:
-    """Standard deviation (m) of the strip's outer edge, from how widths of neighbours differ.
+    """Returns the standard deviation (m) of the strip's outer edge, from differences of neighbouring widths.
 
-    It is 15 cm at least: cells that a wall shares with the strip are no part of it.
+    It is 15 cm at least: cells shared with a wall do not belong to the strip.
     """
     width = strip.column("width_m")[strip.known]
     if width.size < 3:

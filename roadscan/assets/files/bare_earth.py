@@ -1,4 +1,4 @@
-"""Bare earth of a square as a GeoTIFF: what was seen, and what lies between."""
+"""Bare earth of a square as a GeoTIFF: seen heights, and interpolated ones."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from roadscan.tiles.products.raster import about, height_unit
 
 
 def within(model: GroundModel, box: Box) -> GroundModel | None:
-    """The cells of a model whose middle lies in a box; None without any."""
+    """Returns the cells of a model whose middle lies in a box; None without any."""
     rows, columns = model.height_m.shape
     x = model.x_min_m + (np.arange(columns) + 0.5) * model.cell_m
     y = model.y_min_m + (np.arange(rows) + 0.5) * model.cell_m
@@ -60,7 +60,7 @@ def write_bare_earth(path: Path, model: GroundModel, corner_m: tuple[float, floa
 
 
 def read_bare_earth(content: bytes, corner_m: tuple[float, float], context: ProductContext) -> GroundModel:
-    """The model that :func:`write_bare_earth` wrote, from the corner that is given.
+    """Returns the model that :func:`write_bare_earth` wrote, from the corner that is given.
 
     Raises
     ------

@@ -18,11 +18,11 @@ from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.las import LasOptions, write_las
 
 _OWN_CODES: Final = {code: name for code, name in CLASS_NAMES.items() if code >= 64}
-"""LAS leaves these to whoever writes the file, which then says what they are."""
+"""LAS leaves the meaning of these codes to the file, which names them."""
 
 
 def classified_points(returns: Returns, classes: npt.NDArray[np.uint8], square: TileId) -> TilePoints:
-    """Returns (n,) of a square as points, each with its class (n,)."""
+    """Returns returns (n,) of a square as points, each with its class (n,)."""
     quanta = [np.rint(v * QUANTA_PER_M).astype(np.int32) for v in (returns.x_m, returns.y_m, returns.height_m)]
     return TilePoints(
         tile=square,
@@ -38,7 +38,7 @@ def classified_points(returns: Returns, classes: npt.NDArray[np.uint8], square: 
 
 
 def write_classified(path: Path, points: TilePoints, squares: TileGrid, context: ProductContext) -> None:
-    """Write the points of a square (one or more) as LAZ, with the names of the classes that are not ASPRS's own."""
+    """Write the points of a square (one or more) as LAZ, with the names of the user-defined classes."""
     codes, counts = np.unique(points.classification, return_counts=True)
     facts = {
         "survey": context.survey_id,

@@ -19,7 +19,7 @@ from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import in_crs_unit
 
 _WRITTEN: Final = "2000-01-01T00:00:00.000Z"
-"""A GeoPackage states when a layer changed; equal tables have to give equal bytes."""
+"""Time of change that a GeoPackage states of its layers: equal tables give equal bytes."""
 _DEGREE_DECIMALS: Final = 9
 """Decimals of degrees in GeoJSON: 0.1 mm."""
 GEOMETRIES: Final = {"PointZ": "Point Z", "LineStringZ": "LineString Z", "PolygonZ": "Polygon Z"}
@@ -80,7 +80,7 @@ def write_dxf(path: Path, layers: Sequence[Layer], context: ProductContext) -> N
 
 
 def _lines(shape: shapely.Geometry) -> Iterator[shapely.Geometry]:
-    """What a drawing shows of a shape."""
+    """Yields the lines that a drawing shows of a shape."""
     if shape.geom_type == "Polygon":
         yield from (shapely.LineString(ring) for ring in (shape.exterior, *shape.interiors))
     else:
@@ -103,7 +103,7 @@ def _write(
 
 @contextmanager
 def _without_crs_warning() -> Iterator[None]:
-    """Keep pyogrio from warning of a file without a CRS: a drawing, or of a local map."""
+    """Suppress pyogrio's warning about a file without a CRS: a drawing, or of a local map."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*'crs' was not provided.*")
         yield

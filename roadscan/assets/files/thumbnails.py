@@ -17,10 +17,10 @@ from roadscan.core.extras import cv2
 Float64 = npt.NDArray[np.float64]
 UInt8 = npt.NDArray[np.uint8]
 
-EDGE_PX: Final = 220
-_GAP_PX: Final = 6
-_BACK: Final = (24, 26, 32)
-_OUTLINE: Final = (255, 210, 60)
+EDGE_PX: Final = 220  # Edge of a thumbnail (pixels).
+_GAP_PX: Final = 6  # Gap between thumbnails (pixels).
+_BACK: Final = (24, 26, 32)  # Colour of the background (RGB).
+_OUTLINE: Final = (255, 210, 60)  # Colour of an outline (RGB).
 _COLOURS: Final = {
     classes.GROUND: (150, 120, 84), classes.ROAD: (120, 124, 132), classes.LOW_VEGETATION: (96, 150, 78),
     classes.MEDIUM_VEGETATION: (80, 160, 70), classes.HIGH_VEGETATION: (60, 150, 60), classes.BUILDING: (206, 140, 110),
@@ -29,12 +29,12 @@ _COLOURS: Final = {
     classes.FENCE: (190, 160, 240), classes.SIDEWALK: (190, 170, 150), classes.BRIDGE_DECK: (140, 200, 200),
     classes.OVERHEAD_STRUCTURE: (110, 170, 180),
 }  # fmt: skip
-_OTHER: Final = (170, 176, 186)
-_LEAST_M: Final = 2.0
-_AROUND: Final = 1.3
+_OTHER: Final = (170, 176, 186)  # Colour of classes without one of their own (RGB).
+_LEAST_M: Final = 2.0  # Least half width of the drawn square (m).
+_AROUND: Final = 1.3  # Ratio of the drawn square to the asset.
 _DEEP_M: Final = 1.5
-"""From the side, returns so far before and behind an asset are drawn."""
-_FEWEST: Final = 20
+"""Depth (m) before and behind an asset of the returns drawn from the side."""
+_FEWEST: Final = 20  # With fewer returns there is no drawing.
 
 
 def read_classified(path: Path) -> tuple[Float64, UInt8, npt.NDArray[np.uint16]]:
@@ -44,7 +44,7 @@ def read_classified(path: Path) -> tuple[Float64, UInt8, npt.NDArray[np.uint16]]
 
 
 def drawn_from_side(points: tuple[Float64, UInt8, Any], place_m: Sequence[float], height_m: float) -> UInt8 | None:
-    """Returns (220, 220, 3) around an upright asset, seen from the south or west, whichever shows more of it.
+    """Image (220, 220, 3) of the returns around an upright asset, from the south or west, whichever shows more.
 
     None where there are too few.
 
@@ -67,7 +67,7 @@ def drawn_from_side(points: tuple[Float64, UInt8, Any], place_m: Sequence[float]
 
 
 def drawn_from_above(points: tuple[Float64, UInt8, Any], shape: shapely.Geometry) -> UInt8 | None:
-    """Returns (220, 220, 3) about a line or an area, with its outline, north upwards; None where there are too few."""
+    """Image (220, 220, 3) of the returns about a line or an area with its outline, north up; None if too few."""
     xyz, codes, intensity = points
     west, south, east, north = shape.bounds
     middle = np.array([(west + east) / 2, (south + north) / 2])
@@ -88,7 +88,7 @@ def drawn_from_above(points: tuple[Float64, UInt8, Any], shape: shapely.Geometry
 
 
 def fitted(picture: UInt8) -> UInt8:
-    """A cut-out (h, w, 3) as large as fits into a thumbnail (220, 220, 3)."""
+    """Returns a cut-out (h, w, 3) scaled to fit into a thumbnail (220, 220, 3)."""
     scale = EDGE_PX / max(picture.shape[:2])
     size = max(round(picture.shape[1] * scale), 1), max(round(picture.shape[0] * scale), 1)
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
@@ -99,13 +99,13 @@ def fitted(picture: UInt8) -> UInt8:
 
 
 def read_cut_out(content: bytes) -> UInt8 | None:
-    """Pixels (h, w, 3), red first, of a cut-out; None where it cannot be read."""
+    """Returns pixels (h, w, 3), red first, of a cut-out; None where it cannot be read."""
     picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     return None if picture is None else np.ascontiguousarray(picture[:, :, ::-1])
 
 
 def sheet(thumbnails: Sequence[UInt8]) -> bytes:
-    """Thumbnails side by side, as PNG."""
+    """Returns thumbnails side by side, as PNG."""
     gap = np.full((EDGE_PX, _GAP_PX, 3), 255, np.uint8)
     parts = [part for one in thumbnails for part in (gap, one)][1:]
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(np.hstack(parts)[:, :, ::-1]))
@@ -113,7 +113,7 @@ def sheet(thumbnails: Sequence[UInt8]) -> bytes:
 
 
 def _dots(flat: Float64, codes: UInt8, intensity: npt.NDArray[Any], reach_m: float) -> UInt8:
-    """Returns (n, 2) within `reach_m` of the middle, brighter where they are bright, in the colours of classes."""
+    """Returns an image of returns (n, 2) within `reach_m` of the middle, by intensity and class."""
     out = np.full((EDGE_PX, EDGE_PX, 3), _BACK, np.uint8)
     table = np.array([_COLOURS.get(code, _OTHER) for code in range(256)], np.float64)
     light = intensity.astype(np.float64)

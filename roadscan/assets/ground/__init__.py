@@ -1,1 +1,1 @@
-"""Bare earth: which returns lie on it, its raster, its cross-sections."""
+"""Bare earth: the returns on it, its raster, its cross-sections."""

@@ -1,4 +1,4 @@
-"""Bare earth of a window: which returns lie on it, and its raster."""
+"""Bare earth of a window: the returns on it, and its raster."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from roadscan.assets.scene import GroundModel
 Float32 = npt.NDArray[np.float32]
 
 _NOISE_M: Final = 0.3
-"""A return is noise that lies below the ground by more."""
+"""A return farther below the ground (m) is noise."""
 
 
 class BareEarth(NamedTuple):
-    """What is known of the ground of a window."""
+    """The ground of a window."""
 
     model: GroundModel
     above_m: Float32
@@ -34,7 +34,7 @@ class BareEarth(NamedTuple):
 
 
 def bare_earth(place: Place) -> BareEarth:
-    """Ground of the returns of a window."""
+    """Returns the ground under the returns of a window."""
     found = ground_returns(place)
     model = ground_model(place, found)
     above = np.empty(len(place.returns), np.float32)
@@ -45,7 +45,7 @@ def bare_earth(place: Place) -> BareEarth:
 
 
 def ground_returns(place: Place) -> Found:
-    """Returns on the ground by the filter that the settings name."""
+    """Returns a mask of returns on the ground, by the filter that the settings name."""
     if place.settings.method == "planes":
         return plane_ground(place)
     return dense_ground(place) if is_dense(place) else sparse_ground(place)

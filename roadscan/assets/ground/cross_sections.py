@@ -30,8 +30,8 @@ class CrossSections(NamedTuple):
     """1 σ of the heights: the noise of the returns where they were seen; elsewhere it grows with the distance."""
 
     def joined(self, other: Self) -> Self:
-        """The same sections from two ground models, such as those of neighbouring tiles: what was seen goes before what
-        was interpolated, and this one before the other.
+        """Same sections from two ground models, such as those of neighbouring tiles: seen heights first, then
+        interpolated ones, each from this model before the other.
         """
         better = np.isnan(self.height_m) | (other.seen & ~self.seen)
         return self._replace(
@@ -42,7 +42,7 @@ class CrossSections(NamedTuple):
 
 
 def cross_sections(ground: GroundModel, line_xy_m: Float64, station_m: Float64, offset_m: Float64) -> CrossSections:
-    """Bare earth on lines square to a reference line.
+    """Returns bare earth on lines square to a reference line.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def cross_sections(ground: GroundModel, line_xy_m: Float64, station_m: Float64, 
 
 
 def stations(line_xy_m: Float64, station_m: Float64) -> tuple[Float64, Float64]:
-    """Places (s, 2) at stations of a line (n, 2), and unit vectors (s, 2) to its right; places beyond its ends are NaN.
+    """Returns places (s, 2) at stations of a line (n, 2), and unit vectors (s, 2) to its right; NaN beyond its ends.
 
     The direction at a station is that of the line from half a metre before to half a metre behind it, so that it does
     not jump at the line's vertices.
@@ -88,14 +88,14 @@ def _about(station_m: Float64) -> tuple[Float64, Float64, Float64]:
 
 
 def inside(ground: GroundModel, x_m: Float64, y_m: Float64) -> Bools:
-    """Which places lie on the raster."""
+    """Returns a mask of the places on the raster."""
     rows, columns = ground.height_m.shape
     u, v = (x_m - ground.x_min_m) / ground.cell_m, (y_m - ground.y_min_m) / ground.cell_m
     return np.asarray((u >= 0.0) & (u < columns) & (v >= 0.0) & (v < rows))
 
 
 def cells(ground: GroundModel, x_m: Float64, y_m: Float64) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Row and column of places, clamped to the raster."""
+    """Returns row and column of places, clamped to the raster."""
     rows, columns = ground.height_m.shape
     row = np.nan_to_num((y_m - ground.y_min_m) / ground.cell_m, nan=0.0)
     column = np.nan_to_num((x_m - ground.x_min_m) / ground.cell_m, nan=0.0)

@@ -1,4 +1,4 @@
-"""Bare earth of dense returns, those of scanners on the road: several in each cell of a quarter of a metre."""
+"""Bare earth of dense returns of scanners on the road: several in each cell of a quarter of a metre."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from roadscan.core.extras import cv2
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
-LOWEST_CELL_M: Final = 0.5
+LOWEST_CELL_M: Final = 0.5  # Edge of a cell of the lowest returns (m).
 _PIT_M: Final = 0.5
-"""A lowest return is noise where it lies below the surface around by more: a mirror image, seen in a car."""
-_CELL_M: Final = 0.25
+"""A lowest return farther below its surroundings (m) is noise: a mirror image, seen in a car."""
+_CELL_M: Final = 0.25  # Edge of a cell of the finer grid (m).
 _NEAR_M, _CLOSE_M = (-0.25, 0.40), 0.20
-"""Returns between these heights above the provisional ground tell how rough a cell is, and where the ground lies."""
+"""Between these heights above the first estimate of the ground (m) show a cell's roughness, close ones its height."""
 _ROUGH_M, _EVEN_M, _REACH_M = 0.03, 0.02, 0.03
 """Beyond the noise of the data: scatter from which a place is rough, up to which a cell is even, and how far a return
 may lie from an even cell's height."""
 _NOISIEST_M: Final = 0.04
-"""More than this is no noise of the data."""
+"""Noise of the data is no more than this (m)."""
 _AROUND: Final = 5
-"""A place is rough where most cells of so many by so many are."""
+"""A place is rough if most of the cells in a square of this many by as many are."""
 _LEAST: Final = 3
-"""Returns of a cell that tell its scatter."""
+"""Least number of returns of a cell for its scatter."""
 _TOLERANCE_M, _TOLERANCE_SLOPE = 0.15, 0.35
-"""How far returns in places that are not rough may lie from the provisional ground, and more with its slope (m, m)."""
+"""Tolerance of returns in places that are not rough about the first estimate of the ground (m), and per slope (m)."""
 
 
 class Cells(NamedTuple):
-    """Arrays (rows, columns) of cells near the provisional ground."""
+    """Arrays (rows, columns) of cells near the first estimate of the ground."""
 
     rough: Bools
-    """Most cells around scatter more than ground does: hedges, planted beds, walls."""
+    """True where most cells around scatter more than ground does: hedges, planted beds, walls."""
     even_m: Float32
-    """Height of even cells above the provisional ground; NaN for all others."""
+    """Height of even cells above the first estimate of the ground; NaN for all others."""
     noise_m: float
     """Scatter of the evenest quarter of cells: noise of the data."""
 
 
 def dense_ground(place: Place) -> Found:
-    """Returns near the surface of the cells that remain when windows have opened it, where places are not rough, and
+    """Mask of the returns near the surface of the cells that remain after opening, where places are not rough, and
     those as high as an even cell beside.
     """
     returns = place.returns
@@ -77,7 +77,7 @@ def dense_ground(place: Place) -> Found:
 
 
 def judged(sums: npt.NDArray[np.float64]) -> Cells:
-    """Which cells are rough or even, from their sums (rows, columns, 5) as `scatter` makes them."""
+    """Returns rough and even cells, from their sums (rows, columns, 5) as `scatter` makes them."""
     count, total, squares, close, close_total = np.moveaxis(sums, -1, 0)
     several = count >= _LEAST
     mean = np.divide(total, count, out=np.zeros(count.shape), where=several)
@@ -93,13 +93,13 @@ def judged(sums: npt.NDArray[np.float64]) -> Cells:
 
 
 def around(cells: Bools) -> npt.NDArray[np.int64]:
-    """How many of the cells (rows, columns) about each one are True."""
+    """Returns how many of the cells (rows, columns) about each one are True."""
     side = (_AROUND, _AROUND)
     counted = cv2.boxFilter(cells.view(np.uint8), cv2.CV_32S, side, None, (-1, -1), False, cv2.BORDER_CONSTANT)
     return np.asarray(counted, np.int64)
 
 
 def tolerances(base: Surface, fine: Grid) -> Float32:
-    """How far returns on the ground may lie from the provisional one, at each cell of the finer grid (m)."""
+    """Returns the tolerance of ground returns about the first estimate, at each cell of the finer grid (m)."""
     slope = Surface(base.grid, base.slope()).at(fine)
     return np.asarray(_TOLERANCE_M + _TOLERANCE_SLOPE * slope, np.float32)

@@ -1,4 +1,4 @@
-"""Rasters with holes, filled, and how far holes reach."""
+"""Filling of holes in rasters, and distances to known cells."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
 _SWEEPS: Final = 8
-"""Turns of relaxation a level: the membrane is wrong by less than a hundredth of the fall across a hole."""
+"""Sweeps of relaxation a level: the membrane is wrong by less than a hundredth of the fall across a hole."""
 
 
 def filled(height_m: Float32, known: Bools) -> Float32:
-    """Heights (rows, columns), the unknown ones on a membrane through the known ones; 0 everywhere where none is known.
+    """Returns heights (rows, columns), the unknown ones on a membrane through the known ones; 0 if none is known.
 
     height_m : (rows, columns), read where `known` is True.
     """
@@ -35,6 +35,6 @@ def filled(height_m: Float32, known: Bools) -> Float32:
 
 
 def distances(found: Bools, cell_m: float) -> Float32:
-    """Distance (rows, columns) of each cell from the nearest one that is True (m)."""
+    """Returns the distance (rows, columns) of each cell from the nearest one that is True (m)."""
     away = cv2.distanceTransform((~found).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     return np.asarray(away * np.float32(cell_m))

@@ -1,4 +1,4 @@
-"""The raster that ground is sought on."""
+"""The raster in which ground is sought."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ class Grid(NamedTuple):
 
     @property
     def origin(self) -> npt.NDArray[np.float64]:
-        """(2,) x and y of the corner (m)."""
+        """Returns (2,) x and y of the corner (m)."""
         return np.array([self.x_min_m, self.y_min_m])
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Returns rows and columns."""
         return self.rows, self.columns
 
     @property
     def middles_m(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Middles of the columns (x) and of the rows (y) (m)."""
+        """Returns the middles of the columns (x) and of the rows (y) (m)."""
         x = self.x_min_m + (np.arange(self.columns, dtype=np.float64) + 0.5) * self.cell_m
         return x, self.y_min_m + (np.arange(self.rows, dtype=np.float64) + 0.5) * self.cell_m
 
 
 def grid_over(window: Box, cell_m: float) -> Grid:
-    """Cells that cover the window from its south-western corner."""
+    """Returns cells that cover the window from its south-western corner."""
     columns = max(math.ceil((window.x_max_m - window.x_min_m) / cell_m - 1e-9), 1)
     rows = max(math.ceil((window.y_max_m - window.y_min_m) / cell_m - 1e-9), 1)
     return Grid(window.x_min_m, window.y_min_m, cell_m, rows, columns)

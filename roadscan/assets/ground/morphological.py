@@ -20,16 +20,16 @@ Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
 _GROWTH: Final = 1.15
-"""Each window is wider than the one before by this factor, and by a cell at the least."""
+"""Each window is wider than the one before by this factor, and by at least one cell."""
 
 
 def opened(z: Float32, radius: int) -> Float32:
-    """Opening of a surface (rows, columns) by a disk of so many cells; what lies outside does not count."""
+    """Returns the opening of a surface (rows, columns) by a disk of so many cells; cells outside do not count."""
     return -_least_over_disk(-_least_over_disk(z, radius), radius)
 
 
 def _least_over_disk(z: Float32, radius: int) -> Float32:
-    """Least height within a disk about each cell: of the cells whose middles lie within `radius` cells."""
+    """Returns the least height within a disk about each cell: of the cells whose middles lie within `radius` cells."""
     widths = np.array([math.isqrt(radius * radius - up * up) for up in range(radius + 1)])
     out = np.full(z.shape, np.inf, np.float32)
     least_over_disk(np.ascontiguousarray(z, np.float32), widths, np.empty(z.shape[1], np.float32), out)
@@ -37,7 +37,7 @@ def _least_over_disk(z: Float32, radius: int) -> Float32:
 
 
 def windows(largest_m: float, cell_m: float) -> list[int]:
-    """Radii (cells), growing to the largest."""
+    """Returns radii (cells), growing to the largest."""
     last, found, radius = max(round(largest_m / cell_m), 1), [], 1
     while radius < last:
         found.append(radius)
@@ -46,9 +46,9 @@ def windows(largest_m: float, cell_m: float) -> list[int]:
 
 
 def objects(surface: Float32, cell_m: float, steepest: float, largest_m: float) -> Bools:
-    """Cells of a whole surface (rows, columns) that stand on the ground instead of being part of it (section 2.2).
+    """Returns a mask of the cells of a whole surface (rows, columns) that stand on the ground (section 2.2).
 
-    Beyond its edges the surface goes on as its reflection through them, so that a slope stays one: opened alone, its
+    Beyond its edges the surface continues as its reflection, so that a slope stays one: opened alone, its
     upper edge would be cut.
     """
     margin = min(max(round(largest_m / cell_m), 1), *(side - 1 for side in surface.shape))
@@ -64,9 +64,9 @@ def objects(surface: Float32, cell_m: float, steepest: float, largest_m: float) 
 
 
 def bare_cells(lowest_m: Float32, cell_m: float, pit_m: float, settings: GroundSettings) -> Bools:
-    """Cells (rows, columns) whose lowest return lies on the ground.
+    """Returns a mask (rows, columns) of the cells whose lowest return lies on the ground.
 
-    lowest_m : (rows, columns), inf where a cell holds no return.
+    lowest_m : (rows, columns), inf where a cell has no return.
     pit_m : a lowest return is noise where it lies below the surface around by more.
     """
     known = np.isfinite(lowest_m)

@@ -1,4 +1,4 @@
-"""Bare earth as planes, fitted to returns again and again.
+"""Bare earth as planes, fitted to returns one after another.
 
 Sairam, Nagarajan, Ornitz (2016), "Development of mobile mapping system for 3D road asset inventory", Sensors 16, 367,
 section 3.3.2: RANSAC finds the plane of most returns, then that of most returns which the planes before left over, and
@@ -22,20 +22,20 @@ from roadscan.assets.kernels.planes import planes
 from roadscan.core.extras import cv2
 
 _BLOCK_M: Final = 10.0
-"""Planes are sought in squares of the map of this edge."""
-_CELL_M: Final = 0.5
+"""Planes are sought in squares of the map of this edge (m)."""
+_CELL_M: Final = 0.5  # Edge of a cell of the lowest returns (m).
 _ABOVE_LOWEST_M, _AROUND_M = 0.5, 1.5
-"""Returns take part that lie no more than this above the lowest one so near: roofs of cars do not (m, m)."""
+"""Returns take part up to this height above the lowest one within this distance: roofs of cars do not (m, m)."""
 _STEEPEST: Final = 0.5
-"""A plane is no steeper (m/m)."""
+"""Steepest slope of a plane (m/m)."""
 _DENSE, _SPARSE = (0.06, 30), (0.3, 6)
-"""Returns lie on a plane within this, upright (m), and it has so many of them, in dense and in sparse data."""
+"""Vertical reach of a plane (m) and least number of returns on it, in dense and in sparse data."""
 _PLANES, _DRAWS, _JUDGES = 8, 120, 1500
-"""The most planes of a square, draws of a plane, and returns that judge a draw."""
+"""Most planes of a square, draws of a plane, and returns that judge a draw."""
 
 
 def plane_ground(place: Place) -> Found:
-    """Returns on planes near the lowest returns around."""
+    """Returns a mask of returns on planes near the lowest returns around."""
     returns = place.returns
     x, y, z = returns.x_m, returns.y_m, returns.height_m
     grid = grid_over(place.window, _CELL_M)
@@ -59,7 +59,7 @@ def plane_ground(place: Place) -> Found:
 
 
 def lowest_around(place: Place, grid: Grid) -> npt.NDArray[np.float32]:
-    """Lowest height (n,) near each return."""
+    """Returns the lowest height (n,) near each return."""
     returns = place.returns
     lowest = np.full(grid.shape, np.inf, np.float32)
     lowest_returns(returns.x_m, returns.y_m, returns.height_m, grid.origin, 1.0 / grid.cell_m, lowest)
@@ -71,7 +71,7 @@ def lowest_around(place: Place, grid: Grid) -> npt.NDArray[np.float32]:
 
 
 def above_planes(place: Place, grid: Grid, on_ground: npt.NDArray[np.bool_]) -> Found:
-    """The surface through the lowest of the returns that lie on planes, and heights above it."""
+    """Returns the surface through the lowest of the returns on planes, and heights above it."""
     returns = place.returns
     lowest = np.full(grid.shape, np.inf, np.float32)
     x, y, z = returns.x_m, returns.y_m, returns.height_m

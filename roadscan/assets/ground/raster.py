@@ -16,19 +16,19 @@ from roadscan.assets.scene import GroundModel
 Float32 = npt.NDArray[np.float32]
 
 _TIMES, _LEAST_M = 2.5, 0.01
-"""Of a cell's returns those count that lie within this many standard deviations of their mean, and this at the least.
+"""Returns of a cell count within this many standard deviations of their mean, and at least within this distance (m).
 """
 _SEVERAL: Final = 5
-"""So many returns tell their scatter."""
+"""Least number of returns for their scatter."""
 _UNKNOWN_M: Final = 0.05
-"""Scatter of returns where no cell tells it (m)."""
+"""Scatter of returns where no cell shows it (m)."""
 _GROWTH: Final = 0.05
-"""σ of an interpolated height over its distance from ground that was seen: what was hidden of two recorded streets and
+"""σ of an interpolated height over its distance from seen ground: parts of two recorded streets that were hidden and
 interpolated again was wrong by so much (m/m, RMS)."""
 
 
 def ground_model(place: Place, found: Found) -> GroundModel:
-    """Heights of the cells in which ground was seen; between them a membrane, as far as the settings say."""
+    """Returns heights of the cells in which ground was seen; between them a membrane, as far as the settings say."""
     grid = grid_over(place.window, place.settings.cell_m)
     x, y = place.returns.x_m, place.returns.y_m
     middle, half = np.zeros(grid.shape, np.float32), np.full(grid.shape, np.inf, np.float32)
@@ -47,9 +47,9 @@ def ground_model(place: Place, found: Found) -> GroundModel:
 
 
 def sigmas(count: npt.NDArray[np.float64], scatter: Float32, away_m: Float32) -> Float32:
-    """1 σ (rows, columns) of the heights of cells: of a mean where returns were seen, more with the distance elsewhere.
+    """Returns 1 σ (rows, columns) of the heights of cells: of a mean where returns were seen, else by distance.
 
-    count : returns of each cell; scatter : their standard deviation (m), which few returns do not tell: it is no less
+    count : returns of each cell; scatter : their standard deviation (m), which few returns underestimate: it is no less
     than the median of all.
     """
     seen = count > 0
@@ -61,7 +61,7 @@ def sigmas(count: npt.NDArray[np.float64], scatter: Float32, away_m: Float32) ->
 
 
 def means(sums: npt.NDArray[np.float64], middle: Float32) -> tuple[Float32, Float32]:
-    """Means and standard deviations (rows, columns) of cells from their sums about `middle`; 0 of none."""
+    """Returns means and standard deviations (rows, columns) of cells from their sums about `middle`; 0 of none."""
     held = np.maximum(sums[..., 0], 1.0)
     mean = sums[..., 1] / held
     variance = np.maximum(sums[..., 2] / held - mean * mean, 0.0)

@@ -1,4 +1,4 @@
-"""The part of bare earth that is known to be road: even ground that the drive reaches without a step."""
+"""Road: even ground of the bare earth that the drive reaches without a step."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from roadscan.core.extras import cv2
 Bools = npt.NDArray[np.bool_]
 
 _REACH_M: Final = 8.0
-"""Road is known this far to both sides of the drive."""
+"""Road reaches this far to both sides of the drive (m)."""
 _DRIVEN_M: Final = 1.25
-"""What lies so near to the drive was driven on."""
+"""Ground this near to the drive (m) was driven on."""
 _STEEPEST: Final = 0.08
 """Slope between neighbouring cells that is no kerb: 20 mm over a quarter of a metre (m/m)."""
 _APART_M: Final = 10.0
-"""Poses further apart are not joined to a path."""
-_PLUS: Final = np.ones((3, 3), np.uint8)
+"""Poses farther apart (m) are not joined to a path."""
+_PLUS: Final = np.ones((3, 3), np.uint8)  # The eight neighbours of a cell, and itself.
 
 
 def road_cells(ground: GroundModel, drive_xyh_m: npt.NDArray[np.float64]) -> Bools:
-    """Cells (rows, columns) of bare earth that are known to be road; they were seen.
+    """Returns a mask (rows, columns) of the cells of bare earth that are road; they were seen.
 
     drive_xyh_m : (p, 4) x, y, height and pass.
     """
@@ -44,7 +44,7 @@ def road_cells(ground: GroundModel, drive_xyh_m: npt.NDArray[np.float64]) -> Boo
 
 
 def driven_cells(ground: GroundModel, drive_xyh_m: npt.NDArray[np.float64]) -> Bools:
-    """Cells (rows, columns) on the paths of the drives."""
+    """Returns a mask (rows, columns) of the cells on the paths of the drives."""
     cells = np.zeros(ground.height_m.shape, np.uint8)
     place = np.floor((drive_xyh_m[:, :2] - [ground.x_min_m, ground.y_min_m]) / ground.cell_m).astype(np.int32)
     joined = np.hypot(*np.diff(drive_xyh_m[:, :2], axis=0).T) < _APART_M
@@ -55,7 +55,7 @@ def driven_cells(ground: GroundModel, drive_xyh_m: npt.NDArray[np.float64]) -> B
 
 
 def steps(height_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Greatest difference (rows, columns) between each cell's height and those of its four neighbours (m).
+    """Returns the greatest difference (rows, columns) between each cell's height and those of its four neighbours (m).
 
     It is infinite beside cells whose height is not known.
     """

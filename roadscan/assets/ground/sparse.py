@@ -1,4 +1,4 @@
-"""Bare earth of sparse returns, those from the air: one in a square metre or fewer."""
+"""Bare earth of sparse returns from the air: one in a square metre or fewer."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from roadscan.core.extras import cv2
 
 Float32 = npt.NDArray[np.float32]
 
-CELL_M: Final = 1.0
+CELL_M: Final = 1.0  # Edge of a cell (m).
 _PIT_M: Final = 8.0
-"""A lowest return is noise where it lies below the surface around by more: gaps in crowns are no deeper."""
+"""A lowest return farther below its surroundings (m) is noise: gaps in crowns are no deeper."""
 _SMOOTH: Final = 0.7
-"""Standard deviation of the Gaussian that smooths the ground before returns are held against it (cells)."""
+"""Standard deviation (cells) of the Gaussian that smooths the ground before returns are compared with it."""
 _TOLERANCE_M, _TOLERANCE_SLOPE = 0.5, 1.25
-"""How far returns may lie from the ground, and more with its slope (m, m) (section 2.4, table 3)."""
+"""Tolerance of returns about the ground (m), and per slope (m) (section 2.4, table 3)."""
 _CLOSE: Final = 0.5
-"""Of that tolerance: returns so near make the ground anew."""
+"""Share of that tolerance within which returns define the ground anew."""
 
 
 def sparse_ground(place: Place) -> Found:
-    """Returns near the surface of the cells that remain when windows have opened it.
+    """Returns a mask of returns near the surface of the cells that remain after opening.
 
     The surface of lowest returns leans to the lowest place of each cell, so it is made anew from the returns that lie
     close to it.
@@ -46,13 +46,13 @@ def sparse_ground(place: Place) -> Found:
 
 
 def smoothed(surface: Surface) -> Surface:
-    """The surface through a Gaussian."""
+    """Returns the surface through a Gaussian."""
     z = cv2.GaussianBlur(surface.height_m, (0, 0), _SMOOTH, borderType=cv2.BORDER_REPLICATE)
     return Surface(surface.grid, np.asarray(z))
 
 
 def near(place: Place, base: Surface, share: float) -> Found:
-    """Returns near a surface: within a share of the tolerance."""
+    """Returns a mask of returns near a surface: within a share of the tolerance."""
     x, y, z = place.returns.x_m, place.returns.y_m, place.returns.height_m
     grid = base.grid
     above, tolerance = np.empty(x.size, np.float32), np.empty(x.size, np.float32)
@@ -63,7 +63,7 @@ def near(place: Place, base: Surface, share: float) -> Found:
 
 
 def remade(place: Place, found: Found) -> Surface:
-    """The surface through the mean heights of the returns that were found."""
+    """Returns the surface through the mean heights of the returns that were found."""
     grid, x, y = found.base.grid, place.returns.x_m, place.returns.y_m
     sums, wide = np.zeros((*grid.shape, 3)), np.full(grid.shape, np.inf, np.float32)
     middle = np.zeros(grid.shape, np.float32)

@@ -1,4 +1,4 @@
-"""A provisional ground and what lies on it: what every filter hands on."""
+"""First estimate of the ground and the returns on it: the common output of all filters."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 
 DENSE_PER_M2: Final = 4
-"""Median number of returns of the square metres that hold any, from which the data are those of a scanner on the road:
+"""Median number of returns of the non-empty square metres from which the data are those of a scanner on the road:
 scanners from the air give about one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """What a filter gets: the returns of a window, and the settings."""
+    """Input of a filter: the returns of a window, and the settings."""
 
     returns: Returns
     window: Box
@@ -39,11 +39,11 @@ class Surface(NamedTuple):
     height_m: Float32
 
     def at(self, grid: Grid) -> Float32:
-        """Heights at the middles of another grid's cells, bilinear."""
+        """Returns heights at the middles of another grid's cells, bilinear."""
         return sampled(self.height_m, self.grid, grid)
 
     def slope(self) -> Float32:
-        """Slope (rows, columns) of the surface (m/m)."""
+        """Returns the slope (rows, columns) of the surface (m/m)."""
         if min(self.height_m.shape) < 2:
             return np.zeros(self.height_m.shape, np.float32)
         north, east = np.gradient(self.height_m, self.grid.cell_m)
@@ -51,18 +51,18 @@ class Surface(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Which returns lie on the ground."""
+    """The returns on the ground."""
 
     base: Surface
-    """A provisional ground, near to it."""
+    """A first estimate of the ground, near to it."""
     above_m: Float32
-    """(n,) heights of returns above the provisional ground (m)."""
+    """(n,) heights of returns above that estimate (m)."""
     on_ground: npt.NDArray[np.bool_]
     """(n,)."""
 
 
 def sampled(z: Float32, grid: Grid, other: Grid) -> Float32:
-    """Raster z of a grid (rows, columns), bilinear at the middles of another grid's cells."""
+    """Returns raster z of a grid (rows, columns), bilinear at the middles of another grid's cells."""
     x_m, y_m = other.middles_m
     u = np.clip((x_m - grid.x_min_m) / grid.cell_m - 0.5, 0, grid.columns - 1).astype(np.float32)
     v = np.clip((y_m - grid.y_min_m) / grid.cell_m - 0.5, 0, grid.rows - 1).astype(np.float32)
@@ -70,7 +70,7 @@ def sampled(z: Float32, grid: Grid, other: Grid) -> Float32:
 
 
 def is_dense(place: Place) -> bool:
-    """Whether the returns of the window lie as dense as those of a scanner on the road."""
+    """Returns whether the returns of the window are as dense as those of a scanner on the road."""
     grid = grid_over(place.window, 1.0)
     found = np.zeros(grid.shape, np.int32)
     counts(place.returns.x_m, place.returns.y_m, grid.origin, 1.0, found)

@@ -16,20 +16,20 @@ Bools = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]
 
 _NEAR_LOWEST_M: Final = 0.15
-"""Returns up to this above the lowest one of a cell lie on the same surface."""
+"""Returns up to this above the lowest one of a cell (m) lie on the same surface."""
 _MARGIN: Final = 0.05
-"""By so much more than the surface a sight line rises that comes from below it (m/m)."""
+"""Excess of the rise of a sight line over that of the surface (m/m) that shows that it comes from below."""
 _SMOOTH: Final = (5, 5)
-"""Cells over which the slope is taken."""
-_AROUND: Final = np.ones((5, 5), np.uint8)
+"""Cells over which the slope is computed."""
+_AROUND: Final = np.ones((5, 5), np.uint8)  # Cells around an underside that count as one too.
 _OVER_SENSOR_M: Final = 1.0
-"""A structure hangs higher above the sensor; slopes, hedges and branches that come lower are left to other rules."""
+"""A structure is higher above the sensor than this (m); slopes, hedges and lower branches are left to other rules."""
 _LEAST: Final = np.ones((3, 3), np.uint8)
-"""A face is as wide as so many cells in both directions."""
+"""Least extent of a face in both directions (cells)."""
 
 
 def undersides(returns: Returns, grid: Grid, lowest_m: Float32, height_m: Float32) -> Bools:
-    """Cells (rows, columns) whose lowest returns were seen from below.
+    """Returns a mask (rows, columns) of the cells whose lowest returns were seen from below.
 
     A sight line that comes from above a surface falls against it: it rises less, along its way, than the surface does.
 
@@ -45,7 +45,7 @@ def undersides(returns: Returns, grid: Grid, lowest_m: Float32, height_m: Float3
     rows, (row, column) = rows[kept], np.unravel_index(cell[kept], grid.shape)
     if not rows.size or min(grid.shape) < 2:
         return out
-    # slopes are made smooth, not heights: at the border these would be mirrored, and a bank look level
+    # slopes are smoothed, not heights: at the border these would be mirrored, and a bank look level
     north, east = (cv2.blur(g, _SMOOTH, borderType=cv2.BORDER_REPLICATE) for g in np.gradient(height_m, grid.cell_m))
     dx, dy = returns.x_m[rows] - returns.sensor_x_m[rows], returns.y_m[rows] - returns.sensor_y_m[rows]
     away = np.maximum(np.hypot(dx, dy), 0.1)

@@ -1,1 +1,1 @@
-"""Loops over returns of lidars: ground, vehicles, classes."""
+"""Kernels over returns of lidars: ground, vehicles, classes."""

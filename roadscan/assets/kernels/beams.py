@@ -1,4 +1,4 @@
-"""How beams meet the ground, and what gains their intensities have by a table."""
+"""Incidence of beams on the ground, and gains of their intensities from a table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from roadscan.compute.kernel_options import inlined, kernel
 
 @kernel
 def ground_heights(x, y, grid, height_m, out):
-    """Height of the ground at each place: out (n,), bilinear between the middles of cells, NaN where it is not known.
+    """Compute the height of the ground at each place: out (n,), bilinear between middles of cells, NaN if unknown.
 
     x, y : (n,) places (m). grid : (x_min_m, y_min_m, cell_m). height_m : (rows, columns) float32.
     """
@@ -58,7 +58,7 @@ def meet_ground(place, sensor, grid, slope_x, slope_y, wanted, range_m, cosine):
 
 @inlined
 def _between(value, nodes, levels):
-    """Level at a value, linear between nodes; the levels of the ends beyond them."""
+    """Returns the level at a value, linear between nodes; the levels of the ends beyond them."""
     last = nodes.size - 1
     if not value < nodes[last]:
         return levels[last] if value >= nodes[last] else np.nan
@@ -73,7 +73,7 @@ def _between(value, nodes, levels):
 
 @kernel
 def log_gains(mine, laser, range_m, incidence, on_ground, by_laser, range_gains, incidence_gains, out):
-    """Logarithm of the gain of a sensor's returns: out (n,), other sensors' stay as they are.
+    """Compute the logarithm of the gain of a sensor's returns: out (n,), other sensors' are unchanged.
 
     mine : (n,) bool. laser : (n,) uint16. range_m, incidence : (n,) (m, degrees). on_ground : (n,) bool; the gain of
     incidence of all others is 1. by_laser : (65536,) logarithms. range_gains, incidence_gains : nodes (k,), ascending,

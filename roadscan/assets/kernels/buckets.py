@@ -1,4 +1,4 @@
-"""Returns sorted by the cell that they lie in, seen from above."""
+"""Sorting of returns by their cell, seen from above."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from roadscan.compute.kernel_options import inlined, kernel
 
 @inlined
 def _cell(x, y, corner, cell_m, shape):
-    """Flat number of the cell of a place; -1 outside."""
+    """Returns the flat number of the cell of a place; -1 outside."""
     u, v = (x - corner[0]) / cell_m, (y - corner[1]) / cell_m
     if not (u >= 0.0 and v >= 0.0 and u < shape[1] and v < shape[0]):
         return -1
@@ -18,10 +18,10 @@ def _cell(x, y, corner, cell_m, shape):
 
 @kernel
 def by_number(number, starts, order):
-    """Sort things by their number, ascending in each: `order` (n,) int64, and where each number begins.
+    """Sort items by their number, ascending in each: `order` (n,) int64, and the beginning of each number.
 
-    number : (n,) integers from 0 on; things of a negative one are left out. starts : (numbers + 1,) int64, zeroed; last
-    where all end. order : room for all things.
+    number : (n,) integers from 0 on; items of a negative one are left out. starts : (numbers + 1,) int64, zeroed; last
+    the end of all. order : room for all items.
     """
     for i in range(number.size):
         if number[i] >= 0:
@@ -37,7 +37,7 @@ def by_number(number, starts, order):
 
 @kernel
 def rows_within(x, y, box, rows):
-    """Numbers of the places within a box, ascending, to `rows` (n,) int64; returns how many there are.
+    """Write the numbers of the places within a box, ascending, to `rows` (n,) int64; returns their count.
 
     x, y : (n,) whole numbers. box : (4,) least x and y, which belong to it, and those that it ends before.
     """
@@ -50,7 +50,7 @@ def rows_within(x, y, box, rows):
 
 @kernel
 def raster_cells(x, y, grid, shape, cell):
-    """Flat number of each place's cell of a raster: cell (n,) int32; −1 outside.
+    """Compute the flat number of each place's cell of a raster: cell (n,) int32; −1 outside.
 
     x, y : (n,) places (m); grid : (x_min_m, y_min_m, cell_m); shape : (rows, columns).
     """
@@ -62,7 +62,7 @@ def raster_cells(x, y, grid, shape, cell):
 
 @kernel
 def count_buckets(x, y, counted, corner, cell_m, shape, starts):
-    """Where each cell's returns begin, and last where all end: starts (cells + 1,) int64, zeroed.
+    """Compute the beginning of each cell's returns, and last the end of all: starts (cells + 1,) int64, zeroed.
 
     x, y : (n,) places (m); counted : (n,) bool; corner : (x, y) of cell (0, 0); shape : (rows, columns).
     """
@@ -77,7 +77,7 @@ def count_buckets(x, y, counted, corner, cell_m, shape, starts):
 
 @kernel
 def fill_buckets(x, y, counted, corner, cell_m, shape, at, order):
-    """Numbers of the returns (n,) int64 by cell, ascending in each; at : (cells + 1,) where each begins, is used up."""
+    """Write the numbers of the returns (n,) int64 by cell, ascending in each; at : (cells + 1,) beginnings, used up."""
     for i in range(x.size):
         if counted[i]:
             cell = _cell(x[i], y[i], corner, cell_m, shape)

@@ -1,4 +1,4 @@
-"""What stands in each cell of a raster: at which heights, and when ground and things were seen there."""
+"""Columns above the cells of a raster: occupied heights, and times at which ground and objects were seen there."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from roadscan.compute.kernel_options import kernel
 LEVELS = 32
 """Bits of a column: heights above ground in steps."""
 THINGS, GROUND, HIGH = range(3)
-"""What may be seen in a slot of time."""
+"""Kinds of what is seen in a slot of time."""
 
 
 @kernel
 def distinct(epoch, step, out):
-    """Write each step of time that follows another one to out (most,) int64; how many there are, at most `most`.
+    """Write each step of time that differs from the one before to out (most,) int64; returns how many, at most `most`.
 
     epoch : (n,) int64; step : int64, its length in the epoch's unit.
     """
@@ -33,7 +33,7 @@ def distinct(epoch, step, out):
 
 @kernel
 def slots(epoch, step, steps, per_slot, out):
-    """Slot (n,) uint8 of each epoch: its step's place in the sorted `steps` (m,) int64, so many a slot."""
+    """Compute the slot (n,) uint8 of each epoch: its step's place in the sorted `steps` (m,) int64, so many a slot."""
     last, slot = np.int64(-1), 0
     for k in range(epoch.size):
         at = epoch[k] // step
@@ -45,7 +45,7 @@ def slots(epoch, step, steps, per_slot, out):
 
 @kernel
 def columns(x, y, above, on_ground, slot, origin, per_m, level_m, band, levels, seen):
-    """Heights that each cell holds, and the slots of time in which things, ground, and what is higher were seen in it.
+    """Compute the heights in each cell, and the time slots in which things, ground, and higher things were seen there.
 
     Parameters
     ----------
@@ -71,9 +71,9 @@ def columns(x, y, above, on_ground, slot, origin, per_m, level_m, band, levels, 
 
 @kernel
 def tops(levels, first, start, gap, out):
-    """Level that what stands on the ground reaches in each cell, -1 of none.
+    """Compute the level that what stands on the ground reaches in each cell, -1 of none.
 
-    It begins at a level from `first` up to `start` and goes on over no more than `gap` empty levels.
+    It begins at a level from `first` up to `start` and continues over no more than `gap` empty levels.
     levels : (rows, columns) uint32; out : (rows, columns) int32.
     """
     for i in range(levels.shape[0]):
@@ -92,7 +92,7 @@ def tops(levels, first, start, gap, out):
 
 @kernel
 def marked(x, y, above, origin, per_m, cells, lowest, highest, out):
-    """Number (n,) int32 of the cell of each return between the heights that the cell's number stands for; else 0.
+    """Compute the number (n,) int32 of the cell of each return between the heights of that number; else 0.
 
     cells : (rows, columns) int32; lowest, highest : (numbers,) float64, heights by number (m).
     """

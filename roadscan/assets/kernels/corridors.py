@@ -1,4 +1,4 @@
-"""Cells along the way that a vehicle drove."""
+"""Cells along the path of a vehicle."""
 
 from __future__ import annotations
 

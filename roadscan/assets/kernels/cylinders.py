@@ -1,4 +1,4 @@
-"""Upright cylinders through returns that lie on the side that sensors saw."""
+"""Upright cylinders through returns on the side that sensors saw."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import numpy as np
 
 from roadscan.compute.kernel_options import inlined, kernel
 
-_ROUNDS = 12
+_ROUNDS = 12  # Rounds of Gauss–Newton, at most.
 _INNER = 0.04
 """Share of the offsets across the sight lines that is left out at each end."""
 _LEAST_OF_SECTOR = 15
-"""Returns seen from one direction that tell a width."""
-_LEAST_RADIUS_M, _MOST_RADIUS_M = 0.01, 0.6
+"""Least number of returns seen from one direction for a width."""
+_LEAST_RADIUS_M, _MOST_RADIUS_M = 0.01, 0.6  # Bounds of a radius (m).
 _STIFF = 0.002
-"""Weight of an upright axis, a return."""
+"""Weight of an upright axis, per return."""
 
 
 @inlined
 def _width(sorted_values):
-    """Distance between the inner quantiles of sorted values (n,)."""
+    """Returns the distance between the inner quantiles of sorted values (n,)."""
     n = sorted_values.size
     out = 0.0
     for share, sign in ((1.0 - _INNER, 1.0), (_INNER, -1.0)):
@@ -35,7 +35,7 @@ def _width(sorted_values):
 def radius_across(across, kept, sector):
     """Half the width of evenly spread offsets, seen from one direction each: the weighted median of all directions.
 
-    About the axis itself an error of the axis would widen the shaft, and a wider shaft push the axis away.
+    About the axis itself, an error of the axis would widen the shaft, and a wider shaft push the axis away.
     across : (n,) offsets (m); kept : (n,) which count; sector : (n,) int64 direction, ascending.
     """
     n = across.size
@@ -74,7 +74,7 @@ def radius_across(across, kept, sector):
 
 @kernel
 def fit_cylinder(table, sector, lean, state, work):
-    """Root mean square distance from the fitted cylinder (m), and the number of returns that it rests on.
+    """Returns the root mean square distance from the fitted cylinder (m), and the number of returns used.
 
     table : (n, 5) x, y, height past the middle, and the unit vector towards the sensor, seen from above; sector : (n,)
     int64 direction of that vector, ascending; lean : the axis may lean; state : (5,) x, y, slopes of both with height,

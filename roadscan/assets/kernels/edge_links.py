@@ -1,4 +1,4 @@
-"""Paths through places of an edge: which place may follow which, and the evidence of the best way on from each."""
+"""Paths through places of an edge: links between places, and the evidence of the best path from each."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy as np
 from roadscan.compute.kernel_options import inlined, kernel
 
 MAX_LINKS = 12
-"""Places that may follow a place, at most."""
+"""Most links from a place."""
 
 
 @inlined
 def link_gain(ax, ay, adx, ady, aq, bx, by, bdx, bdy, bq, limits):
-    """Evidence (σ · m) of going on from a place to another, or −inf where that is no smooth way.
+    """Returns the evidence (σ · m) of a link from a place to another, or −inf where it is not smooth.
 
     limits : (longest free gap (m), cosine of the greatest bend, cost of a metre of gap, cost of a bend).
     """
@@ -77,7 +77,7 @@ def insert(links, lengths, gains, count, j, length, gain):
 
 @kernel
 def best_ways(links, lengths, gains, memory_m, rounds, ahead, following, behind, preceding):
-    """Fill `ahead` and `behind` (n,): the evidence of the best way on from each place and to it; and the next places.
+    """Fill `ahead` and `behind` (n,): the evidence of the best path from each place and to it; and the next places.
 
     Evidence of what lies x metres away counts e^(−x / memory_m): the sum is that of a path of about `memory_m`.
     following, preceding : (n,) the next place of the best way, −1 where it ends.
@@ -169,7 +169,7 @@ def trace(place, total, following, preceding, ranked, order, starts, bins, limit
 
 @inlined
 def cover(place, chain, length, number, order, starts, bins, reach, owner):
-    """Give all places beside the chain that ends the list to it, and the other sides of its gutter.
+    """Assign all places beside the last chain to it, and the other sides of its gutter.
 
     reach : distances within which places lie beside it, and within which they are the other side of a gutter (m).
     """

@@ -1,4 +1,4 @@
-"""Heights of cells that hold none, from those around: a membrane (Laplace's equation), solved from coarse to fine."""
+"""Heights of empty cells from those around: a membrane (Laplace's equation), solved from coarse to fine."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from roadscan.compute.kernel_options import kernel
 
 @kernel
 def halved(z, known, coarse, coarse_known):
-    """Mean height of the known cells of each two by two.
+    """Compute the mean height of the known cells of each two by two.
 
     z : (rows, columns) float32; known : (rows, columns) bool; coarse, coarse_known : (⌈rows/2⌉, ⌈columns/2⌉), out.
     """

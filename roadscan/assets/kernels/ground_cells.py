@@ -1,4 +1,4 @@
-"""Cells of returns near a provisional ground: how they scatter, which of them lie on it, and its robust height."""
+"""Cells of returns near a first estimate of the ground: their scatter, returns on the ground, and robust heights."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ NEAR, SUM, SQUARES, CLOSE, CLOSE_SUM = range(5)
 
 @inlined
 def cell_of(x, y, origin, per_m):
-    """Row and column of a place."""
+    """Returns row and column of a place."""
     return math.floor((y - origin[1]) * per_m), math.floor((x - origin[0]) * per_m)
 
 
 @kernel
 def scatter(x, y, z, origin, coarse_per_m, ground, per_m, limits, above, sums):
-    """Height of each return above a provisional ground, and the sums of each cell of a finer raster.
+    """Compute heights of returns above a first estimate of the ground, and the sums of each cell of a finer raster.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def scatter(x, y, z, origin, coarse_per_m, ground, per_m, limits, above, sums):
 
 @kernel
 def on_ground(x, y, above, origin, per_m, rough, tolerance, even, reach, found):
-    """Which returns lie on the ground: near it in cells that are not rough, or as high as an even cell beside.
+    """Find the returns on the ground: near it in cells that are not rough, or as high as an even cell beside.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def on_ground(x, y, above, origin, per_m, rough, tolerance, even, reach, found):
 
 @kernel
 def cell_heights(x, y, above, chosen, origin, per_m, middle, half, sums):
-    """Number, sum and squares of the heights of chosen returns in each cell, of those near the cell's middle height.
+    """Compute number, sum and squares of the heights of chosen returns near the middle height of each cell.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def cell_heights(x, y, above, chosen, origin, per_m, middle, half, sums):
 
 @kernel
 def least_over_disk(z, widths, line, out):
-    """Least height within a disk about each cell of a raster.
+    """Compute the least height within a disk about each cell of a raster.
 
     Pieces of a row grow cell by cell, and each row of the disk takes the piece of its own width.
     z : (rows, columns) float32, finite. widths : (radius + 1,) int64, half the width of the disk in each of its rows,

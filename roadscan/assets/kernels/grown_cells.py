@@ -1,4 +1,4 @@
-"""Moments of what lies low, by cells."""
+"""Moments of low returns, by cells."""
 
 from __future__ import annotations
 

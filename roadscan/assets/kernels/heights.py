@@ -1,4 +1,4 @@
-"""Returns against a raster of ground: their height above it."""
+"""Heights of returns above a raster of ground."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def bilinear(z, u, v):
 
 @kernel
 def heights_above(x, y, z, origin, per_m, ground, out):
-    """Height of each return above a raster of ground.
+    """Compute the height of each return above a raster of ground.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Robust low height of cells: the mean of the returns that lie near the lowest one."""
+"""Robust low height of cells: the mean of the returns near the lowest one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lowest returns of the cells of a grid, and how dense returns lie."""
+"""Lowest returns of the cells of a grid, and their number."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from roadscan.compute.kernel_options import kernel
 
 @kernel
 def lowest_returns(x, y, z, origin, per_m, out):
-    """Lowest height of each cell.
+    """Compute the lowest height of each cell.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def lowest_returns(x, y, z, origin, per_m, out):
 
 @kernel
 def counts(x, y, origin, per_m, out):
-    """Number of returns in each cell, added to out (rows, columns) int32; other arguments as of `lowest_returns`."""
+    """Count the returns in each cell, added to out (rows, columns) int32; other arguments as of `lowest_returns`."""
     rows, columns = out.shape
     for k in range(x.size):
         i, j = math.floor((y[k] - origin[1]) * per_m), math.floor((x[k] - origin[0]) * per_m)

@@ -1,4 +1,4 @@
-"""The brightness of the surface around each place, whatever is painted on it, and the contrast of returns to it."""
+"""Brightness of the unpainted surface around each place, and the contrast of returns to it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 from roadscan.compute.kernel_options import inlined, kernel
 
 MOST_OF_A_CELL = 16
-"""Readings of a cell that are looked at; of more, every so-manieth."""
-FEWEST = 12
-_LOW, _MIDDLE = 0.05, 0.35
+"""Readings of a cell that are used; of more, an even choice."""
+FEWEST = 12  # Least number of readings in a neighbourhood.
+_LOW, _MIDDLE = 0.05, 0.35  # Quantiles of the brightness that are compared.
 _NORMAL_BETWEEN = 1.2595
 """Standard deviations between the quantiles 0.05 and 0.35 of a normal distribution."""
 
 
 @kernel
 def paint_levels(value, first, half, level, upper):
-    """Median and upper bound of the unpainted surface around each cell of a raster.
+    """Compute median and upper bound of the unpainted surface around each cell of a raster.
 
-    Up to half of a neighbourhood may be painted: what lies far above its lower third, in units of the spread below
+    Up to half of a neighbourhood may be painted: values far above its lower third, in units of the spread below
     that, is left out first.
 
     Parameters
@@ -58,7 +58,7 @@ def paint_levels(value, first, half, level, upper):
 
 @inlined
 def _sampled(value, row, column, fu, fv):
-    """Value between the middles of cells: row and column of the lower one, and how far the place lies past it."""
+    """Value between the middles of cells: row and column of the lower one, and the place's distance past it."""
     rows, columns = value.shape
     i, j = min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)
     north, east = min(max(row + 1, 0), rows - 1), min(max(column + 1, 0), columns - 1)
@@ -90,7 +90,7 @@ def contrasts(x, y, intensity, grid, level, upper, bounds, contrast, noise):
 
 @kernel
 def seen_on_ground(place, sensor, above, wanted, limits, box, rows):
-    """Numbers of the returns on the ground that beams met steeply enough, to `rows` (n,) int64; how many there are.
+    """Write the numbers of the ground returns whose beams were steep enough to `rows` (n,) int64; returns their count.
 
     place, sensor : three (n,) float64 arrays, x, y and height of the return and of the sensor (m); returns whose sensor
     is not known count as met steeply. above : (n,) float32 height above the ground (m). wanted : (n,) bool. limits :
@@ -114,7 +114,7 @@ def seen_on_ground(place, sensor, above, wanted, limits, box, rows):
 
 @kernel
 def scan_lines(rows, epoch, sensor, laser, step, out):
-    """Number of the scan line of some returns: out (k,) int64, what one laser of a sensor saw within a step of time.
+    """Compute the number of the scan line of some returns: out (k,) int64, what one laser saw within a step of time.
 
     rows : (k,) int64 numbers of returns; epoch : (n,) int64 and step, of one unit; sensor : (n,) uint8; laser : (n,)
     uint16.
@@ -145,7 +145,7 @@ def paint_sums(cell, contrast, noise, height_m, sums):
 
 @kernel
 def distinct_in_groups(starts, order, value, out):
-    """How many different values each group has: out (groups,) int64.
+    """Count the different values of each group: out (groups,) int64.
 
     starts : (groups + 1,) where the things of each group begin in `order`. value : (n,) int64 of each thing.
     """

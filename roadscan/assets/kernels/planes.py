@@ -11,7 +11,7 @@ from roadscan.compute.kernel_options import inlined, kernel
 
 @inlined
 def mixed(counter):
-    """64 random bits for a counter: the finaliser of SplitMix64 (Steele, Lea, Flood 2014)."""
+    """Returns 64 random bits for a counter: the finaliser of SplitMix64 (Steele, Lea, Flood 2014)."""
     z = counter * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -32,7 +32,7 @@ def plane_through(x, y, z, a, b, c):
 
 @inlined
 def supporters(x, y, z, left, many, step, plane, reach):
-    """How many of the returns `left[:many]`, every `step`-th of them, lie within `reach` of a plane, upright (m)."""
+    """How many of the returns `left[:many]`, every `step`-th of them, lie within `reach` of a plane, vertically (m)."""
     east, north, height = plane
     found = 0
     for k in range(0, many, step):
@@ -44,7 +44,7 @@ def supporters(x, y, z, left, many, step, plane, reach):
 
 @inlined
 def fitted(x, y, z, left, many, plane, reach):
-    """The plane of least squares through the returns within `reach` of another one."""
+    """Returns the plane of least squares through the returns within `reach` of another one."""
     east, north, height = plane
     n, sx, sy, sz, sxx, sxy, syy, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(many):
@@ -73,7 +73,7 @@ def fitted(x, y, z, left, many, plane, reach):
 
 @kernel
 def planes(x, y, z, begin, key, reach, steepest, counts, found):
-    """Which returns lie on a large plane of their block: each plane is sought among what those before left over.
+    """Find the returns on a large plane of their block: each plane is sought among the returns that others left.
 
     Parameters
     ----------

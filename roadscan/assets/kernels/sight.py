@@ -1,4 +1,4 @@
-"""Which places rays pass on their way to what they hit, and which ones lie behind that."""
+"""Places that rays pass on their way to a hit, and places behind it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from roadscan.compute.kernel_options import inlined, kernel
 
 
 class Rays(NamedTuple):
-    """n rays from a sensor to what they hit; x, y from a corner of the map and height (m)."""
+    """n rays from a sensor to a hit; x, y from a corner of the map and height (m)."""
 
     from_x: npt.NDArray[np.float64]
     from_y: npt.NDArray[np.float64]
@@ -22,12 +22,12 @@ class Rays(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Cells of a raster, each cut into bands of height above the ground."""
+    """Cells of a raster, each divided into bands of height above the ground."""
 
     corner: npt.NDArray[np.float64]
     """(2,) x and y of the raster's south-western corner (m)."""
     cell_m: float
-    """Edge of a cell, and the way along a ray from one of its places to the next."""
+    """Edge of a cell, and the step along a ray."""
     ground: npt.NDArray[np.float32]
     """(rows, columns) height of the ground at the middles of cells (m), row 0 the southern one; NaN where unknown."""
     bands: npt.NDArray[np.float64]
@@ -36,7 +36,7 @@ class Places(NamedTuple):
 
 @inlined
 def part_within(start, way, least, most, first, last):
-    """The part of first … last along a ray where its coordinate lies between least and most; empty: first > last."""
+    """Part of first … last along a ray where its coordinate lies between least and most; empty: first > last."""
     if way == 0.0:
         return (first, last) if least <= start <= most else (1.0, 0.0)
     one, other = (least - start) / way, (most - start) / way
@@ -45,9 +45,9 @@ def part_within(start, way, least, most, first, last):
 
 @kernel
 def follow_rays(rays, places, reach_m, hit_m, passed, hidden):
-    """Count rays by the places that they pass, and by those behind what they hit.
+    """Count rays by the places that they pass, and by those behind their hits.
 
-    A ray counts once for each `cell_m` of its way. What it hits counts as passed, `hit_m` to both sides.
+    A ray counts once for each `cell_m` of its way. The hit counts as passed, `hit_m` to both sides.
 
     Parameters
     ----------

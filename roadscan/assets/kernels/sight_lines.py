@@ -1,4 +1,4 @@
-"""Whether something stands between a camera and a place: a walk along the line through voxels that hide."""
+"""Occlusion between a camera and a place: a walk along the line through voxels that hide."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from roadscan.compute.kernel_options import kernel
 
 @kernel
 def find_hidden(eye_m, place_m, epoch_gps_ns, keys, spans_gps_ns, shape, edge_m, limits_m, hidden):
-    """Note which places are hidden from cameras.
+    """Mark the places that are hidden from cameras.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Horizontal slices of what stands above the ground: which cells hold returns, and what hangs together in a slice."""
+"""Horizontal slices of the returns above the ground: occupied cells, and connected components of a slice."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from roadscan.compute.kernel_options import kernel
 
 @kernel
 def fill_slices(x, y, above, corner, cell_m, slice_m, counts, cell_of):
-    """Count returns into the cells of their slice, and note the flat number of each return's cell (-1: none).
+    """Count returns into the cells of their slice, and write the flat number of each return's cell (-1: none).
 
     x, y : (n,) float64, places (m); above : (n,) float32, height above the ground (m), NaN where that is not known;
     corner : (x, y, height) of cell (0, 0, 0); counts : (slices, rows, columns) uint16, saturating; cell_of : (n,)
@@ -31,7 +31,7 @@ def fill_slices(x, y, above, corner, cell_m, slice_m, counts, cell_of):
 
 @kernel
 def label_slices(counts, cells, labels, boxes, stack):
-    """Number of components of all slices: cells with returns that touch, corners too, within their slice.
+    """Label the components of all slices, cells that touch, also at corners, within a slice; returns their number.
 
     cells : (m,) int64 flat numbers of the cells with returns, ascending; labels : (slices, rows, columns) int32,
     zeroed; gets the component's number from 1; boxes : (m, 5) int32, gets slice, first and last row, first and last
@@ -89,7 +89,7 @@ def owners(x, y, cell, labels, number, owner, sums):
 
 @kernel
 def slices_above_one_another(row, column, level, reach, foot, masks, scores):
-    """Give each component the number of slices that hold a component within `reach` cells of its middle.
+    """Write for each component the number of slices with a component within `reach` cells of its middle.
 
     It is 0 where none of the `foot` lowest slices does.
     row, column, level : (n,) int64 cell of the middle, and slice (0 … 62); masks : (rows, columns) int64, zeroed;

@@ -1,4 +1,4 @@
-"""Weighted and plain means of the surroundings of each cell of a raster, row by row on vector registers."""
+"""Weighted and plain means of the surroundings of each cell of a raster, row by row in vector registers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def add_pairs(before, after, weight, out):
 
 @bare_inlined
 def mirrored(at, size):
-    """Place of a row beyond the ends of so many, which are mirrored there."""
+    """Returns the index of a row beyond the ends, which are mirrored."""
     at %= 2 * size
     return at if at < size else 2 * size - 1 - at
 
@@ -60,14 +60,14 @@ def add_row(value, total):
 
 @bare_inlined
 def moved(entering, leaving, total):
-    """Move sums of rows on by a row."""
+    """Advance sums of rows by one row."""
     for i in range(total.size):
         total[i] += entering[i] - leaving[i]
 
 
 @bare_inlined
 def divided(total, size, out):
-    """Sums made means."""
+    """Divide sums to means."""
     for i in range(out.size):
         out[i] = total[i] / size
 

@@ -1,4 +1,4 @@
-"""Classes of returns that stand still beside and over the road, by what their cubes are."""
+"""Classes of stationary returns beside and over the road, by the features of their cubes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LEAFY, WALL, WIRE, ALONE = 1, 2, 4, 8
 
 @kernel
 def standing_classes(above, number, cubes, place, sensor, limits, codes, out):
-    """Give returns that have no class yet the class of what stands there.
+    """Give returns without a class the class of what stands there.
 
     above : (n,) float32, heights above the ground (m). number : (n,) int32 cube of each return, −1 of none. cubes :
     (k,) uint8 bits of each cube. place, sensor : three (n,) arrays, x, y and height (m). limits : (height of what lies

@@ -1,4 +1,4 @@
-"""Matched filter for steps: two one-sided straight lines that meet at a cell, and how far apart they are there.
+"""Matched filter for steps: two one-sided straight lines that meet at a cell, and their difference there.
 
 For a direction u along the edge, cells are first summed into strips along u, then the strips of each side give a line
 across the edge. Heights along u follow a known slope, so that a grade is no step.
@@ -13,8 +13,8 @@ import numpy as np
 
 from roadscan.compute.kernel_options import bare, bare_inlined, inlined, kernel
 
-MIN_STRIPS = 3
-CHUNK = 64
+MIN_STRIPS = 3  # Least number of strips on each side.
+CHUNK = 64  # Cells of a row that are processed together.
 FRAME = 16
 """Cells around a raster; strips and windows reach no farther."""
 WORK = 20
@@ -23,7 +23,7 @@ WORK = 20
 
 @bare_inlined
 def fallen(height_m, slope_x, slope_y, east_m, north_m, out):
-    """Heights at a place less what the ground rises to there."""
+    """Compute heights at a place less the expected rise of the ground to there."""
     for i in range(CHUNK):
         out[i] = height_m[i] - slope_x[i] * east_m - slope_y[i] * north_m
 
@@ -45,7 +45,7 @@ def add_squares(weight, value, squares):
 
 @bare_inlined
 def means_of(total, weighted, squares):
-    """Sums made a mean and a χ²; 0 where nothing was added."""
+    """Compute a mean and a χ² from sums; 0 where nothing was added."""
     for i in range(CHUNK):
         w = total[i] if total[i] > 0.0 else 1.0
         rest = squares[i] - weighted[i] * weighted[i] / w
@@ -111,28 +111,28 @@ def add_known(weight, rest, known, chi2):
 
 @bare_inlined
 def level_of(s0, s1, s2, t0, t1, out):
-    """Height of a line at the edge."""
+    """Compute the height of a line at the edge."""
     for i in range(CHUNK):
         out[i] = (s2[i] * t0[i] - s1[i] * t1[i]) / (s0[i] * s2[i] - s1[i] * s1[i])
 
 
 @bare_inlined
 def variance_of(s0, s1, s2, out):
-    """Variance of a line's height at the edge."""
+    """Compute the variance of a line's height at the edge."""
     for i in range(CHUNK):
         out[i] = s2[i] / (s0[i] * s2[i] - s1[i] * s1[i])
 
 
 @bare_inlined
 def slope_of(s0, s1, s2, t0, t1, out):
-    """Slope of a line."""
+    """Compute the slope of a line."""
     for i in range(CHUNK):
         out[i] = (s0[i] * t1[i] - s1[i] * t0[i]) / (s0[i] * s2[i] - s1[i] * s1[i])
 
 
 @bare_inlined
 def expect_slope(slope, side, precision, s2, t1):
-    """Add what is expected of a side's slope to its sums."""
+    """Add the expected slope of a side to its sums."""
     for i in range(CHUNK):
         s2[i] += precision
         t1[i] += precision * (side * slope[i])
@@ -140,14 +140,14 @@ def expect_slope(slope, side, precision, s2, t1):
 
 @bare_inlined
 def expect_squares(slope, precision, q):
-    """Add what is expected of a side's slope to its squares."""
+    """Add the expected slope of a side to its squares."""
     for i in range(CHUNK):
         q[i] += precision * slope[i] * slope[i]
 
 
 @bare_inlined
 def add_rest(q, level, t0, found, t1, chi2):
-    """Add what strips deviate from their line to the χ² within them."""
+    """Add the deviations of strips from their line to the χ² within them."""
     for i in range(CHUNK):
         rest = q[i] - level[i] * t0[i] - found[i] * t1[i]
         chi2[i] += rest if rest > 0.0 else 0.0
@@ -184,7 +184,7 @@ def side_lines(strip, r, c, across, side, slope, precision, work, first):
 
 @bare_inlined
 def spread_of(right, left, freedom, out):
-    """How much more than expected both sides scatter, by their χ²."""
+    """Compute by how much more than expected both sides scatter, by their χ²."""
     for i in range(CHUNK):
         free = freedom[i] - 4.0
         spread = (right[i] + left[i]) / (free if free > 1.0 else 1.0)
@@ -193,14 +193,14 @@ def spread_of(right, left, freedom, out):
 
 @bare_inlined
 def sigma_of(right, left, spread, floor_m, out):
-    """Standard deviation of a step."""
+    """Compute the standard deviation of a step."""
     for i in range(CHUNK):
         out[i] = np.sqrt((right[i] + left[i]) * spread[i] + floor_m * floor_m)
 
 
 @bare_inlined
 def steps_of(right, left, sigma, told, step_m, evidence):
-    """Steps, and steps over their σ; 0 where nothing is told."""
+    """Compute steps, and steps over their σ; 0 where they are not measurable."""
     for i in range(CHUNK):
         step = right[i] - left[i]
         step_m[i] = step if told[i] > 0.0 else 0.0
@@ -211,7 +211,7 @@ def steps_of(right, left, sigma, told, step_m, evidence):
 
 @bare_inlined
 def tell(active, right, left, out):
-    """1 where both sides have strips enough and a step is looked for, else 0."""
+    """Write 1 where both sides have enough strips and a step is sought, else 0."""
     for i in range(CHUNK):
         enough = right[i] >= MIN_STRIPS and left[i] >= MIN_STRIPS and active[i]
         out[i] = 1.0 if enough else 0.0
@@ -219,7 +219,7 @@ def tell(active, right, left, out):
 
 @bare_inlined
 def slope_towards(slope_x, slope_y, unit, out):
-    """Slope in a direction."""
+    """Compute the slope in a direction."""
     for i in range(CHUNK):
         out[i] = slope_x[i] * unit[0] + slope_y[i] * unit[1]
 
@@ -269,7 +269,7 @@ def sizes_of(evidence, still, bounds, counted, size):
 
 @bare
 def take_excess(evidence, counted, size, prior, usual):
-    """Divide `evidence` (rows, columns) by how much more than usual steps scatter around each cell; 1 at least.
+    """Divide `evidence` (rows, columns) by the excess scatter of steps around each cell over the usual; 1 at least.
 
     counted, size : means around each cell of what :func:`sizes_of` fills. prior : (mean share and mean size that are
     added). usual : size by chance.
@@ -311,7 +311,7 @@ def thin(step_m, evidence, direction, across_unit, limits, first, best):
 
 @inlined
 def sample(field, column, row, first):
-    """Bilinear value of a field (rows, columns) at a place inside it; first : row and column that it begins at."""
+    """Bilinear value of a field (rows, columns) at a place in it; first : row and column of its beginning."""
     c, r = int(np.floor(column)), int(np.floor(row))
     u, v = column - c, row - r
     c, r = c - first[1], r - first[0]

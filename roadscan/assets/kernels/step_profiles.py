@@ -1,4 +1,4 @@
-"""The step at a node of an edge: where it lies, how high it is, and how wide its face, from a profile across."""
+"""The step at a node of an edge: its place, its height, and the width of its face, from a profile across."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import numpy as np
 
 from roadscan.compute.kernel_options import inlined, kernel
 
-BIN_M = 0.01
+BIN_M = 0.01  # Width of a bin (m).
 QUARTERS = 4
-"""Parts of a window along the edge, of which COVERED tells the share that was seen on both sides."""
-NEAR_M = 0.35
+"""Parts of a window along the edge, of which COVERED is the share that was seen on both sides."""
+NEAR_M = 0.35  # Heights this near to the node (m) count for COVERED.
 HALF_BINS = 120
 """A profile reaches this many bins to each side."""
-RESULTS = 11
+RESULTS = 11  # Number of columns.
 OFFSET, STEP, SIGMA_STEP, FACE, TOP, SCATTER, RETURNS, SEEN_LOW, SEEN_HIGH, SIGMA_OFFSET, COVERED = range(RESULTS)
 """Columns of what :func:`fit_nodes` fills, all in metres except the number of returns."""
 
 
 @kernel
 def fit_nodes(node, x_m, y_m, z_m, starts, bins, along_m, search, prior, out):
-    """Fill `out` (n, RESULTS) with the step at each node; SIGMA_STEP is NaN where it cannot be told.
+    """Fill `out` (n, RESULTS) with the step at each node; SIGMA_STEP is NaN where it is not measurable.
 
     node : (n, 7) x, y (m), unit vector along the edge (higher side to its right), height (m) and the ground's slope at
     large along and across it (to the right). x_m, y_m, z_m : (m,) heights of the ground, sorted by bin. starts : the
@@ -34,7 +34,7 @@ def fit_nodes(node, x_m, y_m, z_m, starts, bins, along_m, search, prior, out):
     profile, near = np.empty((4, 2 * HALF_BINS)), np.empty((2, QUARTERS))
     sums, lines = np.empty((6, 2 * HALF_BINS + 1)), np.empty((7, 2 * HALF_BINS + 1))
     reach = np.sqrt(along_m * along_m + (BIN_M * HALF_BINS) ** 2)
-    # How far from the middle of a bin its heights lie at most.
+    # Greatest distance of a bin's heights from its middle.
     corner = 0.708 * bins[2]
     for i in range(node.shape[0]):
         profile[:] = 0.0
@@ -73,7 +73,7 @@ def fit_nodes(node, x_m, y_m, z_m, starts, bins, along_m, search, prior, out):
 
 @inlined
 def accumulate(profile, sums):
-    """Running sums over bins of 1, d, d², z, d z and z²."""
+    """Compute running sums over bins of 1, d, d², z, d z and z²."""
     sums[:, 0] = 0.0
     for b in range(2 * HALF_BINS):
         n = profile[0, b]
@@ -88,7 +88,7 @@ def accumulate(profile, sums):
 
 @inlined
 def line_between(sums, a, b, at_m, slope, precision):
-    """Line through bins a to b: its height at `at_m`, its slope, its χ (m²), returns, and share of variance there."""
+    """Line through bins a to b: its height at `at_m`, its slope, its χ (m²), returns, and share of variance."""
     n = sums[0, b] - sums[0, a]
     if n < 4.0:
         return 0.0, 0.0, np.inf, n, np.inf
@@ -105,7 +105,7 @@ def line_between(sums, a, b, at_m, slope, precision):
 
 @inlined
 def side_lines(profile, sums, ends, bounds, slope, precision, lines):
-    """Fill `lines` with the lines of both sides at each bin that a face may begin or end at.
+    """Fill `lines` with the lines of both sides at each bin where a face may begin or end.
 
     ends : first and last bin of the lower and the higher side. bounds : first and last bin that is asked for. lines :
     height, rest and returns of the lower side's line, then those of the higher side's, then the mean place of the bin's
@@ -123,7 +123,7 @@ def side_lines(profile, sums, ends, bounds, slope, precision, lines):
 
 @inlined
 def search_step(profile, sums, lines, search, prior, slope, out):
-    """Find offset and face of least rest, and fill a row of results; all candidates are held against the same bins."""
+    """Find offset and face of least rest, and fill a row of results; all candidates are compared over the same bins."""
     precision = (prior[1] / prior[0]) ** 2
     farthest, narrow, wide = int(search[0] / BIN_M), int(search[1] / BIN_M), int(search[2] / BIN_M)
     first, last = HALF_BINS - farthest - int(search[3] / BIN_M), HALF_BINS + farthest + int(search[3] / BIN_M)
@@ -131,7 +131,7 @@ def search_step(profile, sums, lines, search, prior, slope, out):
     side_lines(profile, sums, (first, last), bounds, slope, precision, lines)
     best, a, b = np.inf, -1, -1
     for face in range(narrow, wide + 1, 2):
-        # A face wider than needed has to explain more than chance would.
+        # A wider face must explain more than chance would.
         doubt = 1.0 + 0.002 * (face - narrow)
         for e in range(-farthest, farthest + 1):
             begin = HALF_BINS + e - face // 2
@@ -190,7 +190,7 @@ def scatter(profile, a, b, low, slope_low, high, slope_high, out):
             if n > 0.0:
                 seen += 1
                 last = j + 1
-                # What lies farther off may bend away.
+                # Farther strips may bend away.
                 total += min(abs(rest / n), 0.1) / (1.0 + 0.15 * j)
                 strips += 1
         if side == 0:

@@ -1,4 +1,4 @@
-"""Walks outward from a line over the raster of the ground: how far the surface goes on, and what ends it."""
+"""Transects outward from a line over the raster of the ground: extent of the surface, and what ends it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 
 from roadscan.compute.kernel_options import kernel
 
-RESULTS = 5
+RESULTS = 5  # Number of columns.
 WIDTH, END, OUTER_HEIGHT, SLOPE, MIDDLE_HEIGHT = range(RESULTS)
 UNSEEN, OBSTACLE, STEP_DOWN, STEP_UP, BENT, FAR = range(6)
-"""What ends a walk: nothing is known on, something stands there, an edge down or up, a bend or a rough place, none."""
+"""Ends of a transect: nothing known, an object, an edge down or up, a bend or a rough place, none."""
 
 
 @kernel
@@ -61,7 +61,7 @@ def walk(node, height_m, rough_m, blocked, edge_x, edge_y, grid, limits, out):
             before = levels[k - 5] if k > 5 else np.nan
             if rough_m[r, c] > limits[4] or abs(z - before) > limits[3] * 5.0 * step:
                 end = BENT
-                # Smooth heights bend before the edge that they bend at.
+                # Smooth heights bend before the edge.
                 for m in range(1, 6):
                     ahead = t + m * step
                     c = int(np.floor((node[i, 0] + ahead * node[i, 2] - grid[0]) / step))

@@ -1,4 +1,4 @@
-"""Upright planes in voxels: moments of the returns seen from above, thin elements of them, and what they join to."""
+"""Upright planes in voxels: moments of the returns seen from above, thin elements, and regions of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from roadscan.compute.kernel_options import inlined, kernel
 
 @kernel
 def gather_moments(x, y, above, corner, sizes, index, moments, voxel_of):
-    """Number of voxels with returns; their moments, and the voxel of each return (-1: none).
+    """Compute voxels with returns, their moments, and the voxel of each return (-1: none); returns how many there are.
 
     x, y : (n,) float64; above : (n,) float32 heights (m), NaN is left out; corner : (x, y, height) of voxel (0, 0, 0);
     sizes : (side, height of a layer) of a voxel (m); index : (layers, rows, columns) int32, all -1, gets the voxel's
@@ -52,7 +52,7 @@ def gather_moments(x, y, above, corner, sizes, index, moments, voxel_of):
 
 @kernel
 def thin_elements(index, moments, side_m, limits, elements):
-    """Number of voxels whose returns, with those of the eight beside them in their layer, lie on an upright plane.
+    """Find voxels whose returns, with those of the eight beside them in their layer, lie on an upright plane.
 
     limits : (4,) fewest returns, least standard deviation along the plane, greatest across it (m), greatest ratio of
     the two; elements : (voxels, 6) float64, gets 1 or 0, middle x, y (from the corner of the voxels, m), direction of
@@ -98,7 +98,7 @@ def thin_elements(index, moments, side_m, limits, elements):
 
 @inlined
 def _continue_one_another(elements, i, j, least_cosine, most_m):
-    """Whether two elements lie on one plane, within limits."""
+    """Returns whether two elements lie on one plane, within limits."""
     if abs(elements[i, 3] * elements[j, 3] + elements[i, 4] * elements[j, 4]) < least_cosine:
         return False
     dx, dy = elements[j, 1] - elements[i, 1], elements[j, 2] - elements[i, 2]
@@ -109,7 +109,7 @@ def _continue_one_another(elements, i, j, least_cosine, most_m):
 
 @kernel
 def grow_regions(index, elements, least_cosine, most_m, reach, region, stack):
-    """Number of regions: elements that touch, in and across layers, and continue one another's plane.
+    """Join elements that touch, in and across layers, and lie on one plane; returns the number of regions.
 
     reach : (layers, cells) that a neighbour may be away; region : (voxels,) int32, all 0, gets the region's number from
     1, in the order of layers, rows and columns; stack : (voxels, 3) int32, working space.

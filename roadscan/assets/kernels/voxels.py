@@ -1,4 +1,4 @@
-"""Returns in cubes over the ground, and how those of each cube and its neighbours scatter."""
+"""Returns in cubes over the ground, and the scatter in each cube and its neighbours."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOMENTS = 10
 
 @kernel
 def numbered(x, y, above, chosen, origin, per_m, index, number, place):
-    """Number the cubes that hold chosen returns in the order of their first ones.
+    """Number the cubes of chosen returns in the order of their first ones.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def numbered(x, y, above, chosen, origin, per_m, index, number, place):
 
 @kernel
 def moments(x, y, above, number, origin, per_m, place, out):
-    """Sums of the returns of each cube, in cubes from its own corner.
+    """Sum the returns of each cube, in cubes from its corner.
 
     out : (cubes, 10) float64, added to: number; x, y, z; xx, xy, xz, yy, yz, zz. Other arguments as of `numbered`.
     """
@@ -78,7 +78,7 @@ def moments(x, y, above, number, origin, per_m, place, out):
 
 @inlined
 def eigenvalues(a, b, c, d, e, f):
-    """Eigenvalues, largest first, of the matrix of rows (a, b, c), (b, d, e), (c, e, f) (Smith 1961)."""
+    """Returns eigenvalues, largest first, of the matrix of rows (a, b, c), (b, d, e), (c, e, f) (Smith 1961)."""
     q = (a + d + f) / 3.0
     p = (a - q) ** 2 + (d - q) ** 2 + (f - q) ** 2 + 2.0 * (b * b + c * c + e * e)
     if p < 1e-24:
@@ -94,7 +94,7 @@ def eigenvalues(a, b, c, d, e, f):
 
 @inlined
 def upward(a, b, c, d, e, f, value):
-    """How far the eigenvector of an eigenvalue of that matrix points upwards: 0 level, 1 upright."""
+    """Returns how far the eigenvector of an eigenvalue of that matrix points upwards: 0 level, 1 upright."""
     a, d, f = a - value, d - value, f - value
     x1, y1, z1 = b * e - c * d, c * b - a * e, a * d - b * b
     x2, y2, z2 = b * f - c * e, c * c - a * f, a * e - b * c
@@ -110,7 +110,7 @@ def upward(a, b, c, d, e, f, value):
 
 @kernel
 def features(index, place, sums, out):
-    """How the returns of each cube and the 26 about it scatter (Demantké, Mallet, David, Vallet 2011, eq. 2).
+    """Compute the scatter of each cube's returns and the 26 about it (Demantké, Mallet, David, Vallet 2011, eq. 2).
 
     Parameters
     ----------

@@ -13,9 +13,9 @@ from roadscan.assets.scene import Scene
 from roadscan.assets.upright.cushions import PIECE_SCHEMA, boxes_of
 from roadscan.assets.upright.probability import logistic
 
-_NEAR_END_M: Final = 2.0
+_NEAR_END_M: Final = 2.0  # Greatest distance of a box to the end of a line (m).
 _LEAST_LINE_M: Final = 4.0
-"""What is shielded is longer."""
+"""Least length of a shielded line (m)."""
 
 
 class Attenuator(AssetKind):
@@ -28,13 +28,13 @@ class Attenuator(AssetKind):
     piece_schema = PIECE_SCHEMA
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """Boxes of the tile."""
+        """Returns boxes of the tile."""
         return Evidence(boxes_of(scene))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """Boxes at the end of something that they shield."""
+        """Yields boxes at the end of a line that they shield."""
         lines = [o.geometry for kind in self.after for o in others.get(kind, ()) if o.geometry.length > _LEAST_LINE_M]
         if not lines:
             return

@@ -1,4 +1,4 @@
-"""Clearance: the lowest structure, wire or branch above the way of each drive."""
+"""Clearance: the lowest structure, wire or branch above the path of each drive."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Clearance(AssetKind):
     piece_schema = PIECE_SCHEMA
 
     def evidence(self, scene: Scene, options: ClearanceOptions) -> Evidence:
-        """Cells of the tile with something above them."""
+        """Returns cells of the tile with something above them."""
         return Evidence(overhead_cells(scene, options))
 
     def objects(
         self, pieces: pa.Table, options: ClearanceOptions, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """The lowest places of each drive, apart from one another."""
+        """Yields the lowest places of each drive, apart from one another."""
         for row in lowest_places(pieces, options.apart_m):
             probability = logistic(-1.0, [(0.3, min(row["returns"], 15)), (0.3, min(row["cells"], 5))])
             yield AssetObject(

@@ -25,11 +25,11 @@ class Facade(SurfaceKind):
     code = classes.BUILDING
 
     def marks(self, scene: Scene, rows: Any) -> Any:
-        """Returns on the surface, in its recesses and on its balconies."""
+        """Returns the returns on the surface, in its recesses and on its balconies."""
         return beside(scene, rows)
 
     def made(self, chain: Chain) -> AssetObject:
-        """The object of a chain: its outline, upright."""
+        """Returns the object of a chain: its outline, upright."""
         polygon = outline(chain)
         shown = np.isfinite(chain.values["high_m"])
         heights = (chain.values["high_m"] - chain.values["low_m"])[shown]

@@ -1,4 +1,4 @@
-"""Kind `kerb`: steps beside the road, sought along it, with their height and type."""
+"""Kerbs: steps beside the road, traced along it, with their height and type."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from roadscan.core.strict import Strict
 Float64 = npt.NDArray[np.float64]
 
 SLOPED_FACE_M = 0.12
-"""A face wider than this is sloped."""
-_FACE_NODES, _LEAST_NODES = 31, 4
+"""A kerb with a wider face (m) is sloped."""
+_FACE_NODES, _LEAST_NODES = 31, 4  # Nodes of the median of faces; least nodes of a run of one type.
 FACE_REACH_M = 0.15
-"""Returns this near to the line, between the foot and the top of the step, belong to the kerb."""
+"""Returns this near to the line (m), between the foot and the top of the step, belong to the kerb."""
 
 
 class KerbOptions(Strict):
@@ -56,7 +56,7 @@ class Kerb(AssetKind):
     piece_schema: ClassVar[pa.Schema] = LINE_PIECES
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """Parts of the scene's steps within its tile."""
+        """Returns parts of the scene's steps within its tile."""
         raster = raster_of(scene)
         parts = [part for edge in free_edges(scene) for part in cut_at(columns_of(edge), scene.tile)]
         return Evidence(pieces_table(parts, scene, raster), _marked([p.nodes for p in parts], scene, raster))
@@ -64,7 +64,7 @@ class Kerb(AssetKind):
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """Lines joined across tiles, a kerb for each run of one type."""
+        """Yields lines joined across tiles, a kerb for each run of one type."""
         settings: KerbOptions = options
         for line in joined_lines(pieces):
             probability = kerb_probability(line)
@@ -74,13 +74,13 @@ class Kerb(AssetKind):
             begin = 0
             for name, run in itertools.groupby(types):
                 end = begin + sum(1 for _ in run)
-                # Runs share the node between them, so that no piece of the kerb is missing.
+                # Runs share the node between them, so that the kerb has no gap.
                 yield _kerb(line, slice(begin, min(end + 1, len(types))), str(name), probability)
                 begin = end
 
 
 def types_along(line: Line, dropped_m: float) -> list[str]:
-    """Type (n,) of a kerb at each node of its line: a run shorter than 1.5 m takes that of the nodes before it."""
+    """Returns the type (n,) of a kerb at each node: a run shorter than 1.5 m takes that of the nodes before it."""
     step, face = line.column("step_m"), line.column("face_m")
     known = np.isfinite(step) & (line.column("seen") > 0.5)
     if not known.any():
@@ -103,7 +103,7 @@ def types_along(line: Line, dropped_m: float) -> list[str]:
 
 
 def _kerb(line: Line, rows: slice, name: str, probability: float) -> AssetObject:
-    """A kerb of one type; returns and epochs are the share and the span of its line's."""
+    """Returns a kerb of one type; returns and epochs are the share and the span of its line's."""
     nodes = Line(line.nodes[rows], line.seen_by, line.names)
     step, sigma = nodes.column("step_m"), nodes.column("sigma_step_m")
     known = np.isfinite(step)
@@ -127,7 +127,7 @@ def _kerb(line: Line, rows: slice, name: str, probability: float) -> AssetObject
 
 
 def _marked(parts: Sequence[Float64], scene: Scene, raster: HeightRaster) -> tuple[Marked, ...]:
-    """Returns on the faces of kerbs."""
+    """Returns the numbers of the returns on the faces of kerbs."""
     if not parts:
         return ()
     places, levels = [], []
@@ -154,7 +154,7 @@ def _marked(parts: Sequence[Float64], scene: Scene, raster: HeightRaster) -> tup
 
 
 def _cells_near(places: Float64, raster: HeightRaster) -> npt.NDArray[np.bool_]:
-    """Flat cells (rows · columns + 1,) that hold all returns within reach of some places (k, 2); none is the last."""
+    """Returns a mask of flat cells (rows · columns + 1,) with all returns within reach of some places (k, 2)."""
     reach = math.ceil(FACE_REACH_M / raster.cell_m)
     near = np.zeros(raster.count.shape, np.uint8)
     near[raster.cells_of(places[:, 0], places[:, 1])] = 1

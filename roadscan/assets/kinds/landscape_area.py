@@ -23,13 +23,13 @@ class LandscapeArea(AssetKind):
     piece_schema = PIECE_SCHEMA
 
     def evidence(self, scene: Scene, options: LandscapeOptions) -> Evidence:
-        """Cells of the tile."""
+        """Returns cells of the tile."""
         return Evidence(grown_cells(scene, options))
 
     def objects(
         self, pieces: pa.Table, options: LandscapeOptions, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """A polygon an area."""
+        """Yields a polygon for each area."""
         columns = {n: np.asarray(pieces[n]) for n in ("column", "row", "height_m", "probability", "returns")}
         first, last = np.asarray(pieces["first_epoch_gps_ns"]), np.asarray(pieces["last_epoch_gps_ns"])
         passes = pieces["passes"].to_pylist()

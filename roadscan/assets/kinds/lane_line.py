@@ -1,4 +1,4 @@
-"""Lane lines: paint along the road, joined over its dashes."""
+"""Lane lines: paint along the road, joined over its gaps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from roadscan.assets.paint.line_pieces import LINE_PIECES, line_pieces
 from roadscan.assets.scene import Scene
 from roadscan.core.strict import Strict
 
-_LONGEST_GAP_M: Final = 15.0
+_LONGEST_GAP_M: Final = 15.0  # Default of the setting below (m).
 
 
 class LaneLineOptions(Strict):
@@ -36,7 +36,7 @@ class LaneLine(AssetKind):
     piece_schema: ClassVar[pa.Schema] = LINE_PIECES
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """Straight pieces of lines in the tile."""
+        """Returns straight pieces of lines in the tile."""
         paint = paint_of(scene)
         marked = Marked(rows_of_paint(paint.contrast, paint.lines), MARKING)
         counts = {"dense_cells": paint.contrast.dense_cells, "rough_cells": paint.contrast.rough_cells}
@@ -45,5 +45,5 @@ class LaneLine(AssetKind):
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """Lines of the pieces of all tiles."""
+        """Returns lines of the pieces of all tiles."""
         return lane_lines(pieces, options.longest_gap_m)

@@ -1,4 +1,4 @@
-"""Kind `median`: a raised strip between two edges whose higher sides face each other."""
+"""Medians: raised strips between two edges whose higher sides face each other."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ class Median(AssetKind):
     piece_schema: ClassVar[pa.Schema] = BESIDE_PIECES
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """The scene's edges within its tile, and at each node the surface behind it."""
+        """Returns the scene's edges within its tile, and at each node the surface behind it."""
         return Evidence(pieces_beside(scene))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """Runs of a joined line with a surface behind it that an edge down ends, each median once."""
+        """Yields runs of a joined line with a surface behind it that ends at an edge down, each median once."""
         settings: MedianOptions = options
         found: list[shapely.Polygon] = []
         for line in joined_lines(pieces):
@@ -66,7 +66,7 @@ class Median(AssetKind):
 
 
 def _same(a: shapely.Polygon, b: shapely.Polygon) -> bool:
-    """Whether two polygons cover each other so far that they are one median."""
+    """Returns whether two polygons overlap so far that they are one median."""
     if not a.intersects(b):
         return False
     return float(a.intersection(b).area) > SAME_SHARE * min(float(a.area), float(b.area))

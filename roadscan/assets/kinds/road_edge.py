@@ -1,4 +1,4 @@
-"""Kind `road_edge`: the edges of the carriageway on both sides of the drives."""
+"""Road edges: the edges of the carriageway on both sides of the drives."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class RoadEdge(AssetKind):
     piece_schema: ClassVar[pa.Schema] = line_schema(EDGE_COLUMNS)
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """Edges beside the drives within the scene's tile."""
+        """Returns edges beside the drives within the scene's tile."""
         return Evidence(pieces_table(road_edges(scene), scene, raster_of(scene), self.piece_schema))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """Lines joined across tiles, an edge for each run of one type."""
+        """Yields lines joined across tiles, an edge for each run of one type."""
         settings: RoadEdgeOptions = options
         for right in (False, True):
             side = [i for i, row in enumerate(pieces["right"].to_pylist()) if (row[0] > 0.5) == right]

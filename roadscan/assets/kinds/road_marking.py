@@ -18,13 +18,13 @@ from roadscan.assets.paint.patch_pieces import PATCH_PIECES, patch_pieces
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.places import places_of
 
-_LARGE_M2: Final = 0.5
-_STANDS_M: Final = (0.3, 1.5)
-_LEAST_STANDING: Final = 5
+_LARGE_M2: Final = 0.5  # Larger patches are not tested for a post (m²).
+_STANDS_M: Final = (0.3, 1.5)  # Heights above the ground (m) between which a post is seen.
+_LEAST_STANDING: Final = 5  # Least number of returns of a post.
 
 
 def _at_foot(scene: Scene, patch: Patch) -> bool:
-    """Whether a small patch is the foot of a post: something stands on it."""
+    """Returns whether a small patch is the foot of a post: something stands on it."""
     if patch.shape.area > _LARGE_M2:
         return False
     west, south, east, north = patch.shape.bounds
@@ -43,7 +43,7 @@ class RoadMarking(AssetKind):
     piece_schema: ClassVar[pa.Schema] = PATCH_PIECES
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """Polygons of markings in the tile."""
+        """Returns polygons of markings in the tile."""
         paint = paint_of(scene)
         paint = replace(paint, patches=tuple(p for p in paint.patches if not _at_foot(scene, p)))
         return Evidence(patch_pieces(scene, paint), (Marked(rows_of_paint(paint.contrast, paint.patches), MARKING),))
@@ -51,5 +51,5 @@ class RoadMarking(AssetKind):
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """Markings of the pieces of all tiles."""
+        """Returns markings of the pieces of all tiles."""
         return markings(pieces)

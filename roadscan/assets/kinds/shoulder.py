@@ -1,4 +1,4 @@
-"""Kind `shoulder`: the paved strip between the outermost lane line and the edge of the carriageway."""
+"""Shoulders: paved strips between the outermost lane line and the edge of the carriageway."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from roadscan.compute.ways import way_along
 
 Float64 = npt.NDArray[np.float64]
 
-STATION_M = 1.0
+STATION_M = 1.0  # Distance of stations along an edge (m).
 GAP_NODES = 6
-"""So many nodes between two dashes of a line are bridged."""
+"""Longest run of nodes between two dashes of a line that is bridged."""
 
 
 class ShoulderOptions(KindOptions):
@@ -44,7 +44,7 @@ class Shoulder(AssetKind):
     name: ClassVar[str] = "shoulder"
     title: ClassVar[str] = "shoulders: paved strips beyond the outer lane line"
     curve: ClassVar[str] = "products"
-    """It is the product of what is stated of its edge and of its line."""
+    """It is the product of the stated probabilities of its edge and of its line."""
     options: ClassVar[type[KindOptions]] = ShoulderOptions
     after: ClassVar[Sequence[str]] = ("lane_line", "road_edge")
     piece_schema: ClassVar[pa.Schema] = pa.schema(
@@ -52,7 +52,7 @@ class Shoulder(AssetKind):
     )
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """The first node of each road edge within the tile: a mark that there may be a shoulder."""
+        """Returns the first node of each road edge within the tile: a mark that there may be a shoulder."""
         corner = scene.returns.corner_m
         marks = [(corner[0] + part.nodes[0, 0], corner[1] + part.nodes[0, 1]) for part in road_edges(scene)]
         columns = {"easting_m": [m[0] for m in marks], "northing_m": [m[1] for m in marks]}
@@ -61,7 +61,7 @@ class Shoulder(AssetKind):
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """A shoulder for each run of a road edge with a lane line inside it."""
+        """Yields a shoulder for each run of a road edge with a lane line inside it."""
         settings: ShoulderOptions = options
         lines = others.get("lane_line", ())
         if not lines:
@@ -75,7 +75,7 @@ class Shoulder(AssetKind):
 def _beside(
     edge: AssetObject, lines: Sequence[AssetObject], tree: shapely.STRtree, settings: ShoulderOptions
 ) -> Iterable[AssetObject]:
-    """Shoulders along one edge."""
+    """Yields shoulders along one edge."""
     inner, width, line_of = _widths(edge, lines, tree, settings.greatest_width_m)
     outer = _even(edge)
     good = np.isfinite(width)
@@ -115,7 +115,7 @@ def _beside(
 
 
 def _even(edge: AssetObject) -> Float64:
-    """Points (n, 3) of an edge about each metre."""
+    """Returns points (n, 3) of an edge, about one a metre."""
     nodes = shapely.get_coordinates(edge.geometry, include_z=True)
     x, y = dense(nodes[:, :2], STATION_M)
     length = way_along(nodes)
@@ -125,7 +125,7 @@ def _even(edge: AssetObject) -> Float64:
 def _widths(
     edge: AssetObject, lines: Sequence[AssetObject], tree: shapely.STRtree, reach_m: float
 ) -> tuple[Float64, Float64, npt.NDArray[np.int64]]:
-    """Nearest points (n, 3) of lane lines straight inside an edge's points, their distances, and the lines' numbers."""
+    """Nearest points (n, 3) of lane lines straight inside an edge's points, their distances, and lines' numbers."""
     outer = _even(edge)
     heading = np.gradient(outer[:, :2], axis=0)
     heading /= np.maximum(np.hypot(*heading.T), 1e-9)[:, None]

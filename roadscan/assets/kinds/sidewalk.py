@@ -1,4 +1,4 @@
-"""Kind `sidewalk`: the smooth surface behind a kerb, up to a façade, a fence, plants, or another edge."""
+"""Sidewalks: smooth surfaces behind a kerb, up to a façade, a fence, plants, or another edge."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ class Sidewalk(AssetKind):
     piece_schema: ClassVar[pa.Schema] = BESIDE_PIECES
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """The scene's edges within its tile, and at each node the surface behind it."""
+        """Returns the scene's edges within its tile, and at each node the surface behind it."""
         return Evidence(pieces_beside(scene))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """Runs of a joined line with a surface behind it that no edge down ends."""
+        """Yields runs of a joined line with a surface behind it that does not end at an edge down."""
         settings: SidewalkOptions = options
         for line in joined_lines(pieces):
             probability = kerb_probability(line)

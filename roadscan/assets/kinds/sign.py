@@ -17,12 +17,12 @@ from roadscan.assets.scene import Scene
 from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of, schema_of
 from roadscan.assets.upright.plates import Plate, SignOptions, plates_of
 
-_LEAST = 0.5
-_APART_M = 0.3
+_LEAST = 0.5  # Least probability of a plate.
+_APART_M = 0.3  # Plates nearer to one another (m) are one.
 _BESIDE_POST_M = 0.4
-"""A plate's middle stands so near before the axis of its post; of two posts of a board each stands within its width."""
+"""Distance of a plate's middle before the axis of its post (m); the two posts of a board stand within its width."""
 _BELOW_M = 0.3
-"""A post reaches to the plate's lower edge, or ends so far below it, as seen."""
+"""A post reaches to the plate's lower edge, or appears to end this far below it (m)."""
 
 
 class Sign(AssetKind):
@@ -38,7 +38,7 @@ class Sign(AssetKind):
     )
 
     def evidence(self, scene: Scene, options: SignOptions) -> Evidence:
-        """Plates whose middle the tile holds."""
+        """Returns plates whose middle lies in the tile."""
         found = [p for p in plates_of(scene, options) if p.probability >= _LEAST]
         pieces = pieces_of(scene, [_place(p) for p in found], self.piece_schema)
         return Evidence(pieces, tuple(Marked(p.rows, classes.SIGN) for p in found))
@@ -46,14 +46,14 @@ class Sign(AssetKind):
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """An object a plate, with the post that carries it."""
+        """Yields an object for each plate, with the post that carries it."""
         posts = [(kind, one) for kind in self.after for one in others.get(kind, ())]
         for sign in objects_at_places(pieces, _APART_M):
             yield replace(sign, attributes={**sign.attributes, "post": _post_of(sign, posts)})
 
 
 def _post_of(sign: AssetObject, posts: Iterable[tuple[str, AssetObject]]) -> str | None:
-    """Name of the nearest post at a sign; None where none stands at it."""
+    """Returns the name of the nearest post at a sign; None where none stands at it."""
     plate, values = sign.geometry, sign.attributes
     near: list[tuple[float, str]] = []
     for kind, post in posts:

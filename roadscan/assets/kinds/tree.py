@@ -22,7 +22,7 @@ class Tree(ShaftKind):
     piece_schema = schema_of(["asset_height_m", "trunk_diameter_m", "crown_diameter_m", "lean_deg"])
 
     def marks(self, scene: Scene, upright: Upright) -> Iterable[tuple[Any, int]]:
-        """Trunk and crown by their height above the ground, as ASPRS has vegetation: up to 0.5 m, up to 2 m, higher."""
+        """Trunk and crown by height above the ground, as ASPRS classes vegetation: up to 0.5 m, up to 2 m, higher."""
         above = scene.above_ground_m[upright.rows]
         yield upright.rows[above > 2.0], classes.HIGH_VEGETATION
         yield upright.rows[(above > 0.5) & (above <= 2.0)], classes.MEDIUM_VEGETATION

@@ -1,1 +1,1 @@
-"""Paint on the road: where the ground is brighter than its surroundings, and what shape that has."""
+"""Paint on the road: ground brighter than its surroundings, and the shape of it."""

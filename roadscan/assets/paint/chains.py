@@ -1,4 +1,4 @@
-"""Pieces of lines put together, end to end: first to continuous paint, then over the gaps between dashes."""
+"""Chains of pieces of lines, end to end: first continuous paint, then over the gaps between dashes."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _TOUCHING_M: Final = 0.45
-"""Ends that are no farther apart belong to one band of paint."""
-_ASIDE_M: Final = 0.12
+"""Ends no farther apart than this (m) belong to one band of paint."""
+_ASIDE_M: Final = 0.12  # Lateral offset of ends that touch (m).
 _GAP_SHARE: Final = 4.5
-"""Longest gap, in lengths of the longer dash beside it."""
-_SHORT_GAP_M: Final = 4.0
+"""Longest gap, in lengths of the longer dash beside it …"""
+_SHORT_GAP_M: Final = 4.0  # … and at least (m).
 _TIGHTEST_M: Final = 25.0
-"""Least radius of a curve that a line follows over a gap."""
+"""Least radius (m) of a curve that a line follows over a gap."""
 _TURN_DEG: Final = 4.0
-"""1 σ of the direction of a short dash, times two."""
-_MISS_M, _MISS_PER_M = 0.12, 0.03
+"""1 σ of the direction of a short dash, times two (degrees)."""
+_MISS_M, _MISS_PER_M = 0.12, 0.03  # Lateral offset of ends across a gap (m), and more per metre.
 
 
 class Run(NamedTuple):
-    """Pieces (k,) one after another, and which of them are turned end for end."""
+    """Pieces (k,) one after another, and which of them are reversed."""
 
     pieces: tuple[int, ...]
     turned: tuple[bool, ...]
@@ -34,7 +34,7 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Straight or bent bands (n,): where they end, which way they point there (unit vectors out of the band)."""
+    """Straight or bent bands (n,): their ends, and the unit vectors that point out of the band there."""
 
     place: Float64
     """(n, 2, 2) begin and end in the map."""
@@ -45,9 +45,9 @@ class Bands:
 
 
 def joined(bands: Bands, longest_gap_m: float) -> list[Run]:
-    """Bands put one after another, each in one run; with `longest_gap_m` of 0 only those that touch.
+    """Returns bands joined one after another, each in one run; with `longest_gap_m` of 0 only those that touch.
 
-    The nearest ends find one another first; an end is used once, and no run closes to a ring.
+    The nearest ends are matched first; an end is used once, and no run closes to a ring.
     """
     count = len(bands.length_m)
     partner = np.full((count, 2), -1)
@@ -68,7 +68,7 @@ def joined(bands: Bands, longest_gap_m: float) -> list[Run]:
 
 
 def _runs(partner: Int64) -> list[Run]:
-    """Chains of bands, from the first free end of each."""
+    """Returns chains of bands, from the first free end of each."""
     used, out = np.zeros(len(partner), np.bool_), []
     for start in range(len(partner)):
         if used[start]:
@@ -92,7 +92,7 @@ def _runs(partner: Int64) -> list[Run]:
 
 
 def _candidates(bands: Bands, longest_gap_m: float) -> Sequence[tuple[float, int, int]]:
-    """Pairs of ends that may belong together, best first: cost, and both ends (2 · band + 0 or 1)."""
+    """Returns pairs of ends that may belong together, best first: cost, and both ends (2 · band + 0 or 1)."""
     from scipy.spatial import cKDTree
 
     if not bands.length_m.size:

@@ -16,25 +16,25 @@ from roadscan.assets.paint.contrast import CELL_M, Contrast
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-SEED_CONTRAST: Final = 0.55
+SEED_CONTRAST: Final = 0.55  # Paint starts at cells of this contrast (share of the surface's brightness) …
 SEED_SIGMAS: Final = 4.0
-"""Paint begins at cells of this contrast, in units of the surface's brightness and of the noise."""
+"""… that is also at least this many σ of the noise."""
 _EDGE_SHARE: Final = 0.4
-"""Paint reaches to where the contrast is this share of the greatest near it."""
+"""Paint extends to where the contrast is this share of the greatest near it."""
 _MEAN_SHARE: Final = 2.0 / 3.0
-"""The mean contrast of all of a component's returns, as a share of what paint begins at: a kerb's border or a worn
+"""Least mean contrast of all of a component's returns, as a share of `SEED_CONTRAST`: a kerb's border or a worn
 surface holds bright specks, paint is bright everywhere. On the labelled street and on simulated paint that is worn,
 what is paint has 0.40 or more, what is none mostly less than 0.36."""
-_NEAR_M: Final = 0.2
-_LEAST_CONTRAST: Final = 0.10
+_NEAR_M: Final = 0.2  # Distance within which that greatest contrast is sought (m).
+_LEAST_CONTRAST: Final = 0.10  # Least contrast of paint.
 _AROUND_M: Final = 0.3
-"""Returns within this of its cells belong to a component's surroundings."""
-FEWEST_RETURNS: Final = 8
-FEWEST_LINES: Final = 3
+"""Returns within this distance of its cells (m) belong to a component's surroundings."""
+FEWEST_RETURNS: Final = 8  # A component needs this many returns …
+FEWEST_LINES: Final = 3  # … on this many scan lines.
 EVIDENCE_SIGMAS: Final = 5.0
-"""Mean contrast of a component, in units of its standard deviation on a bare surface."""
+"""Least mean contrast of a component, in units of its standard deviation on a bare surface."""
 _LINE_SIGMA: Final = 0.15
-"""1 σ of the contrast that a scan line as a whole has on a bare surface: what its gain does not explain."""
+"""1 σ of the contrast of a whole scan line on a bare surface: errors of its gain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +49,11 @@ class Component:
     near: Int64
     """(n,) indices of the contrast's returns on or around the cells."""
     inside: npt.NDArray[np.bool_]
-    """(n,) which of them lie in the cells."""
+    """(n,) mask of those that lie in the cells."""
     evidence_sigma: float
 
     def part(self, cells: npt.NDArray[np.bool_], returns: npt.NDArray[np.bool_]) -> Component:
-        """The component of some of its cells (c,) and returns (n,)."""
+        """Returns the component of some of its cells (c,) and returns (n,)."""
         return Component(
             self.cell[cells], self.cell_x_m[cells], self.cell_y_m[cells], self.near[returns], self.inside[returns],
             self.evidence_sigma,
@@ -61,7 +61,7 @@ class Component:
 
 
 def components_of(found: Contrast) -> list[Component]:
-    """All components of paint in the window, in the order of their first cell."""
+    """Returns all components of paint in the window, in the order of their first cell."""
     from scipy import ndimage
 
     mask, seeds = _painted(found)
@@ -116,7 +116,7 @@ def _painted(found: Contrast) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.boo
 
 
 def _evidence(found: Contrast, own: Int64, count: int) -> tuple[Float64, Float64, Int64]:
-    """Mean contrast of the returns in each label, in units of its standard deviation and as it is; scan lines."""
+    """Mean contrast of each label's returns, in units of its standard deviation and as it is; scan lines."""
     returns = np.maximum(np.bincount(own, minlength=count + 1), 1)
     mean = np.bincount(own, weights=found.contrast, minlength=count + 1) / returns
     variance = np.bincount(own, weights=found.noise**2, minlength=count + 1) / returns**2
@@ -127,7 +127,7 @@ def _evidence(found: Contrast, own: Int64, count: int) -> tuple[Float64, Float64
 
 
 def _nearest(label: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-    """Label of the nearest labelled cell within reach, else 0."""
+    """Returns the label of the nearest labelled cell within reach, else 0."""
     from scipy import ndimage
 
     reach = math.ceil(_AROUND_M / CELL_M) + 1

@@ -20,28 +20,28 @@ Float32 = npt.NDArray[np.float32]
 Int64 = npt.NDArray[np.int64]
 
 CELL_M: Final = 0.05
-"""Cells of paint; they lie on a grid of the map."""
-ON_GROUND_M: Final = 0.1
-_LEVEL_CELL_M: Final = 0.5
+"""Edge of a cell of paint (m); cells lie on a grid of the map."""
+ON_GROUND_M: Final = 0.1  # Returns within this height of the ground (m) are on it.
+_LEVEL_CELL_M: Final = 0.5  # Edge of a cell of brightness (m).
 _LEVEL_HALF: Final = 2
-"""The surroundings are 2.5 m wide."""
+"""Half width of the surroundings (cells): they are 2.5 m wide."""
 _USUAL_STEP, _USUAL_SIZE = 3, 9
 """The usual brightness is a median over 13 m, of every third cell."""
 _DARKEST: Final = 0.9
-"""Where the surroundings are darker than this share of the usual brightness (fresh bitumen, water), that counts."""
-ROUGHEST_M: Final = 0.03
+"""Surroundings darker than this share of the usual brightness (fresh bitumen, water) count as this bright."""
+ROUGHEST_M: Final = 0.03  # Ground that scatters more (m) is not searched for paint.
 _ROUGH_M: Final = 0.12
-"""Paved ground scatters less than this about its own mean height, weighted within this."""
+"""Weights of the height's scatter about its mean fall within this distance (m)."""
 SMOOTH_M: Final = 0.06
-"""1 σ of the weights of the returns around a cell."""
+"""1 σ of the weights of the returns around a cell (m)."""
 _FEWEST_PER_M2: Final = 40.0
-"""Where fewer returns lie, a stripe would be seen by a few of them only."""
+"""With fewer returns (1/m²), only few would hit a stripe."""
 _FLATTEST: Final = 0.1
-"""Sine of the angle between beam and road below which a beam's footprint is ten times as long as it is wide."""
-_LINE_NS: Final = 20_000_000
-_LEAST_NOISE: Final = 0.06
+"""Least sine of the angle between beam and road: below it a beam's footprint is ten times as long as it is wide."""
+_LINE_NS: Final = 20_000_000  # A scan line is what one laser sees within this time (ns).
+_LEAST_NOISE: Final = 0.06  # Least 1 σ of a return's contrast.
 _CLIP: Final = (-0.5, 2.0)
-"""Contrasts beyond this (glints) count as this."""
+"""Bounds of contrasts: glints are clipped to these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +64,16 @@ class Contrast:
     box: Box
     """The extent of the scene, from the corner of its returns."""
     mean: Float32
-    """Contrast, as the weighted mean of the returns around each cell; 0 where there are none."""
+    """Mean contrast, weighted over the returns around each cell; 0 where there are none."""
     sigma: Float32
     """Its standard deviation; infinite where there are none."""
     dense_cells: int = 0
-    """Cells in which enough returns lie on the ground."""
+    """Number of cells in which enough returns lie on the ground."""
     rough_cells: int = 0
     """Those of them that scatter by more than `ROUGHEST_M`: no paint is sought there."""
 
     def cell_of(self, x_m: Float64, y_m: Float64) -> Int64:
-        """Cell of points (n,) within the window."""
+        """Returns the cell of points (n,) within the window."""
         rows, columns = self.mean.shape
         column = np.clip(((x_m - self.box.x_min_m) / CELL_M).astype(np.int64), 0, columns - 1)
         row = np.clip(((y_m - self.box.y_min_m) / CELL_M).astype(np.int64), 0, rows - 1)
@@ -81,7 +81,7 @@ class Contrast:
 
 
 def contrast_of(scene: Scene) -> Contrast:
-    """Contrast of the returns of a scene that lie on the ground and on no vehicle or person."""
+    """Returns the contrast of a scene's returns that lie on the ground and on no vehicle or person."""
     found = scene.returns
     window = scene.extent
     rows = _on_surface(scene, window)
@@ -97,7 +97,7 @@ def contrast_of(scene: Scene) -> Contrast:
 
 
 def _on_surface(scene: Scene, box: Box) -> Int64:
-    """Rows of the returns on the ground and on no road user; those that a beam met at a small angle are left out,
+    """Returns rows of the returns on the ground and on no road user, without those that a beam met at a small angle,
     where it is known where the sensor stood.
     """
     r, looked_at = scene.returns, np.ones(256, np.bool_)
@@ -111,14 +111,14 @@ def _on_surface(scene: Scene, box: Box) -> Int64:
 
 
 def _lines(found: Returns, rows: Int64) -> Int64:
-    """Number (n,) of the scan line of each return at `rows`."""
+    """Returns the number (n,) of the scan line of each return at `rows`."""
     out = np.empty(rows.size, np.int64)
     scan_lines(rows, read_only(found.epoch_gps_ns), found.sensor, found.laser, _LINE_NS, out)
     return out
 
 
 def _levels(x: Float64, y: Float64, intensity: Float64, window: Box) -> tuple[Float64, Float64]:
-    """Brightness (rows, columns) of the surface around cells, and what 84 % of the returns on it do not reach."""
+    """Brightness (rows, columns) of the surface around cells, and what 84 % of the returns on it do not exceed."""
     from scipy import ndimage
 
     edge = _LEVEL_CELL_M
@@ -141,7 +141,7 @@ def _levels(x: Float64, y: Float64, intensity: Float64, window: Box) -> tuple[Fl
 def _means(
     cell: Int64, contrast: Float64, noise: Float64, height: Float32, shape: tuple[int, int]
 ) -> tuple[Float32, Float32, tuple[int, int]]:
-    """Weighted mean of the contrast around each cell, and its standard deviation; nothing where the ground is rough.
+    """Returns the weighted mean of the contrast around each cell, and its standard deviation; none where it is rough.
 
     The last are the numbers of cells with enough returns, and of rough ones among them.
     """

@@ -13,17 +13,17 @@ from roadscan.assets.paint.stripes import Stripe
 
 Float64 = npt.NDArray[np.float64]
 
-_WIDTH_M: Final = (0.25, 1.0)
-_LENGTH_M: Final = (1.2, 9.0)
-_PARALLEL_DEG: Final = 12.0
+_WIDTH_M: Final = (0.25, 1.0)  # Width of a bar (m).
+_LENGTH_M: Final = (1.2, 9.0)  # Length of a bar (m).
+_PARALLEL_DEG: Final = 12.0  # Greatest angle between two bars (degrees).
 _SPACING: Final = (1.3, 3.6)
-"""From middle to middle, in widths of a bar."""
-_OVERLAP: Final = 0.5
-_FEWEST: Final = 3
-_COVER_M: Final = (0.4, 1.0)
-_ROUND: Final = 0.1
+"""Spacing of bars from middle to middle, in widths of a bar."""
+_OVERLAP: Final = 0.5  # Least common length of two bars (share of the longer).
+_FEWEST: Final = 3  # Least number of bars.
+_COVER_M: Final = (0.4, 1.0)  # Diameter of a manhole cover (m).
+_ROUND: Final = 0.1  # Tolerance of a disc's share of its rectangle.
 _FILLED: Final = 0.7
-"""Share of its rectangle that a bar covers."""
+"""Least share of its rectangle that a bar covers."""
 
 
 class Bar(NamedTuple):
@@ -38,13 +38,13 @@ class Bar(NamedTuple):
 
     @classmethod
     def of_stripe(cls, stripe: Stripe) -> Self:
-        """The rectangle of a band."""
+        """Returns the rectangle of a band."""
         x, y = stripe.at((stripe.begin_m + stripe.end_m) / 2)
         return cls(x, y, float(np.arctan2(stripe.along[1], stripe.along[0])), stripe.length_m, stripe.width_m, 1.0)
 
     @classmethod
     def of_cells(cls, x_m: Float64, y_m: Float64) -> Self:
-        """The rectangle along the main axis of cells."""
+        """Returns the rectangle along the main axis of cells."""
         dx, dy = x_m - x_m.mean(), y_m - y_m.mean()
         angle = 0.5 * float(np.arctan2(2 * float(dx @ dy), float(dx @ dx - dy @ dy)))
         s, o = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
@@ -56,7 +56,7 @@ class Bar(NamedTuple):
 
 
 def is_round(bar: Bar) -> bool:
-    """True for what is as long as it is wide and has no corners: the cover of a manhole."""
+    """Returns True for a shape as long as wide without corners: the cover of a manhole."""
     return bool(
         _COVER_M[0] <= bar.width_m <= bar.length_m <= min(_COVER_M[1], 1.2 * bar.width_m + CELL_M)
         and abs(bar.filled - np.pi / 4) <= _ROUND
@@ -64,7 +64,7 @@ def is_round(bar: Bar) -> bool:
 
 
 def crosswalk_bars(bars: Sequence[Bar]) -> npt.NDArray[np.bool_]:
-    """Which bars (n,) stand in a row of three or more that are alike."""
+    """Returns a mask (n,) of the bars that stand in a row of three or more alike."""
     out = np.zeros(len(bars), np.bool_)
     fit = [
         i

@@ -1,4 +1,4 @@
-"""All paint of a scene: lines along the road, and everything else, with the returns that show it."""
+"""Detection of all paint of a scene: lines along the road, and everything else, with the returns that show it."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 ACROSS_DEG: Final = 55.0
-"""Bands at this angle to the road or more lie across it."""
-WIDEST_LINE_M: Final = 0.42
+"""Bands at this angle to the road or more (degrees) lie across it."""
+WIDEST_LINE_M: Final = 0.42  # Widest line (m).
 _STOP_BAR_M: Final = (0.15, 1.0)
-"""Narrowest band across the road that is a bar, and shortest."""
-_LEAST_AREA_M2: Final = 0.03
-_INSIDE_LOGIT, _BESIDE_LOGIT = 1.5, 0.0
-_OWN_LOGIT, _NEAR_LOGIT = 2.5, 1.0
+"""Narrowest band across the road that is a bar, and shortest (m)."""
+_LEAST_AREA_M2: Final = 0.03  # Least area of a patch (m²).
+_INSIDE_LOGIT, _BESIDE_LOGIT = 1.5, 0.0  # Log odds of paint inside an outline, and beside it.
+_OWN_LOGIT, _NEAR_LOGIT = 2.5, 1.0  # Bounds of the log odds of a return's contrast, and of the mean around it.
 _SPREAD: Final = 0.25
 """1 σ of the contrast of fresh paint from place to place, as a share of its mean."""
 
@@ -49,12 +49,12 @@ class Patch:
     returns: Int64
     """Indices of the contrast's returns within it."""
     around: Int64
-    """Those beside it."""
+    """Indices of the returns beside it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """What is painted in the window of a scene."""
+    """All paint in the window of a scene."""
 
     contrast: Contrast
     lines: tuple[Stripe, ...]
@@ -63,7 +63,7 @@ class Paint:
 
 @once_a_scene
 def paint_of(scene: Scene) -> Paint:
-    """Paint of a scene."""
+    """Returns the paint of a scene."""
     found = contrast_of(scene)
     road = RoadDirection(scene)
     bands: list[Stripe] = []
@@ -92,12 +92,12 @@ def paint_of(scene: Scene) -> Paint:
 
 
 def rows_of_paint(found: Contrast, shapes: Sequence[Stripe | Patch]) -> Int64:
-    """Rows of the scene's returns that are paint of some shapes, ascending."""
+    """Returns rows of the scene's returns that are paint of some shapes, ascending."""
     return np.unique(np.concatenate([np.zeros(0, np.int64), *(_painted_rows(found, one) for one in shapes)]))
 
 
 def _painted_rows(found: Contrast, shape: Stripe | Patch) -> Int64:
-    """Rows of the scene for the returns of a shape that are paint, as its outline, they and those near them tell.
+    """Rows of a shape's returns that are paint, by its outline, their contrast and that of the returns near them.
 
     Logarithms of odds add up: of the outline (worn paint has holes, edges are ragged), of the return's own contrast,
     and of the mean contrast around it, each held between bounds.

@@ -12,11 +12,11 @@ import shapely
 from roadscan.assets.kind import AssetObject
 
 _APART_M: Final = (0.12, 0.55)
-"""Distance between the middles of the two lines."""
-_EVEN_M: Final = 0.06
-_STEP_M: Final = 0.5
-_SHORTEST_M: Final = 2.0
-_TOGETHER: Final = 0.7
+"""Distance between the middles of the two lines (m)."""
+_EVEN_M: Final = 0.06  # Greatest variation of that distance (m).
+_STEP_M: Final = 0.5  # Distance of the points that are compared (m).
+_SHORTEST_M: Final = 2.0  # Shorter lines are not paired (m).
+_TOGETHER: Final = 0.7  # Share of the shorter line that runs beside the longer.
 _KINDS: Final = {
     ("solid", "solid"): "double_solid",
     ("dashed", "dashed"): "double_dashed",
@@ -25,7 +25,7 @@ _KINDS: Final = {
 
 
 def paired(lines: Sequence[AssetObject]) -> list[AssetObject]:
-    """The lines, with two that run side by side made one; the longest find their partner first."""
+    """Returns the lines, with two parallel ones made one; the longest find their partner first."""
     order = sorted(range(len(lines)), key=lambda k: (-lines[k].attributes["length_m"], lines[k].geometry.coords[0]))
     tree = shapely.STRtree([line.geometry for line in lines])
     taken: set[int] = set()
@@ -45,7 +45,7 @@ def paired(lines: Sequence[AssetObject]) -> list[AssetObject]:
 
 
 def _beside(long: AssetObject, short: AssetObject) -> bool:
-    """True where the shorter line runs beside the longer one, evenly."""
+    """Returns True where the shorter line runs beside the longer one, at an even distance."""
     length = short.geometry.length
     if length < _SHORTEST_M or length < _TOGETHER * long.geometry.length or None in (_of(long), _of(short)):
         return False
@@ -61,7 +61,7 @@ def _of(line: AssetObject) -> str | None:
 
 
 def _double(one: AssetObject, other: AssetObject) -> AssetObject:
-    """Both as one line, midway between them."""
+    """Returns both as one line, midway between them."""
     kinds = tuple(sorted((str(_of(one)), str(_of(other)))))
     places = shapely.get_coordinates(one.geometry, include_z=True)
     nearest = shapely.line_interpolate_point(

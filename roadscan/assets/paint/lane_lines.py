@@ -1,4 +1,4 @@
-"""Lane lines: pieces of all tiles, put together along each line, with the pattern that they show."""
+"""Lane lines: pieces of all tiles, joined along each line, with their pattern."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from roadscan.assets.paint.probability import probability
 Float64 = npt.NDArray[np.float64]
 
 _SHORTEST_M: Final = 1.0
-"""Shorter paint, alone, is no line."""
+"""Isolated paint shorter than this (m) is no line."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Pieces:
-    """Pieces (n,) of all tiles, in an order of their own."""
+    """Pieces (n,) of all tiles, in canonical order."""
 
     ends: Float64
-    """(n, 2, 3) begin and end: easting, northing, height."""
+    """(n, 2, 3) start and end: easting, northing, height."""
     seen: npt.NDArray[np.bool_]
-    """(n, 2) bare ground beyond the ends."""
+    """(n, 2) mask of ends with bare ground beyond."""
     table: pa.Table
 
     @property
     def length_m(self) -> Float64:
-        """Lengths (n,) of the pieces."""
+        """Returns the lengths (n,) of the pieces."""
         return np.asarray(np.hypot(*(self.ends[:, 1, :2] - self.ends[:, 0, :2]).T))
 
     def numbers(self, name: str) -> Float64:
-        """A column of the table (n,)."""
+        """Returns a column of the table (n,)."""
         return np.asarray(self.table[name].to_numpy(), np.float64)
 
 
@@ -66,7 +66,7 @@ def lane_lines(table: pa.Table, longest_gap_m: float) -> list[AssetObject]:
 
 
 def _sorted(table: pa.Table) -> _Pieces:
-    """The pieces by their begin and end."""
+    """Returns the pieces, sorted by their ends."""
     names = [f"{end}_{axis}_m" for end in ("begin", "end") for axis in ("x", "y", "height")]
     ends = np.stack([np.asarray(table[name].to_numpy(), np.float64) for name in names], axis=1).reshape(-1, 2, 3)
     seen = np.stack(
@@ -77,7 +77,7 @@ def _sorted(table: pa.Table) -> _Pieces:
 
 
 def _stretch(pieces: _Pieces, run: Run) -> Stretch:
-    """Paint without a gap: its centre line, passing midway between pieces that meet."""
+    """Returns paint without a gap: its centre line, midway between pieces that meet."""
     nodes = np.concatenate([pieces.ends[p][:: -1 if t else 1] for p, t in zip(run.pieces, run.turned, strict=True)])
     if len(run.pieces) > 1:
         inner = (nodes[1:-1:2] + nodes[2:-1:2]) / 2
@@ -97,7 +97,7 @@ def _in_order(stretches: list[Stretch], chain: Run) -> list[Stretch]:
 
 
 def _object(pieces: _Pieces, group: tuple[str | None, list[Stretch]]) -> AssetObject:
-    """A line of stretches of one pattern."""
+    """Returns a line of stretches of one pattern."""
     kind, stretches = group
     numbers = [p for s in stretches for p in s.pieces]
     weight = np.maximum(pieces.length_m[numbers], 1e-3)
@@ -131,7 +131,7 @@ def _object(pieces: _Pieces, group: tuple[str | None, list[Stretch]]) -> AssetOb
 
 
 def _middle(values: Float64, weight: Float64) -> float:
-    """Weighted median."""
+    """Returns the weighted median."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weight[order])
     return float(values[order][int(np.searchsorted(total, total[-1] / 2))])

@@ -1,4 +1,4 @@
-"""Pieces of painted lines, as the tiles tell them: straight, and cut at the tile's border."""
+"""Pieces of painted lines in a tile: straight, and cut at the tile's border."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ LINE_PIECES: Final = pa.schema(
 )
 """A straight piece of a line: its ends in the map, and whether bare ground was seen beyond them."""
 
-_SHORTEST_M: Final = 0.01
+_SHORTEST_M: Final = 0.01  # Shorter pieces are left out (m).
 
 
 def line_pieces(scene: Scene, paint: Paint) -> pa.Table:
-    """Pieces of lines within the scene's tile, in the order of the paint's lines."""
+    """Returns pieces of lines within the scene's tile, in the order of the paint's lines."""
     rows = [piece for stripe in paint.lines if (piece := _piece(scene, paint, stripe)) is not None]
     return pa.Table.from_pylist(rows, schema=LINE_PIECES)
 
 
 def _piece(scene: Scene, paint: Paint, stripe: Stripe) -> dict[str, object] | None:
-    """The part of a stripe in the tile."""
+    """Returns the part of a stripe in the tile."""
     span = _within(stripe, scene.tile)
     if span is None:
         return None
@@ -71,14 +71,14 @@ def _piece(scene: Scene, paint: Paint, stripe: Stripe) -> dict[str, object] | No
 
 
 def height_sigma(above_m: Float64) -> float:
-    """1 σ (m) of the mean height of returns (n,) that lie this high above the ground model."""
+    """Returns 1 σ (m) of the mean height of returns (n,) that lie this high above the ground model."""
     if above_m.size < 2:
         return 0.05
     return float(np.std(above_m) / np.sqrt(above_m.size) + abs(float(np.median(above_m))))
 
 
 def _within(stripe: Stripe, box: Box) -> tuple[float, float] | None:
-    """Where the centre line runs inside a box (Liang and Barsky, 1984), from its middle; None outside."""
+    """Returns where the centre line runs inside a box (Liang and Barsky, 1984), from its middle; None outside."""
     low, high = stripe.begin_m, stripe.end_m
     for axis, (least, greatest) in enumerate(((box.x_min_m, box.x_max_m), (box.y_min_m, box.y_max_m))):
         place, step = float(stripe.middle_m[axis]), float(stripe.along[axis])

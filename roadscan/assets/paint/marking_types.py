@@ -1,4 +1,4 @@
-"""What a marking is, by its shape and how it lies to the road."""
+"""Type of a marking, by its shape and its direction relative to the road."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import shapely
 
 Float64 = npt.NDArray[np.float64]
 
-_MARKER_M: Final = 0.30
-_BAR_ALONG_M: Final = (0.15, 1.0)
-_BAR_ACROSS_M: Final = 1.0
-_BAR_FILLED: Final = 0.7
-_ARROW_ALONG_M: Final = (1.2, 8.0)
-_ARROW_ACROSS_M: Final = (0.25, 2.5)
-_HEAD_TO_SHAFT: Final = 1.6
-_SLICES: Final = 12
+_MARKER_M: Final = 0.30  # Largest marker (m).
+_BAR_ALONG_M: Final = (0.15, 1.0)  # Extent of a bar along the road (m).
+_BAR_ACROSS_M: Final = 1.0  # Least extent of a bar across the road (m).
+_BAR_FILLED: Final = 0.7  # Least share of its rectangle that a bar covers.
+_ARROW_ALONG_M: Final = (1.2, 8.0)  # Extent of an arrow along the road (m).
+_ARROW_ACROSS_M: Final = (0.25, 2.5)  # Extent of an arrow across the road (m).
+_HEAD_TO_SHAFT: Final = 1.6  # Least ratio of an arrow's head to its shaft.
+_SLICES: Final = 12  # Slices along a shape whose widths are compared.
 _SYMBOL_M: Final = 6.0
-"""What is larger is an area."""
+"""Larger shapes (m) are areas."""
 
 
 def type_of(outline: shapely.Geometry, road_rad: float) -> str:
-    """Type of a polygon in the map, where the road runs in a direction (rad, anticlockwise from east)."""
+    """Returns the type of a polygon in the map, where the road runs in a direction (rad, anticlockwise from east)."""
     turned = _turned(outline, road_rad)
     along_min, across_min, along_max, across_max = turned.bounds
     along, across = along_max - along_min, across_max - across_min
@@ -42,7 +42,7 @@ def type_of(outline: shapely.Geometry, road_rad: float) -> str:
 
 
 def _is_arrow(turned: shapely.Geometry) -> bool:
-    """True for a slim shaft along x with one wide end."""
+    """Returns True for a slim shaft along x with one wide end."""
     x_min, y_min, x_max, y_max = turned.bounds
     along, across = x_max - x_min, y_max - y_min
     slim = _ARROW_ALONG_M[0] <= along <= _ARROW_ALONG_M[1] and _ARROW_ACROSS_M[0] <= across <= _ARROW_ACROSS_M[1]
@@ -57,7 +57,7 @@ def _is_arrow(turned: shapely.Geometry) -> bool:
 
 
 def _widths(turned: shapely.Geometry) -> Float64:
-    """Painted width of slices along x."""
+    """Returns the painted width of slices along x."""
     x_min, y_min, x_max, y_max = turned.bounds
     edges = np.linspace(x_min, x_max, _SLICES + 1)
     slices = shapely.box(edges[:-1], y_min, edges[1:], y_max)
@@ -65,7 +65,7 @@ def _widths(turned: shapely.Geometry) -> Float64:
 
 
 def _turned(outline: shapely.Geometry, road_rad: float) -> shapely.Geometry:
-    """The outline with the road's direction along x."""
+    """Returns the outline with the road's direction along x."""
     cos, sin = np.cos(road_rad), np.sin(road_rad)
     turn = np.array([[cos, -sin], [sin, cos]])
     middle = shapely.get_coordinates(outline.centroid)

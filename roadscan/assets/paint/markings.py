@@ -1,4 +1,4 @@
-"""Markings: pieces of all tiles put together, and what they are by their shape."""
+"""Markings: pieces of all tiles joined, and their type by shape."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from roadscan.assets.paint.probability import probability
 
 Float64 = npt.NDArray[np.float64]
 
-_TOUCHING_M: Final = 0.03
-_LINE_HALF_M: Final = 0.1
+_TOUCHING_M: Final = 0.03  # Pieces this near to one another (m) touch.
+_LINE_HALF_M: Final = 0.1  # Half width of lines that are cut off a marking (m).
 _BAR_GAP_M: Final = 1.2
-"""Bars of a crosswalk are no farther apart."""
+"""Greatest gap between bars of a crosswalk (m)."""
 
 
 def markings(table: pa.Table) -> list[AssetObject]:
@@ -36,7 +36,7 @@ def markings(table: pa.Table) -> list[AssetObject]:
 
 
 def _groups(shapes: npt.NDArray[Any], in_crosswalk: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
-    """Number (n,) of the marking that each piece belongs to."""
+    """Returns the number (n,) of each piece's marking."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -50,7 +50,7 @@ def _groups(shapes: npt.NDArray[Any], in_crosswalk: npt.NDArray[np.bool_]) -> np
 
 
 def _object(shapes: npt.NDArray[Any], table: pa.Table) -> AssetObject:
-    """The marking of some pieces."""
+    """Returns the marking of some pieces."""
     painted = shapely.union_all(shapes)
     crosswalk = bool(np.any(table["in_crosswalk"].to_numpy(zero_copy_only=False)))
     outline = painted.convex_hull if crosswalk else _whole(painted)
@@ -83,7 +83,7 @@ def _object(shapes: npt.NDArray[Any], table: pa.Table) -> AssetObject:
 
 
 def _whole(painted: shapely.Geometry) -> shapely.Geometry:
-    """One polygon; parts that touch at corners grow together."""
+    """Returns one polygon; parts that touch at corners are merged."""
     if painted.geom_type == "Polygon":
         return painted
     closed = painted.buffer(_TOUCHING_M, join_style="mitre").buffer(-_TOUCHING_M, join_style="mitre")
@@ -91,13 +91,13 @@ def _whole(painted: shapely.Geometry) -> shapely.Geometry:
 
 
 def _without_lines(outline: shapely.Geometry) -> shapely.Geometry:
-    """The thick part of a polygon: lines that touch it are cut off."""
+    """Returns the thick part of a polygon, without lines that touch it."""
     thick = outline.buffer(-_LINE_HALF_M, join_style="mitre").buffer(_LINE_HALF_M, join_style="mitre")
     return thick if thick.geom_type == "Polygon" and not thick.is_empty else outline
 
 
 def _own_direction(outline: shapely.Geometry) -> float:
-    """Direction (rad) of the longer side of the least rectangle around it."""
+    """Returns the direction (rad) of the longer side of the least rectangle around it."""
     corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(outline))
     sides = np.diff(corners[:3], axis=0)
     side = sides[int(np.argmax(np.hypot(*sides.T)))]
@@ -105,7 +105,7 @@ def _own_direction(outline: shapely.Geometry) -> float:
 
 
 def _extent(outline: shapely.Geometry, road_rad: float) -> tuple[float, float]:
-    """Extent along and across a direction."""
+    """Returns the extent along and across a direction."""
     xy = shapely.get_coordinates(outline)
     along = xy @ np.array([np.cos(road_rad), np.sin(road_rad)])
     across = xy @ np.array([-np.sin(road_rad), np.cos(road_rad)])
@@ -113,7 +113,7 @@ def _extent(outline: shapely.Geometry, road_rad: float) -> tuple[float, float]:
 
 
 def _with_heights(outline: shapely.Geometry, shapes: npt.NDArray[Any], table: pa.Table) -> shapely.Geometry:
-    """The outline with the height of the plane of the nearest piece at each corner."""
+    """Returns the outline with the height of the plane of the nearest piece at each corner."""
     xy = shapely.get_coordinates(outline)
     nearest = shapely.STRtree(shapes).nearest(shapely.points(xy))
     middle = shapely.get_coordinates(shapely.centroid(shapes))[nearest]

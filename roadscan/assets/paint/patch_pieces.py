@@ -1,4 +1,4 @@
-"""Pieces of markings that are no lines, as the tiles tell them: polygons cut at the tile's border."""
+"""Pieces of markings that are no lines: polygons cut at the tile's border."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PATCH_PIECES: Final = pa.schema(
 
 
 def patch_pieces(scene: Scene, paint: Paint) -> pa.Table:
-    """Pieces of patches within the scene's tile, in the order of the paint's patches."""
+    """Returns pieces of patches within the scene's tile, in the order of the paint's patches."""
     tile = shapely.box(scene.tile.x_min_m, scene.tile.y_min_m, scene.tile.x_max_m, scene.tile.y_max_m)
     rows = []
     for patch in paint.patches:

@@ -1,4 +1,4 @@
-"""The pattern of a line: where it is solid, where dashed."""
+"""The pattern of a line: where it is solid, and where dashed."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 Float64 = npt.NDArray[np.float64]
 
-_LONGEST_DASH_M: Final = 8.0
+_LONGEST_DASH_M: Final = 8.0  # Longest dash (m).
 _WORN_GAP_M: Final = 2.0
-"""A solid line goes on over a gap of this length."""
+"""Longest gap (m) over which a solid line continues."""
 _SOLID_SHARE: Final = 0.8
 """Painted share from which dashes are a worn solid line."""
 
@@ -32,12 +32,12 @@ class Stretch:
     width_m: float
 
     def turned(self) -> Stretch:
-        """The same, end for end."""
+        """Returns the same in the other direction."""
         return Stretch(self.line[::-1], self.pieces[::-1], self.seen[::-1], self.length_m, self.width_m)
 
 
 def patterned(chain: Sequence[Stretch]) -> list[tuple[str | None, list[Stretch]]]:
-    """Stretches one behind another, parted where the pattern changes; None where nothing tells the pattern."""
+    """Returns stretches in sequence, split where the pattern changes; None where no pattern is known."""
     groups: list[list[list[Stretch]]] = []
     for bundle in _over_hidden_gaps(chain):
         if groups and _goes_on(groups[-1][-1], bundle):
@@ -48,7 +48,7 @@ def patterned(chain: Sequence[Stretch]) -> list[tuple[str | None, list[Stretch]]
 
 
 def _over_hidden_gaps(chain: Sequence[Stretch]) -> list[list[Stretch]]:
-    """Stretches between which no bare ground was seen belong together: something hid the line."""
+    """Join stretches between which no bare ground was seen: something hid the line."""
     out = [[chain[0]]]
     for before, after in pairwise(chain):
         if before.seen[1] and after.seen[0]:

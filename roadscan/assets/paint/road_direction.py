@@ -10,10 +10,10 @@ import numpy.typing as npt
 from roadscan.assets.scene import Scene
 from roadscan.compute.ways import way_along
 
-_STEP_M: Final = 1.0
+_STEP_M: Final = 1.0  # Distance of points along a drive (m).
 _OVER_M: Final = 3.0
-"""The direction is that of a chord of twice this length."""
-_FARTHEST_M: Final = 25.0
+"""The direction is that of a chord of twice this length (m)."""
+_FARTHEST_M: Final = 25.0  # No direction is known farther from all drives (m).
 
 
 class RoadDirection:
@@ -37,7 +37,7 @@ class RoadDirection:
         self._direction = np.concatenate(directions)
 
     def at(self, x_m: float, y_m: float) -> float:
-        """Direction (rad) anticlockwise from x; NaN where no drive is within 25 m."""
+        """Returns the direction (rad) anticlockwise from x; NaN where no drive is within 25 m."""
         if not self._direction.size:
             return float("nan")
         away = np.hypot(self._place[:, 0] - x_m, self._place[:, 1] - y_m)
@@ -48,5 +48,5 @@ class RoadDirection:
 def _along(
     at: npt.NDArray[np.float64], driven: npt.NDArray[np.float64], xy: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Points (n, 2) at lengths along a line, held at its ends."""
+    """Returns points (n, 2) at lengths along a line, clamped to its ends."""
     return np.stack([np.interp(at, driven, xy[:, i]) for i in (0, 1)], axis=1)

@@ -1,4 +1,4 @@
-"""Stripes: straight bands of paint, with edges where the contrast has fallen to half."""
+"""Stripes: straight bands of paint, whose edges lie where the contrast falls to half."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 CHUNK_M: Final = 5.0
-"""Long components are cut at multiples of this in the map, so that each piece is straight."""
-_LONGEST_WHOLE_M: Final = 7.0
+"""Long components are cut at multiples of this in the map (m), so that each piece is straight."""
+_LONGEST_WHOLE_M: Final = 7.0  # Longer components are cut (m).
 WIDEST_M: Final = 0.7
-"""Widest band: lines, and bars of crossings and stops."""
+"""Widest band (m): lines, and bars of crossings and stops."""
 _SLIMMEST: Final = 2.0
-"""Length over width of a band."""
-_SHORTEST_M: Final = 0.35
-_BESIDE_M: Final = 0.25
+"""Least ratio of length to width of a band."""
+_SHORTEST_M: Final = 0.35  # Shortest band (m).
+_BESIDE_M: Final = 0.25  # Width of the surface beside a band that is compared (m).
 AROUND_M: Final = 0.08
-"""Returns this near to paint may lie on it: ranges and poses are not exact, and edges not straight."""
-_SEEN_ASIDE_M: Final = 0.05
-_EDGE_M: Final = 0.03
+"""Returns this near to paint (m) may lie on it: ranges and poses are not exact, and edges not straight."""
+_SEEN_ASIDE_M: Final = 0.05  # Ground within this distance beside a band (m) shows its ends.
+_EDGE_M: Final = 0.03  # Returns this near to a band's side (m) belong to neither.
 _BEND_M: Final = 0.02
-"""A road's surface rises or falls less than this at its lines, against the mean of both sides."""
+"""Greatest rise or fall of a road's surface at its lines (m), against the mean of both sides."""
 _UNEVEN: Final = 0.5
 """Paint lies on one surface: its sides differ by less than this share of its contrast to them, or it is as bright as
 paint against the brighter one too, as where fresh bitumen lies along a line."""
-_FLAT_M: Final = 0.02
-_STEEPEST: Final = 0.15
-_STEP_M: Final = 0.04
-_TWO_SHORTEST_M: Final = 1.0
+_FLAT_M: Final = 0.02  # Greatest scatter of flat ground about its plane (m).
+_STEEPEST: Final = 0.15  # Steepest ground (m/m).
+_STEP_M: Final = 0.04  # Greatest step between a band and one side (m).
+_TWO_SHORTEST_M: Final = 1.0  # Shortest band that may be a double line (m).
 _LEAST_APART_M: Final = 0.12
-"""Two lines side by side are at least so long, and their middles so far apart."""
-_WIDER: Final = 1.5
+"""Least length of two lines side by side, and least distance of their middles (m)."""
+_WIDER: Final = 1.5  # Greatest ratio of the widths of a double line.
 _ALONG_ROAD: Final = 0.35
-"""Sine of the greatest angle between a double line and the road; what lies at a larger one is no lane line."""
-_TURNS_RAD: Final = np.linspace(-0.06, 0.06, 13)
+"""Sine of the greatest angle between a double line and the road; at a larger one it is no lane line."""
+_TURNS_RAD: Final = np.linspace(-0.06, 0.06, 13)  # Turns that are tried (rad).
 _BIN_M, _BINS = 0.03, 20
-"""Contrast is taken across in bins of this width, so many on each side."""
-_FEWEST_IN_BIN: Final = 3
+"""Width of the bins of contrast across (m), and their number on each side."""
+_FEWEST_IN_BIN: Final = 3  # With fewer returns a bin counts as bare.
 _PIECE_M: Final = 0.7
-"""The middle of a band is sought in pieces of this length."""
-_FEWEST: Final = 8
+"""Length of the pieces in which the middle of a band is sought (m)."""
+_FEWEST: Final = 8  # With fewer returns there is no band.
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,16 +78,16 @@ class Stripe:
 
     @property
     def length_m(self) -> float:
-        """Length of the band."""
+        """Returns the length of the band."""
         return self.end_m - self.begin_m
 
     def at(self, along_m: float) -> Float64:
-        """Point (2,) of the centre line."""
+        """Returns a point (2,) of the centre line."""
         out: Float64 = self.middle_m + along_m * self.along
         return out
 
     def coordinates(self, x_m: Float64, y_m: Float64) -> tuple[Float64, Float64]:
-        """Along and across (to the left) of points (n,), from `middle_m`."""
+        """Returns coordinates along and across (to the left) of points (n,), from `middle_m`."""
         dx, dy = x_m - self.middle_m[0], y_m - self.middle_m[1]
         return dx * self.along[0] + dy * self.along[1], dy * self.along[0] - dx * self.along[1]
 
@@ -95,7 +95,7 @@ class Stripe:
 def stripes_of(
     found: Contrast, component: Component, corner_m: tuple[float, float], road: RoadDirection
 ) -> list[Stripe] | None:
-    """Bands of a component, end to end or side by side; None if it is of another shape. Surfaces' edges are none."""
+    """Bands of a component, end to end or side by side; None if it has another shape or is an edge of surfaces."""
     axis = _axis(component.cell_x_m, component.cell_y_m)
     if axis is None:
         return None
@@ -128,7 +128,7 @@ def _side_by_side(
 ) -> tuple[Component, Component] | None:
     """Both lines of a double one whose cells touch; None unless the contrast across falls to less than half between.
 
-    The direction is that in which the contrast across varies the most.
+    The direction is that in which the contrast across varies most.
     """
     contrast = found.contrast[component.near]
     cells = np.stack([component.cell_x_m, component.cell_y_m], axis=1) - middle
@@ -143,7 +143,7 @@ def _side_by_side(
         total = np.bincount(number[held], weights=contrast[held], minlength=2 * _BINS)
         profiles.append((np.where(count >= _FEWEST_IN_BIN, total / np.maximum(count, 1), 0.0), normal))
     level, normal = max(profiles, key=lambda one: float(np.sum(one[0] ** 2)))
-    # The other line is where the level stands the most above the lowest one on the way from the brightest place.
+    # The other line is where the level rises most above the lowest one on the way from the brightest place.
     at = int(np.argmax(level))
     lowest = np.concatenate([np.minimum.accumulate(level[at::-1])[::-1], np.minimum.accumulate(level[at:])[1:]])
     other = int(np.argmax(level - lowest))
@@ -157,13 +157,13 @@ def _side_by_side(
 
 
 def _are_alike(one: Stripe, other: Stripe) -> bool:
-    """True for two lines that may be a double one: neither is short, and one is hardly wider than the other."""
+    """Returns True for two lines that may be a double one: neither is short, and their widths are similar."""
     narrow, wide = sorted((one.width_m, other.width_m))
     return min(one.length_m, other.length_m) >= _TWO_SHORTEST_M and wide <= _WIDER * narrow
 
 
 def fitted(found: Contrast, start: Stripe) -> Stripe | None:
-    """The stripe with its middle, direction, width and ends fitted to the returns of `start`; None if there is none."""
+    """Stripe with its middle, direction, width and ends fitted to the returns of `start`; None if none fits."""
     stripe, near = start, start.returns
     if near.size < _FEWEST:
         return None
@@ -192,7 +192,7 @@ def fitted(found: Contrast, start: Stripe) -> Stripe | None:
     count = np.count_nonzero(inside)
     scatter = float(np.mean(noise[inside])) / max(stripe.contrast, 1e-3)
     sigma = float(np.hypot(stripe.width_m * scatter, 0.03) / np.sqrt(count) + 0.002)
-    seen = [  # of bare ground beyond the begin, and beyond the end
+    seen = [  # of bare ground beyond the start, and beyond the end
         bool(np.any((np.abs(across) <= stripe.width_m / 2 + _SEEN_ASIDE_M) & beyond))
         for beyond in (
             (along < stripe.begin_m) & (along > stripe.begin_m - 0.3),
@@ -206,7 +206,7 @@ def fitted(found: Contrast, start: Stripe) -> Stripe | None:
 
 
 def lies_flat(found: Contrast, component: Component) -> bool:
-    """True where the ground on and around a component is a plane, and not steep."""
+    """Returns True where the ground on and around a component is a plane, and not steep."""
     near = component.near
     x, y = found.x_m[near] - component.cell_x_m.mean(), found.y_m[near] - component.cell_y_m.mean()
     design = np.stack([x, y, np.ones(x.size)], axis=1)
@@ -236,7 +236,7 @@ def _is_an_edge(found: Contrast, component: Component, stripe: Stripe) -> bool:
 
 
 def _centred(stripe: Stripe, along: Float64, across: Float64, excess: Float64) -> Stripe | None:
-    """The stripe turned and moved onto the middle of the paint, with its width."""
+    """Returns the stripe turned and moved onto the middle of the paint, with its width."""
     pieces = max(1, int(stripe.length_m / _PIECE_M))
     if pieces >= 2:
         number = np.clip(((along - stripe.begin_m) / stripe.length_m * pieces).astype(np.int64), 0, pieces - 1)
@@ -278,7 +278,7 @@ def _line(at: Float64, value: Float64, weight: Float64) -> tuple[float, float]:
 
 
 def _most(place: Float64, excess: Float64) -> tuple[float, float] | None:
-    """The interval over which the excess of contrast over half of the paint's sums up to the most.
+    """Returns the interval over which the excess of contrast over half of the paint's has the greatest sum.
 
     Its ends are where the mean contrast passes through half, whatever the density of returns on either side.
     """
@@ -301,7 +301,7 @@ def _most(place: Float64, excess: Float64) -> tuple[float, float] | None:
 
 
 def _axis(x: Float64, y: Float64) -> tuple[Float64, Float64, float, float, float] | None:
-    """Middle, direction, length, mean width and scatter across of cells."""
+    """Returns middle, direction, length, mean width and scatter across of cells."""
     if x.size < 4:
         return None
     middle = np.array([x.mean(), y.mean()])

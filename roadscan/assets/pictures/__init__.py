@@ -1,1 +1,1 @@
-"""What pictures tell of assets: which show an object best, its cut-outs, its colours."""
+"""Pictures of assets: the best views of an object, its cut-outs, its colours."""

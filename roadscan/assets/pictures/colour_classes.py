@@ -1,4 +1,4 @@
-"""Colours of a plate in cut-outs, as classes: by hue, which shade and sun change little."""
+"""Classes of colours of a plate in cut-outs: by hue, which shade and sun change little."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ UInt8 = npt.NDArray[np.uint8]
 HUES: Final = {"red": (340.0, 14.0), "orange": (14.0, 40.0), "yellow": (40.0, 70.0), "green": (70.0, 178.0),
                "blue": (178.0, 275.0), "purple": (275.0, 340.0)}  # fmt: skip
 """Hue (degrees of the colour circle) from which and up to which a class reaches."""
-_LEAST_SATURATION: Final = 0.28
-_LEAST_VALUE: Final = 0.08
+_LEAST_SATURATION: Final = 0.28  # Least saturation of a pixel with a hue.
+_LEAST_VALUE: Final = 0.08  # Least value (0 … 1) of a pixel with a hue.
 _COLOURED: Final = 0.15
-"""Share of a plate that has to have a hue; a red rim is a quarter of a round plate or more."""
+"""Least share of a plate that has a hue; a red rim is a quarter of a round plate or more."""
 _BROWN_BELOW: Final = 0.55
 """Orange that is darker than this share of the brightest parts around is brown."""
-_WHITE_FROM, _BLACK_BELOW = 0.5, 0.22
+_WHITE_FROM, _BLACK_BELOW = 0.5, 0.22  # Brightness relative to the brightest parts around.
 _INSIDE: Final = 0.92
-"""The outline is drawn in by so much, so that what is behind the plate stays out."""
-_PRIOR_PIXELS: Final = 12.0
+"""The outline is shrunk by this factor, to exclude what is behind the plate."""
+_PRIOR_PIXELS: Final = 12.0  # Number of pixels with which the probability is halfway to even odds.
 
 
 def colour_of(cut_outs: Sequence[CutOut]) -> tuple[str, float] | None:
-    """Main colour of a plate and its probability, from cut-outs with colours; None where there are none.
+    """Returns the main colour of a plate and its probability, from cut-outs with colours; None where there are none.
 
     A hue that covers at least 15 % of the plate is its colour, that which covers most of it; else it is white, grey or
     black, by its brightness against the brightest parts of the picture around. The probability is the mean share of
@@ -56,7 +56,7 @@ def colour_of(cut_outs: Sequence[CutOut]) -> tuple[str, float] | None:
 
 
 def _inside(one: CutOut) -> npt.NDArray[np.bool_]:
-    """Pixels (h, w) of a cut-out within the outline, drawn in a little."""
+    """Returns a mask (h, w) of the pixels of a cut-out within the outline, shrunk a little."""
     middle = one.outline_px.mean(axis=0)
     shrunk = middle + _INSIDE * (one.outline_px - middle)
     drawn = np.zeros(one.pixels.shape[:2], np.uint8)
@@ -65,7 +65,7 @@ def _inside(one: CutOut) -> npt.NDArray[np.bool_]:
 
 
 def _shares(pixels: UInt8, inside: npt.NDArray[np.bool_]) -> dict[str, float]:
-    """Shares of the classes among the pixels that decide: those with a hue, or all where few have one."""
+    """Returns the shares of the classes among the pixels that decide: those with a hue, or all where few have one."""
     hue, saturation, value = hue_saturation_value(pixels[inside])
     brightest = float(np.quantile(hue_saturation_value(pixels.reshape(-1, 3))[2], 0.95))
     has_hue = (saturation >= _LEAST_SATURATION) & (value >= _LEAST_VALUE)
@@ -80,7 +80,7 @@ def _shares(pixels: UInt8, inside: npt.NDArray[np.bool_]) -> dict[str, float]:
 
 
 def hue_saturation_value(rgb: UInt8) -> tuple[Float64, Float64, Float64]:
-    """Hue (n,) in degrees, saturation and value (0 … 1) of colours (n, 3), as A. R. Smith (1978) has them."""
+    """Hue (n,) in degrees, saturation and value (0 … 1) of colours (n, 3), as A. R. Smith (1978) defines them."""
     c = rgb.astype(np.float64) / 255.0
     value, low = c.max(axis=-1), c.min(axis=-1)
     span = value - low

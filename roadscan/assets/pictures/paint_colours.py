@@ -14,16 +14,16 @@ from roadscan.compute.robust import scatter_about
 UInt8 = npt.NDArray[np.uint8]
 Float64 = npt.NDArray[np.float64]
 
-_LEAST_PLACES: Final = 5
+_LEAST_PLACES: Final = 5  # Least number of places of paint, and of surface.
 _BRIGHTER: Final = 1.15
-"""Paint that is not brighter than this multiple of the surface beside it is worn, or was not hit."""
+"""Paint no brighter than this multiple of the surface beside it is worn, or was missed."""
 _BETWEEN: Final = 0.82
 """Blue over the mean of red and green, of paint relative to the surface: white paint is near 1, yellow below 0.65."""
-_SPREAD: Final = 0.10
+_SPREAD: Final = 0.10  # Systematic 1 σ of that ratio.
 
 
 class PaintReader(ColourReader):
-    """A reader of the colour of paint; where its places lie, each kind says."""
+    """A reader of the colour of paint; each kind chooses its places."""
 
     def read(self, own: UInt8, beside: UInt8) -> Mapping[str, Any]:
         """Columns colour and colour_probability."""
@@ -33,9 +33,9 @@ class PaintReader(ColourReader):
 def paint_colour(own: UInt8, beside: UInt8) -> Mapping[str, Any]:
     """Columns `colour` and `colour_probability` from colours (n, 3) of paint and (m, 3) of the surface beside it.
 
-    Asphalt and concrete are grey, so dividing by the surface's colour takes out the light and the camera's white
-    balance. Blue against red and green then tells white from yellow. The median over the places decides, and nothing
-    is told where fewer than five places are brighter than the surface, or where the picture has no colours.
+    Asphalt and concrete are grey, so dividing by the surface's colour removes the light and the camera's white
+    balance. Blue against red and green then distinguishes white from yellow, by the median over the places. There is no
+    colour if fewer than five places are brighter than the surface, or if the picture has no colours.
     """
     if len(own) < _LEAST_PLACES or len(beside) < _LEAST_PLACES or _is_grey(own, beside):
         return {}
@@ -53,7 +53,7 @@ def paint_colour(own: UInt8, beside: UInt8) -> Mapping[str, Any]:
 
 
 def _linear(colours: UInt8) -> Float64:
-    """Linear light (IEC 61966-2-1) of colours (n, 3)."""
+    """Returns linear light (IEC 61966-2-1) of colours (n, 3)."""
     c = colours.astype(np.float64) / 255.0
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 

@@ -1,4 +1,4 @@
-"""Outlines of plates in space, and which shape the edges in pictures speak for."""
+"""Outlines of plates in space, by their shapes."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from roadscan.compute.ways import way_along
 
 Float64 = npt.NDArray[np.float64]
 
-_POINTS: Final = 48
+_POINTS: Final = 48  # Points of an outline.
 
 
 def plate_outline(shape: str, width_m: float, height_m: float) -> Float64:
-    """Points (48, 2: right, up) around the outline of a plate about the middle of its bounding box (m).
+    """Returns points (48, 2: right, up) around the outline of a plate about the middle of its bounding box (m).
 
     A shape that is not known is taken for a rectangle.
     """
@@ -37,7 +37,7 @@ def on_plate(plane: Float64, middle_m: Float64, facing_deg: float, tilt_deg: flo
 
 
 def plate_axes(facing_deg: float, tilt_deg: float) -> tuple[Float64, Float64, Float64]:
-    """Unit vectors to the right as seen from the front, upwards on the plate, and out of its front."""
+    """Returns unit vectors to the right as seen from the front, upwards on the plate, and out of its front."""
     a, t = math.radians(facing_deg), math.radians(tilt_deg)
     normal = np.array([math.sin(a) * math.cos(t), math.cos(a) * math.cos(t), math.sin(t)])
     right = np.array([-math.cos(a), math.sin(a), 0.0])
@@ -45,7 +45,7 @@ def plate_axes(facing_deg: float, tilt_deg: float) -> tuple[Float64, Float64, Fl
 
 
 def _polygon(count: int, first_deg: float) -> Float64:
-    """Corners of a regular polygon in a bounding box of 1 by 1."""
+    """Returns the corners of a regular polygon in a bounding box of 1 by 1."""
     angle = np.deg2rad(first_deg + 360.0 / count * np.arange(count))
     corners = np.column_stack([np.cos(angle), np.sin(angle)])
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -61,4 +61,4 @@ _CORNERS: Final[Mapping[str, Float64]] = {
     "triangle down": _polygon(3, 270.0),
 }
 SHAPES: Final[Sequence[str]] = tuple(_CORNERS)
-"""Shapes that pictures are held against."""
+"""Shapes that pictures are compared with."""

@@ -1,4 +1,4 @@
-"""Which shape of a plate the edges of its cut-outs speak for."""
+"""Shape of a plate from the edges in its cut-outs."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from roadscan.core.extras import cv2
 Float64 = npt.NDArray[np.float64]
 
 _NEAR: Final = 0.07
-"""Colours are compared so far within and beyond an outline, as a share of the plate."""
+"""Colours are compared this far within and beyond an outline, as a share of the plate."""
 _FULL_STEP: Final = 60.0
-"""Difference of colours (CIE 1976 L*a*b*, 8 bits) that counts as a whole edge; more counts no more."""
-_WEIGHT: Final = 14.0
+"""Difference of colours (CIE 1976 L*a*b*, 8 bits) at which an edge has full weight."""
+_WEIGHT: Final = 14.0  # Weight of a mean edge in the logarithm of a shape's weight.
 _FROM_RETURNS: Final = 0.7
 """Probability that the outline of the returns alone has the right shape."""
-_LEAST_PX: Final = 12.0
+_LEAST_PX: Final = 12.0  # Smaller cut-outs (pixels) are not used.
 
 
 def shape_of(cut_outs: Sequence[CutOut], shape: str, width_m: float, height_m: float) -> tuple[str, float]:
-    """Shape of a plate and its probability.
+    """Returns the shape of a plate and its probability.
 
-    Every shape in the plate's bounding box is laid over the cut-outs. Where it is the right one, colours differ all
+    Every shape in the plate's bounding box is compared with the cut-outs. For the right one, colours differ all
     along its outline from just within to just beyond it. A shape's weight grows exponentially with the mean of these
-    steps; that which the returns speak for begins with 0.7. Without a cut-out of 12 pixels or more only that is told.
+    steps; the shape of the returns starts with 0.7. Without a cut-out of 12 pixels or more only that is reported.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def shape_of(cut_outs: Sequence[CutOut], shape: str, width_m: float, height_m: f
 
 
 def _fits(name: str, width_m: float, height_m: float) -> bool:
-    """Whether a plate of this size may have the shape: all but rectangles are as high as they are wide, or nearly."""
+    """Returns whether a plate of this size may have the shape: all but rectangles are as high as wide, or nearly."""
     ratio = height_m / width_m
     if name.startswith("triangle"):
         return 0.75 <= ratio <= 1.05
@@ -68,7 +68,7 @@ def _fits(name: str, width_m: float, height_m: float) -> bool:
 
 
 def _edges(one: CutOut, name: str) -> float:
-    """Mean step of the colours (0 … 1) across the outline of a shape in the plate's box."""
+    """Returns the mean step of the colours (0 … 1) across the outline of a shape in the plate's box."""
     lab = cv2.cvtColor(one.pixels, cv2.COLOR_RGB2LAB).astype(np.float32)
     turn = cv2.getPerspectiveTransform(_BOX, one.outline_px[:4].astype(np.float32))
     outline = plate_outline(name, 1.0, 1.0)
@@ -78,10 +78,10 @@ def _edges(one: CutOut, name: str) -> float:
 
 
 def _sampled(lab: npt.NDArray[np.float32], turn: Float64, plane: Float64) -> Float64:
-    """Colours (n, 3) at points (n, 2) of the plate's box."""
+    """Returns colours (n, 3) at points (n, 2) of the plate's box."""
     at = cv2.perspectiveTransform(plane[None].astype(np.float32), turn.astype(np.float32))[0]
     found = cv2.remap(lab, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(found[0], np.float64)
 
 
-_BOX: Final = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]], np.float32)
+_BOX: Final = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]], np.float32)  # Corners of a box of 1 by 1.

@@ -1,4 +1,4 @@
-"""What is looked for in the pictures of an asset: the contract of a reader, and the registry that finds readers.
+"""The contract of a reader of an asset's pictures, and the registry that finds readers.
 
 A reader is one file of `roadscan/assets/pictures/readers/` (or an entry point of the group
 ``roadscan.asset_picture_readers``) with a subclass of :class:`PictureReader` that has the name of a kind of assets. A
@@ -24,17 +24,17 @@ Float64 = npt.NDArray[np.float64]
 UInt8 = npt.NDArray[np.uint8]
 
 ENTRY_POINT_GROUP: Final = "roadscan.asset_picture_readers"
-_EYE_LEVEL_M: Final = 2.0
+_EYE_LEVEL_M: Final = 2.0  # The sight of a tall object is no higher than this above its foot (m).
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What of an object a picture has to show. Coordinates are easting, northing and height of the map (m)."""
+    """What a picture must show of an object. Coordinates are easting, northing and height of the map (m)."""
 
     places_m: Float64
-    """(k, 3) places that all have to lie in the picture; the first is the one whose pixel is told."""
+    """(k, 3) places that must all lie in the picture; the pixel of the first is reported."""
     facing: Float64 | None = None
-    """(3,) unit vector that its front looks to: pictures of its back do not show it; None where it has no front."""
+    """(3,) unit vector in which its front faces: pictures of its back do not show it; None where it has no front."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,64 +46,64 @@ class CutOut:
     outline_px: Float64
     """(k, 2) the outline in it: u to the right, v downwards, from the centre of the upper left pixel."""
     resolution_m: float
-    """What a pixel spans at the object (m)."""
+    """Size of a pixel at the object (m)."""
     is_grey: bool
     """Whether the picture has no colours."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColourPlaces:
-    """Places of an object whose colours tell something, and others beside it to hold them against; (n, 3), (m, 3)."""
+    """Places of an object whose colours are used, and places beside it for comparison; (n, 3), (m, 3)."""
 
     own_m: Float64
     beside_m: Float64
 
 
 class Recognition(ABC):
-    """Reads what stands on a cut-out. Where nothing reads, both say None."""
+    """Reader of the content of a cut-out. Without recognisers both methods return None."""
 
     @abstractmethod
     def text(self, cut_out: CutOut) -> tuple[str, float] | None:
-        """Text on it and the probability that it is read right."""
+        """Returns the text on it and the probability that it is read right."""
 
     @abstractmethod
     def label(self, cut_out: CutOut) -> tuple[str, float] | None:
-        """What it is, in the words of a model, and its probability."""
+        """Returns its type, in the words of a model, and its probability."""
 
 
 class PictureReader:
-    """What is looked for in the pictures of a kind. All of it is a pure function of the objects and the pictures."""
+    """Reader of the pictures of a kind. All of it is a pure function of the objects and the pictures."""
 
     name: ClassVar[str]
-    """Of the kind."""
+    """Name of the kind."""
 
     def sight(self, one: AssetObject) -> Sight:
-        """What pictures have to show of an object, unless a reader knows better (:func:`usual_sight`)."""
+        """Returns what pictures must show of an object; by default :func:`usual_sight`."""
         return usual_sight(one)
 
 
 class CutOutReader(PictureReader, ABC):
-    """A reader that looks at cut-outs of the best pictures."""
+    """A reader of cut-outs of the best pictures."""
 
     @abstractmethod
     def outline_m(self, one: AssetObject) -> Float64 | None:
-        """Outline (k, 3) of an object on the map (m); None for one that is not to be cut out."""
+        """Returns the outline (k, 3) of an object on the map (m); None for one that is not cut out."""
 
     @abstractmethod
     def read(self, one: AssetObject, cut_outs: Sequence[CutOut], recognition: Recognition) -> Mapping[str, Any]:
-        """Columns of the kind that the cut-outs of an object tell, that with the best view first."""
+        """Returns the kind's columns that the cut-outs of an object give, the one with the best view first."""
 
 
 class ColourReader(PictureReader, ABC):
-    """A reader that looks at colours of places."""
+    """A reader of colours of places."""
 
     @abstractmethod
     def places(self, one: AssetObject) -> ColourPlaces:
-        """Places whose colours are wanted."""
+        """Returns places whose colours are wanted."""
 
     @abstractmethod
     def read(self, own: UInt8, beside: UInt8) -> Mapping[str, Any]:
-        """Columns of the kind that colours (n, 3) of an object and (m, 3) beside it tell.
+        """Returns the kind's columns that colours (n, 3) of an object and (m, 3) beside it give.
 
         Places that no picture shows are left out; there may be none.
         """
@@ -111,19 +111,19 @@ class ColourReader(PictureReader, ABC):
 
 @functools.cache
 def picture_readers() -> dict[str, CutOutReader | ColourReader]:
-    """All readers by the kind that they read."""
+    """Returns all readers by their kind."""
     found = found_kinds("assets/pictures/readers/*.py", PictureReader, ENTRY_POINT_GROUP)
     return {name: kind() for name, kind in found.items()}
 
 
 def sight_of(kind: str, one: AssetObject) -> Sight:
-    """What pictures have to show of an object: what the reader of its kind says, else its reference point."""
+    """Returns what pictures must show of an object: as the reader of its kind says, else its reference point."""
     reader = picture_readers().get(kind)
     return usual_sight(one) if reader is None else reader.sight(one)
 
 
 def usual_sight(one: AssetObject) -> Sight:
-    """The reference point of an object; of what stands at a point its middle, but no more than 2 m above the foot.
+    """Returns the reference point of an object; of a point object its middle, but no more than 2 m above the foot.
 
     Parked cars hide the feet of posts and trees.
     """

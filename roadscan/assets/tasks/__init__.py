@@ -1,1 +1,1 @@
-"""Assets: returns of each square into evidence, evidence of all squares into objects, objects into tables and files."""
+"""Assets: returns of each square become evidence, evidence of all squares objects, objects tables and files."""

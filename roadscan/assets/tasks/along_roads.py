@@ -1,4 +1,4 @@
-"""Where along the roads assets stand: road, station, offset and lane of their reference points."""
+"""Position of assets along the roads: road, station, offset and lane of their reference points."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from roadscan.condition.road_line import Lane
 from roadscan.condition.tasks.lines import Roads
 
 _BESIDE_M: Final = 50.0
-"""Assets farther from all lines have no road."""
+"""Assets farther from all lines (m) have no road."""
 _BEYOND_M: Final = 1.0
-"""So far beyond a line's ends stations still count."""
+"""Stations count this far beyond a line's ends (m)."""
 
 
 class Along(NamedTuple):
-    """Where n places lie along the roads; None and NaN where they lie along none."""
+    """Positions of n places along the roads; None and NaN where there is none."""
 
     road: list[str | None]
     station_m: npt.NDArray[np.float64]
@@ -27,7 +27,7 @@ class Along(NamedTuple):
 
 
 def along_roads(places_m: npt.NDArray[np.float64], roads: Roads) -> Along:
-    """Road, station, offset and lane of places (n, 2) on the map (m): those of the nearest reference line."""
+    """Road, station, offset and lane of places (n, 2) on the map (m), relative to the nearest reference line."""
     count = len(places_m)
     road: list[str | None] = [None] * count
     lane: list[int | None] = [None] * count
@@ -54,7 +54,7 @@ def along_roads(places_m: npt.NDArray[np.float64], roads: Roads) -> Along:
 
 
 def _lane(lanes: list[Lane], station_m: float, offset_m: float) -> int | None:
-    """Number of the lane that a place lies in: its name where that is a number, else counted from the left."""
+    """Returns the number of a place's lane: its name where that is a number, else counted from the left."""
     for number, one in enumerate(lanes, 1):
         if one.first_m <= station_m <= one.last_m:
             middle = float(one.offsets(np.array([station_m]))[0])

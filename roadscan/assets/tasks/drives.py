@@ -1,4 +1,4 @@
-"""How well the poses are known that assets were seen from: a share of σ that all returns of a drive have in common."""
+"""Uncertainty of the poses from which assets were seen: a share of σ common to all returns of a drive."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _TICK_NS: Final = 1_000_000_000
-"""A pose of each of these is looked at."""
+"""Interval of the poses that are used (ns)."""
 _REACH_M: Final = 100.0
-"""Nothing is seen from farther."""
+"""Farthest distance (m) from which anything is seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Drives:
     """(k, 6) of north, east, down (m), roll, pitch, heading (rad)."""
 
     def sigma_m(self, places_m: Float64, seen_gps_ns: Int64) -> Float64:
-        """1 σ (n, 2) that poses give to places (n, 2), horizontal (of each axis) and down.
+        """Returns the 1 σ (n, 2) that poses give to places (n, 2), horizontal (of each axis) and down.
 
         It is the root mean square of the poses within 100 m while a place was seen. Errors of angles count with the
         distance to the nearest one of them.
@@ -66,7 +66,7 @@ class Drives:
 
 
 def drives_key(plan: AssetPlan) -> str:
-    """Key of what :func:`load_drives` reads."""
+    """Returns the key of what :func:`load_drives` reads."""
     survey, runs = plan.survey, [source.run for source in _sources(plan)]
     settings = survey.survey.config.navigation.calibration
     files = [
@@ -80,7 +80,7 @@ def drives_key(plan: AssetPlan) -> str:
 
 
 def load_drives(plan: AssetPlan) -> Drives:
-    """Poses of the runs that assets are sought in; those of clouds without a trajectory are not known."""
+    """Returns poses of the runs in which assets are sought; those of clouds without a trajectory are not known."""
     survey, parts = plan.survey, []
     for source in _sources(plan):
         spans = [span for file in source.files for span in file.group_spans]
@@ -103,7 +103,7 @@ def load_drives(plan: AssetPlan) -> Drives:
 
 
 def with_pose_sigma(rows: pa.Table, drives: Drives) -> pa.Table:
-    """Rows of objects whose σ of the place holds that of the poses as well."""
+    """Returns rows of objects whose σ of the place includes that of the poses."""
     places = np.column_stack([rows["easting_m"].to_numpy(), rows["northing_m"].to_numpy()])
     seen = np.column_stack([rows["first_epoch_gps_ns"].to_numpy(), rows["last_epoch_gps_ns"].to_numpy()])
     sigma = drives.sigma_m(places, seen)

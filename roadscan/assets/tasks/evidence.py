@@ -44,31 +44,31 @@ EVIDENCE: Final = "asset_evidence"
 CLASSIFIED: Final = "classified_points"
 BARE_EARTH: Final = "bare_earth"
 SCREENS: Final = "asset_screens"
-"""Manifest name of what hides things from cameras."""
+"""Manifest name of the occluders of views."""
 VISIBILITY: Final = "asset_visibility"
 """Cells of a square, and how many passes had them in sight."""
 OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, VISIBILITY)
 
 
 def evidence_unit(kind: str, square: TileId) -> str:
-    """Name of a kind's evidence of a square in the manifest."""
+    """Returns the name of a kind's evidence of a square in the manifest."""
     return f"{kind}/{square}"
 
 
 @dataclass(frozen=True)
 class SquareWork:
-    """What is due of a square; empty keys stand for what is not."""
+    """Outputs that are due of a square; empty keys mean that none is due."""
 
     square: TileId
     kinds: tuple[tuple[str, str], ...]
     """Names of the kinds whose evidence is due, with its key."""
     beside: Mapping[str, str]
-    """What else is due: the key of each of :data:`OF_SQUARES` by its name."""
+    """Other outputs that are due: the key of each of :data:`OF_SQUARES` by its name."""
 
 
 @dataclass(frozen=True)
 class EvidenceTask:
-    """Some neighbouring squares to be searched. Sent to workers: it holds no data."""
+    """Some neighbouring squares to be searched. Sent to workers: it carries no data."""
 
     load: ReturnsTask
     work: tuple[SquareWork, ...]
@@ -76,24 +76,24 @@ class EvidenceTask:
     """All kinds of the survey with their settings: the classes of points come from all of them."""
     ground: GroundSettings
     gains: OutputRecord | None
-    """Table that intensities are calibrated by; None where they are taken as recorded."""
+    """Table by which intensities are calibrated; None where they are used as recorded."""
     context: ProductContext
 
     @property
     def block(self) -> Block:
-        """The squares."""
+        """Returns the squares."""
         return Block(self.load.squares)
 
     @property
     def store(self) -> Store:
-        """Where the survey lies."""
+        """Returns the store of the survey."""
         return self.load.readings.store
 
 
 def due_squares(
     plan: AssetPlan, manifest: Manifest, gains: OutputRecord | None, forced: Sequence[TileId] = ()
 ) -> list[SquareWork]:
-    """What is missing or stale of each square, and all of those that are forced."""
+    """Returns the missing or stale outputs of each square, and all of those that are forced."""
     calibrated = "" if gains is None else gains.digest
     kind_keys = {one.name: key_of(one.evidence_key(), calibrated) for one in plan.kinds}
     code = code_digest("roadscan.assets.tasks.evidence:find_evidence")
@@ -120,14 +120,14 @@ def due_squares(
 def evidence_tasks(
     plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, workers: int = 1
 ) -> list[EvidenceTask]:
-    """Tasks over the squares of which anything is due."""
+    """Returns tasks over the squares of which anything is due."""
     return [_task(plan, due, gains, squares) for squares in plan.blocks([one.square for one in due], workers)]
 
 
 def singly(
     plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, squares: Sequence[TileId]
 ) -> list[EvidenceTask]:
-    """A task for each square."""
+    """Returns a task for each square."""
     return [_task(plan, due, gains, (square,)) for square in squares]
 
 
@@ -159,12 +159,12 @@ def find_evidence(task: EvidenceTask) -> TaskResult:
                 failures += search.failures
             except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
                 failures.append((str(work.square), reason_of(error)))
-            search = loaded = None  # type: ignore[assignment]  # noqa: PLW2901  the next square takes their room
+            search = loaded = None  # type: ignore[assignment]  # noqa: PLW2901  frees the memory for the next square
     return TaskResult.of(records, failures)
 
 
 class _Search:
-    """A square on its way from returns to files."""
+    """One square during its search, from returns to files."""
 
     def __init__(
         self, task: EvidenceTask, work: SquareWork, loaded: LoadedSquare, folder: Path, gains: pa.Table | None
@@ -203,7 +203,7 @@ class _Search:
             yield self._write_classified(scene, marked, self._work.beside[CLASSIFIED])
 
     def _nothing(self) -> Iterator[OutputRecord]:
-        """Records of a square without returns: finished, and no file."""
+        """Yields records of a square without returns: finished, and no file."""
         for name, key in self._work.kinds:
             yield OutputRecord(EVIDENCE, evidence_unit(name, self._work.square), key, "", 0, "", _told(0))
         for product, key in self._work.beside.items():
@@ -216,7 +216,7 @@ class _Search:
     def _write_rows(
         self, product: str, unit: str, key: str, rows: pa.Table, counts: Mapping[str, int] | None = None
     ) -> OutputRecord:
-        """Keep rows as the table of that name; without any there is no file. The record keeps `counts`, too."""
+        """Write rows as the table of that name; without any there is no file. The record stores `counts`, too."""
         told = _told(rows.num_rows, **(counts or {}))
         if not rows.num_rows:
             return OutputRecord(product, unit, key, "", 0, "", told)
@@ -264,15 +264,15 @@ class _Search:
 
 
 def visibility_rows(scene: Scene) -> pa.Table:
-    """Cells that passes had in sight, as the table `asset_visibility` has them; its metadata says their edge."""
+    """Cells that passes had in sight, as rows of the table `asset_visibility`; its metadata states their edge."""
     schema = table_schema(VISIBILITY).arrow()
     return passes_in_sight(scene).cast(schema).replace_schema_metadata({"edge_m": str(CELL_M)})
 
 
 def marked_classes(scene: Scene, marked: Sequence[Marked]) -> npt.NDArray[np.uint8]:
-    """Classes (n,) of the scene's returns, with those that kinds give to the returns of their pieces.
+    """Returns classes (n,) of the scene's returns, with those that kinds give to the returns of their pieces.
 
-    A return that two kinds mark has the class of the last one.
+    A return that two kinds mark gets the class of the last one.
     """
     classes = scene.classes.copy()
     for one in marked:
@@ -281,7 +281,7 @@ def marked_classes(scene: Scene, marked: Sequence[Marked]) -> npt.NDArray[np.uin
 
 
 def conformed(pieces: pa.Table, kind: AssetKind) -> pa.Table:
-    """Pieces as the kind's schema says; SchemaError where they are not."""
+    """Returns pieces in the kind's schema; SchemaError where they do not fit it."""
     if pieces.schema.names != kind.piece_schema.names:
         raise SchemaError(
             f"pieces of '{kind.name}' have the columns {', '.join(pieces.schema.names)}",

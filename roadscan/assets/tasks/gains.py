@@ -1,4 +1,4 @@
-"""Gains of the intensity: samples of some squares → one small table, by which evidence is calibrated."""
+"""Gains of the intensity: samples of some squares make one small table, by which evidence is calibrated."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ SAMPLES: Final = "intensity_samples"
 GAINS: Final = "intensity_gains"
 _UNIT: Final = "all"
 _MOST_SQUARES: Final = 24
-"""Squares that tell of gains; which ones is told by a digest of their place."""
-_LEAST_RETURNS: Final = 20_000
+"""Number of sampled squares; a digest of their place selects them."""
+_LEAST_RETURNS: Final = 20_000  # Squares with fewer returns are sampled only if no square has more.
 _COLUMNS: Final = ("place", "sensor", "laser", "range_m", "incidence_deg", "intensity", "returns")
 
 
 @dataclass(frozen=True)
 class SampleTask:
-    """Some squares that tell of gains. Sent to workers: it holds no data."""
+    """Some squares to be sampled. Sent to workers: it carries no data."""
 
     load: ReturnsTask
     keys: tuple[str, ...]
@@ -47,34 +47,34 @@ class SampleTask:
 
     @property
     def block(self) -> Block:
-        """The squares."""
+        """Returns the squares."""
         return Block(self.load.squares)
 
 
 @dataclass(frozen=True)
 class GainsPlan:
-    """Samples of a survey, and the table made of them."""
+    """Samples of a survey, and the table made from them."""
 
     samples: tuple[tuple[TileId, str], ...]
-    """Squares that tell of gains, with the key of each sample."""
+    """Sampled squares, with the key of each sample."""
 
     def due(self, manifest: Manifest) -> list[tuple[TileId, str]]:
-        """Samples that are missing or stale."""
+        """Returns samples that are missing or stale."""
         return [(s, key) for s, key in self.samples if not manifest.is_current(SAMPLES, str(s), key)]
 
     def units(self) -> set[str]:
-        """Names of the samples in the manifest."""
+        """Returns names of the samples in the manifest."""
         return {str(square) for square, _ in self.samples}
 
     def key(self, manifest: Manifest) -> str:
-        """Key of the table, once all samples are there."""
+        """Returns the key of the table, once all samples exist."""
         held = manifest.of(SAMPLES)
         read = [(unit, held[unit].digest) for unit in sorted(self.units()) if unit in held]
         return key_of(code_digest("roadscan.assets.tasks.gains:write_gains"), read)
 
 
 def plan_gains(plan: AssetPlan) -> GainsPlan:
-    """The squares that tell of gains: of those with many returns some, by a digest of their place; none where the
+    """Returns the sampled squares: of those with many returns some, by a digest of their place; none where the
     survey asks for raw intensities.
     """
     if plan.config.intensity == "raw":
@@ -89,13 +89,13 @@ def plan_gains(plan: AssetPlan) -> GainsPlan:
 def sample_tasks(
     plan: AssetPlan, due: Sequence[tuple[TileId, str]], squares: Sequence[TileId] = ()
 ) -> list[SampleTask]:
-    """A task for each sample that is due, or for some of them."""
+    """Returns a task for each sample that is due, or for some of them."""
     wanted = set(squares) or {square for square, _ in due}
     return [SampleTask(plan.load((square,)), (key,), plan.config.ground) for square, key in due if square in wanted]
 
 
 def find_samples(task: SampleTask) -> TaskResult:
-    """Write what the squares of a task tell of gains (runs on a worker)."""
+    """Write the samples of the squares of a task (runs on a worker)."""
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     keys = dict(zip(task.load.squares, task.keys, strict=True))
@@ -113,7 +113,7 @@ def _sampled(task: SampleTask, loaded: LoadedSquare, key: str) -> OutputRecord:
         return OutputRecord(SAMPLES, unit, key, "", 0, "")
     scene = make_scene(loaded.returns, grid.own_box, grid.window_box, loaded.drive_xyh_m, task.ground)
     sample = intensity_sample(scene)
-    known = np.isfinite(sample.range_m) & np.isfinite(sample.incidence_deg)  # where a sensor stood may be unknown
+    known = np.isfinite(sample.range_m) & np.isfinite(sample.incidence_deg)  # the place of a sensor may be unknown
     if not known.any():
         return OutputRecord(SAMPLES, unit, key, "", 0, "")
     rows = pa.table({name: getattr(sample, name)[known] for name in _COLUMNS})
@@ -144,7 +144,7 @@ def write_gains(gains: GainsPlan, manifest: Manifest, plan: AssetPlan, key: str)
 
 
 def current_gains(plan: GainsPlan, manifest: Manifest) -> OutputRecord | None:
-    """The table of gains; None where it is not there or stale, or the survey asks for none."""
+    """Returns the table of gains; None where it is missing or stale, or the survey asks for none."""
     if not plan.samples or plan.due(manifest):
         return None
     record = manifest.get(GAINS, _UNIT)

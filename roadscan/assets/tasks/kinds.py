@@ -1,4 +1,4 @@
-"""Kinds of assets that a survey asks for, with their checked settings, each after those that it looks at."""
+"""Kinds of assets that a survey asks for, with their validated settings, each after those that it uses."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from roadscan.store.asset_schema import AssetSchema, asset_schema
 
 @dataclass(frozen=True)
 class WantedKind:
-    """A kind of assets and what shapes its evidence and its objects, beside what was seen."""
+    """A kind of assets and what determines its evidence and its objects, beside the returns."""
 
     kind: AssetKind
     options: Strict
 
     @property
     def name(self) -> str:
-        """Of the kind."""
+        """Returns its name."""
         return self.kind.name
 
     @property
     def schema(self) -> AssetSchema:
-        """Its table."""
+        """Returns its schema."""
         return asset_schema(self.kind.name)
 
     def evidence_key(self) -> str:
-        """Key of what shapes its evidence."""
+        """Returns the key of what determines its evidence."""
         code = code_digest("roadscan.assets.tasks.evidence:find_evidence", name_of(type(self.kind)))
         return key_of(self.name, code, self.options.model_dump(mode="json"))
 
     def objects_key(self) -> str:
-        """Key of what shapes its objects."""
+        """Returns the key of what determines its objects."""
         code = code_digest("roadscan.assets.tasks.objects:join_objects", name_of(type(self.kind)))
         columns = [[c.name, c.type] for c in self.schema.columns]
         return key_of(self.name, code, self.options.model_dump(mode="json"), columns)
 
 
 def wanted_kinds(config: AssetsConfig) -> tuple[WantedKind, ...]:
-    """The kinds that are asked for and those that they need, each after those that it names.
+    """Returns the requested kinds and those that they need, each after those that it names.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def wanted_kinds(config: AssetsConfig) -> tuple[WantedKind, ...]:
 
 
 def _needed(name: str, known: dict[str, AssetKind]) -> list[str]:
-    """All kinds that a kind looks at, directly or not, as far as there are such."""
+    """Returns all kinds that a kind uses, directly or not, as far as they exist."""
     found: list[str] = []
     waiting = [name]
     while waiting:

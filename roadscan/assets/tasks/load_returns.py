@@ -1,4 +1,4 @@
-"""Returns of squares and their halos: read by row group, placed with corrected poses, in canonical order."""
+"""Returns of squares and their halos: read by row group, georeferenced with corrected poses, in canonical order."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ _RETURN_COLUMNS: Final = [
     "epoch_gps_ns", "pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m", "intensity", "laser",
 ]  # fmt: skip
 _SCAN_COLUMNS: Final = ["epoch_gps_ns", "range", "intensity"]
-_DRIVE_TICK_NS: Final = 50_000_000
+_DRIVE_TICK_NS: Final = 50_000_000  # Interval of the places of a drive (ns).
 _DRIVE_STEP_M: Final = 0.25
-"""A place of a drive is kept where it lies in another square of this edge than the one before."""
+"""A place of a drive is kept if it lies in another square of this edge (m) than the one before."""
 
 
 @dataclass(frozen=True)
 class ReturnsTask:
-    """What loads the returns of some squares. Sent to workers: it holds no data."""
+    """Sources of the returns of some squares. Sent to workers: it carries no data."""
 
     grid: AssetGrid
     squares: tuple[TileId, ...]
     readings: TileTask
     """Row groups that may touch them."""
     sensors: tuple[str, ...]
-    """All sensors that the survey looks for assets with, by name."""
+    """All sensors in whose returns the survey seeks assets, by name."""
     ways: tuple[tuple[str, TrajectorySource], ...]
-    """Trajectories of runs whose clouds are looked at, by run."""
+    """Trajectories of runs whose clouds are used, by run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class LoadedSquare:
 
 
 def load_squares(task: ReturnsTask) -> Iterator[LoadedSquare]:
-    """Returns of each square, in the order of the task; one without any comes with none."""
+    """Yields returns of each square, in the order of the task; one without any comes with none."""
     block = _Block(task)
     for square in task.squares:
         yield block.square(square)
@@ -86,12 +86,12 @@ class _Columns(NamedTuple):
     number_of_returns: npt.NDArray[np.uint8]
 
     def at(self, rows: Any) -> _Columns:
-        """Some of them; columns without values stay so."""
+        """Returns a subset; columns without values stay so."""
         return _Columns._make(column[rows] if column.size else column for column in self)
 
 
 class _Block:
-    """Returns of some neighbouring squares, placed at once."""
+    """Returns of some neighbouring squares, georeferenced at once."""
 
     def __init__(self, task: ReturnsTask) -> None:
         self._task, readings = task, task.readings
@@ -108,7 +108,7 @@ class _Block:
         self._trajectories = [self._trajectory(source) for source in self._sources]
 
     def square(self, square: TileId) -> LoadedSquare:
-        """Returns of a square and its halo, and the drives through it."""
+        """Returns the returns of a square and its halo, and the drives through it."""
         grid, size = self._task.grid, self._ground.grid.size_quanta
         west, south = ((n * grid.per_edge - first) * size for n, first in zip(square, self._corner, strict=True))
         halo, edge = round(grid.halo_m * QUANTA_PER_M), grid.per_edge * size
@@ -150,7 +150,7 @@ class _Block:
         return np.array([self._task.sensors.index(s.sensor) for s in self._sources], np.uint8)
 
     def _parts(self, one: RawSlice) -> Iterator[_Columns]:
-        """Returns of a slice, chunk by chunk."""
+        """Yields returns of a slice, chunk by chunk."""
         number = self._sources.index(one.source)
         passes = [p for p in self._task.readings.passes if p.run == one.source.run]
         found = self._of_cloud(one) if one.source.table == "cloud" else self._of_sensor(one)
@@ -187,7 +187,7 @@ class _Block:
         laser: npt.NDArray[np.uint16],
         numbers: Sequence[npt.NDArray[Any]],
     ) -> _Columns:
-        """Columns of placed readings, pass and source still to be told."""
+        """Returns columns of georeferenced readings; pass and source are filled in later."""
         size = self._ground.grid.size_quanta
         x, y = ((tiles[:, k] - self._corner[k]) * np.int32(size) + quanta[:, k] for k in range(2))
         unset = np.zeros(0, np.uint16)
@@ -197,7 +197,7 @@ class _Block:
         )  # fmt: skip
 
     def _trajectory(self, source: ReadingSource) -> Trajectory | None:
-        """Poses that tell where a source's sensor stood; None where that is not known."""
+        """Returns the poses of a source's sensor; None where they are not known."""
         known = self._placer.trajectory(source)
         way = dict(self._task.ways).get(source.run)
         if known is not None or way is None:
@@ -206,7 +206,7 @@ class _Block:
         return load_trajectory(self._store, way, spans, self._ground.max_gap_s)
 
     def _sensor_places(self, own: _Columns) -> Float64:
-        """(n, 3) easting, northing, height of the sensor; NaN where it is not known."""
+        """Returns easting, northing, height (n, 3) of the sensor; NaN where they are not known."""
         parts = [self._places(k, own.epoch_gps_ns[rows]) for k, rows in _by_source(own.source, len(self._sources))]
         return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, 3)), *parts])
 
@@ -218,7 +218,7 @@ class _Block:
         return sensor_places(trajectory, self._ground.map, mountings, epochs_gps_ns)
 
     def _drives(self, own: _Columns, square: TileId) -> Float64:
-        """(p, 4) places of the first sensor of each pass within the window while it looked there, and the pass."""
+        """Places (p, 4) of the first sensor of each pass within the window while it looked there, and the pass."""
         grid = self._task.grid
         found = [np.zeros((0, 4))]
         seen: set[int] = set()
@@ -245,7 +245,7 @@ def _metres(quanta: npt.NDArray[np.integer[Any]]) -> Float64:
 
 
 def _numbered(sources: Sequence[ReadingSource]) -> list[ReadingSource]:
-    """Each source once, in an order that does not depend on which others there are."""
+    """Returns each source once, in an order that does not depend on the other sources."""
     held = {one.key: one for one in sources}
     return sorted(held.values(), key=lambda s: (s.run, s.sensor, s.table, s.key))
 
@@ -253,7 +253,7 @@ def _numbered(sources: Sequence[ReadingSource]) -> list[ReadingSource]:
 def _recorded(
     batch: pa.RecordBatch, geometry: ScanGeometry | None, found: Located
 ) -> tuple[Int64, npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
-    """Epoch, intensity and laser (n,) of located readings."""
+    """Returns epoch, intensity and laser (n,) of georeferenced readings."""
     epochs = batch.column("epoch_gps_ns").to_numpy()
     if geometry is None:
         intensity, laser = (batch.column(name).to_numpy()[found.row] for name in ("intensity", "laser"))
@@ -269,7 +269,7 @@ def _recorded(
 
 
 def _joined(parts: list[_Columns]) -> _Columns:
-    """All parts as one; they are given up."""
+    """Returns all parts as one; it empties them."""
     kinds = (np.uint16, np.int64, np.uint16, np.int32, np.int32, np.int32, np.uint16, np.uint16, np.uint8, np.uint8)
     if not parts:
         return _Columns._make(np.zeros(0, kind) for kind in kinds)
@@ -279,9 +279,9 @@ def _joined(parts: list[_Columns]) -> _Columns:
 
 
 def in_order(c: _Columns) -> _Columns:
-    """Returns by source, epoch and laser; where these repeat, by their places and intensities.
+    """Returns the returns by source, epoch and laser; where these repeat, by their places and intensities.
 
-    Logs come so ordered, but for repeats, so as a rule little is moved.
+    Logs are sorted so, but for repeats, so usually little is moved.
     """
     if _falls(c).any():
         c = c.at(np.lexsort((c.laser, c.epoch_gps_ns, c.source)))
@@ -310,7 +310,7 @@ def _falls(c: _Columns) -> Bool:
 
 
 def _by_source(source: npt.NDArray[np.uint16], count: int) -> Iterator[tuple[int, slice]]:
-    """Rows of each source, which are ascending."""
+    """Yields the rows of each source, which are ascending."""
     ends = np.searchsorted(source, np.arange(count + 1, dtype=source.dtype))
     for number in range(count):
         if ends[number] < ends[number + 1]:
@@ -318,7 +318,7 @@ def _by_source(source: npt.NDArray[np.uint16], count: int) -> Iterator[tuple[int
 
 
 def thinned(places_m: Float64) -> Float64:
-    """Places (k, 3) of a drive without those where it has hardly moved."""
+    """Returns places (k, 3) of a drive without those where it has hardly moved."""
     cell = np.floor(places_m[:, :2] / _DRIVE_STEP_M)
     moved = np.ones(len(places_m), bool)
     moved[1:] = (np.diff(cell, axis=0) != 0).any(axis=1)

@@ -1,4 +1,4 @@
-"""Objects: pieces of neighbouring squares, joined kind after kind; only what changed is joined again."""
+"""Objects: pieces of neighbouring squares, joined kind after kind; only changed clusters are joined again."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ OBJECTS: Final = "asset_objects"
 
 @dataclass(frozen=True)
 class Cluster:
-    """Squares that touch one another and hold pieces of a kind: an object lies within one of these."""
+    """Squares that touch one another and contain pieces of a kind: an object lies within one cluster."""
 
     kind: str
     squares: tuple[TileId, ...]
@@ -38,22 +38,22 @@ class Cluster:
 
     @property
     def unit(self) -> str:
-        """Its name in the manifest."""
+        """Returns its name in the manifest."""
         return f"{self.kind}/{self.squares[0]}"
 
     def meets(self, squares: set[TileId]) -> bool:
-        """Whether one of its squares is among others."""
+        """Returns whether one of its squares is among others."""
         return not squares.isdisjoint(self.squares)
 
     def near(self) -> set[TileId]:
-        """Its squares and those around them."""
+        """Returns its squares and those around them."""
         around = (-1, 0, 1)
         return {TileId(s.column + c, s.row + r) for s in self.squares for c in around for r in around}
 
 
 @dataclass(frozen=True)
 class JoinTask:
-    """A cluster of pieces to be joined. Sent to workers: it holds no data."""
+    """A cluster of pieces to be joined. Sent to workers: it carries no data."""
 
     store: Store
     grid: AssetGrid
@@ -62,16 +62,16 @@ class JoinTask:
     pieces: tuple[OutputRecord, ...]
     """Evidence of its squares, in their order."""
     others: tuple[tuple[str, tuple[OutputRecord, ...]], ...]
-    """Objects of other kinds near it, which this one looks at."""
+    """Objects of other kinds near it, which this one uses."""
     key: str
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Its one unit."""
+        """Returns its one unit."""
         return (self.cluster.unit,)
 
     def singly(self) -> list[JoinTask]:
-        """It cannot be cut."""
+        """Returns itself: it cannot be divided."""
         return [self]
 
 
@@ -81,17 +81,17 @@ class JoinPlan:
 
     tasks: tuple[JoinTask, ...] = ()
     gone: tuple[OutputRecord, ...] = field(default=())
-    """Objects of clusters that are no more."""
+    """Objects of clusters that no longer exist."""
 
     def due(self, manifest: Manifest) -> list[JoinTask]:
-        """Those that are missing or stale."""
+        """Returns those that are missing or stale."""
         return [t for t in self.tasks if not manifest.is_current(OBJECTS, t.cluster.unit, t.key)]
 
 
 def plan_joins(
     store: Store, grid: AssetGrid, wanted: WantedKind, manifest: Manifest, clusters: dict[str, list[Cluster]]
 ) -> JoinPlan:
-    """Clusters of a kind, from the evidence that there is; they join `clusters`, which holds those of kinds before."""
+    """Returns clusters of a kind, from the existing evidence; they are added to `clusters`, those of former kinds."""
     held = {
         TileId.parse(r.unit.partition("/")[2]): r
         for r in manifest.of(EVIDENCE).values()
@@ -120,7 +120,7 @@ def plan_joins(
 
 
 def clustered(squares: Mapping[TileId, object]) -> list[tuple[TileId, ...]]:
-    """Squares that touch one another, also at a corner, together; each cluster and all of them by row and column."""
+    """Returns clusters of squares that touch, also at a corner; each cluster and all of them by row and column."""
     waiting = dict.fromkeys(sorted(squares, key=lambda t: (t.row, t.column)))
     found: list[tuple[TileId, ...]] = []
     while waiting:
@@ -177,7 +177,7 @@ def _joined(task: JoinTask) -> OutputRecord:
 
 
 def _near(task: JoinTask, records: Sequence[OutputRecord], near: set[TileId]) -> list[AssetObject]:
-    """Objects of another kind whose place lies in the cluster or in the squares around it."""
+    """Returns objects of another kind whose place lies in the cluster or in the squares around it."""
     found: list[AssetObject] = []
     for record in records:
         rows = _read(task.store, record) if record.path else None

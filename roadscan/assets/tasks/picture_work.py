@@ -1,4 +1,4 @@
-"""Pictures of assets: which objects of which squares are to be held against which pictures, and tasks over them."""
+"""Work on pictures of assets: objects by square, the pictures that may show them, and tasks."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from roadscan.store.store import Store, bytes_digest, file_digest
 from roadscan.surface.tasks.pictures import Pictures, plan_pictures
 
 SEEN: Final = "asset_pictures"
-"""Manifest name of what pictures told of a kind's objects in a square."""
+"""Manifest name of what pictures show of a kind's objects in a square."""
 CUT_OUTS: Final = "asset_cut_outs"
 """Manifest name of the files that were cut out."""
 _BEYOND_M: Final = 10.0
-"""Objects reach so far beyond the square that holds their place."""
+"""Objects reach this far (m) beyond the square of their place."""
 
 
 @dataclass(frozen=True)
@@ -43,37 +43,37 @@ class SquareObjects:
     kind: str
     square: TileId
     box: Bounds
-    """All that pictures have to show of them lies in it."""
+    """Box of all that pictures must show of them."""
     objects: tuple[OutputRecord, ...]
-    """Files that hold them, among others."""
+    """Files that contain them, among others."""
     key: str = ""
 
     @property
     def unit(self) -> str:
-        """Its name in the manifest."""
+        """Returns its name in the manifest."""
         return f"{self.kind}/{self.square}"
 
 
 @dataclass(frozen=True)
 class PictureTask:
-    """Objects of some neighbouring squares to be held against pictures. Sent to workers: it holds no picture."""
+    """Objects of some neighbouring squares to be searched in pictures. Sent to workers: it carries no picture."""
 
     store: Store
     grid: AssetGrid
     work: tuple[SquareObjects, ...]
     pictures: Pictures
     screens: tuple[tuple[TileId, OutputRecord], ...]
-    """What hides things, in these squares and around them."""
+    """Occluders in these squares and around them."""
     settings: AssetPicturesSettings
     recogniser: Path | None
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Their names."""
+        """Returns their names."""
         return tuple(one.unit for one in self.work)
 
     def singly(self) -> list[PictureTask]:
-        """A task for each."""
+        """Returns a task for each."""
         return [
             PictureTask(self.store, self.grid, (w,), self.pictures, self.screens, self.settings, self.recogniser)
             for w in self.work
@@ -82,37 +82,37 @@ class PictureTask:
 
 @dataclass(frozen=True)
 class PicturePlan:
-    """What there is to look for in pictures."""
+    """Work to be done on pictures."""
 
     work: tuple[SquareObjects, ...] = ()
     pictures: Pictures | None = None
     notes: tuple[str, ...] = field(default=())
-    """Why nothing is looked for, or what is left out."""
+    """Notes on why nothing is searched, or what is left out."""
 
     def due(self, manifest: Manifest) -> list[SquareObjects]:
-        """What is missing or stale, with the files that were cut out of it."""
+        """Returns what is missing or stale, with the files of cut-outs."""
         return [one for one in self.work if not _is_current(one, manifest)]
 
     def gone(self, manifest: Manifest) -> list[OutputRecord]:
-        """Outputs of squares and objects that are no more."""
+        """Returns outputs of squares and objects that no longer exist."""
         held = manifest.of(SEEN)
         files = {unit for one in self.work if one.unit in held for unit in cut_outs_of(held[one.unit])}
         return [*manifest.beside({SEEN}, {one.unit for one in self.work}), *manifest.beside({CUT_OUTS}, files)]
 
     def records(self, kind: str, manifest: Manifest) -> tuple[OutputRecord, ...]:
-        """What was told of a kind, by square."""
+        """Returns the records of a kind, by square."""
         held = manifest.of(SEEN)
         return tuple(held[one.unit] for one in self.work if one.kind == kind and one.unit in held)
 
     def unreadable(self, manifest: Manifest) -> list[str]:
-        """Names of pictures that could not be read, each with the reason where that is known."""
+        """Returns names of pictures that could not be read, each with the reason where that is known."""
         held = manifest.of(SEEN)
         records = (held[one.unit] for one in self.work if one.unit in held)
         return sorted({str(name) for r in records for name in r.figures().get("unreadable", ())})
 
 
 def cut_outs_of(record: OutputRecord) -> list[str]:
-    """Units of the files that were cut out for a record's objects."""
+    """Returns units of the files of cut-outs of a record's objects."""
     return [str(name) for name in record.figures().get("cut_outs", ())]
 
 
@@ -124,7 +124,7 @@ def _is_current(one: SquareObjects, manifest: Manifest) -> bool:
 
 
 def plan_asset_pictures(plan: AssetPlan, manifest: Manifest) -> PicturePlan:
-    """Objects that there are and the pictures that may show them; nothing where the survey has no pictures."""
+    """Returns objects and the pictures that may show them; none where the survey has no pictures."""
     if not plan.wants_pictures:
         return PicturePlan()
     settings = plan.config.pictures
@@ -156,7 +156,7 @@ def plan_asset_pictures(plan: AssetPlan, manifest: Manifest) -> PicturePlan:
 def picture_tasks(
     plan: AssetPlan, pictures: Pictures, due: Sequence[SquareObjects], manifest: Manifest, workers: int = 1
 ) -> list[PictureTask]:
-    """Tasks over neighbouring squares, which share pictures."""
+    """Returns tasks over neighbouring squares, which share pictures."""
     settings, survey = plan.config.pictures, plan.survey.survey
     screens = {TileId.parse(unit): record for unit, record in manifest.of(SCREENS).items() if record.path}
     model = None if settings.recogniser is None else survey.resolve(settings.recogniser)
@@ -176,7 +176,7 @@ def picture_tasks(
 def around(
     square: TileId, screens: dict[TileId, OutputRecord], grid: AssetGrid, reach_m: float
 ) -> list[tuple[TileId, OutputRecord]]:
-    """What hides things in a square and in those within reach of it, by row and column."""
+    """Returns occluders in a square and in those within reach of it, by row and column."""
     rings = math.ceil((reach_m + _BEYOND_M) / grid.edge_m)
     steps = range(-rings, rings + 1)
     names = (TileId(square.column + c, square.row + r) for r in steps for c in steps)
@@ -186,9 +186,9 @@ def around(
 def _objects(
     plan: AssetPlan, kind: str, manifest: Manifest, *, reaches: bool
 ) -> list[tuple[SquareObjects, str]]:  # fmt: skip
-    """Objects of a kind by the square of their place, each with a digest of all that is known of them.
+    """Returns objects of a kind by the square of their place, each with a digest of all that is known of them.
 
-    reaches : what is looked at is all of a line or area, not its place alone.
+    reaches : the whole of a line or area is searched, not its place alone.
     """
     held = [r for unit, r in sorted(manifest.of(OBJECTS).items()) if unit.startswith(f"{kind}/") and r.path]
     parts: dict[TileId, list[tuple[OutputRecord, pa.Table]]] = {}
@@ -213,7 +213,7 @@ def _objects(
 
 
 def rows_by_square(rows: pa.Table, grid: AssetGrid) -> list[tuple[TileId, pa.Table]]:
-    """Rows of objects by the square that holds their place, in the order of the rows."""
+    """Returns rows of objects by the square of their place, in the order of the rows."""
     places = np.column_stack([rows["easting_m"].to_numpy(), rows["northing_m"].to_numpy()])
     number = np.floor(places / grid.edge_m).astype(np.int64)
     squares, owner = np.unique(number, axis=0, return_inverse=True)

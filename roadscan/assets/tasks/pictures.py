@@ -1,4 +1,4 @@
-"""What pictures tell of assets: the best of them, cut-outs of signs, colours of paint."""
+"""Search of assets in pictures: the best views, cut-outs of signs, colours of paint."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from roadscan.tiles.tasks.tiles import TaskResult
 Float64 = npt.NDArray[np.float64]
 
 TOLD: Final = pa.schema([("object", pa.string()), ("pictures", pa.string()), ("told", pa.string())])
-"""What pictures tell of objects: `told` holds columns of the kind as JSON."""
+"""What pictures show of objects: `told` contains columns of the kind as JSON."""
 FOLDER: Final = "products/asset_pictures"
 _JPEG_QUALITY: Final = 90
 _LEAST_MARGIN_PX: Final = 6.0
@@ -42,7 +42,7 @@ _GREY_WITHIN: Final = 3
 
 
 def find_pictures(task: PictureTask) -> TaskResult:
-    """Hold the objects of a task against its pictures, and write what they tell (runs on a worker)."""
+    """Search the objects of a task in its pictures, and write the results (runs on a worker)."""
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     source = ColourSource(task.pictures)
@@ -57,7 +57,7 @@ def find_pictures(task: PictureTask) -> TaskResult:
 
 @dataclass
 class _Answer:
-    """What pictures told of the objects of a square."""
+    """Results of the objects of a square."""
 
     pictures: list[str | None]
     told: list[dict[str, Any]]
@@ -66,7 +66,7 @@ class _Answer:
 
 
 class _Search:
-    """Objects on their way from places to what pictures tell of them."""
+    """Objects during their search in pictures."""
 
     def __init__(self, task: PictureTask, source: ColourSource) -> None:
         self._task, self._source = task, source
@@ -74,7 +74,7 @@ class _Search:
         self._screens = {square: self._read(record) for square, record in task.screens}
 
     def records(self, one: SquareObjects) -> list[OutputRecord]:
-        """Records of what is told of the objects of a square, and of the files cut out of pictures."""
+        """Returns records of the results of a square's objects, and of the files of cut-outs."""
         grid = self._task.grid
         parts = [dict(rows_by_square(self._read(r), grid))[one.square] for r in one.objects]
         rows = pa.concat_tables(parts)
@@ -136,7 +136,7 @@ class _Search:
             answer.told[number] = told
 
     def _cut_outs(self, outline_m: Float64, found: Sights, pictures: Pictures, answer: _Answer) -> list[CutOut]:
-        """Cut-outs of the best pictures that can be read."""
+        """Returns cut-outs of the best pictures that can be read."""
         worlds = [world_places(pictures, world, outline_m) for world in pictures.worlds]
         cut: list[CutOut] = []
         for view, resolution in zip(found.view.tolist(), found.resolution_m.tolist(), strict=True):
@@ -166,7 +166,7 @@ class _Search:
         return OutputRecord(CUT_OUTS, unit, one.key, target, len(content), bytes_digest(content))
 
     def _coloured(self, reader: ColourReader, asset: AssetObject, answer: _Answer) -> Mapping[str, Any]:
-        """What colours of an object and beside it tell."""
+        """Returns the columns from the colours of an object and beside it."""
         places = reader.places(asset)
         every = np.vstack([places.own_m, places.beside_m])
         if not len(every):
@@ -183,18 +183,18 @@ class _Search:
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """Sights of objects, and the pictures that they count."""
+    """Sights of objects, and the pictures to which they refer."""
 
     pictures: Pictures
     sights: Sights
 
     def of(self, item: int) -> Sights:
-        """Those of one object."""
+        """Returns those of one object."""
         return self.sights.at(np.flatnonzero(self.sights.item == item))
 
 
 def _cut_out(picture: npt.NDArray[np.uint8], outline_px: Float64, resolution_m: float, margin: float) -> CutOut:
-    """The part of a picture around an outline (k, 2)."""
+    """Returns the part of a picture around an outline (k, 2)."""
     low, high = outline_px.min(axis=0), outline_px.max(axis=0)
     beyond = np.maximum(margin * (high - low), _LEAST_MARGIN_PX)
     height, width = picture.shape[:2]

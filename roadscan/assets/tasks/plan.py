@@ -1,4 +1,4 @@
-"""What assets are sought in: squares that a sensor with a wide view saw, their keys, and tasks over them."""
+"""Plan of the search for assets: squares that a sensor with a wide view saw, their keys, and tasks over them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from roadscan.tiles.tasks.tile_plan import TilePlan, plan_tiles
 from roadscan.tiles.tasks.wanted_products import product_context
 
 _BLOCK_SQUARES: Final = 16
-"""Edge of the largest block of squares that one task searches: a lidar sees 100 m to both sides, and row groups that
+"""Edge of the largest block of squares of one task: a lidar sees 100 m to both sides, and row groups that
 touch several blocks are read for each."""
 
 
@@ -50,22 +50,22 @@ class AssetPlan:
     keys: Mapping[TileId, str]
     """Key of what was seen in each square, by row and column."""
     readings: Mapping[TileId, int]
-    """About how many returns each square holds."""
+    """Approximate number of returns in each square."""
 
     @property
     def context(self) -> ProductContext:
-        """What files need to know of the survey."""
+        """Returns what files need to know of the survey."""
         return self.tiles.context
 
     @property
     def wants_pictures(self) -> bool:
-        """Whether pictures of assets are wanted, and the rig has a camera that could take them."""
+        """Returns whether pictures of assets are wanted, and the rig has a camera for them."""
         settings = self.config.pictures
         cameras = [one for one in self.survey.survey.rig.sensors.values() if one.kind == "camera"]
         return settings.on and bool(settings.cameras or any(one.interior is not None for one in cameras))
 
     def blocks(self, squares: Sequence[TileId], workers: int = 1) -> list[tuple[TileId, ...]]:
-        """Neighbouring squares that fit into memory together; fewer where there are few for that many workers."""
+        """Returns batches of neighbouring squares, bounded by memory and by squares per worker."""
         readings = {square: self.readings[square] for square in squares}
         edge = _BLOCK_SQUARES
         blocks = cut_blocks(readings, edge, self.config.max_block_returns)
@@ -75,20 +75,20 @@ class AssetPlan:
         return [b.tiles for b in blocks]
 
     def load(self, squares: tuple[TileId, ...]) -> ReturnsTask:
-        """What loads the returns of some squares."""
+        """Returns the sources of the returns of some squares."""
         known = self.tiles.tiles.number
         under = dict.fromkeys(t for square in squares for t in self.grid.tiles_under(square) if t in known)
         own = tuple(sorted(under, key=lambda t: (t.row, t.column)))
         return ReturnsTask(self.grid, squares, self.tiles.task(Block(own)), self.sensors, self.ways)
 
     def near(self, chosen: Sequence[TileId]) -> set[TileId]:
-        """Squares that see one of some of the survey's tiles, in themselves or in their halo."""
+        """Returns squares that see one of some of the survey's tiles, in themselves or in their halo."""
         near = set(chosen)
         return {square for square in self.keys if not near.isdisjoint(self.grid.tiles_under(square))}
 
 
 def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
-    """The squares that the sensors which are looked at may have seen.
+    """Returns the plan over the squares that the used sensors may have seen.
 
     Raises
     ------
@@ -119,14 +119,14 @@ def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
 
 
 def asset_grid(survey: Survey, config: AssetsConfig) -> AssetGrid:
-    """Squares of a survey."""
+    """Returns the squares of a survey."""
     tiles = survey.config.tiles
     edge_m = config.edge_m(tiles.size_m)
     return AssetGrid(TileGrid(tiles.size_m, tiles.cell_m), round(edge_m / tiles.size_m), config.halo_m)
 
 
 def is_looked_at(source: ReadingSource, config: AssetsConfig) -> bool:
-    """Whether assets are sought in a source's readings."""
+    """Returns whether assets are sought in a source's readings."""
     if config.sensors is not None:
         return source.sensor in config.sensors
     geometry = geometry_of(source)
@@ -134,7 +134,7 @@ def is_looked_at(source: ReadingSource, config: AssetsConfig) -> bool:
 
 
 def check_assets(survey: Survey) -> None:
-    """Raise :class:`ConfigError` where the section [assets] names what there is not; reads nothing."""
+    """Raise :class:`ConfigError` where the section [assets] names what does not exist; reads nothing."""
     config = AssetsConfig.stated(survey)
     if config is None:
         return
@@ -154,7 +154,7 @@ def check_assets(survey: Survey) -> None:
 
 
 def _looked_at(footprints: FootprintRanges, config: AssetsConfig) -> FootprintRanges:
-    """Footprints of the sources that are looked at; nothing of their profiles is left out for not being road."""
+    """Returns footprints of the used sources; of their profiles also those that are not road."""
     held = np.array([is_looked_at(one.source, config) for one in footprints.slices], bool)
     rows = held[footprints.slice_index] if held.size else np.zeros(0, bool)
     slices = tuple(replace(one, source=replace(one.source, road=None)) for one in footprints.slices)
@@ -166,7 +166,7 @@ def _looked_at(footprints: FootprintRanges, config: AssetsConfig) -> FootprintRa
 
 
 def _ways(plan: SurveyPlan, config: AssetsConfig) -> tuple[tuple[str, TrajectorySource], ...]:
-    """Trajectories of the runs of clouds, as far as they have one: they tell where the sensor stood."""
+    """Returns trajectories of the runs of clouds, where they have one: they give the place of the sensor."""
     runs = sorted({s.run for s, _ in plan.sources if s.table == "cloud" and is_looked_at(s, config)})
     held = {r.run for r in plan.records if r.tables.get("trajectory")}
     return tuple((run, trajectory_source(run, plan.records)) for run in runs if run in held)

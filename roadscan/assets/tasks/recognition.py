@@ -18,11 +18,11 @@ from roadscan.store.store import file_digest
 
 Float32 = npt.NDArray[np.float32]
 
-_LEAST_TEXT_PX: Final = 24
+_LEAST_TEXT_PX: Final = 24  # Smaller cut-outs (pixels) are not searched for text.
 _TEXT_PX: Final = 320
-"""Cut-outs are enlarged to this height before text is sought."""
-_LEAST_TEXT: Final = 0.75
-_SQUARE_PX: Final = 64
+"""Cut-outs are enlarged to this height (pixels) before text is sought."""
+_LEAST_TEXT: Final = 0.75  # Least probability of a line of text.
+_SQUARE_PX: Final = 64  # Edge of the input of a model that takes any size (pixels).
 _ONE_THREAD: Final = {
     "EngineConfig.onnxruntime.intra_op_num_threads": 1, "EngineConfig.onnxruntime.inter_op_num_threads": 1,
 }  # fmt: skip
@@ -30,14 +30,14 @@ _ONE_THREAD: Final = {
 
 
 class SignRecognition(Recognition):
-    """Reads text and types of signs with what the survey asks for."""
+    """Reads text and types of signs with the recognisers that the survey asks for."""
 
     def __init__(self, text: bool, model: Path | None) -> None:
         self._ocr = _ocr() if text else None
         self._model = None if model is None else OnnxModel(model)
 
     def text(self, cut_out: CutOut) -> tuple[str, float] | None:
-        """Lines of text joined by blanks, with the least probability of them."""
+        """Returns lines of text joined by blanks, with the least probability of them."""
         if self._ocr is None or min(cut_out.pixels.shape[:2]) < _LEAST_TEXT_PX:
             return None
         scale = max(_TEXT_PX / cut_out.pixels.shape[0], 1.0)
@@ -49,7 +49,7 @@ class SignRecognition(Recognition):
         return (" ".join(words for words, _ in kept), min(score for _, score in kept)) if kept else None
 
     def label(self, cut_out: CutOut) -> tuple[str, float] | None:
-        """The most probable label of the model."""
+        """Returns the most probable label of the model."""
         return None if self._model is None else self._model.label(cut_out)
 
 
@@ -94,7 +94,7 @@ class OnnxModel:
         self._path = path
 
     def label(self, cut_out: CutOut) -> tuple[str, float] | None:
-        """The most probable label of a cut-out and its probability; None where that is the empty one."""
+        """Returns the most probable label of a cut-out and its probability; None where the label is empty."""
         (values,) = self._session.run([self._output], {self._name: upright(cut_out, self._size)})
         values = np.asarray(values, np.float64).reshape(-1)
         if values.size != len(self._labels):
@@ -110,7 +110,7 @@ class OnnxModel:
 
 
 def upright(cut_out: CutOut, size: Sequence[int]) -> Float32:
-    """A cut-out as a model takes it (1, 3, height, width): the box of the plate, upright, 0 … 1, red first.
+    """Returns a cut-out as a model takes it (1, 3, height, width): the box of the plate, upright, 0 … 1, red first.
 
     The first four points of the outline are the corners of the box: lower left, lower right, upper right, upper left.
     """
@@ -122,7 +122,7 @@ def upright(cut_out: CutOut, size: Sequence[int]) -> Float32:
 
 
 def recognition_of(text: bool, model: Path | None) -> Recognition:
-    """What reads signs, loaded once a worker."""
+    """Returns the recognisers of signs, loaded once a worker."""
     return _recognition(text, model, "" if model is None else file_digest(model))
 
 

@@ -1,4 +1,4 @@
-"""Cross-sections of bare earth by station: a file a road for CAD, and one for spreadsheets."""
+"""Cross-sections of bare earth by station: for each road a file for CAD, and one for spreadsheets."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ class SectionTask:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Its files."""
+        """Returns its files."""
         return tuple(f"{self.line.road}{suffix}" for suffix in _SUFFIXES)
 
 
 def plan_sections(
     roads: Roads, config: GroundSectionsConfig | None, grid: AssetGrid, manifest: Manifest, context: ProductContext
 ) -> list[SectionTask]:
-    """Cross-sections of every road; none where they are not asked for."""
+    """Returns cross-sections of every road; none where they are not asked for."""
     if config is None:
         return []
     code = code_digest("roadscan.assets.tasks.sections:write_sections")
@@ -94,7 +94,7 @@ def write_sections(task: SectionTask, grid: AssetGrid, store: Store, context: Pr
 
 
 def _rows(task: SectionTask, grid: AssetGrid, store: Store, context: ProductContext) -> pd.DataFrame:
-    """A row a height that is known, by station and offset."""
+    """Returns a row for each known height, by station and offset."""
     import pandas as pd  # slow to import
 
     line, config = task.line, task.config
@@ -131,7 +131,7 @@ def _rows(task: SectionTask, grid: AssetGrid, store: Store, context: ProductCont
 def _near(
     line: RoadLine, station: Float64, config: GroundSectionsConfig, box: shapely.Polygon
 ) -> npt.NDArray[np.int64]:
-    """Cross-sections that reach into a square."""
+    """Returns cross-sections that reach into a square."""
     middle = line.places(station, 0.0)[:, :2]
     away = shapely.distance(shapely.points(middle), box)
     return np.flatnonzero(away <= config.half_width_m + 1.0)
@@ -140,7 +140,7 @@ def _near(
 def _take(
     found: CrossSections, near: npt.NDArray[np.int64], height: Float64, sigma: Float64, seen: npt.NDArray[np.bool_]
 ) -> None:
-    """Heights that a square knows, where none was known or seen before."""
+    """Add heights of a square where none was known or seen before."""
     better = np.isfinite(found.height_m) & (np.isnan(height[near]) | (found.seen & ~seen[near]))
     for whole, own in ((height, found.height_m), (sigma, found.sigma_m), (seen, found.seen)):
         whole[near] = np.where(better, own, whole[near])
@@ -151,7 +151,7 @@ def _write_csv(path: Path, rows: pd.DataFrame, context: ProductContext) -> None:
 
 
 def _write_drawing(path: Path, rows: pd.DataFrame, context: ProductContext) -> None:
-    """A 3D line a section, interrupted where nothing is known."""
+    """Write a 3D line for each section, interrupted where nothing is known."""
     shapes = np.array([*_drawn(rows), None], object)[:-1]
     write_dxf(path, [Layer(SECTIONS, "LineStringZ", pa.table({}), shapes)], context)
 

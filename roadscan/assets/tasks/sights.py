@@ -1,4 +1,4 @@
-"""Which pictures show some assets best: seen from the front, inside the picture, and with nothing between."""
+"""Selection of the pictures that show assets best: from the front, inside the picture, and unobstructed."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _WALKED_M: Final = np.array([1.5, 0.8, 0.25])
-"""A line of sight is looked at from so far beyond the camera to so far before the object, in steps of this."""
+"""A line of sight is tested from this far beyond the camera to this far before the object, in steps of this (m)."""
 
 
 def best_sights(looks: Sequence[Sight], pictures: Pictures, screens: pa.Table) -> Sights:
-    """Pictures that show n objects, each object's best first; those from where something hides it are left out.
+    """Returns the pictures that show n objects, each object's best first, without those in which something hides it.
 
     Parameters
     ----------
-    looks : what of each object a picture has to show, with the same number of places each.
+    looks : what a picture must show of each object, with the same number of places each.
     screens : voxels that hide (:data:`roadscan.assets.screens.SCREENS`).
     """
     places = np.stack([one.places_m for one in looks])
@@ -47,7 +47,7 @@ def best_sights(looks: Sequence[Sight], pictures: Pictures, screens: pa.Table) -
 
 
 def _hidden(found: Sights, places_m: Float64, pictures: Pictures, screens: pa.Table) -> npt.NDArray[np.bool_]:
-    """Which sights (n,) something stands in the way of."""
+    """Returns a mask (n,) of the sights that are obstructed."""
     hidden = np.zeros(len(found), np.bool_)
     if not (len(found) and screens.num_rows):
         return hidden
@@ -67,7 +67,7 @@ def _hidden(found: Sights, places_m: Float64, pictures: Pictures, screens: pa.Ta
 
 
 def _eyes_m(pictures: Pictures) -> Float64:
-    """Easting, northing and height (n, 3) of the cameras."""
+    """Returns easting, northing and height (n, 3) of the cameras."""
     views = pictures.views
     out = np.empty((len(views), 3))
     for number, world in enumerate(pictures.worlds):
@@ -77,7 +77,7 @@ def _eyes_m(pictures: Pictures) -> Float64:
 
 
 def named(found: Sights, pictures: Pictures, count: int, most: int) -> list[str | None]:
-    """What the column `pictures` says of each of `count` objects; None where no picture shows it."""
+    """Returns the column `pictures` of `count` objects; None where no picture shows one."""
     words: list[list[dict[str, object]]] = [[] for _ in range(count)]
     for item, view, (u, v), distance in zip(
         found.item.tolist(), found.view.tolist(), found.pixel.tolist(), found.distance_m.tolist(), strict=True

@@ -1,4 +1,4 @@
-"""Tables of assets, one a kind, and the files made of them."""
+"""Tables of assets, one a kind, and the files made from them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
 from roadscan.tiles.tasks.tile_files import publish_file
 
 TABLES: Final = "assets"
-"""Manifest name of the tables and files; they lie in the folder of this name."""
+"""Manifest name of the tables and files, and of their folder."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,18 @@ class TableTask:
     schema: AssetSchema
     objects: tuple[OutputRecord, ...]
     seen: tuple[OutputRecord, ...]
-    """What pictures told of them."""
+    """What pictures show of them."""
     key: str
 
     @property
     def unit(self) -> str:
-        """Its file."""
+        """Returns its file."""
         return f"{self.schema.table}.parquet"
 
 
 @dataclass(frozen=True)
 class FileTask:
-    """A file to be made of tables."""
+    """A file to be made from tables."""
 
     unit: str
     tables: tuple[tuple[AssetSchema, OutputRecord], ...]
@@ -66,7 +66,7 @@ def plan_tables(
     context: ProductContext,
     pictures: PicturePlan,
 ) -> list[TableTask]:
-    """A table for each kind; `places_key` is that of the roads and drives."""
+    """Returns a table for each kind; `places_key` is that of the roads and drives."""
     code = code_digest("roadscan.assets.tasks.tables:write_table")
     held = manifest.of(OBJECTS)
     tasks = []
@@ -84,7 +84,7 @@ def plan_tables(
 def plan_files(
     kinds: Sequence[WantedKind], manifest: Manifest, config: AssetsConfig, context: ProductContext
 ) -> list[FileTask]:
-    """The files that the survey asks for, of the tables that there are."""
+    """Returns the files that the survey asks for, of the existing tables."""
     held = manifest.of(TABLES)
     tables = tuple(
         (one.schema, held[unit])
@@ -111,7 +111,7 @@ def _one_geojson(path: Path, layers: Sequence[Layer], context: ProductContext) -
 
 
 def write_table(task: TableTask, roads: Roads, drives: Drives, store: Store, context: ProductContext) -> OutputRecord:
-    """Write a kind's table: the objects of all clusters, with where they lie along the roads, and σ of the poses."""
+    """Write a kind's table: the objects of all clusters, with positions along the roads, and σ of the poses."""
     schema = task.schema.arrow()
     parts = [store.parse_table(read_recorded(store, r), r.path).cast(schema) for r in task.objects]
     rows = with_pose_sigma(pa.concat_tables([schema.empty_table(), *parts]).combine_chunks(), drives)
@@ -137,7 +137,7 @@ def write_table(task: TableTask, roads: Roads, drives: Drives, store: Store, con
 
 
 def _with_pictures(rows: pa.Table, seen: Sequence[pa.Table]) -> pa.Table:
-    """Rows of objects with what pictures told of them."""
+    """Returns rows of objects with the results from pictures."""
     if not seen:
         return rows
     told = {one["object"]: one for part in seen for one in part.to_pylist()}
@@ -162,6 +162,6 @@ def write_file(task: FileTask, store: Store, context: ProductContext) -> OutputR
 
 
 def read_layer(schema: AssetSchema, record: OutputRecord, store: Store, context: ProductContext) -> Layer:
-    """Rows and geometries of a table."""
+    """Returns rows and geometries of a table."""
     rows, shapes = read_geo_table(read_recorded(store, record), context)
     return Layer(schema.table, schema.geometry, rows, shapes)

@@ -1,4 +1,4 @@
-"""What the stage `assets` has to do: evidence, objects and files there are against those there should be."""
+"""Work of the stage `assets`: existing evidence, objects and files compared with those that are wanted."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MADE = (
 
 @dataclass(frozen=True)
 class AssetsWork:
-    """What there is to do, as far as that can be told before the parts before it are done."""
+    """Work that is due, as far as known before earlier steps are done."""
 
     plan: AssetPlan | None = None
     """None where no assets are asked for."""
@@ -52,12 +52,12 @@ class AssetsWork:
 
     @property
     def evidence_due(self) -> int:
-        """How many outputs of squares are due."""
+        """Returns how many outputs of squares are due."""
         return len(self.samples) + sum(len(one.kinds) + len(one.beside) for one in self.squares)
 
 
 def plan_evidence(session: Session) -> AssetsWork:
-    """Compare the evidence there is with what there should be; with a selection of tiles, of their squares."""
+    """Returns the difference of existing and wanted evidence; with a selection of tiles, of their squares."""
     manifest = session.manifest
     if not session.survey.has("assets"):
         return AssetsWork(gone=manifest.beside(set(MADE), ()))
@@ -98,7 +98,7 @@ def _gone(plan: AssetPlan, gains: GainsPlan, manifest: Manifest) -> list[OutputR
 
 
 def _files(plan: AssetPlan) -> set[str]:
-    """Names of the tables and files that the survey asks for."""
+    """Returns names of the tables and files that the survey asks for."""
     exports = plan.config.exports
     tables = {one.schema.table for one in plan.kinds}
     names = {f"{table}.parquet" for table in tables}
@@ -107,7 +107,7 @@ def _files(plan: AssetPlan) -> set[str]:
 
 
 def due_joins(plan: AssetPlan, manifest: Manifest) -> list[JoinTask]:
-    """Clusters of all kinds whose objects are missing or stale, as far as is known before others are joined."""
+    """Returns clusters of all kinds whose objects are missing or stale, as far as known before others are joined."""
     clusters: dict[str, list[Cluster]] = {}
     return [
         task

@@ -1,1 +1,1 @@
-"""What stands upright beside the road and hangs over it: shafts, plates, upright planes, and their shared figures."""
+"""Upright things beside the road and over it: shafts, plates, upright planes, and their shared figures."""

@@ -1,4 +1,4 @@
-"""What a shaft carries: crowns, arms with lamps, heads of signals."""
+"""Attachments of a shaft: crowns, arms with lamps, heads of signals."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from roadscan.assets.upright.shafts import Shaft
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_LEVEL_M: Final = 0.4
-_SECTORS: Final = 8
-_CROWN_REACH_M: Final = 4.5
-_HEAD_REACH_M: Final = 0.75
-_CROWN_M: Final = 1.5
+_LEVEL_M: Final = 0.4  # Height of a level of a crown (m).
+_SECTORS: Final = 8  # Directions around a shaft.
+_CROWN_REACH_M: Final = 4.5  # Returns within this distance of the axis (m) may belong to a crown.
+_HEAD_REACH_M: Final = 0.75  # Returns within this distance (m) may belong to a signal's head.
+_CROWN_M: Final = 1.5  # Returns within this distance (m) show a crown.
 _CROWN_GAP_M: Final = 2.0
-"""A crown begins no higher above the shaft's top."""
-_BEYOND_SHARE: Final = 0.1
+"""A crown starts no higher above the shaft's top than this (m)."""
+_BEYOND_SHARE: Final = 0.1  # Share of those returns beyond a head, at most.
 _ARM_M: Final = 0.2
-"""What hangs from an arm lies below its top by more."""
+"""What hangs from an arm lies below its top by more than this (m)."""
 _BRIGHT_SHARE: Final = 0.1
-"""Heads of signals are dark; of the returns of a sign more are bright than this share."""
+"""Heads of signals are dark; of the returns of a sign more than this share are bright."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class About:
 
     rows: Int64
     right_m: Float64
-    """(n,) to the east of the axis; and to the north of it: `ahead_m`."""
+    """(n,) to the east of the axis; `ahead_m` is to the north."""
     ahead_m: Float64
     away_m: Float64
     above_m: Float64
@@ -46,7 +46,7 @@ class About:
 
 @dataclass(frozen=True)
 class Arms:
-    """What reaches out from the upper end of a shaft, in one direction or two opposite ones."""
+    """Arms at the upper end of a shaft, in one direction or two opposite ones."""
 
     reach_m: float
     """Of the longer side."""
@@ -61,7 +61,7 @@ class Arms:
 
 
 def about(scene: Scene, shaft: Shaft) -> About:
-    """Returns within 4.5 m of a shaft's axis."""
+    """Returns the returns within 4.5 m of a shaft's axis."""
     rows = places_of(scene).within(shaft.axis.x_m, shaft.axis.y_m, _CROWN_REACH_M)
     rows = rows[scene.classes[rows] != classes.BRIDGE_DECK]
     height = scene.returns.height_m[rows]
@@ -73,7 +73,7 @@ def about(scene: Scene, shaft: Shaft) -> About:
 
 
 def crown_share(near: About, shaft: Shaft) -> float:
-    """Share of the eight directions that hold returns within 1.5 m, mean of the three fullest levels of 0.4 m.
+    """Returns the share of the eight directions with returns within 1.5 m, mean of the three fullest levels of 0.4 m.
 
     Crowns fill all directions; plates, arms and façades one to three of them. What begins far above the shaft's top,
     and above all that hangs on it, is no crown of it.
@@ -93,7 +93,7 @@ def crown_share(near: About, shaft: Shaft) -> float:
 
 
 def crown(near: About, shaft: Shaft, others_xy: Float64) -> tuple[float, float, Int64]:
-    """Top above the foot, mean diameter, and returns of a crown; what lies nearer to another trunk belongs to that.
+    """Top above the foot, mean diameter, and returns of a crown; returns nearer to another trunk belong to that.
 
     others_xy : (k, 2) axes of the other trunks about.
     """
@@ -113,7 +113,7 @@ def crown(near: About, shaft: Shaft, others_xy: Float64) -> tuple[float, float, 
 
 
 def arms(near: About, shaft: Shaft) -> Arms | None:
-    """What reaches out sideways near the top of a shaft 3 m high or higher, in one or two directions; else None.
+    """Returns arms near the top of a shaft 3 m high or higher, in one or two directions; None where there are none.
 
     Of 24 directions those count whose strip, 0.5 m wide, holds returns from the shaft outwards without a gap. Where
     more than a third of them do, a crown or a roof is about.
@@ -143,7 +143,7 @@ def arms(near: About, shaft: Shaft) -> Arms | None:
 
 
 def _reach(along: Float64, above: Float64) -> tuple[float, float]:
-    """How far returns follow one another outwards without a gap of more than 0.6 m, and the height of the end."""
+    """Returns how far returns extend outwards without a gap of more than 0.6 m, and the height of the end."""
     order = np.argsort(along, kind="stable")
     out = along[order][along[order] > 0.0]
     if out.size < 5:
@@ -159,9 +159,9 @@ def _reach(along: Float64, above: Float64) -> tuple[float, float]:
 
 
 def signal_head(scene: Scene, near: About, out: Arms | None) -> tuple[float, float] | None:
-    """Height of the middle above the foot, and height of a box as signals have them; else None.
+    """Returns height of the middle above the foot, and height of a box like that of a signal; None where there is none.
 
-    A shaft carries it itself, or the end of its arm. It is 0.15–0.6 m wide and deep and 0.55–1.5 m high, 1.8 m above
+    A shaft carries it directly, or at the end of its arm. It is 0.15–0.6 m wide and deep, 0.55–1.5 m high, 1.8 m above
     the foot or more; plates are thinner, and bright.
     """
     held = _head(scene, near, near.away_m < _HEAD_REACH_M)
@@ -172,7 +172,7 @@ def signal_head(scene: Scene, near: About, out: Arms | None) -> tuple[float, flo
 
 
 def is_head_alone(scene: Scene, near: About) -> bool:
-    """Whether a shaft carries a signal's head, and nothing about it reaches as far as a crown."""
+    """Returns whether a shaft carries a signal's head, and nothing about it reaches as far as a crown."""
     crown = (near.away_m < _CROWN_M) & (near.above_m > 1.8)
     beyond = crown & (near.away_m >= _HEAD_REACH_M)
     return int(beyond.sum()) <= _BEYOND_SHARE * int(crown.sum()) and signal_head(scene, near, None) is not None

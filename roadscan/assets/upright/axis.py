@@ -14,7 +14,7 @@ from roadscan.assets.kernels.cylinders import fit_cylinder
 Float64 = npt.NDArray[np.float64]
 
 SECTOR_DEG: Final = 8.0
-"""Sight lines of one sector count as of one direction."""
+"""Sight lines within a sector (degrees) count as of one direction."""
 
 
 @dataclass(frozen=True)
@@ -34,21 +34,21 @@ class Axis:
 
     @property
     def lean_deg(self) -> float:
-        """Angle from the vertical (degrees)."""
+        """Returns the angle from the vertical (degrees)."""
         return math.degrees(math.atan(math.hypot(self.slope_x, self.slope_y)))
 
     def at(self, height_m: npt.ArrayLike) -> tuple[Float64, Float64]:
-        """X and y of the axis at heights (any shape)."""
+        """Returns x and y of the axis at heights (any shape)."""
         past = np.asarray(height_m, np.float64) - self.height_m
         return self.x_m + self.slope_x * past, self.y_m + self.slope_y * past
 
 
 def fit_axis(xyh: Float64, sensor_xy: Float64, *, lean: bool = True) -> Axis:
-    """Cylinder through returns (n, 3), seen from (n, 2).
+    """Returns the cylinder through returns (n, 3), seen from (n, 2).
 
-    Sight lines meet a cylinder evenly across its width, so the spread of the returns across their sight lines tells the
+    Sight lines meet a cylinder evenly across its width, so the spread of the returns across their sight lines shows the
     radius, and the middle of that spread the axis across them; along them the axis lies where the returns are one
-    radius away from it (Gauss–Newton, Huber weights). A circle fit alone tells neither for shafts as thin as the range
+    radius away from it (Gauss–Newton, Huber weights). A circle fit alone shows neither for shafts as thin as the range
     noise.
 
     lean : the axis may lean; otherwise it is upright.

@@ -19,13 +19,13 @@ from roadscan.assets.upright.slices import usable
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_CELL_M: Final = 0.2
-_LOW_M: Final = 0.2
-_HIGH_M: Final = (0.5, 1.3)
-_LENGTH_M: Final = (1.5, 10.0)
-_WIDTH_M: Final = (0.35, 1.4)
-_LEAST_RETURNS: Final = 40
-_LONG_M: Final = 5.0
+_CELL_M: Final = 0.2  # Edge of a cell (m).
+_LOW_M: Final = 0.2  # Returns above this height (m) are used.
+_HIGH_M: Final = (0.5, 1.3)  # Height of a box (m).
+_LENGTH_M: Final = (1.5, 10.0)  # Length of a box (m).
+_WIDTH_M: Final = (0.35, 1.4)  # Width of a box (m).
+_LEAST_RETURNS: Final = 40  # Least number of returns of a box.
+_LONG_M: Final = 5.0  # Longer surfaces (m) are barriers.
 PIECE_SCHEMA: Final = pa.schema(
     [
         ("ring", pa.list_(pa.list_(pa.float64()))), ("ground_m", pa.float64()), ("asset_height_m", pa.float64()),
@@ -33,11 +33,11 @@ PIECE_SCHEMA: Final = pa.schema(
         ("passes", pa.list_(pa.int32())), ("first_epoch_gps_ns", pa.int64()), ("last_epoch_gps_ns", pa.int64()),
     ]
 )  # fmt: skip
-"""A row a box: its corners in the map (easting, northing), and what is known of it."""
+"""A row for each box: its corners in the map (easting, northing), and its figures."""
 
 
 def boxes_of(scene: Scene) -> pa.Table:
-    """Boxes 0.5–1.3 m high, 1.5–10 m long and 0.35–1.4 m wide whose middle the tile holds; long barriers left out."""
+    """Boxes 0.5–1.3 m high, 1.5–10 m long and 0.35–1.4 m wide whose middle lies in the tile; no long barriers."""
     returns = scene.returns
     above = scene.above_ground_m
     free = usable(scene) & (above > _LOW_M)

@@ -14,11 +14,11 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _BEFORE_M, _BEHIND_M = 0.4, 1.5
-"""Balconies stand before the plane of a façade, windows and doors behind it, this far at the most."""
+"""Balconies stand before the plane of a façade, windows and doors behind it, this far at the most (m)."""
 
 
 def outline(chain: Chain) -> Float64:
-    """Ring (n, 3) of a façade: its lower edge, then its upper edge back; stretches without returns as those beside."""
+    """Returns the ring (n, 3) of a façade: its lower edge, then its upper edge back; gaps are filled from beside."""
     low, high = _filled(chain.values["low_m"]), _filled(chain.values["high_m"])
     xy = np.repeat(chain.xy_m, 2, axis=0)[1:-1]
     lower, upper = np.column_stack([xy, np.repeat(low, 2)]), np.column_stack([xy, np.repeat(high, 2)])
@@ -34,7 +34,7 @@ def _filled(values: Float64) -> Float64:
 
 
 def beside(scene: Scene, rows: Int64) -> Int64:
-    """Returns of a façade: those of its surface (`rows`), and what stands close before it or behind it."""
+    """Returns the returns of a façade: those of its surface (`rows`), and those close before it or behind it."""
     returns = scene.returns
     xy = np.column_stack([returns.x_m[rows], returns.y_m[rows]])
     middle = xy.mean(axis=0)

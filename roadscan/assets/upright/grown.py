@@ -1,4 +1,4 @@
-"""Cells of the map that are planted or grown over: their height scatters, over an area, more than that of the road."""
+"""Cells of the map that are planted or grown over: areas whose height scatters more than that of the road."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
-CELL_M: Final = 0.25
+CELL_M: Final = 0.25  # Edge of a cell (m).
 _LEAST_RETURNS: Final = 6
-"""Of a cell with the eight around it."""
+"""Least number of returns of a cell with the eight around it."""
 _LOW_M: Final = (-0.3, 1.0)
-"""Heights above the ground of what grows, and of the ground below it."""
+"""Heights above the ground of plants, and of the ground below them (m)."""
 _LOW: Final = (
     classes.UNCLASSIFIED, classes.GROUND, classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.ROAD,
 )  # fmt: skip
 _LONG_M: Final = 2.0
-"""Upright surfaces longer than this are rails, fences and walls."""
+"""Upright surfaces longer than this (m) are rails, fences and walls."""
 _WIDE: Final = np.ones((7, 7), np.uint8)
 """Walls, rails, kerbs and fences, with a cell to each side, are narrower than this (cells)."""
 _POOLED: Final = np.ones((3, 3), np.uint8)
@@ -57,9 +57,9 @@ class LandscapeOptions(Strict):
 
 
 def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
-    """Cells of the tile that are probably grown over: heights scatter more than the road's, over an area.
+    """Returns cells of the tile that are probably grown over: areas whose heights scatter more than the road's.
 
-    Long upright surfaces take no part, and an opening leaves out what is narrow.
+    Long upright surfaces are excluded, and an opening removes narrow areas.
     """
     tile, window = scene.tile, scene.window
     margin = int((tile.x_min_m - window.x_min_m) / CELL_M)
@@ -103,7 +103,7 @@ def _sums(scene: Scene, corner: Float64, shape: tuple[int, int]) -> Float64:
 
 
 def _cells_with(scene: Scene, code: int, corner: Float64, shape: tuple[int, int]) -> Bools:
-    """Cells (rows, columns) that hold returns of a class."""
+    """Returns a mask (rows, columns) of cells with returns of a class."""
     rows = np.flatnonzero(scene.classes == code)
     grid = (float(corner[0]), float(corner[1]), CELL_M)
     cell = cells_of(scene.returns.x_m[rows], scene.returns.y_m[rows], grid, shape)
@@ -113,7 +113,7 @@ def _cells_with(scene: Scene, code: int, corner: Float64, shape: tuple[int, int]
 
 
 def _table(scene: Scene, chosen: Bools, ratio: Float64, corner: Float64) -> pa.Table:
-    """Rows of the chosen cells, by row and column."""
+    """Returns rows of the chosen cells, by row and column."""
     returns, columns = scene.returns, chosen.shape[1]
     low = np.flatnonzero((scene.above_ground_m >= _LOW_M[0]) & (scene.above_ground_m <= _LOW_M[1]))
     grid = (float(corner[0]), float(corner[1]), CELL_M)
@@ -144,7 +144,7 @@ def _table(scene: Scene, chosen: Bools, ratio: Float64, corner: Float64) -> pa.T
 
 
 def components(column: Int64, row: Int64) -> list[Int64]:
-    """Numbers of the cells of each area: cells that share a side; areas by their first cell (row, column)."""
+    """Returns numbers of the cells of each area: cells that share a side; areas by their first cell (row, column)."""
     if column.size == 0:
         return []
     order = np.lexsort((column, row))
@@ -157,7 +157,7 @@ def components(column: Int64, row: Int64) -> list[Int64]:
 
 
 def area_of(column: Int64, row: Int64, cell_m: float = CELL_M) -> shapely.Geometry:
-    """Union of cells of the map's grid (easting and northing, m)."""
+    """Returns the union of cells of the map's grid (easting and northing, m)."""
     order = np.lexsort((column, row))
     column, row = column[order], row[order]
     ends = np.flatnonzero((np.diff(column) != 1) | (np.diff(row) != 0))

@@ -1,4 +1,4 @@
-"""Pieces of upright surfaces, cut at the borders of tiles, and the chains that they join to."""
+"""Pieces of upright surfaces, cut at the borders of tiles, and their chains."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ PIECE_SCHEMA: Final = pa.schema(
 )  # fmt: skip
 """A row a piece: ends of its stretches in the map, then values of each stretch."""
 
-_JOIN_M: Final = 1.5
-_JOIN_TURN: Final = math.cos(math.radians(25.0))
-_JOIN_BESIDE_M: Final = 0.35
+_JOIN_M: Final = 1.5  # Greatest distance between the ends of two pieces that join (m).
+_JOIN_TURN: Final = math.cos(math.radians(25.0))  # Cosine of the greatest angle between them.
+_JOIN_BESIDE_M: Final = 0.35  # Greatest lateral offset between them (m).
 _JOIN_LEVEL_M: Final = 0.15
-"""Low surfaces join where they begin at one height above the ground: a rail does not go on as a solid end …"""
+"""Low surfaces join where they start at one height above the ground, within this (m): rail and solid end do not …"""
 _LOW_M: Final = 1.2
-"""… of this height or less."""
-_SHORTEST_M: Final = 0.02
+"""… and low ones are up to this height (m)."""
+_SHORTEST_M: Final = 0.02  # Shorter pieces and gaps are left out (m).
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,46 +56,46 @@ class Chain:
 
     @property
     def length_m(self) -> float:
-        """From end to end, along it."""
+        """Returns its length from end to end, along it."""
         return float(self.values["length_m"].sum())
 
     def median(self, name: str) -> float:
-        """Median of a height above the ground, over the stretches that are known; NaN where none is."""
+        """Returns the median of a height above the ground, over the stretches that are known; NaN where none is."""
         above = self.values[name] - self.values["ground_m"]
         return float(np.median(above[np.isfinite(above)])) if np.isfinite(above).any() else math.nan
 
     def sigma_median_m(self, name: str) -> float:
-        """1 σ (m) of that median, from how the stretches scatter about it."""
+        """Returns 1 σ (m) of that median, from its scatter over the stretches."""
         above = self.values[name] - self.values["ground_m"]
         above = above[np.isfinite(above)]
         return float(1.2533 * SIGMA_OF_MAD * np.median(np.abs(above - np.median(above))) / math.sqrt(above.size))
 
     @property
     def passing(self) -> float:
-        """Share of the sight lines at it that go through."""
+        """Returns the share of the sight lines at it that pass through."""
         passed, stopped = float(self.values["passed"].sum()), float(self.values["stopped"].sum())
         return passed / max(passed + stopped, 1.0)
 
     @property
     def open_top(self) -> float:
-        """Share of its length whose upper edge is higher than scanners saw."""
+        """Returns the share of its length whose upper edge is higher than scanners saw."""
         return float(self.values["length_m"] @ self.values["open_top"]) / max(self.length_m, 1e-9)
 
     @property
     def covered(self) -> float:
-        """Share of its length that returns show."""
+        """Returns the share of its length with returns."""
         shown = np.isfinite(self.values["high_m"])
         return float(self.values["length_m"] @ shown) / max(self.length_m, 1e-9)
 
 
 def pieces_of_panels(scene: Scene, panels: list[Panel]) -> pa.Table:
-    """Pieces of panels inside the scene's tile; ends at its border lie on it."""
+    """Returns pieces of panels inside the scene's tile; ends at its border lie on it."""
     rows = [_row(scene, panel, part) for panel in panels for part in _inside(panel, scene.tile)]
     return pa.Table.from_pylist(rows, schema=PIECE_SCHEMA)
 
 
 def _inside(panel: Panel, tile: Box) -> list[list[tuple[int, float, float]]]:
-    """Runs of stretches inside the tile: number of a stretch, and the shares of it where it enters and leaves."""
+    """Returns runs of stretches inside the tile: number of a stretch, and the shares at which it enters and leaves."""
     runs: list[list[tuple[int, float, float]]] = [[]]
     for k in range(panel.returns.size):
         enters, leaves = _clip(panel.xy_m[k], panel.xy_m[k + 1], tile)
@@ -150,9 +150,9 @@ def _row(scene: Scene, panel: Panel, run: list[tuple[int, float, float]]) -> dic
 
 
 def chains_of(pieces: pa.Table) -> list[Chain]:
-    """Chains of pieces whose ends meet, by the place of their first point; pieces without any returns are left out.
+    """Returns chains of pieces whose ends meet, by the place of their first point; empty pieces are left out.
 
-    Ends meet that are at most 1.5 m apart, where the one goes on in the other's direction and line. Of several the
+    Ends meet that are at most 1.5 m apart, where one continues the other in direction and line. Of several the
     nearest pair is joined first, so the chains do not depend on the order of the pieces.
     """
     parts = [_part(row) for row in pieces.to_pylist() if sum(row["length_m"]) > _SHORTEST_M]
@@ -187,7 +187,7 @@ def _reversed(part: Chain) -> Chain:
 
 
 def _matched(parts: list[Chain]) -> dict[tuple[int, int], tuple[int, int]]:
-    """Which end (0 or 1) of which piece each end is joined to."""
+    """Returns the end (0 or 1) and the piece to which each end is joined."""
     ends = np.array([p.xy_m[[0, -1]] for p in parts]).reshape(-1, 2)
     outwards = np.array([[_way(p.xy_m[::-1]), _way(p.xy_m)] for p in parts]).reshape(-1, 2)
     levels = [_level(p) for p in parts]
@@ -222,13 +222,13 @@ def _matched(parts: list[Chain]) -> dict[tuple[int, int], tuple[int, int]]:
 
 
 def _level(part: Chain) -> float:
-    """Height above the ground that the bulk of a low surface begins at; 0 of high ones, which join in any case."""
+    """Height above the ground at which the bulk of a low surface starts; 0 of high ones, which join anyway."""
     bulk, top = part.median("bulk_m"), part.median("high_m")
     return bulk if np.isfinite(bulk) and top <= _LOW_M else 0.0
 
 
 def _way(xy: Float64) -> Float64:
-    """Direction (2,) in which a line ends, over its last 3 m."""
+    """Returns the direction (2,) in which a line ends, over its last 3 m."""
     past = np.hypot(*(xy[:-1] - xy[-1]).T)
     back = int(np.argmax(past <= 3.0)) if (past <= 3.0).any() else len(xy) - 2
     way = xy[-1] - xy[back]
@@ -237,7 +237,7 @@ def _way(xy: Float64) -> Float64:
 
 
 def _first_of(start: int, following: dict[tuple[int, int], tuple[int, int]]) -> tuple[int, bool]:
-    """Where the chain of a piece begins, and whether that piece runs backwards in it."""
+    """Returns the first piece of a piece's chain, and whether that one is reversed."""
     piece, end = start, 0
     while (piece, end) in following:
         piece, other = following[(piece, end)]
@@ -248,7 +248,7 @@ def _first_of(start: int, following: dict[tuple[int, int], tuple[int, int]]) -> 
 
 
 def _walk(piece: int, back: bool, following: dict[tuple[int, int], tuple[int, int]]) -> list[tuple[int, bool]]:
-    """Pieces of a chain from its first one on, each with whether it runs backwards."""
+    """Returns pieces of a chain from its first one on, each with whether it is reversed."""
     run = [(piece, back)]
     while (end := (run[-1][0], 0 if run[-1][1] else 1)) in following:
         piece, other = following[end]
@@ -259,7 +259,7 @@ def _walk(piece: int, back: bool, following: dict[tuple[int, int], tuple[int, in
 
 
 def _linked(parts: list[Chain]) -> Chain:
-    """One chain of pieces in their order."""
+    """Returns one chain of pieces in their order."""
     xy, values = [parts[0].xy_m], {name: [value] for name, value in parts[0].values.items()}
     for part in parts[1:]:
         gap = float(np.hypot(*(part.xy_m[0] - xy[-1][-1])))

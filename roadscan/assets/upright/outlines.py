@@ -1,4 +1,4 @@
-"""Outlines of plates: which shape fits the returns of a plane, and how large it is."""
+"""Outlines of plates: shape and size from the returns of a plane."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from roadscan.assets.upright.plate_beams import Beams
 
 Float64 = npt.NDArray[np.float64]
 
-_DIRECTIONS: Final = 36
-_TRIMMED: Final = 0.0005
+_DIRECTIONS: Final = 36  # Directions in which the extent of the returns is measured.
+_TRIMMED: Final = 0.0005  # Share of the outermost returns that is left out.
 _BEYOND: Final = 0.35
-"""The edge lies past the outermost return by this share of the mean distance from return to return: none of evenly
+"""The edge lies past the outermost return by this share of the mean distance between returns: none of evenly
 spread returns would make it 0, a grid of them 0.5."""
-_LEAST_M: Final = 0.02
+_LEAST_M: Final = 0.02  # Least size of a shape (m).
 _SQUARE: Final = 0.08
-"""Sides that differ by less than this share make a square."""
+"""Greatest relative difference of the sides of a square."""
 _CLOSE: Final = 2.0
-"""Shapes whose misfit is at most this multiple of the best one are held against the beams."""
+"""Shapes whose misfit is at most this multiple of the best one are compared with the beams."""
 _BLURS_M: Final = (0.02, 0.002)
-"""So unsharp is an edge between what it stops and what goes by, first and at last."""
+"""Width (m) of the transition between beams that a plate stops and those that pass, first and at last."""
 _WELL_INSIDE: Final = 0.25
-"""Returns so far within an edge tell nothing of it, as a share of the plate."""
+"""Returns farther within an edge than this share of the plate do not determine it."""
 _NEAR_EDGE_M: Final = (-0.05, 0.6)
-"""Two beams that go by so far beyond a side bound it."""
+"""Two beams that pass this far (m) beyond a side bound it."""
 _LEAST_GAP_M: Final = 0.005
-"""A gap between lines is taken for at least so wide."""
+"""Least gap between lines that is assumed (m)."""
 _SIGMA_SHARE, _LEAST_SIGMA_M = 0.1, 0.002
-"""σ of the size as a share of half the widest gap between lines, and at least (m): 95 % of 172 drawn signs lie within
+"""σ of the size as a share of half the widest gap between lines, and least σ (m): 95 % of 172 drawn signs lie within
 2 σ."""
 _HOLD: Final = 0.002
-"""Pull towards the first solution, where nothing else holds (1/m)."""
+"""Weight of the first solution, where nothing else determines the result (1/m)."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Outline:
 
 
 def outline_of(points: Float64, beams: Beams | None = None) -> Outline:
-    """Best of rectangle, disc, octagon, diamond and triangles about points (n, 2) of a plane, second axis upwards.
+    """Best of rectangle, disc, octagon, diamond and triangles about points (n, 2) of a plane, second axis up.
 
     A convex shape is known by how far it reaches in each direction (its support function), which is linear in its place
     and its size; each template is fitted by least squares. Where beams are known, the shapes that fit best are then set
@@ -86,7 +86,7 @@ def outline_of(points: Float64, beams: Beams | None = None) -> Outline:
 
 
 def _hulls(points: Float64) -> list[tuple[float, str, Float64]]:
-    """Misfit, name, and place and size of each template about points, the best first."""
+    """Returns misfit, name, and place and size of each template about points, the best first."""
     angle = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
     ways = np.column_stack([np.cos(angle), np.sin(angle)])
     reach = np.sort(points @ ways.T, axis=0)[-1 - int(_TRIMMED * len(points))]
@@ -102,9 +102,9 @@ def _hulls(points: Float64) -> list[tuple[float, str, Float64]]:
 
 
 def _parting(shape: str, first: Float64, beams: Beams) -> tuple[float, Float64, float]:
-    """Loss, place and size, and σ of the size, of the template that parts beams that hit from those that passed.
+    """Returns loss, place and size, and σ of the size, of the template that separates hitting from passing beams.
 
-    The loss is logistic in how far a beam lies beyond the nearest side or within it. It grows straight with that on the
+    The loss is logistic in the distance of a beam beyond the nearest side or within it. It grows linearly on the
     wrong side, so single wrong beams do little, and leaves the edge in the middle between both on the right one.
     """
     from scipy.optimize import minimize
@@ -138,7 +138,7 @@ def _parting(shape: str, first: Float64, beams: Beams) -> tuple[float, Float64, 
 
 
 def _to_sides(within: Float64, beyond: Float64, half_gap: Float64) -> Float64:
-    """How far each side really lies beyond where it was put (m).
+    """Returns the distance of each side beyond its first place (m).
 
     It lies in the middle between the outermost line on the plate and the nearest beam that went by. Where no beam went
     by as near as the lines lie from one another, it lies half of their widest gap beyond the outermost one.
@@ -158,14 +158,14 @@ def _to_sides(within: Float64, beyond: Float64, half_gap: Float64) -> Float64:
 
 
 def _half_gap(ways: Float64, beams: Beams) -> Float64:
-    """Half the widest gap between lines on a plate (k,), by how far they reach in some directions (k, 2)."""
+    """Returns half the widest gap between lines on a plate (k,), by their reach in some directions (k, 2)."""
     starts = np.flatnonzero(np.append(True, np.diff(beams.line) != 0))
     reach = np.sort(np.maximum.reduceat(beams.hits @ ways.T, starts, axis=0), axis=0)
     return np.asarray(np.diff(reach, axis=0).max(axis=0, initial=2.0 * _LEAST_GAP_M) / 2)
 
 
 def _expected(first: Float64, ways: Float64, columns: Float64, beams: Beams, lines: Float64) -> Float64:
-    """Places (n, 2) beyond sides that no beam passed by near: their widest gap beyond the outermost line."""
+    """Returns places (n, 2) beyond sides that no beam passed near: their widest gap beyond the outermost line."""
     reach, out = columns @ first, [np.zeros((0, 2))]
     farthest = (beams.hits @ ways.T).max(axis=0)
     for k in range(0, len(ways), max(1, len(ways) // 8)):
@@ -194,7 +194,7 @@ def _diamond(ways: Float64) -> Float64:
 
 
 def _triangle(ways: Float64) -> Float64:
-    """Equal sides, one of them below; its bounding box has the width 1."""
+    """Support function of a triangle with equal sides, one of them below; its bounding box has the width 1."""
     half = math.sqrt(3.0) / 4.0
     out: Float64 = np.max(ways @ np.array([[-0.5, 0.5, 0.0], [-half, -half, half]]), axis=1)
     return out
@@ -221,4 +221,4 @@ _SIDES: Final = {
     "triangle": 120.0 * np.arange(3) - 90.0,
     "triangle down": 120.0 * np.arange(3) + 90.0,
 }
-"""Directions that the sides look to (degrees from the first axis)."""
+"""Directions in which the sides face (degrees from the first axis)."""

@@ -1,4 +1,4 @@
-"""What hangs over the way of each drive: the lowest returns of cells of half a metre."""
+"""Obstacles over the path of each drive: the lowest returns of cells of half a metre."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from roadscan.assets.upright.slices import usable
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-CELL_M: Final = 0.5
-_SUPPORT_M: Final = 0.25
-_NOISE_M: Final = 0.1
-_NEAR_M: Final = 12.0
+CELL_M: Final = 0.5  # Edge of a cell (m).
+_SUPPORT_M: Final = 0.25  # Returns within this height above the lowest one support it (m).
+_NOISE_M: Final = 0.1  # Returns within this height above the lowest one give its height (m).
+_NEAR_M: Final = 12.0  # Returns nearer than this (m) always count.
 _VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 PIECE_SCHEMA: Final = pa.schema(
     [
@@ -34,7 +34,7 @@ PIECE_SCHEMA: Final = pa.schema(
         ("last_epoch_gps_ns", pa.int64()),
     ]
 )  # fmt: skip
-"""A row a cell of a drive's corridor with something above it."""
+"""A row for each cell of a drive's corridor with something above it."""
 
 
 class ClearanceOptions(KindOptions):
@@ -53,7 +53,7 @@ class ClearanceOptions(KindOptions):
 
 
 def overhead_cells(scene: Scene, options: ClearanceOptions) -> pa.Table:
-    """Lowest supported return above each cell of the corridors of all drives, in the scene's tile."""
+    """Returns the lowest supported return above each cell of the corridors of all drives, in the scene's tile."""
     returns, tile = scene.returns, scene.tile
     above = scene.above_ground_m
     hanging = usable(scene) & (above >= options.lowest_m) & (above <= options.highest_m)
@@ -98,7 +98,7 @@ def _near_enough(own: Int64, flat: Int64, ranges: Float64) -> tuple[Int64, Int64
 
 
 def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float) -> dict[str, Any] | None:
-    """The lowest supported return of a cell, of rows sorted by height."""
+    """Returns the lowest supported return of a cell, of rows sorted by height."""
     returns = scene.returns
     heights = returns.height_m[part]
     need = options.least_returns
@@ -127,7 +127,7 @@ def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float) -
 
 
 def _lowest(heights: Float64) -> float:
-    """Height of what hangs lowest, of ascending heights: a tenth of the returns within 0.1 m lie below it.
+    """Height of the lowest obstacle, of ascending heights: a tenth of the returns within 0.1 m lie below it.
 
     The lowest of many returns lies as far below a surface as their noise reaches.
     """
@@ -136,7 +136,7 @@ def _lowest(heights: Float64) -> float:
 
 
 def lowest_places(pieces: pa.Table, apart_m: float) -> list[dict[str, Any]]:
-    """The lowest cells of each drive, each at least so far from a lower one, with what hangs there (`type`)."""
+    """Returns the lowest cells of each drive, each at least so far from a lower one, with the obstacle's `type`."""
     rows = sorted(pieces.to_pylist(), key=lambda r: (r["pass_id"], r["clearance_m"], r["easting_m"], r["northing_m"]))
     out: list[dict[str, Any]] = []
     for pass_id in sorted({r["pass_id"] for r in rows}):
@@ -155,7 +155,7 @@ def lowest_places(pieces: pa.Table, apart_m: float) -> list[dict[str, Any]]:
 
 
 def _type(row: dict[str, Any], near: list[dict[str, Any]]) -> str:
-    """What hangs at a place, by its own returns and those of the cells about it."""
+    """Returns the type of an obstacle, by its returns and those of the cells about it."""
     if row["bright"] > 0.5:
         return "sign"
     if row["vegetation"] > 0.5:

@@ -1,4 +1,4 @@
-"""Upright surfaces in stretches of a metre: where they run, how high they stand, and what passes through them."""
+"""Upright surfaces in stretches of a metre: their lines, their heights, and what passes through them."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from roadscan.assets.upright.regions import Region, regions_of
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-STRETCH_M: Final = 1.0
+STRETCH_M: Final = 1.0  # Length of a stretch (m).
 _MOST_LINES: Final = 150_000
-"""Sight lines that are held against surfaces: every k-th return, so that no more are taken."""
+"""Sight lines that are compared with surfaces: every k-th return, so that there are no more."""
 _HIGH_M: Final = 4.0
-"""What passes through higher surfaces is not asked."""
+"""Sight lines through higher surfaces (m) are not counted."""
 _BESIDE_M: Final = 0.2
-"""Returns of a region that lie this far beside its line or less make the surface."""
-_OPEN_DEG: Final = 1.2
+"""Returns of a region up to this distance beside its line (m) make the surface."""
+_OPEN_DEG: Final = 1.2  # The top of a surface is open within this angle of the highest beam (degrees).
 _NEAR_M: Final = 3.0
-"""What belongs to a surface lies within this of its line."""
+"""Returns within this distance of its line (m) may belong to a surface."""
 _VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 
 
@@ -42,15 +42,15 @@ class Panel:
     ground_m: Float64
     """(k,) height of the ground in the map frame."""
     low_m: Float64
-    """(k,) lower edge, that 2 % of the returns lie below; NaN where there is none."""
+    """(k,) lower edge: 2 % of the returns lie below; NaN where there are none."""
     high_m: Float64
     """(k,) upper edge."""
     bulk_m: Float64
-    """(k,) height that 15 % of the returns lie below: the posts of a guardrail hold less of them."""
+    """(k,) height below which 15 % of the returns lie: the posts of a guardrail have fewer."""
     returns: Int64
     """(k,)"""
     stopped: Int64
-    """(k,) sight lines of the sample that end on it; those that go through: `passed`."""
+    """(k,) sight lines of the sample that end on it; `passed` is the number of those through it."""
     passed: Int64
     open_top: npt.NDArray[np.bool_]
     """(k,) True where the highest laser still meets it: its top is not seen."""
@@ -64,20 +64,20 @@ class Panel:
     """Stretch of each row."""
 
     def comes_near(self, tile: Box) -> bool:
-        """Whether a tile may hold a part of it, or a return that belongs to it."""
+        """Returns whether a tile may contain a part of it, or a return that belongs to it."""
         return tile.comes_near(self.xy_m, _NEAR_M)
 
 
 @once_a_scene
 def panels_of(scene: Scene) -> list[Panel]:
-    """Panels of all upright surfaces of a scene with its halo."""
+    """Returns panels of all upright surfaces of a scene with its halo."""
     highest = _highest_elevation_deg(scene)
     panels = [_panel(scene, region, highest) for region in regions_of(scene)]
     return _with_sight(scene, [p for p in panels if p is not None])
 
 
 def _highest_elevation_deg(scene: Scene) -> float:
-    """Elevation that hardly any sight line exceeds (degrees)."""
+    """Returns the elevation that hardly any sight line exceeds (degrees)."""
     returns = scene.returns
     if len(returns) == 0:
         return 90.0
@@ -128,7 +128,7 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
 
 
 def _medians(d: Float64, stretch: npt.NDArray[np.int32], count: int) -> Float64:
-    """Median of d in each stretch (count,); where fewer than 5 are known, as beside it."""
+    """Returns the median of d in each stretch (count,); where fewer than 5 are known, that of its neighbours."""
     out = np.full(count, np.nan)
     starts, order = in_bins(stretch, count)
     for k in range(count):
@@ -143,7 +143,7 @@ def _medians(d: Float64, stretch: npt.NDArray[np.int32], count: int) -> Float64:
 
 
 def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
-    """The panels with the sight lines that end on them, and those that go through."""
+    """Returns the panels with the numbers of sight lines that end on them, and that pass through."""
     returns = scene.returns
     step = max(1, -(-len(returns) // _MOST_LINES))
     some = slice(None, None, step)
@@ -174,7 +174,7 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
 
 
 def _is_low(panel: Panel) -> bool:
-    """Whether it is asked what passes through a surface."""
+    """Returns whether sight lines through a surface are counted."""
     above = panel.high_m - panel.ground_m
     known = above[np.isfinite(above)]
     return known.size > 0 and float(np.median(known)) <= _HIGH_M

@@ -1,4 +1,4 @@
-"""Pieces of things at a place, and the objects they become: a point belongs to the tile that holds its foot."""
+"""Pieces of things at a place, and their objects: a point belongs to the tile that contains its foot."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ class Place:
 
 
 def schema_of(numbers: Sequence[str], texts: Sequence[str] = ()) -> pa.Schema:
-    """Schema of the pieces of a kind with these values of its own."""
+    """Returns the schema of a kind's pieces with these values of its own."""
     own = [(name, pa.float64()) for name in numbers] + [(name, pa.string()) for name in texts]
     return pa.schema([*_COMMON, *own])
 
 
 def passes_of(scene: Scene, rows: Int64) -> list[int]:
-    """Passes that saw some returns, ascending."""
+    """Returns passes that saw some returns, ascending."""
     out: list[int] = np.flatnonzero(np.bincount(scene.returns.pass_id[rows])).tolist()
     return out
 
 
 def seen_by(scene: Scene, rows: Int64) -> dict[str, Any]:
-    """Number of returns, passes (ascending), first and last epoch of some returns."""
+    """Returns number of returns, passes (ascending), first and last epoch of some returns."""
     epochs = scene.returns.epoch_gps_ns[rows]
     return {
         "returns": int(rows.size),
@@ -66,7 +66,7 @@ def seen_by(scene: Scene, rows: Int64) -> dict[str, Any]:
 
 
 def pieces_of(scene: Scene, places: Iterable[Place], schema: pa.Schema) -> pa.Table:
-    """Table of the things that stand in the scene's tile."""
+    """Returns the table of the things that stand in the scene's tile."""
     east, north = scene.returns.corner_m
     rows = [
         {
@@ -82,10 +82,10 @@ def pieces_of(scene: Scene, places: Iterable[Place], schema: pa.Schema) -> pa.Ta
 
 
 def objects_at_places(pieces: pa.Table, apart_m: float) -> list[AssetObject]:
-    """An object a piece, by easting and northing; of pieces nearer than `apart_m` the one with the most returns.
+    """Object for each piece, by easting and northing; of pieces nearer than `apart_m` the one with most returns.
 
-    Two tiles that see one thing a little differently may both hold its foot. Plates that face away from each other are
-    two.
+    Two tiles that see one thing a little differently may both contain its foot. Plates that face away from each other
+    are two.
     """
     rows = pieces.to_pylist()
     rows.sort(key=lambda r: (-r["returns"], r["easting_m"], r["northing_m"]))
@@ -107,7 +107,7 @@ def _distance(first: Mapping[str, Any], second: Mapping[str, Any]) -> float:
 
 
 def _back_to_back(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
-    """Whether two pieces that have a face look to opposite sides."""
+    """Returns whether two pieces with a front face opposite sides."""
     if "facing_deg" not in first:
         return False
     return bool(abs((first["facing_deg"] - second["facing_deg"] + 180.0) % 360.0 - 180.0) > 90.0)

@@ -1,4 +1,4 @@
-"""Returns of a scene by their place, seen from above."""
+"""Index of the returns of a scene by their place, seen from above."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from roadscan.assets.upright.slices import usable
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
 
-_CELL_M: Final = 1.0
+_CELL_M: Final = 1.0  # Edge of a cell (m).
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Places:
 
     window: Box
     returns: Returns
-    """Those of the scene, which is not held itself: what is remembered of it would keep it in memory."""
+    """Those of the scene, which is not referenced: the cache would keep it in memory."""
     rows: Int64
     x_m: Float64
     """Places of these rows."""
@@ -36,7 +36,7 @@ class Places:
     shape: tuple[int, int]
 
     def within(self, x_m: float, y_m: float, reach_m: float) -> Int64:
-        """Returns within reach of a place, seen from above, in order of their number."""
+        """Returns the returns within reach of a place, seen from above, in order of their number."""
         window = self.window
         u, v = (x_m - window.x_min_m) / _CELL_M, (y_m - window.y_min_m) / _CELL_M
         reach = reach_m / _CELL_M
@@ -53,7 +53,7 @@ class Places:
 
 @once_a_scene
 def places_of(scene: Scene) -> Places:
-    """Returns of a scene, those of ground, vehicles, people and noise left out, by cells of a metre."""
+    """Returns the index of a scene's returns without ground, vehicles, people and noise."""
     window, returns = scene.window, scene.returns
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / _CELL_M - 1e-9))
     columns = int(np.ceil((window.x_max_m - window.x_min_m) / _CELL_M - 1e-9))
@@ -68,6 +68,6 @@ def places_of(scene: Scene) -> Places:
 
 @once_a_scene
 def ground_light(scene: Scene) -> float:
-    """Median intensity of the ground; infinite where there is none."""
+    """Returns the median intensity of the ground; infinite where there is none."""
     ground = (scene.classes == classes.GROUND) | (scene.classes == classes.ROAD)
     return float(np.median(scene.returns.intensity[ground])) if ground.any() else float("inf")

@@ -1,4 +1,4 @@
-"""Where beams meet the plane of a plate: those that it stopped, and those that went by."""
+"""Beams at the plane of a plate: those that it stopped, and those that passed."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _LEAST_COSINE: Final = 0.3
-"""Beams that graze the plane tell little of where they meet it."""
+"""Least cosine between a beam and the normal: grazing beams show poorly where they meet the plane."""
 _SWEEP: Final = 100
-"""After so many firings of a laser without a return from the plate, the next one belongs to another sweep over it."""
+"""Number of firings of a laser without a return from the plate after which the next one belongs to another sweep."""
 _AROUND: Final = 40
-"""So many returns before and after a sweep are looked at."""
+"""Number of returns before and after a sweep that are used."""
 _ABOUT_M: Final = 0.6
-"""Beams that go by farther from the returns are left out."""
+"""Beams that pass farther from the returns (m) are left out."""
 _BEHIND_M: Final = 0.15
-"""What returns so far behind the plane went by."""
+"""Returns this far behind the plane (m) passed it."""
 _LEAST_GAP: Final = 1e-4
-"""Lasers nearer to one another draw the same line (rad)."""
+"""Lasers nearer to one another (rad) draw the same line."""
 
 
 class Beams(NamedTuple):
@@ -48,7 +48,7 @@ class _Fan(NamedTuple):
     """(k, 3) unit vectors of the beams."""
     range_m: Float64
     on: Bool
-    """Which lie on the plane."""
+    """Mask of those on the plane."""
     sweep: Int64
     laser: Int64
     line: Int64
@@ -58,9 +58,9 @@ class _Fan(NamedTuple):
 
 
 def beams_of(scene: Scene, edge: Int64, rows: Int64, middle: Float64, axes: tuple[Float64, Float64]) -> Beams | None:
-    """Beams that meet the plane of a plate near it; None where lasers draw no lines on it.
+    """Returns beams that meet the plane of a plate near it; None where lasers draw no lines on it.
 
-    Returns from behind the plane went by. Where nothing came back, two kinds of beams are told from their neighbours:
+    Returns from behind the plane passed it. Without a return, two kinds of beams are known from their neighbours:
     those of the firings next to a line on the plate, and those of the lasers next to the outermost lines.
 
     Parameters
@@ -74,7 +74,7 @@ def beams_of(scene: Scene, edge: Int64, rows: Int64, middle: Float64, axes: tupl
         return None
 
     def met(sensor: Float64, way: Float64) -> tuple[Float64, Float64]:
-        """Where beams meet the plane (n, 2), and how far from the sensor; NaN for those that graze it."""
+        """Returns where beams meet the plane (n, 2), and the distance from the sensor; NaN for grazing ones."""
         rate = way @ normal
         away = np.where(np.abs(rate) > _LEAST_COSINE, ((middle - sensor) @ normal) / rate, np.nan)
         past = sensor + away[:, None] * way - middle
@@ -92,7 +92,7 @@ def beams_of(scene: Scene, edge: Int64, rows: Int64, middle: Float64, axes: tupl
 
 
 def _fan(scene: Scene, rows: Int64, normal: Float64) -> _Fan | None:
-    """Returns of the sweeps over a plate, from rows on its plane that do not graze it."""
+    """Returns the returns of the sweeps over a plate, from rows on its plane that do not graze it."""
     returns = scene.returns
 
     def beam(rows: Int64) -> tuple[Float64, Float64, Float64]:
@@ -124,7 +124,7 @@ def _fan(scene: Scene, rows: Int64, normal: Float64) -> _Fan | None:
 
 
 def _beside_lines(fan: _Fan) -> tuple[Float64, Float64]:
-    """Sensor and way (n, 3) of the firings before and after each line on the plate that brought nothing back."""
+    """Returns sensor and direction (n, 3) of the firings without a return before and after each line on the plate."""
     on = np.flatnonzero(fan.on)
     starts = np.flatnonzero(np.append(True, np.diff(fan.line[on]) != 0))
     sensor, way = [np.zeros((0, 3))], [np.zeros((0, 3))]
@@ -141,7 +141,7 @@ def _beside_lines(fan: _Fan) -> tuple[Float64, Float64]:
 
 
 def _beside_lasers(fan: _Fan) -> tuple[Float64, Float64]:
-    """Sensor and way (n, 3) of the lasers next to the outermost ones on the plate, in sweeps that they saw nothing in.
+    """Sensor and direction (n, 3) of the lasers next to the outermost ones on the plate, where they saw nothing.
 
     The angles between lasers are those of sweeps in which both saw something, on the plate or elsewhere.
     """

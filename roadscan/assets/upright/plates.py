@@ -25,21 +25,21 @@ from roadscan.compute.robust import SIGMA_OF_MAD
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_VOXEL_M: Final = 0.2
-_THICK_M: Final = 0.06
-_SEARCHED_ABOVE_M: Final = 1.0
+_VOXEL_M: Final = 0.2  # Edge of a voxel (m).
+_THICK_M: Final = 0.06  # Greatest distance of a plate's returns from its plane (m).
+_SEARCHED_ABOVE_M: Final = 1.0  # Bright returns are sought above this height (m).
 _BESIDE_M: Final = 0.7
-"""Returns this far beyond a cluster tell how large its plate is."""
-_LEAST_BRIGHT: Final = 8
+"""Returns this far beyond a cluster (m) show the size of its plate."""
+_LEAST_BRIGHT: Final = 8  # Least number of bright returns of a plate.
 _FOOT_M, _BAND_M, _BEHIND_M = 0.3, 0.3, 0.15
-"""Below a plate, from this height above the ground, bands of this height are looked at, this far before and behind its
+"""Below a plate, bands of this height are searched, from this height above the ground, this far before and behind its
 plane (m)."""
 _ITSELF: Final = 0.7
-"""A shaft of which a plate holds such a share is that plate."""
+"""A shaft of which a plate contains this share is that plate."""
 _BACK_TO_BACK_M: Final = 0.04
-"""Two plates on one post stand at least so far apart; the two sides of one plate do not."""
+"""Two plates on one post are at least this far apart (m); the two sides of one plate are not."""
 _ENOUGH_BRIGHT: Final = 60
-"""So many bright returns tell the outline by themselves."""
+"""Number of bright returns that suffice for the outline."""
 
 
 class SignOptions(KindOptions):
@@ -63,7 +63,7 @@ class SignOptions(KindOptions):
 
 @dataclass(frozen=True, eq=False)
 class Plate:
-    """A plate, measured."""
+    """A measured plate."""
 
     rows: Int64
     middle_m: tuple[float, float, float]
@@ -77,7 +77,7 @@ class Plate:
 
 
 def plates_of(scene: Scene, options: SignOptions) -> list[Plate]:
-    """Plates of which the scene's tile may hold a part, by their place."""
+    """Returns plates of which the scene's tile may contain a part, by their place."""
     bright = _bright(scene, options.intensity_ratio)
     rows = np.flatnonzero(bright & ~_in_large_planes(scene, options.greatest_board_m))
     clusters = [side for cluster in _clusters(scene, rows) for side in _sides(scene, cluster)]
@@ -86,7 +86,7 @@ def plates_of(scene: Scene, options: SignOptions) -> list[Plate]:
 
 
 def _on_thick_shaft(scene: Scene, plate: Plate) -> bool:
-    """Whether a plate is not wider than the trunk or mast that it would hang on: then it is its bark or paint."""
+    """Returns whether a plate is no wider than the trunk or mast behind it: then it is its bark or paint."""
     for shaft in shafts_of(scene):
         x, y = shaft.axis.at(plate.middle_m[2])
         away = math.hypot(float(x) - plate.middle_m[0], float(y) - plate.middle_m[1])
@@ -97,13 +97,13 @@ def _on_thick_shaft(scene: Scene, plate: Plate) -> bool:
 
 
 def _bright(scene: Scene, ratio: float) -> npt.NDArray[np.bool_]:
-    """Returns (n,) more than a metre above the ground, as bright as `ratio` times the median of the ground."""
+    """Returns a mask (n,) of returns more than a metre above the ground, as bright as `ratio` times its median."""
     least = ratio * ground_light(scene)
     return usable(scene) & (scene.above_ground_m > _SEARCHED_ABOVE_M) & (scene.returns.intensity >= least)
 
 
 def _in_large_planes(scene: Scene, longest_m: float) -> npt.NDArray[np.bool_]:
-    """Returns (n,) on upright surfaces that are too long for a plate, or that reach the ground."""
+    """Returns a mask (n,) of returns on upright surfaces that are too long for a plate, or that reach the ground."""
     out = np.zeros(len(scene.returns), np.bool_)
     for region in regions_of(scene):
         if region.length_m > longest_m or (region.length_m > 2.5 and region.low_above_m < 1.0):
@@ -112,7 +112,7 @@ def _in_large_planes(scene: Scene, longest_m: float) -> npt.NDArray[np.bool_]:
 
 
 def _clusters(scene: Scene, rows: Int64) -> list[Int64]:
-    """Rows in voxels of 0.2 m that touch, corners too, by their first row."""
+    """Returns clusters of rows in voxels of 0.2 m that touch, also at corners, by their first row."""
     if rows.size == 0:
         return []
     returns, window = scene.returns, scene.window
@@ -140,7 +140,7 @@ def _clusters(scene: Scene, rows: Int64) -> list[Int64]:
 
 
 def _plane(xyh: Float64) -> tuple[Float64, Float64, float]:
-    """Middle, unit normal and root mean square residual of points (n, 3), those far off left out twice."""
+    """Returns middle, unit normal and root mean square residual of points (n, 3), outliers left out twice."""
     kept = np.ones(len(xyh), np.bool_)
     for _ in range(3):
         middle = xyh[kept].mean(axis=0)
@@ -154,7 +154,7 @@ def _plane(xyh: Float64) -> tuple[Float64, Float64, float]:
 
 
 def _sides(scene: Scene, cluster: Int64) -> list[Int64]:
-    """A cluster, or its two sides: two plates back to back, each seen from its own front."""
+    """Returns a cluster, or its two sides: two plates back to back, each seen from its front."""
     returns = scene.returns
     xyh = np.column_stack([returns.x_m[cluster], returns.y_m[cluster], returns.height_m[cluster]])
     middle, normal, _ = _plane(xyh)
@@ -167,7 +167,7 @@ def _sides(scene: Scene, cluster: Int64) -> list[Int64]:
 
 
 def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options: SignOptions) -> Plate | None:
-    """The plate of a cluster of bright returns; None where it is none."""
+    """Returns the plate of a cluster of bright returns; None where it is none."""
     returns = scene.returns
     xyh = np.column_stack([returns.x_m[cluster], returns.y_m[cluster], returns.height_m[cluster]])
     spread = np.ptp(xyh, axis=0)
@@ -216,7 +216,7 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
 
 
 def _in_front(scene: Scene, rows: Int64, middle: Float64, normal: Float64) -> npt.NDArray[np.bool_]:
-    """Which returns were seen from the front of a plane."""
+    """Returns a mask of the returns seen from the front of a plane."""
     returns = scene.returns
     sensor = np.column_stack([returns.sensor_x_m[rows], returns.sensor_y_m[rows]]) - middle[:2]
     front: npt.NDArray[np.bool_] = ~(sensor @ normal[:2] < 0.0)
@@ -224,14 +224,14 @@ def _in_front(scene: Scene, rows: Int64, middle: Float64, normal: Float64) -> np
 
 
 def _axes(normal: Float64) -> tuple[Float64, Float64]:
-    """Right, seen from the front, and up, in a plane of a unit normal."""
+    """Returns the axes right, seen from the front, and up, in a plane of a unit normal."""
     right = np.array([-normal[1], normal[0], 0.0])
     right /= np.hypot(right[0], right[1])
     return right, np.cross(normal, right)
 
 
 def _on_plane(scene: Scene, near: Int64, middle: Float64, normal: Float64, cluster: Float64) -> tuple[Int64, float]:
-    """Returns on the plane within the box of the cluster, and the share of those just outside it."""
+    """Returns the returns on the plane within the box of the cluster, and the share of those just outside it."""
     returns = scene.returns
     past = np.column_stack([returns.x_m[near], returns.y_m[near], returns.height_m[near]]) - middle
     right, up = _axes(normal)
@@ -250,7 +250,7 @@ def _on_plane(scene: Scene, near: Int64, middle: Float64, normal: Float64, clust
 
 
 def _stands(scene: Scene, near: Int64, plane: tuple[Float64, Float64], outline: Outline, ground_m: float) -> bool:
-    """Whether the plane goes on to the ground, about as wide: then it is an end of a pier, a wall or a box."""
+    """Whether the plane continues to the ground, about as wide: then it is an end of a pier, a wall or a box."""
     returns, (middle, normal) = scene.returns, plane
     past = np.column_stack([returns.x_m[near], returns.y_m[near], returns.height_m[near]]) - middle
     right, _ = _axes(normal)
@@ -265,7 +265,7 @@ def _stands(scene: Scene, near: Int64, plane: tuple[Float64, Float64], outline: 
 
 
 def _wide(scene: Scene, rows: Int64, middle: Float64, normal: Float64) -> Int64:
-    """Rows at the heights where the plate is wide: its post is not."""
+    """Returns a mask of rows at the heights where the plate is wide, which excludes its post."""
     returns = scene.returns
     past = np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]]) - middle
     right, up = _axes(normal)

@@ -1,4 +1,4 @@
-"""What kinds of shafts have in common: evidence and objects follow from the uprights of a scene."""
+"""Base of the kinds of shafts: evidence and objects follow from the uprights of a scene."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from roadscan.assets.scene import Scene
 from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of
 from roadscan.assets.upright.standing import Upright, uprights_of
 
-_APART_M = 0.4
-_GROUND_SIGMA_M = 0.03
+_APART_M = 0.4  # Shafts nearer to one another (m) are one.
+_GROUND_SIGMA_M = 0.03  # 1 σ of the height of the ground at a foot (m).
 
 
 class ShaftKind(AssetKind):
@@ -23,19 +23,19 @@ class ShaftKind(AssetKind):
     """Class of its returns."""
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """Shafts of this kind whose foot the tile holds."""
+        """Returns shafts of this kind whose foot lies in the tile."""
         own = [u for u in uprights_of(scene) if u.kind == self.name]
         pieces = pieces_of(scene, [_place(u) for u in own], self.piece_schema)
         return Evidence(pieces, tuple(Marked(rows, code) for u in own for rows, code in self.marks(scene, u)))
 
     def marks(self, scene: Scene, upright: Upright) -> Iterable[tuple[Any, int]]:
-        """Returns of a shaft and their class."""
+        """Yields the returns of a shaft and their class."""
         yield upright.rows, self.code
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """An object a shaft."""
+        """Returns an object for each shaft."""
         return objects_at_places(pieces, _APART_M)
 
 

@@ -1,4 +1,4 @@
-"""Upright surfaces in voxels: elements that continue one another's plane, joined where gaps part them."""
+"""Upright surfaces in voxels: elements on one plane, joined over gaps."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from roadscan.assets.upright.slices import usable_above_m
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-SIDE_M: Final = 0.25
-LAYER_M: Final = 0.5
-LOWEST_M: Final = 0.15
+SIDE_M: Final = 0.25  # Side of a voxel (m).
+LAYER_M: Final = 0.5  # Height of a voxel (m).
+LOWEST_M: Final = 0.15  # Height above the ground at which voxels start (m).
 LAYERS: Final = 40
-"""Up to 20 m above the ground."""
+"""Number of layers: up to 20 m above the ground."""
 _LIMITS: Final = np.array([6.0, 0.12, 0.06, 0.35])
-"""Of an element: returns, spread along and across its plane (m), ratio of both."""
-_TURN_DEG: Final = 20.0
+"""Limits of an element: returns, spread along and across its plane (m), ratio of both."""
+_TURN_DEG: Final = 20.0  # Greatest angle between neighbouring elements of one plane (degrees).
 _APART_M: Final = 0.12
-"""Elements are neighbours on one plane where each lies this near to the other's."""
-_LEAST_LENGTH_M: Final = 0.7
-_JOIN_TURN_DEG: Final = 8.0
-_JOIN_APART_M: Final = 0.15
-_JOIN_GAP_M: Final = 1.6
+"""Neighbouring elements lie on one plane if each is this near to the other's (m)."""
+_LEAST_LENGTH_M: Final = 0.7  # Least length of a surface (m).
+_JOIN_TURN_DEG: Final = 8.0  # Greatest angle between two lines that join (degrees).
+_JOIN_APART_M: Final = 0.15  # Greatest lateral distance between them (m).
+_JOIN_GAP_M: Final = 1.6  # Longest gap between them (m).
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,21 +44,21 @@ class Region:
     along: Float64
     """(2,) unit vector of its direction seen from above."""
     span_m: tuple[float, float]
-    """From its middle along it."""
+    """Extent along it, from its middle."""
     across_m: float
     """Median standard deviation of its elements across their planes."""
     low_above_m: float
-    """Height above the ground that 2 % of its returns lie below, and …"""
+    """Height above the ground below which 2 % of its returns lie, and …"""
     top_above_m: float
     """… above."""
 
     @property
     def length_m(self) -> float:
-        """From end to end."""
+        """Returns its length from end to end."""
         return self.span_m[1] - self.span_m[0]
 
     def distance_m(self, x_m: float, y_m: float, beyond_m: float) -> float:
-        """How far a place lies beside its line, `beyond_m` past its ends at the most; infinite elsewhere."""
+        """Returns the distance of a place beside its line, `beyond_m` past its ends at the most; infinite elsewhere."""
         dx, dy = x_m - float(self.middle_xy_m[0]), y_m - float(self.middle_xy_m[1])
         along = dx * float(self.along[0]) + dy * float(self.along[1])
         if not self.span_m[0] - beyond_m <= along <= self.span_m[1] + beyond_m:
@@ -68,7 +68,7 @@ class Region:
 
 @once_a_scene
 def regions_of(scene: Scene) -> list[Region]:
-    """Upright surfaces at least 0.7 m long, pieces on one plane joined over gaps of 1.6 m."""
+    """Returns upright surfaces at least 0.7 m long, with pieces on one plane joined over gaps of 1.6 m."""
     window, returns = scene.extent, scene.returns
     columns = int(np.ceil((window.x_max_m - window.x_min_m) / SIDE_M - 1e-9))
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / SIDE_M - 1e-9))
@@ -95,13 +95,13 @@ def regions_of(scene: Scene) -> list[Region]:
     group_of = np.full(found + 1, -1, np.int32)
     for number, group in enumerate(joined):
         group_of[group] = number
-    first, order = in_bins(group_of[voxel], len(joined))  # voxel −1 is the last one, which belongs to none
+    first, order = in_bins(group_of[voxel], len(joined))  # voxel −1 is the last entry, which belongs to none
     regions = (_region(scene, elements[group], order[first[k] : first[k + 1]]) for k, group in enumerate(joined))
     return [one for one in regions if one is not None]
 
 
 def _line(elements: Float64) -> tuple[Float64, Float64, float, float]:
-    """Middle (2,), direction (2,) and span of elements (n, 6) seen from above."""
+    """Returns middle (2,), direction (2,) and span of elements (n, 6) seen from above."""
     middle = elements[:, 1:3].mean(axis=0)
     past = elements[:, 1:3] - middle
     if past.shape[0] < 3:
@@ -116,7 +116,7 @@ def _line(elements: Float64) -> tuple[Float64, Float64, float, float]:
 
 
 def _joined(elements: Float64, groups: list[Int64]) -> list[Int64]:
-    """Groups of elements, those on one plane beside one another made one; in the order of their first element."""
+    """Returns groups of elements, those on one plane beside one another joined; in the order of their first element."""
     lines = [_line(elements[g]) for g in groups]
     parent = list(range(len(groups)))
 
@@ -139,7 +139,7 @@ def _joined(elements: Float64, groups: list[Int64]) -> list[Int64]:
 
 
 def _boxes_near(ends: Float64, i: int) -> Int64:
-    """Lines whose boxes come within the joining gap of line `i`'s."""
+    """Returns lines whose boxes come within the joining gap of line `i`'s."""
     x0, x1 = np.minimum(ends[:, 0], ends[:, 2]), np.maximum(ends[:, 0], ends[:, 2])
     y0, y1 = np.minimum(ends[:, 1], ends[:, 3]), np.maximum(ends[:, 1], ends[:, 3])
     gap = _JOIN_GAP_M

@@ -20,21 +20,21 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _LEAST_SLICES: Final = 3
-"""A shaft shows in so many slices of 0.2 m at the least."""
-_REACH_M: Final = 0.25
+"""Least number of slices of 0.2 m in which a shaft shows."""
+_REACH_M: Final = 0.25  # Components within this distance (m) may belong to one shaft.
 _MOST_LEAN: Final = 0.2
-"""Horizontal way of an axis per metre of height (11°)."""
+"""Greatest lean: horizontal extent of an axis per metre of height (11°)."""
 _GAP_SLICES: Final = 4
 """Slices that may be missing between two of a shaft: scanners see some heights only."""
-_LEAST_RETURNS: Final = 8
+_LEAST_RETURNS: Final = 8  # Least number of returns of a shaft.
 _HIGHEST_FOOT_M: Final = 2.0
-"""Parked cars and hedges hide the foot of a shaft, not more of it."""
-_FOOT_SLICES: Final = round((_HIGHEST_FOOT_M - LOWEST_M) / SLICE_M) + 1
-_MOST_FITTED: Final = 3000
-_RING_M: Final = 0.6
-ALONE_M: Final = 0.6
+"""Greatest height of a hidden foot (m): parked cars and hedges hide no more."""
+_FOOT_SLICES: Final = round((_HIGHEST_FOOT_M - LOWEST_M) / SLICE_M) + 1  # Slices in which the foot of a shaft may lie.
+_MOST_FITTED: Final = 3000  # Returns used for the axis, at most.
+_RING_M: Final = 0.6  # Outer radius of the ring that must be free (m).
+ALONE_M: Final = 0.6  # Radius of the space about a shaft (m).
 _LEAST_ALONE: Final = 0.25
-"""Clumps of leaves and pieces of façades have more about them."""
+"""Least share of the returns around that belong to a shaft: clumps of leaves and pieces of façades have less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,28 +45,28 @@ class Shaft:
     ground_m: float
     """Height of the ground at the foot, in the map frame."""
     low_above_m: float
-    """Lowest slice that shows it."""
+    """Lowest slice in which it shows."""
     top_above_m: float
     """Highest return of it."""
     rows: Int64
     """Returns of the scene that lie on it."""
     slices: int
-    """Slices that show it, of 0.2 m each."""
+    """Slices in which it shows, of 0.2 m each."""
     filled: float
-    """Share of the slices between its lowest and its highest that show it."""
+    """Share of the slices between its lowest and its highest in which it shows."""
     free: float
     """Share of its slices with nothing else within 0.6 m."""
     alone: float
     """Share of the returns within 0.35 m about it, in its slices, that lie on it."""
     covered: float
-    """Share of the eight directions about its top that hold returns, in the 1.6 m above, within 0.7 m."""
+    """Share of the eight directions about its top with returns, in the 1.6 m above, within 0.7 m."""
     foot_xy_m: tuple[float, float]
     """Where the axis meets the ground."""
 
 
 @once_a_scene
 def shafts_of(scene: Scene) -> list[Shaft]:
-    """All shafts of a scene with its halo, those shown by most slices first."""
+    """Returns all shafts of a scene with its halo, those with most slices first."""
     slices = slices_of(scene)
     if slices.level.size == 0:
         return []
@@ -94,7 +94,7 @@ def shafts_of(scene: Scene) -> list[Shaft]:
 
 
 def _alone(slices: Slices, members: Int64, returns: int) -> float:
-    """Share of the returns about some components, in their slices, that belong to them."""
+    """Returns the share of the returns about some components, in their slices, that belong to them."""
     levels = np.unique(slices.level[members])
     x, y = float(np.median(slices.x_m[members])), float(np.median(slices.y_m[members]))
     near = around(slices, x, y, ALONE_M)[levels]
@@ -104,7 +104,7 @@ def _alone(slices: Slices, members: Int64, returns: int) -> float:
 
 
 class _Neighbours:
-    """Compact components by their place, seen from above."""
+    """Index of compact components by their place, seen from above."""
 
     def __init__(self, slices: Slices) -> None:
         self._slices = slices
@@ -116,7 +116,7 @@ class _Neighbours:
         self._flat = flat[self._order]
 
     def near(self, i: int, reach_m: float) -> Int64:
-        """Components within reach (at most 0.5 m) of component `i`, in order of their number."""
+        """Returns components within reach (at most 0.5 m) of component `i`, in order of their number."""
         row, column = int(self._row[i]), int(self._column[i])
         parts = []
         for r in (row - 1, row, row + 1):
@@ -129,7 +129,7 @@ class _Neighbours:
 
 
 def _scores(slices: Slices) -> Int64:
-    """In how many slices there is a compact component above or below each (k,)."""
+    """Returns the number of slices with a compact component above or below each (k,)."""
     column = ((slices.x_m - slices.corner_m[0]) / CELL_M).astype(np.int64)
     row = ((slices.y_m - slices.corner_m[1]) / CELL_M).astype(np.int64)
     scores = np.zeros(slices.level.size, np.int64)
@@ -139,7 +139,7 @@ def _scores(slices: Slices) -> Int64:
 
 
 def _members(slices: Slices, near: Int64, seed: int, used: npt.NDArray[np.bool_]) -> Int64:
-    """Components of a shaft about a seed: near a straight axis, in slices without long gaps; none where too few."""
+    """Components of a shaft about a seed: near a straight axis, in slices without long gaps; none if too few."""
     near = near[~used[near]]
     x, y, level = slices.x_m[near], slices.y_m[near], slices.level[near].astype(np.float64)
     ax, ay, bx, by = float(slices.x_m[seed]), float(slices.y_m[seed]), 0.0, 0.0
@@ -164,7 +164,7 @@ def _slope(t: Float64, v: Float64) -> float:
 
 
 def _longest_run(level: Int64) -> npt.NDArray[np.bool_]:
-    """Which belong to the run of levels with the most of them, gaps within limits; the lower run where equal."""
+    """Returns a mask of the run of levels with the most members, gaps within limits; the lower run where equal."""
     distinct = sorted(set(level.tolist()))
     breaks = [k for k in range(1, len(distinct)) if distinct[k] - distinct[k - 1] > _GAP_SLICES + 1]
     runs = [(first, end) for first, end in pairwise([0, *breaks, len(distinct)])]
@@ -173,7 +173,7 @@ def _longest_run(level: Int64) -> npt.NDArray[np.bool_]:
 
 
 def _measured(scene: Scene, slices: Slices, members: Int64, rows: Int64, alone: float) -> Shaft | None:
-    """The shaft of some components; None where the ground under it is not known."""
+    """Returns the shaft of some components; None where the ground under it is not known."""
     returns = scene.returns
     xyh = np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]])
     seen_from = np.column_stack([returns.sensor_x_m[rows], returns.sensor_y_m[rows]])
@@ -194,7 +194,7 @@ def _measured(scene: Scene, slices: Slices, members: Int64, rows: Int64, alone: 
 
 
 def _narrow(xyh: Float64) -> npt.NDArray[np.bool_]:
-    """Returns (n,) in the slices where the shaft is narrow: plates, lamps and crowns are wider."""
+    """Returns a mask (n,) of the slices' returns where the shaft is narrow: plates, lamps and crowns are wider."""
     level = np.floor(xyh[:, 2] / SLICE_M).astype(np.int64)
     level -= int(level.min())
     widths = np.full(int(level.max()) + 1, np.nan)
@@ -210,7 +210,7 @@ def _narrow(xyh: Float64) -> npt.NDArray[np.bool_]:
 
 
 def _space(slices: Slices, axis: Axis, levels: Int64, foot: tuple[Float64, Float64]) -> tuple[float, float]:
-    """Share of slices with nothing about the shaft, and share of the directions about its top that hold returns."""
+    """Returns the share of slices with nothing about the shaft, and of the directions about its top with returns."""
     near = around(slices, axis.x_m, axis.y_m, 1.0)
     if near.shape[1] < 21 or near.shape[2] < 21:
         near = np.zeros((near.shape[0], 21, 21), near.dtype)

@@ -1,4 +1,4 @@
-"""Compact components of horizontal slices: what a shaft shows in each of them."""
+"""Compact components of horizontal slices: the cross-sections of shafts."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from roadscan.assets.scene import Scene
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-CELL_M: Final = 0.1
-SLICE_M: Final = 0.2
+CELL_M: Final = 0.1  # Edge of a cell (m).
+SLICE_M: Final = 0.2  # Height of a slice (m).
 LOWEST_M: Final = 0.2
-"""Slices begin here above the ground: below it stand kerbs, grass and the ground's own noise."""
+"""Height above the ground at which slices start (m): below are kerbs, grass and the ground's noise."""
 SLICES: Final = 60
-"""Up to 12.2 m above the ground."""
+"""Number of slices: up to 12.2 m above the ground."""
 WIDEST_M: Final = 1.1
-"""A component this wide or less can be the slice of a shaft."""
+"""Greatest width of a component that can be the slice of a shaft (m)."""
 SET_APART: Final = (
     classes.GROUND, classes.ROAD, classes.SIDEWALK, classes.MARKING, classes.KERB, classes.LOW_NOISE,
     classes.HIGH_NOISE, classes.VEHICLE, classes.PERSON,
 )  # fmt: skip
-"""Classes that nothing upright is made of."""
+"""Classes of which nothing upright consists."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +49,14 @@ class Slices:
     """(n,) compact component of each return of the scene; −1: none."""
 
     def members(self) -> tuple[Int64, Int64]:
-        """Returns sorted by their component, and where each component begins (k + 1,)."""
+        """Returns the returns sorted by their component, and the beginning of each component (k + 1,)."""
         starts, order = in_bins(self.owner, self.level.size)
         return order, starts
 
 
 @once_a_scene
 def usable(scene: Scene) -> npt.NDArray[np.bool_]:
-    """Returns (n,) that may belong to something upright: those of ground, vehicles, people and noise are set apart."""
+    """Returns a mask (n,) of the returns that may belong to something upright: no ground, vehicles, people or noise."""
     lookup = np.ones(256, np.bool_)
     lookup[list(SET_APART)] = False
     return lookup[scene.classes] & np.isfinite(scene.above_ground_m)
@@ -70,7 +70,7 @@ def usable_above_m(scene: Scene) -> npt.NDArray[np.float32]:
 
 @once_a_scene
 def slices_of(scene: Scene) -> Slices:
-    """Slices of a scene, and their compact components: cells that touch, at most 1.1 m wide."""
+    """Returns the slices of a scene, and their compact components: cells that touch, at most 1.1 m wide."""
     returns, window = scene.returns, scene.extent
     columns = int(np.ceil((window.x_max_m - window.x_min_m) / CELL_M - 1e-9))
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / CELL_M - 1e-9))
@@ -93,7 +93,7 @@ def slices_of(scene: Scene) -> Slices:
 
 
 def _not_zero(counts: npt.NDArray[np.uint16]) -> Int64:
-    """Numbers of the cells with returns, ascending: most are empty, so four are looked at together."""
+    """Returns numbers of the cells with returns, ascending: most are empty, so four are tested together."""
     some = counts[: counts.size // 4 * 4].view(np.uint64)
     cells = (4 * np.flatnonzero(some)[:, None] + np.arange(4)).reshape(-1)
     cells = np.concatenate([cells, np.arange(4 * some.size, counts.size)])
@@ -101,7 +101,7 @@ def _not_zero(counts: npt.NDArray[np.uint16]) -> Int64:
 
 
 def around(slices: Slices, x_m: float, y_m: float, reach_m: float) -> npt.NDArray[Any]:
-    """Counts (slices, r, c) of the cells within `reach_m` of a place, a square of them."""
+    """Returns counts (slices, r, c) of the cells within `reach_m` of a place, a square of them."""
     column, row = int((x_m - slices.corner_m[0]) / CELL_M), int((y_m - slices.corner_m[1]) / CELL_M)
     reach = round(reach_m / CELL_M)
     return slices.counts[

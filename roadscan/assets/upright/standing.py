@@ -1,4 +1,4 @@
-"""Shafts told apart: poles, lamp posts, signals, trees, delineators, and what is none of them."""
+"""Classification of shafts: poles, lamp posts, signals, trees, delineators, and what is none of them."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ Int64 = npt.NDArray[np.int64]
 Standing = Literal["pole", "lighting", "signal", "tree", "delineator"]
 
 LEAST: Final = 0.5
-"""What is less probable is left out."""
+"""Less probable shafts are left out."""
 _LOW_M: Final = 1.35
-"""Posts up to this height are delineators and bollards."""
-_BOLLARD_M: Final = 0.08
-_SIGNAL_M: Final = 8.0
+"""Posts up to this height (m) are delineators and bollards."""
+_BOLLARD_M: Final = 0.08  # Least diameter of a bollard (m).
+_SIGNAL_M: Final = 8.0  # Signals are lower than this (m).
 _LAMP_M: Final = 3.5
-"""Least height of a lamp post."""
-_IN_PLANE_M: Final = 0.35
-_BESIDE_M: Final = 0.9
-_LONG_M: Final = 2.5
-_APART_M: Final = 0.45
+"""Least height of a lamp post (m)."""
+_IN_PLANE_M: Final = 0.35  # A shaft nearer to a surface (m) lies in it.
+_BESIDE_M: Final = 0.9  # Surfaces up to this distance (m) are beside a shaft.
+_LONG_M: Final = 2.5  # Surfaces longer than this (m) count as beside a shaft.
+_APART_M: Final = 0.45  # Shafts nearer to one another (m) are one.
 
 
 @dataclass(frozen=True, eq=False)
 class Upright:
-    """A shaft with what it is and carries."""
+    """A shaft with its kind and attachments."""
 
     kind: Standing
     shaft: Shaft
     probability: float
     rows: Int64
-    """Returns of the shaft and of what it carries."""
+    """Returns of the shaft and of its attachments."""
     attributes: Mapping[str, float | str | None]
 
 
 @once_a_scene
 def uprights_of(scene: Scene) -> list[Upright]:
-    """Everything thin that stands upright in a scene with its halo, what is probable at 0.5 or more."""
+    """Returns all thin uprights in a scene with its halo that have a probability of 0.5 or more."""
     planes = [r for r in regions_of(scene) if r.length_m > 2.5 and r.top_above_m > 1.6]
     shafts = _beside_surfaces(scene, shafts_of(scene))
     judged = [(shaft, probability_of(shaft, in_plane(shaft, planes))) for shaft in shafts]
@@ -67,7 +67,7 @@ def uprights_of(scene: Scene) -> list[Upright]:
 
 
 def _beside_surfaces(scene: Scene, shafts: list[Shaft]) -> list[Shaft]:
-    """The shafts; of what is about low ones, long low surfaces beside them, such as guard rails, do not count."""
+    """Shafts; long low surfaces beside low ones, such as guard rails, do not count as their surroundings."""
     surfaces = [r for r in regions_of(scene) if r.length_m > _LONG_M and r.top_above_m <= _LOW_M]
     on_surface = np.zeros(len(scene.returns), np.bool_)
     for one in surfaces:
@@ -88,20 +88,20 @@ def _beside_surfaces(scene: Scene, shafts: list[Shaft]) -> list[Shaft]:
 
 
 def in_plane(shaft: Shaft, planes: list[Region]) -> bool:
-    """Whether the shaft lies in an upright surface and is as good as a piece of it."""
+    """Returns whether the shaft lies in an upright surface and is probably a piece of it."""
     x, y = shaft.axis.x_m, shaft.axis.y_m
     return any(r.low_above_m <= shaft.top_above_m and r.distance_m(x, y, 0.5) < _IN_PLANE_M for r in planes)
 
 
 def probability_of(shaft: Shaft, inside_plane: bool) -> float:
-    """Probability that a shaft stands by itself: a logistic function of its measures.
+    """Returns the probability that a shaft stands by itself: a logistic function of its measures.
 
     Measures: slices that show it, the share of them from its foot up, the share of the returns about it that are its
     own, the share of slices free around, the height of its hidden foot, its lean, its roughness, its returns where they
     are few.
     """
     lean = shaft.axis.lean_deg
-    # Half a radius is how far the middle of a thick shaft's near side wanders from height to height.
+    # On a thick shaft, the middle of the visible side varies by half a radius from height to height.
     wander = math.degrees(math.atan2(0.5 * shaft.axis.radius_m, max(shaft.top_above_m - shaft.low_above_m, 0.2)))
     if shaft.top_above_m <= _LOW_M:
         low = [
@@ -125,7 +125,7 @@ def tree_probability(shaft: Shaft, filled_directions: float) -> float:
 
 
 def _apart(judged: list[tuple[Shaft, float]]) -> list[tuple[Shaft, float]]:
-    """The shafts without those that stand where a more probable one does."""
+    """Returns the shafts without those close to a more probable one."""
     kept: list[tuple[Shaft, float]] = []
     order = sorted(judged, key=lambda one: (-one[1] * one[0].slices, one[0].foot_xy_m))
     for shaft, probability in order:
@@ -142,7 +142,7 @@ def _apart(judged: list[tuple[Shaft, float]]) -> list[tuple[Shaft, float]]:
 def _told(
     scene: Scene, shaft: Shaft, probability: float, near: About, tree: float, trunks: npt.NDArray[np.float64]
 ) -> Upright:
-    """What a shaft is, with the values of its kind."""
+    """Returns the kind of a shaft, with the values of its kind."""
     diameter, lean = round(2.0 * shaft.axis.radius_m, 4), round(shaft.axis.lean_deg, 3)
     values: dict[str, float | str | None] = {"asset_height_m": shaft.top_above_m, "diameter_m": diameter}
     if tree >= 0.5:
@@ -165,7 +165,7 @@ def _told(
 
 
 def _tree(shaft: Shaft, probability: float, near: About, trunks: npt.NDArray[np.float64]) -> Upright:
-    """A tree with its crown; returns nearer to another trunk belong to that."""
+    """Returns a tree with its crown; returns nearer to another trunk belong to that."""
     here = np.array([shaft.axis.x_m, shaft.axis.y_m])
     others = trunks[np.hypot(*(trunks - here).T) > 0.2] - here
     top, wide, rows = crown(near, shaft, others)

@@ -1,4 +1,4 @@
-"""Upright surfaces told apart: façades, walls, barriers, guardrails and fences."""
+"""Classification of upright surfaces: façades, walls, barriers, guardrails and fences."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from roadscan.assets.upright.probability import logistic
 
 Surface = Literal["facade", "wall", "barrier", "guardrail", "fence"]
 
-_SIMPLE_M: Final = 0.03
-_GROUND_SIGMA_M: Final = 0.03
+_SIMPLE_M: Final = 0.03  # Tolerance of the simplified line (m).
+_GROUND_SIGMA_M: Final = 0.03  # 1 σ of the height of the ground at a surface (m).
 _FENCE_PASSES: Final = 0.12
-"""A surface that lets this share of the sight lines through is a fence."""
-_LEAST_FENCE_M: Final = 2.5
-_MOST_VEGETATION: Final = 0.5
+"""Share of the sight lines through a surface from which it is a fence."""
+_LEAST_FENCE_M: Final = 2.5  # Least length of a fence or a wall (m).
+_MOST_VEGETATION: Final = 0.5  # Surfaces with a larger share of vegetation are none.
 
 
 def told(chain: Chain) -> Surface | None:
-    """What an upright surface is; None where it is none of these.
+    """Returns the kind of an upright surface; None where it is none of these.
 
     A façade is solid and rises to 3 m or above what scanners saw; a wall ends lower, a barrier at 1.25 m at the most; a
     guardrail has free space below its rail; a fence lets sight lines through. What begins 2 m above the ground or
@@ -52,7 +52,7 @@ def told(chain: Chain) -> Surface | None:
 
 
 def probability_of(chain: Chain) -> float:
-    """Probability of a surface: a logistic function of its length, its covered share, its returns and its thickness."""
+    """Returns the probability of a surface: a logistic function of its length, covered share, returns and thickness."""
     return logistic(
         -1.5,
         [(0.5, min(chain.length_m, 10.0)), (2.0, chain.covered), (0.02, min(chain.seen, 100)),
@@ -62,7 +62,7 @@ def probability_of(chain: Chain) -> float:
 
 @once_a_scene
 def _names_of_panels(scene: Scene) -> list[set[Surface | None]]:
-    """What the chains of each panel look like; nothing where it does not come near the tile."""
+    """Returns the likely kinds of the chains of each panel; none where it does not come near the tile."""
     whole = replace(scene, tile=scene.window)
     return [
         {told(c) for c in chains_of(pieces_of_panels(whole, [panel]))} if panel.comes_near(scene.tile) else set()
@@ -72,12 +72,12 @@ def _names_of_panels(scene: Scene) -> list[set[Surface | None]]:
 
 @once_a_scene
 def _pieces_of_all(scene: Scene) -> pa.Table:
-    """Pieces of all panels inside the scene's tile."""
+    """Returns pieces of all panels inside the scene's tile."""
     return pieces_of_panels(scene, panels_of(scene))
 
 
 class SurfaceKind(AssetKind):
-    """A kind of upright surfaces: its evidence are the pieces of all of them, told apart once they are joined."""
+    """A kind of upright surfaces: its evidence are the pieces of all of them, classified once they are joined."""
 
     code: ClassVar[int]
     piece_schema = PIECE_SCHEMA
@@ -92,17 +92,17 @@ class SurfaceKind(AssetKind):
         return Evidence(_pieces_of_all(scene), tuple(marked))
 
     def marks(self, scene: Scene, rows: Any) -> Any:
-        """Returns that belong to a surface of these rows."""
+        """Returns the returns that belong to a surface of these rows."""
         return rows
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
-        """An object a chain of this kind."""
+        """Returns an object for each chain of this kind."""
         return [self.made(chain) for chain in chains_of(pieces) if told(chain) == self.name]
 
     def made(self, chain: Chain) -> AssetObject:
-        """The object of a chain: its line along the ground."""
+        """Returns the object of a chain: its line along the ground."""
         ground = chain.values["ground_m"]
         height = np.concatenate([ground[:1], (ground[:-1] + ground[1:]) / 2, ground[-1:]])
         line = shapely.LineString(np.column_stack([chain.xy_m, height])).simplify(_SIMPLE_M)
@@ -113,7 +113,7 @@ class SurfaceKind(AssetKind):
 def as_object(
     chain: Chain, geometry: shapely.Geometry, values: Mapping[str, Any], sigma_size_m: float | None = None
 ) -> AssetObject:
-    """An object of a chain."""
+    """Returns an object of a chain."""
     sigma = max(0.005, chain.across_m / np.sqrt(max(chain.seen / max(chain.length_m, 1.0), 1.0)))
     passes = len(chain.passes)
     return AssetObject(

@@ -1,4 +1,4 @@
-"""Crack response: how far lines of cells lie below their flanks, in whole numbers, so that no order matters."""
+"""Crack response: depth of lines of cells below their flanks, in whole numbers, so that order does not matter."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from roadscan.compute.kernel_options import inner, kernel
 
 @kernel
 def add_row(total, row):
-    """Add: total += row; both (n,) int32."""
+    """Compute total += row; both (n,) int32."""
     for j in range(total.size):
         total[j] += row[j]
 
 
 @kernel
 def line_sums(heights, line, out):
-    """Sum of the heights along a line through each cell.
+    """Sum the heights along a line through each cell.
 
     heights : (rows, columns) int32; line : (k, 2) int64, rows and columns from the cell, at most m away; out : (rows -
     2 m, columns - 2 m) int32, the cells that are m or more from the border.
@@ -35,7 +35,7 @@ def line_sums(heights, line, out):
 
 @inner
 def deepen_row(middle, left, right, far_left, far_right, most, code, depth, which):
-    """Keep the depth of the middle below its lower flank, and its code, where it is the deepest so far.
+    """Store the depth of the middle below its lower flank, and its code, where it is the deepest so far.
 
     A flank counts as high as it is on the straight line from three times as far to the middle, but at most `most` lower
     than it is. All arrays (n,) int32.
@@ -51,14 +51,14 @@ def deepen_row(middle, left, right, far_left, far_right, most, code, depth, whic
 
 @inner
 def bend_row(middle, left, right, bend):
-    """Add: bend += |left + right - 2 middle|; all (n,) int32."""
+    """Compute bend += |left + right - 2 middle|; all (n,) int32."""
     for j in range(bend.size):
         bend[j] += abs(left[j] + right[j] - 2 * middle[j])
 
 
 @kernel
 def deepen(sums, away, most, code, depth, which):
-    """:func:`deepen_row` for a grid.
+    """Apply :func:`deepen_row` to a grid.
 
     sums : (rows + 2 m, columns + 2 m) int32; away : (2, 2) int64, rows and columns to the right flank and three times
     as far, at most m; most, code : int32; depth, which : (rows, columns) int32.
@@ -79,7 +79,7 @@ def deepen(sums, away, most, code, depth, which):
 
 @kernel
 def add_bend(sums, away, bend):
-    """:func:`bend_row` for a grid; arguments as of :func:`deepen`, bend : (rows, columns) int32."""
+    """Apply :func:`bend_row` to a grid; arguments as for :func:`deepen`, bend : (rows, columns) int32."""
     rows, n = bend.shape
     margin = (sums.shape[0] - rows) // 2
     up, east = away[0], away[1]
@@ -95,7 +95,7 @@ def add_bend(sums, away, bend):
 
 @kernel
 def fill_holes(heights, row, column, passes):
-    """Fill holes from their border inwards, a ring of cells a pass, with the mean of the neighbours known before.
+    """Fill holes from their border inwards, one ring of cells a pass, with the mean of the neighbours known before.
 
     heights : (rows, columns) float64, NaN in holes, changed; row, column : (n,) int64, the cells to fill, none at the
     grid's border.

@@ -1,4 +1,4 @@
-"""Cross-sections of a valley in a grid of heights, from all cells around and finer than a cell."""
+"""Cross-sections of a valley in a grid of heights, from all cells around it, with bins finer than a cell."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from roadscan.compute.kernel_options import inner, kernel
 
 HALF_ALONG = 4.5
-"""Cells along the valley, to either side, that a cross-section is the mean of."""
+"""A cross-section is the mean over this many cells along the valley, to either side."""
 BINS = 2
-"""Bins a cell."""
+"""Number of bins per cell."""
 
 
 @inner
 def fill_bins(heights, i, j, north, east, reach, total, count):
-    """Sum and count of the cells around (i, j) by their distance to the right of a line through its middle.
+    """Sum and count the cells around (i, j) by their distance to the right of a line through its middle.
 
     heights : (rows, columns) float64, NaN where none; north, east : unit vector of the line in rows and columns;
     reach : cells to either side; total, count : (2 BINS reach + 1,) float64, out. Returns what all heights were
@@ -41,7 +41,7 @@ def fill_bins(heights, i, j, north, east, reach, total, count):
 
 @inner
 def mean_between(total, count, first, end):
-    """Mean height and mean place of the bins from `first` to `end`; NaN where they hold nothing."""
+    """Returns mean height and mean position of the bins from `first` to `end`; NaN where they are empty."""
     height, place, n = 0.0, 0.0, 0.0
     for k in range(max(first, 0), min(end, total.size)):
         height += total[k]
@@ -52,10 +52,10 @@ def mean_between(total, count, first, end):
 
 @kernel
 def depths(total, count, flank, depth):
-    """Depth of each bin below the straight line between both flanks; empty bins between others are interpolated.
+    """Compute the depth of each bin below the straight line between both flanks; empty inner bins are interpolated.
 
     flank : bins from the middle to where the flanks begin; depth : (bins,) float64, out. Returns the height of that
-    line in the middle and that of the lower flank; NaN where a flank or the valley holds nothing.
+    line in the middle and that of the lower flank; NaN where a flank or the valley is empty.
     """
     middle = total.size // 2
     wide = max(flank // 2, 2 * BINS)
@@ -79,7 +79,7 @@ def depths(total, count, flank, depth):
 
 @inner
 def half_way(depth, peak, step, half):
-    """Bins from `peak` to where the depth falls to `half`, going by `step`, interpolated."""
+    """Returns the distance in bins from `peak` to where the depth falls to `half`, stepping by `step`, interpolated."""
     k = peak
     while 0 < k < depth.size - 1 and depth[k + step] > half:
         k += step
@@ -90,7 +90,7 @@ def half_way(depth, peak, step, half):
 
 @kernel
 def cross_sections(heights, row, column, north, east, flank, reach, out):
-    """Depth, width and middle of a valley at each of its cells.
+    """Compute depth, width and middle of a valley at each of its cells.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def cross_sections(heights, row, column, north, east, flank, reach, out):
     flank : (n,) int64, where its flanks begin (cells); reach : most cells to either side.
     out : (n, 5) float64: depth below the line between both flanks (m), width at half that depth and how far the middle
         lies to the right (cells), depth below the lower flank (m), height of that line at the cell (m). NaN where it
-        cannot be told.
+        is not known.
     """
     size = 2 * BINS * reach + 1
     total, count, depth = np.empty(size), np.empty(size), np.empty(size)

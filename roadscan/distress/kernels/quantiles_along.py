@@ -1,4 +1,4 @@
-"""Quantiles of what the cells of a line hold, over a stretch of it."""
+"""Running quantiles of the values of a line's cells."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from roadscan.compute.kernel_options import inner, kernel
 from roadscan.tiles.kernels.selection import sort_few
 
 HALF_ALONG = 10
-"""Cells to either side, in rows and in columns, that a stretch takes in."""
+"""The window reaches this many cells to either side, in rows and in columns."""
 _HALF_ASIDE = 2.5
-"""Cells aside: bends of the line within the stretch, and no other line beyond."""
+"""The window is this many cells wide to either side: it keeps bends of its line and takes in no other line."""
 
 
 @inner
 def quantile_of(values, count, level):
-    """Quantile of the first `count` values, which change places; between two it is interpolated. NaN of none."""
+    """Returns a quantile of the first `count` values, interpolated between two; it reorders them. NaN of none."""
     sort_few(values[:count])
     if count == 0:
         return np.nan
@@ -28,7 +28,7 @@ def quantile_of(values, count, level):
 
 @kernel
 def quantiles_along(number, row, column, north, east, values, level, out):
-    """Quantile of the values of the cells of a line around each of them.
+    """Compute for each cell of a line the quantile of the values of the line's cells around it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Thinning of a set of cells to lines, a layer a pass."""
+"""Thinning of a set of cells to lines, one layer a pass."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from roadscan.compute.kernel_options import inner, kernel
 
 @inner
 def neighbour_bits(cells, i, j):
-    """The eight neighbours of a cell as bits: north is bit 0, then clockwise (rows grow to the south here)."""
+    """Returns the eight neighbours of a cell as bits: north is bit 0, then clockwise (rows grow to the south here)."""
     return (
         int(cells[i - 1, j])
         | int(cells[i - 1, j + 1]) << 1
@@ -24,7 +24,7 @@ def neighbour_bits(cells, i, j):
 
 @kernel
 def thin(cells, row, column, deletable, passes):
-    """Take away cells that may go, all at once in each half of a pass.
+    """Remove deletable cells, all at once in each half of a pass.
 
     Parameters
     ----------

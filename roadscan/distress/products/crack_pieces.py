@@ -1,4 +1,4 @@
-"""``crack_pieces``: the cracks of a tile's surface, as pieces that `cracks` joins over all tiles."""
+"""``crack_pieces``: the cracks of a tile's surface, as pieces that the product `cracks` joins over all tiles."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from roadscan.tiles.product import ProductContext, SurfaceProduct
 from roadscan.tiles.products.geo_table import check_geo_table, read_geo_table, write_geo_table
 
 _SIMPLER_CELLS: Final = 0.25
-"""Vertices that lie this near to a straight line are left out."""
+"""Vertices this close (cells) to a straight line are left out."""
 
 COLUMNS: Final = pa.schema(
     [pa.field(name, pa.int64(), nullable=False) for name in ("start_row", "start_column", "end_row", "end_column")]
@@ -34,7 +34,7 @@ COLUMNS: Final = pa.schema(
 
 
 def check_cells(cell_m: tuple[float, float], seen: int, needed: int, product: str) -> None:
-    """Raise :class:`ConfigError` where cells do not suit a detection that looks `needed` cells beyond its own."""
+    """Raise :class:`ConfigError` where the cells do not suit a detection that needs a margin of `needed` cells."""
     east, north = cell_m
     if east != north or needed > seen:
         raise ConfigError(
@@ -45,7 +45,7 @@ def check_cells(cell_m: tuple[float, float], seen: int, needed: int, product: st
 
 
 def height_window(surface: SurfaceTile, needed: int, product: str) -> HeightWindow:
-    """The surface of a tile for a detection that looks `needed` cells beyond it."""
+    """Returns the surface of a tile for a detection that needs a margin of `needed` cells."""
     check_cells(surface.cell_m, surface.halo, needed, product)
     window = surface.window
     seen = np.where(surface.origin == FILLED, np.nan, surface.height_m)  # a straight line is no evidence
@@ -81,7 +81,7 @@ class CrackPieces(SurfaceProduct):
         check_cells(cell_m, seen, halo_cells(cast(CrackDetection, options), cell_m[0]), self.name)
 
     def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:
-        """Detect and write."""
+        """Detect the cracks of the tile and write their pieces."""
         config = cast(CrackDetection, options)
         cell_m = surface.cell_m[0]
         window = height_window(surface, halo_cells(config, cell_m), self.name)
@@ -97,12 +97,12 @@ class CrackPieces(SurfaceProduct):
         write_geo_table(path, table, "line", lines, ["LineString"], context)
 
     def check(self, path: Path) -> None:
-        """Decode it."""
+        """Decode the file."""
         check_geo_table(path, COLUMNS)
 
 
 def read_pieces(content: bytes, context: ProductContext) -> tuple[list[CrackPiece], float]:
-    """Pieces of a tile's file, and the edge of its cells (m)."""
+    """Returns the pieces in a tile's file, and the edge of its cells (m)."""
     table, lines = read_geo_table(content, context)
     columns = [table[name].to_pylist() for name in COLUMNS.names]
     pieces = [

@@ -55,7 +55,7 @@ class Cracks(SurveyProduct):
     needs_lanes: ClassVar[bool] = True
 
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
-        """One file."""
+        """Returns one file."""
         return [Output("cracks.parquet", tuple(sorted(t.tile for t in tiles)))]
 
     def write(
@@ -67,7 +67,7 @@ class Cracks(SurveyProduct):
         context: ProductContext,
         path: Path,
     ) -> None:
-        """Join the pieces of all tiles and write what is a crack, from south to north."""
+        """Join the pieces of all tiles and write those that are cracks, from south to north."""
         pieces: list[CrackPiece] = []
         owner: list[str] = []
         cell_m = 0.0
@@ -84,7 +84,7 @@ class Cracks(SurveyProduct):
         write_geo_table(path, pa.Table.from_pylist(rows, COLUMNS), "line", lines, ["MultiLineString"], context)
 
     def check(self, path: Path) -> None:
-        """Decode it."""
+        """Decode the file."""
         check_geo_table(path, COLUMNS)
 
 

@@ -1,4 +1,4 @@
-"""``pothole_pieces``: what may be potholes in a tile's surface, as pieces that `potholes` joins over all tiles."""
+"""``pothole_pieces``: possible potholes in a tile's surface, as pieces that `potholes` joins over all tiles."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ class PotholePieces(SurfaceProduct):
             )
 
     def around_m(self, options: Strict, cell_m: tuple[float, float]) -> float:
-        """As far as the ground around the largest pothole."""
+        """Returns the margin (m) that the ground around the largest pothole needs."""
         return around_cells(cast(PotholeDetection, options), cell_m[0]) * cell_m[0]
 
     def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:
-        """Detect and write."""
+        """Detect the possible potholes of the tile and write them."""
         config = cast(PotholeDetection, options)
         pieces = pothole_pieces(self._window(surface, config), config)
         table = pa.table(
@@ -64,7 +64,7 @@ class PotholePieces(SurfaceProduct):
         write_geo_table(path, table, "outline", outlines, ["Polygon"], context)
 
     def _window(self, surface: SurfaceTile, config: PotholeDetection) -> HeightWindow:
-        """What was measured around the tile, and the tile's smooth heights in the midst of it."""
+        """Returns the measurements around the tile, and the tile's smooth heights in the middle of them."""
         near = height_window(surface, halo_cells(config, surface.cell_m[0]), self.name)
         wide_m, halo = surface.around
         more = halo - near.halo
@@ -74,12 +74,12 @@ class PotholePieces(SurfaceProduct):
         return HeightWindow(wide_m, height_m, near.cell_m, near.sigma_m, *first, halo)
 
     def check(self, path: Path) -> None:
-        """Decode it."""
+        """Decode the file."""
         check_geo_table(path, COLUMNS)
 
 
 def read_pieces(content: bytes, context: ProductContext) -> list[PotholePiece]:
-    """Pieces of a tile's file."""
+    """Returns the pieces in a tile's file."""
     table, outlines = read_geo_table(content, context)
     figures = [table[name].to_pylist() for name in COLUMNS.names]
     return [PotholePiece(one, *row) for one, row in zip(outlines, zip(*figures, strict=True), strict=True)]

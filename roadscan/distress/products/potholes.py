@@ -43,7 +43,7 @@ class Potholes(SurveyProduct):
     reads: ClassVar[tuple[str, ...]] = ("pothole_pieces",)
 
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
-        """One file."""
+        """Returns one file."""
         return [Output("potholes.parquet", tuple(sorted(t.tile for t in tiles)))]
 
     def write(
@@ -55,7 +55,7 @@ class Potholes(SurveyProduct):
         context: ProductContext,
         path: Path,
     ) -> None:
-        """Join the pieces of all tiles and write what is a pothole, from south to north."""
+        """Join the pieces of all tiles and write those that are potholes, from south to north."""
         pieces: list[PotholePiece] = []
         owner: list[str] = []
         for tile in output.tiles:
@@ -69,7 +69,7 @@ class Potholes(SurveyProduct):
         write_geo_table(path, pa.Table.from_pylist(rows, COLUMNS), "outline", outlines, ["Polygon"], context)
 
     def check(self, path: Path) -> None:
-        """Decode it."""
+        """Decode the file."""
         check_geo_table(path, COLUMNS)
 
 

@@ -1,1 +1,1 @@
-"""Where people see and edit the inventory: a GeoPackage, or a PostGIS database."""
+"""Homes in which people see and edit the inventory: a GeoPackage, or a PostGIS database."""

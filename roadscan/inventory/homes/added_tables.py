@@ -1,4 +1,4 @@
-"""What people added to a GeoPackage of the inventory: layers, tables, views, styles. A publication keeps it."""
+"""Additions by people to a GeoPackage of the inventory (layers, tables, views, styles); a publication keeps them."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _NAMES: Final = {
     "gpkg_tile_matrix_set": "table_name", "gpkg_metadata_reference": "table_name", "sqlite_sequence": "name",
     "gpkg_data_column_constraints": "constraint_name", "gpkg_spatial_ref_sys": "srs_id",
 }  # fmt: skip
-"""Tables that describe others, and their column that names what is described."""
+"""Tables that describe others, and the column that names the described table."""
 _OF_OGR: Final = re.compile(r"(rtree|gpkg|trigger_(insert|delete)_feature_count)_")
-"""Triggers and indexes that a program makes for each layer: those of the published layers are made anew."""
+"""Triggers and indexes that a program makes for each layer; those of the published layers are recreated."""
 
 
 def keep_added(published: Path, new: Path) -> None:
-    """Copy what people added to a published GeoPackage into the one that takes its place.
+    """Copy people's additions from a published GeoPackage into the one that replaces it.
 
-    A table, view, index or trigger is theirs where the new file has none of its name; a style, where it is another one
-    than the publication wrote. Rows of tables go over by SQLite alone: no trigger of a spatial index runs.
+    A table, view, index or trigger is an addition if the new file has none of its name; a style, if it differs from
+    what the publication wrote. Rows are copied by SQLite alone: no trigger of a spatial index runs.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def keep_added(published: Path, new: Path) -> None:
 
 
 def _copy(connection: sqlite3.Connection, published: Path) -> None:
-    # A layer that was dropped through other programs may leave its describing rows: they are no one's.
+    # Another program may drop a layer and leave its describing rows behind: these are skipped.
     objects = connection.execute(
         """SELECT type, name, tbl_name, sql FROM old.sqlite_master
            WHERE name NOT IN (SELECT name FROM main.sqlite_master) AND name NOT LIKE 'sqlite_%' ORDER BY rowid"""
@@ -69,7 +69,7 @@ def _copy(connection: sqlite3.Connection, published: Path) -> None:
 
 
 def _columns(connection: sqlite3.Connection, schema: str, table: str) -> list[str]:
-    """Columns of a table that hold values; none where there is no such table."""
+    """Returns the columns of a table that store values; none where there is no such table."""
     return [name for _, name, *_, hidden in connection.execute(f'PRAGMA {schema}.table_xinfo("{table}")') if not hidden]
 
 
@@ -77,14 +77,14 @@ def _copy_rows(connection: sqlite3.Connection, table: str, name: str) -> None:
     columns = ", ".join(f'"{one}"' for one in _columns(connection, "old", table))
     try:
         connection.execute(f'INSERT INTO main."{name}" (rowid, {columns}) SELECT rowid, {columns} FROM old."{table}"')
-    except sqlite3.OperationalError:  # a table without numbers of rows, or a virtual one
+    except sqlite3.OperationalError:  # a table without rowid, or a virtual one
         connection.execute(f'INSERT INTO main."{name}" ({columns}) SELECT {columns} FROM old."{table}"')
 
 
 def _copy_descriptions(
     connection: sqlite3.Connection, table: str, column: str, published: Path, published_tables: set[str]
 ) -> None:
-    """Rows that describe what people added, of a table that both files have."""
+    """Copy the rows that describe people's additions, of a table that both files have."""
     there = _columns(connection, "main", table)
     shared = [one for one in _columns(connection, "old", table) if one in there and one != "id"]
     if column not in shared:
@@ -104,7 +104,7 @@ def _copy_descriptions(
 
 
 def _check_systems(connection: sqlite3.Connection, published: Path) -> None:
-    """HomeError where one number names another CRS in the new file: only numbers that no authority gave can."""
+    """Raise HomeError where one number names another CRS in the new file: only numbers without an authority can."""
     clash = connection.execute(
         """SELECT o.srs_id, o.srs_name FROM old.gpkg_spatial_ref_sys o JOIN main.gpkg_spatial_ref_sys m USING (srs_id)
            WHERE o.organization_coordsys_id IS NOT m.organization_coordsys_id OR lower(o.organization) = 'none'
@@ -119,7 +119,7 @@ def _check_systems(connection: sqlite3.Connection, published: Path) -> None:
 
 
 def _copy_styles(connection: sqlite3.Connection) -> None:
-    """Styles that people wrote or changed: one of a publication bears the instant of its commit, QGIS sets another."""
+    """Copy styles that people wrote or changed: a publication's style bears its commit's instant, QGIS sets another."""
     if not _columns(connection, "old", STYLES):
         return
     theirs = connection.execute(

@@ -1,7 +1,7 @@
-"""A GeoPackage as the home of the inventory: a layer a kind, value lists, styles, and its mark in a table of its own.
+"""A GeoPackage as the home of the inventory: one layer a kind, value lists, styles, and a table for its mark.
 
-Layers are written and read through OGR alone: triggers of a layer's spatial index call functions that SQLite by itself
-does not have. A new state is written beside the file and takes its place at once.
+Layers are written and read through OGR alone: triggers of a layer's spatial index call functions that plain SQLite
+lacks. A new state is written to a second file, which then replaces the first in one step.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from roadscan.store.store import process_lives
 MARKS: Final = "roadscan_inventory"
 CONFLICTS: Final = "conflicts"
 _VERSION: Final = {"VERSION": "1.3"}
-"""Of the standard; programs of today's stable Linux systems warn of newer ones."""
+"""Version of the standard; programs of today's stable Linux systems warn of newer ones."""
 _WAIT_S: Final = 0.5
-"""Longer than the transaction of one edit that another program saves."""
+"""Wait for a lock (s): longer than another program's transaction for one edit."""
 _FOREIGN: Final = "name another file, or move this one away"
 
 
 class GeoPackage(Home):
-    """A GeoPackage file with a layer for each kind of assets, or for some kinds alone."""
+    """A GeoPackage file with a layer for each kind of assets, or for some kinds only."""
 
     def __init__(
         self, file: Path, crs: str | None, kinds: Sequence[str] | None = None, frame: MapFrame | None = None
@@ -59,20 +59,20 @@ class GeoPackage(Home):
 
     @property
     def name(self) -> str:
-        """The file."""
+        """Returns the file's path."""
         return str(self.file)
 
     @property
     def project_file(self) -> Path:
-        """Beside the file."""
+        """Returns the path of the project file, beside the file."""
         return self.file.with_suffix(".qgs")
 
     def layer_address(self, table: str) -> tuple[str, str]:
-        """The layer of a table, relative to the project file."""
+        """Returns the layer of a table, relative to the project file."""
         return "ogr", f"./{self.file.name}|layername={table}"
 
     def mark(self) -> Mark | None:
-        """Its last mark."""
+        """Returns its last mark."""
         import pyogrio
 
         if not self.file.exists():
@@ -101,7 +101,7 @@ class GeoPackage(Home):
         )
 
     def read(self) -> Content:
-        """Rows of all layers."""
+        """Returns the rows of all layers."""
         import pyogrio
 
         layers = {str(name) for name, _ in pyogrio.list_layers(self.file)}
@@ -186,7 +186,7 @@ class GeoPackage(Home):
         return [Decision(row["asset_id"], row["attribute"], row["edit"], row["decision"]) for row in given]
 
     def write(self, content: Content, sheets: Sequence[Sheet], mark: Mark) -> None:
-        """Write all layers beside the file, then take its place."""
+        """Write all layers to a second file, which then replaces this one."""
         self._check_free()
         scratch = self.file.with_name(f".{self.file.stem}-{os.getpid()}.gpkg")
         try:
@@ -206,7 +206,7 @@ class GeoPackage(Home):
             self._clear()
 
     def _clear(self) -> None:
-        """Remove files of this program, and of those that died while they wrote; one program writes at a time."""
+        """Remove temporary files of this program, also of crashed ones; one program writes at a time."""
         scratch = re.compile(rf"\.{re.escape(self.file.stem)}-(\d+)\.gpkg(-.*)?")
         for left in self.file.parent.glob(".*.gpkg*"):
             made = scratch.fullmatch(left.name)
@@ -253,19 +253,19 @@ class GeoPackage(Home):
             raise self._unwritable(error) from error
 
     def _check_unchanged(self) -> None:
-        """HomeError where somebody saved into the file since its rows were read."""
+        """Raise HomeError if somebody saved into the file since its rows were read."""
         if self._as_read is not None and self._stamp() != self._as_read:
             raise HomeError("it was edited in this moment", change="pull, and publish again", file=self.file)
 
     def _check_writable(self) -> None:
-        """HomeError for a file without a right to write; the system does not hold its administrator to that."""
+        """Raise HomeError for a file without write permission, which the system does not enforce for administrators."""
         if self.file.exists():
             mode = self.file.stat().st_mode
             if not mode & (stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH) or not os.access(self.file, os.W_OK):
                 raise self._unwritable(PermissionError("it is read-only"))
 
     def _check_free(self) -> None:
-        """HomeError while another program has the file open with changes that are not in it yet."""
+        """Raise HomeError while another program has the file open with changes that are not in it yet."""
         self._check_writable()
         if not self.file.exists():
             return
@@ -279,7 +279,7 @@ class GeoPackage(Home):
             raise self._held_open(error) from error
 
     def _check_not_locked(self, cause: Exception) -> None:
-        """HomeError where a file could not be read or written because another program has locked it."""
+        """Raise HomeError if a file could not be read or written because another program has locked it."""
         try:
             with contextlib.closing(sqlite3.connect(self.file, timeout=_WAIT_S, isolation_level=None)) as connection:
                 connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
@@ -289,7 +289,7 @@ class GeoPackage(Home):
             if "locked" in str(error):
                 raise self._held_open(error) from cause
         except sqlite3.DatabaseError:
-            return  # it is none: that is what the caller says
+            return  # not a database: the caller reports that
 
     def _held_open(self, error: Exception) -> HomeError:
         who = programs_with(self.file)
@@ -301,7 +301,7 @@ class GeoPackage(Home):
         )
 
     def _layer_rows(self, layer: str) -> tuple[dict[str, Any], pa.Table]:
-        """What OGR says of a layer, and its rows."""
+        """Returns OGR's description of a layer, and its rows."""
         import pyogrio
 
         try:
@@ -322,7 +322,7 @@ class GeoPackage(Home):
 
 
 def programs_with(file: Path) -> list[str]:
-    """Name and number of each other program of this computer that has a file open, as far as its user may see them."""
+    """Returns name and number of each other program here that has a file open, as far as its user may see."""
     import psutil
 
     found = []
@@ -334,7 +334,7 @@ def programs_with(file: Path) -> list[str]:
 
 
 def _told(kind: str) -> pa.Schema:
-    """The kind's columns with what QGIS and others show of them: title, meaning."""
+    """Returns the kind's columns with the metadata that QGIS and others show: title, meaning."""
     fields = [
         pa.field(
             c.name,
@@ -347,7 +347,7 @@ def _told(kind: str) -> pa.Schema:
 
 
 def _title(kind: str, name: str) -> str:
-    """Title of a column with its unit; GeoPackage asks for titles that differ within a layer."""
+    """Returns a column's title with its unit; GeoPackage demands titles that differ within a layer."""
     column = next(c for c in asset_columns(kind) if c.name == name)
     same = [c.name for c in asset_columns(kind) if c.title == column.title]
     return column.title if len(same) == 1 else f"{column.title} ({name})"
@@ -360,11 +360,11 @@ def _mark_rows(mark: Mark) -> pa.Table:
 
 @contextlib.contextmanager
 def _dated(at: str) -> Iterator[None]:
-    """Let OGR write an instant of ours in place of its clock's: same state, same bytes."""
+    """Make OGR write our instant instead of its clock's: same state, same bytes."""
     import pyogrio
 
     moment = dt.datetime.fromisoformat(at).strftime("%Y-%m-%dT%H:%M:%S.000Z")
-    options = {"OGR_CURRENT_DATE": moment, "OGR_SQLITE_SYNCHRONOUS": "OFF"}  # it is synchronised once, as a whole
+    options = {"OGR_CURRENT_DATE": moment, "OGR_SQLITE_SYNCHRONOUS": "OFF"}  # fsync follows once for the whole file
     pyogrio.set_gdal_config_options(options)
     try:
         yield

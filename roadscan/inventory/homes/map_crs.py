@@ -1,4 +1,4 @@
-"""Geometries of a home in the map's CRS, whatever CRS a person exported them to."""
+"""Transformation of a home's geometries into the map's CRS, whatever CRS a person exported them to."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _WAY_OUT: Final = "export the layer in the map's CRS, with heights as the map ha
 
 
 def into_map(stated: str | None, frame: MapFrame, layer: str, home: str) -> Callable[[Shapes], Shapes]:
-    """What brings geometries of a layer into the map.
+    """Returns the transformation of a layer's geometries into the map.
 
     Parameters
     ----------
@@ -73,9 +73,9 @@ def _known(stated: str, layer: str, home: str) -> pyproj.CRS:
 
 
 def _parts(crs: pyproj.CRS, frame: MapFrame, layer: str, home: str) -> tuple[pyproj.CRS, bool]:
-    """The horizontal part of a layer's CRS, and whether its heights above the ellipsoid go through the operation.
+    """Returns the horizontal part of a layer's CRS, and whether its ellipsoidal heights are transformed too.
 
-    A CRS of two axes says nothing of heights: programs export them as they are.
+    A CRS of two axes has no heights: programs export them as they are.
     """
     if crs.is_compound:
         horizontal, vertical = crs.sub_crs_list[:2]
@@ -107,7 +107,7 @@ def _operation(source: pyproj.CRS, target: pyproj.CRS, limit_m: float, layer: st
 
 
 def _transformed(shapes: Shapes, operation: pyproj.Transformer, *, heights: bool) -> Shapes:
-    """Geometries in the map; empty and missing ones as they are."""
+    """Returns transformed geometries; empty and missing ones are unchanged."""
 
     def moved(places: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         out = places.copy()

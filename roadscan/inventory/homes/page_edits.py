@@ -1,6 +1,6 @@
-"""Edits that people made in the page of a survey, as one document: a home that holds a commit's state with them.
+"""Edits made in the page of a survey, as one document: a home that presents a commit's state with them applied.
 
-`docs/viewer.md` says what the document holds. Old values are those of the commit that the page showed; what the
+`docs/viewer.md` specifies the document. Old values are those of the commit that the page showed; what the
 document says of them does not count.
 """
 
@@ -29,25 +29,25 @@ from roadscan.store.asset_schema import asset_schema
 from roadscan.store.inventory_schema import GEOMETRY, asset_table, kinds_by_table
 
 LAYER: Final = "asset_"
-"""Layers of the page are named so, followed by the table of their kind."""
+"""Prefix of the names of the page's layers; the table of their kind follows."""
 
 Outcome = Literal["accepted", "same", "conflict", "asked", "refused"]
 
 
 class EditProperties(Strict):
-    """What one edit says."""
+    """The content of one edit."""
 
     layer: str
     action: Literal["confirm", "reject", "change", "add"]
     asset_id: str | None = None
-    """The asset; null where it was just drawn."""
+    """The asset; null if it was just drawn."""
     attributes: dict[str, bool | int | float | str | None] = Field(default_factory=dict)
-    """Columns that are corrected, with their new values."""
+    """Corrected columns, with their new values."""
     comment: str = ""
     author: str = ""
     edited_utc: dt.datetime | None = None
     confirmed: bool = False
-    """True where the person said that an unlikely place is right."""
+    """True if the person confirmed that an unlikely place is right."""
 
 
 class EditFeature(Strict):
@@ -55,7 +55,7 @@ class EditFeature(Strict):
 
     type: Literal["Feature"]
     geometry: dict[str, Any] | None = None
-    """The new place as GeoJSON writes it, in metres of the map; null where it is not changed."""
+    """The new place as GeoJSON, in metres of the map; null where it is not changed."""
     properties: EditProperties
 
 
@@ -75,17 +75,17 @@ class EditDocument(Strict):
 
 
 class EditOutcome(NamedTuple):
-    """What became of one edit of a document."""
+    """The outcome of one edit of a document."""
 
     outcome: Outcome
-    """`accepted`, `same`: the inventory says so already, `conflict`: it waits, `asked`: it is taken in once it
+    """`accepted`, `same`: the inventory says so already, `conflict`: it waits, `asked`: it is accepted once it
     is confirmed, or `refused`."""
     reason: str = ""
 
 
 @dataclass(frozen=True)
 class PageDocument:
-    """A document of edits, read."""
+    """A parsed document of edits."""
 
     name: str
     edits: EditDocument
@@ -94,12 +94,12 @@ class PageDocument:
 
     @property
     def mark(self) -> Mark:
-        """The inventory and the commit that the page showed."""
+        """Returns the inventory and the commit that the page showed."""
         return Mark(self.edits.inventory, "", "", self.edits.commit, "")
 
     @classmethod
     def parse(cls, name: str, content: bytes, units_m: tuple[float, float, float]) -> PageDocument:
-        """The document of a file or of a page.
+        """Returns the document of a file or of a page.
 
         Raises
         ------
@@ -124,7 +124,7 @@ class PageDocument:
 
 
 class PageEdits(Home):
-    """A document of edits over the rows that its page showed."""
+    """A document of edits applied to the rows that its page showed."""
 
     def __init__(self, document: PageDocument, shown: Mapping[str, pa.Table]) -> None:
         """Take the rows that the page showed, by kind and with `fid`."""
@@ -137,15 +137,15 @@ class PageEdits(Home):
 
     @property
     def name(self) -> str:
-        """The file, or what the page is called."""
+        """Returns the file's name, or that of the page."""
         return self.document.name
 
     def mark(self) -> Mark:
-        """The commit that the page showed."""
+        """Returns the commit that the page showed."""
         return self.document.mark
 
     def read(self) -> Content:
-        """Those rows as the edits leave them; edits that cannot be applied are faults."""
+        """Returns those rows after the edits; edits that cannot be applied are faults."""
         self.records, self._faults, self._authors = [], [], {}
         rows = dict(self.shown)
         by_kind: dict[str, list[EditFeature]] = {}
@@ -173,7 +173,7 @@ class PageEdits(Home):
         return Content(rows, authors=self._authors, faults=tuple(self._faults), confirmed=confirmed)
 
     def _edited(self, kind: str, rows: pa.Table, features: Sequence[EditFeature]) -> tuple[pa.Table, list[str]]:
-        """Rows of a kind with edits, and the record of each edit."""
+        """Returns the rows of a kind after the edits, and the record of each edit."""
         table = asset_schema(kind).table
         place = {one: at for at, one in enumerate(rows["asset_id"].to_pylist())}
         fid = rows.num_rows
@@ -208,7 +208,7 @@ class PageEdits(Home):
         return rows, records
 
     def _values(self, kind: str, feature: EditFeature) -> dict[str, Any]:
-        """New values by column; ValueError where one is not of its column's type."""
+        """Returns new values by column; ValueError where one is not of its column's type."""
         given = feature.properties
         if given.action in ("confirm", "reject"):
             return {"status": "confirmed" if given.action == "confirm" else "rejected"}
@@ -218,7 +218,7 @@ class PageEdits(Home):
         return values
 
     def _geometry(self, kind: str, raw: Mapping[str, Any]) -> bytes | None:
-        """A geometry as WKB; of a kind whose shapes have several parts a single line or area becomes the only part."""
+        """Returns a geometry as WKB; of a multi-part kind, a single line or area becomes its only part."""
         try:
             shape = shapely.geometry.shape(raw)
             if asset_schema(kind).geometry == f"Multi{shape.geom_type}Z":
@@ -233,11 +233,11 @@ class PageEdits(Home):
     def outcomes(
         self, taken: Sequence[Edit], refused: Sequence[EditFault], waiting: Sequence[Conflict]
     ) -> list[EditOutcome]:
-        """What became of each edit, once the document was pulled.
+        """Returns the outcome of each edit, once the document was pulled.
 
         Parameters
         ----------
-        taken, refused : what the pull took in and what it refused; waiting : conflicts of the inventory afterwards.
+        taken, refused : what the pull accepted and refused; waiting : conflicts of the inventory afterwards.
         """
         reasons: dict[tuple[str, str], list[str]] = {}
         for fault in refused:
@@ -266,11 +266,11 @@ class PageEdits(Home):
         return edit.action == "create" and drawn is not None and edit.new == encoded(drawn)
 
     def write(self, content: Content, sheets: Sequence[Sheet], mark: Mark) -> None:
-        """Refuse: a document holds edits alone."""
+        """Refuse: a document contains edits only."""
         raise HomeError("a document of edits shows no state", change="publish to the survey's own home", file=self.name)
 
     def note(self, mark: Mark) -> None:
-        """Do nothing: the document that was taken in says nothing new a second time."""
+        """Do nothing: a document that was taken in says nothing new a second time."""
 
 
 def _assets(edits: Sequence[Edit]) -> set[str]:
@@ -278,7 +278,7 @@ def _assets(edits: Sequence[Edit]) -> set[str]:
 
 
 def _met(one: Conflict) -> str:
-    """A conflict in words."""
+    """Returns a conflict in words."""
     if one.reason == "edit":
         return (
             f"{one.attribute}: somebody else wrote {value_shown(one, 'in_force')} meanwhile, which is in force; "
@@ -296,7 +296,7 @@ def _empty(kind: str) -> pa.Table:
 
 
 def _with_values(rows: pa.Table, name: str, values: Mapping[int, Any]) -> pa.Table:
-    """Rows with other values of a column at some of their places."""
+    """Returns rows with other values of a column at some of their places."""
     at, places = rows.schema.get_field_index(name), sorted(values)
     mask: npt.NDArray[np.bool_] = np.zeros(rows.num_rows, np.bool_)
     mask[places] = True
@@ -307,7 +307,7 @@ def _with_values(rows: pa.Table, name: str, values: Mapping[int, Any]) -> pa.Tab
 
 
 def _value(kind: str, name: str, raw: Any) -> Any:
-    """A value of the document as its column holds it."""
+    """Returns a value of the document in the type of its column."""
     schema = asset_table(kind)
     if name not in schema.names or name in ("asset_id", GEOMETRY):
         raise ValueError(f"there is no column '{name}' to be edited")
@@ -332,7 +332,7 @@ def _value(kind: str, name: str, raw: Any) -> Any:
 
 
 _MOST: Final = 2**31
-"""Numbers of assets are less, also where a column could hold more."""
+"""Numbers of assets are below this, even where a column could store more."""
 _IN_WORDS: Final = {
     "double": "a number", "int32": "a whole number", "int64": "a whole number", "string": "a text",
     "bool": "true or false", "date32[day]": "a date such as 2026-05-04",

@@ -1,6 +1,6 @@
 """A PostGIS database as the home of the inventory, for many people at once.
 
-A publication is one transaction: others see the old state until it ends, and for ever where it is cut off.
+A publication is one transaction: others see the old state until it ends, also if it is interrupted.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from roadscan.store.inventory_schema import GEOMETRY, asset_table, kinds_by_table
 
 MARKS: Final = "roadscan_inventory"
-_WAIT_MS: Final = 10_000
+_WAIT_MS: Final = 10_000  # Wait for a lock on the tables, at most (ms).
 _TYPES: Final = {"geometry": "geometry", "sigmas": "double precision", "significance": "double precision",
                  "distance_m": "double precision", "passes_expected": "integer"}  # fmt: skip
 
@@ -73,24 +73,24 @@ class PostGis(Home):
 
     @property
     def name(self) -> str:
-        """Host, database and schema."""
+        """Returns host, database and schema."""
         host, port = self._parts.get("host") or "local", self._parts.get("port")
         place = f"{host}:{port}" if port else host
         return f"postgis {place}/{self._parts.get('dbname') or ''} {self.schema}"
 
     @property
     def project_file(self) -> Path | None:
-        """The one that was named."""
+        """Returns the path that was given."""
         return self._project
 
     def layer_address(self, table: str) -> tuple[str, str]:
-        """The table, without user and password: QGIS asks for them, or takes them from its own store."""
+        """Returns the table without user and password: QGIS asks for them, or takes them from its own store."""
         shown = " ".join(f"{k}='{self._parts[k]}'" for k in ("dbname", "host", "port") if self._parts.get(k))
         return "postgres", f'{shown} key=\'fid\' srid={self.srid} table="{self.schema}"."{table}" (geom)'
 
     @contextlib.contextmanager
     def _transaction(self, isolation: str = "REPEATABLE READ") -> Iterator[Any]:
-        """A cursor in a transaction, which holds wholly or not at all; errors of the database in words."""
+        """Yields a cursor in a transaction that is committed as a whole; database errors are put into words."""
         import psycopg
 
         try:
@@ -115,7 +115,7 @@ class PostGis(Home):
         return text.replace(str(password), "…") if password else text
 
     def mark(self) -> Mark | None:
-        """Its last mark."""
+        """Returns its last mark."""
         with self._transaction() as cursor:
             return self._mark(cursor)
 
@@ -137,7 +137,7 @@ class PostGis(Home):
         return None if row is None else Mark(*row)
 
     def read(self) -> Content:
-        """Rows of all tables at one instant, and who changed them since they were read last."""
+        """Returns the rows of all tables at one instant, and who changed them since the last read."""
         with self._transaction() as cursor:
             held = self._held(cursor)
             rows = {kind: self._read_table(cursor, kind) for kind in self.kinds if kind in held}
@@ -177,7 +177,7 @@ class PostGis(Home):
         )
 
     def _in_map(self, shapes: npt.NDArray[Any], table: str) -> npt.NDArray[Any]:
-        """Geometries in the map's CRS: a table whose column was altered holds those of another SRID."""
+        """Returns geometries in the map's CRS: a table whose column was altered may have another SRID."""
         stated = shapely.get_srid(shapes)
         out = shapes.copy()
         for srid in sorted(set(stated[~shapely.is_missing(shapes)].tolist()) - {self.srid}):
@@ -186,12 +186,12 @@ class PostGis(Home):
         return out
 
     def _as_owner(self, cursor: Any) -> None:
-        """Go on as the owner of the schema, which all administrators are: tables are replaced by nobody else."""
+        """Switch to the role of the schema's owner, which all administrators have: only it replaces tables."""
         cursor.execute("SELECT nspowner::regrole::text FROM pg_namespace WHERE nspname = %s", [self.schema])
         cursor.execute(f"SET LOCAL ROLE {cursor.fetchone()[0]}")
 
     def _held(self, cursor: Any) -> set[str]:
-        """Kinds that have a table; a schema of an older version lacks those of newer kinds."""
+        """Returns the kinds that have a table; a schema of an older version lacks those of newer kinds."""
         cursor.execute("SELECT tablename FROM pg_tables WHERE schemaname = %s", [self.schema])
         return {kinds_by_table()[table] for (table,) in cursor.fetchall() if table in kinds_by_table()}
 

@@ -1,4 +1,4 @@
-"""The tables of the inventory in PostGIS, from the same schemas: constraints, history, roles, current views."""
+"""The inventory's tables in PostGIS, from the same schemas: constraints, history, roles, current views."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ CREATE TABLE {s}.roadscan_inventory (
 
 
 def statements(schema: str, srid: int, kinds: Sequence[str], *, is_new: bool = True) -> Iterator[str]:
-    """Statements that make tables in a new schema, or further ones in one that is there.
+    """Yields statements that create the tables of a new schema, or missing ones in an existing schema.
 
-    Names of the schema and of the kinds are checked: letters, digits, `_`.
+    Names of the schema and of the kinds are validated: letters, digits, `_`.
     """
     if is_new:
         yield "CREATE EXTENSION IF NOT EXISTS postgis"
@@ -51,7 +51,7 @@ def statements(schema: str, srid: int, kinds: Sequence[str], *, is_new: bool = T
             )
         yield f"GRANT {schema}_admin TO CURRENT_USER"
         yield f"CREATE SCHEMA {schema} AUTHORIZATION {schema}_admin"
-        yield f"SET LOCAL ROLE {schema}_admin"  # all that is made belongs to every administrator
+        yield f"SET LOCAL ROLE {schema}_admin"  # every administrator owns what is created
         yield _HISTORY.format(s=schema)
     for kind in kinds:
         yield from _kind(schema, kind, srid)
@@ -59,7 +59,7 @@ def statements(schema: str, srid: int, kinds: Sequence[str], *, is_new: bool = T
 
 
 def grants(schema: str, kinds: Sequence[str]) -> Iterator[str]:
-    """What readers, editors and administrators may do: look; change assets and decide conflicts; all."""
+    """Yields grants: readers look; editors change assets and decide conflicts; administrators do all."""
     names = ", ".join(f"{schema}_{role}" for role in ROLES)
     yield f"GRANT USAGE ON SCHEMA {schema} TO {names}"
     yield f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {names}"

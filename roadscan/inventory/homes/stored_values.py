@@ -1,4 +1,4 @@
-"""Values of a GeoPackage that are not of their column's type: SQLite stores what it is given, and OGR reads it as 0."""
+"""Values of a GeoPackage that are not of their column's type: SQLite stores any value, and OGR reads these as 0."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _WANTED: Final = {
     "bool": "true or false (1 or 0)", "date32[day]": "a date such as 2026-05-04",
 }  # fmt: skip
 _STORED: Final = {"double": ("real", "integer"), "string": ("text",)}
-"""Types of SQLite that any value of a column of that type may have, beside null."""
+"""Storage classes of SQLite that a column of each type may have, beside null."""
 
 
 class OddValue(NamedTuple):
-    """A cell that does not hold a value of its column."""
+    """A cell whose value is not of its column's type."""
 
     fid: int
     asset_id: str | None
@@ -40,7 +40,7 @@ class OddValue(NamedTuple):
 
 
 def odd_values(file: Path, layer: str, schema: pa.Schema) -> list[OddValue]:
-    """Cells of a layer that do not hold a value of their column's type, by row; of columns of `schema` that it has."""
+    """Returns the cells of a layer whose values are not of their column's type, by row; of the columns in `schema`."""
     with contextlib.closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)) as connection:
         connection.text_factory = lambda content: content.decode("utf-8", "replace")
         there = {name for _, name, *_ in connection.execute(f'PRAGMA table_info("{layer}")')}
@@ -63,7 +63,7 @@ def _of_column(connection: sqlite3.Connection, layer: str, field: pa.Field, ther
 
 
 def _is_value(kind: str, held: str, value: Any) -> bool:
-    """True if a stored value is one of a column whose values do not all have the same type in SQLite."""
+    """Returns True if a stored value is valid in a column that permits several storage classes."""
     if kind == "bool":
         return held in ("integer", "real") and value in (0, 1)
     if kind in ("int32", "int64"):
@@ -73,7 +73,7 @@ def _is_value(kind: str, held: str, value: Any) -> bool:
 
 
 def _is_day(text: str) -> bool:
-    """True for a day, and for a day at midnight, as some programs write it."""
+    """Returns True for a day, and for a day at midnight, as some programs write it."""
     try:
         moment = dt.datetime.fromisoformat(text)
     except ValueError:

@@ -17,9 +17,9 @@ _USE: Final = "UPDATE gpkg_data_columns SET constraint_name = ? WHERE table_name
 
 
 def add_value_lists(file: Path, kinds: Sequence[str]) -> None:
-    """Add those of some kinds to a file that OGR has just written and nobody else knows yet.
+    """Add those of some kinds to a file that OGR has just written and that nobody else uses yet.
 
-    The tables of the extension hold no features, so no trigger of a spatial index is called.
+    The extension's tables contain no features, so no trigger of a spatial index is called.
     """
     known: set[tuple[str, tuple[str, ...], float | None, float | None]] = set()
     with contextlib.closing(sqlite3.connect(file)) as connection, connection:
@@ -36,7 +36,7 @@ def add_value_lists(file: Path, kinds: Sequence[str]) -> None:
 
 
 def constraint_name(kind: str, column: AssetColumn) -> str | None:
-    """Name of a column's value list or range; columns of all kinds share one. None where it has none."""
+    """Returns the name of a column's value list or range, which all kinds share; None where it has none."""
     prefix = f"{kind}_" if column in asset_schema(kind).own else ""
     if column.values or (column.min is not None and column.max is not None):
         return f"{prefix}{column.name}"

@@ -1,1 +1,1 @@
-"""What QGIS shows the inventory by: forms, styles and a project file, all of them from the schemas of the kinds."""
+"""QGIS forms, styles and project file of the inventory, all derived from the schemas of the kinds."""

@@ -1,4 +1,4 @@
-"""Forms of QGIS: a widget, a title, limits and a right to edit for each column of a kind, as elements of its XML."""
+"""QGIS forms: widget, title, limits and permission to edit for each column of a kind, as elements of its XML."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from roadscan.inventory.home import CHOICES
 from roadscan.store.asset_schema import AssetColumn, asset_schema
 from roadscan.store.inventory_schema import asset_columns, editable_columns
 
-_NOT_NULL: Final = 1
-_EXPRESSION: Final = 4
+_NOT_NULL: Final = 1  # Bit of QGIS's constraint flags: not null.
+_EXPRESSION: Final = 4  # Bit of QGIS's constraint flags: expression.
 _HARD: Final = 1
-"""QGIS refuses what breaks the constraint; 2 would warn."""
+"""Constraint strength: QGIS refuses values that violate it; 2 would warn."""
 
 
 def form_elements(kind: str) -> list[Element]:
@@ -57,7 +57,7 @@ def decision_elements() -> list[Element]:
 
 
 def _rule(column: AssetColumn) -> str:
-    """What QGIS holds a value against; empty where any will do."""
+    """Returns QGIS's constraint expression for a value; empty where any value is valid."""
     name = f'"{column.name}"'
     if column.values:
         listed = ", ".join("'" + value.replace("'", "''") + "'" for value in column.values)
@@ -114,7 +114,7 @@ def _configured(kind: str, options: Mapping[str, Any]) -> Element:
 
 
 def _layout(kind: str) -> list[Element]:
-    """Two tabs: what people edit, and what was measured."""
+    """Returns two tabs: what people edit, and what was measured."""
     form = Element("attributeEditorForm")
     columns = asset_columns(kind)
     may_edit = editable_columns(kind)

@@ -1,4 +1,4 @@
-"""A project file of QGIS: the layers of the inventory with styles and forms, and products of the survey behind."""
+"""A QGIS project file: the layers of the inventory with styles and forms, and products of the survey behind."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ _GEOMETRY: Final = {
     "MultiPolygonZ": "Polygon",
 }  # fmt: skip
 _ORDER: Final = tuple(_GEOMETRY)
-"""From the uppermost layer down."""
+"""Order of the layers, from the uppermost down."""
 
 
 class Source(NamedTuple):
-    """Where QGIS finds a layer."""
+    """The provider and address of a layer in QGIS."""
 
     provider: str
     address: str
 
 
 class Raster(NamedTuple):
-    """A product that stands behind the assets."""
+    """A product shown behind the assets."""
 
     title: str
     path: str
@@ -36,7 +36,7 @@ class Raster(NamedTuple):
 def project_text(
     title: str, kinds: Sequence[str], source: Callable[[str], Source], crs: str | None, rasters: Sequence[Raster] = ()
 ) -> str:
-    """A project of QGIS 3 as XML; the same for the same arguments.
+    """Returns a QGIS 3 project as XML; equal arguments give equal text.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Styles of QGIS: a symbol a kind in its colour, by status; written into the GeoPackage, where QGIS takes them up."""
+"""QGIS styles: a symbol for each kind in its colour, by status; stored in the GeoPackage, where QGIS reads them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from roadscan.inventory.qgis.forms import decision_elements, form_elements
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
 
 QGIS_VERSION: Final = "3.22.0-Białowieża"
-"""Of the oldest QGIS that the files are tried with: it warns of files of a newer one."""
+"""The oldest QGIS that the files are tried with: it warns of files of a newer one."""
 STYLES: Final = "layer_styles"
 SHEETS: Final = ("conflicts", "changes")
 """Layers beside those of the kinds, the uppermost first."""
@@ -35,13 +35,13 @@ _COLOURS: Final = (
 
 
 def style_elements(kind: str) -> list[Element]:
-    """Renderer and form of a kind's layer, as elements of QGIS's XML."""
+    """Returns renderer and form of a kind's layer, as elements of QGIS's XML."""
     return [_renderer(kind), *form_elements(kind)]
 
 
 @functools.cache
 def style_text(kind: str) -> str:
-    """The same as a style file (QML)."""
+    """Returns the same as a style file (QML)."""
     return _text(style_elements(kind))
 
 
@@ -90,8 +90,8 @@ def add_styles(file: Path, kinds: Sequence[str], at: dt.datetime) -> None:
 
 
 def sheet_elements(name: str) -> list[Element]:
-    """Renderer of a layer beside those of the kinds, `conflicts` or `changes`, and of conflicts the form: all that is
-    edited is the decision.
+    """Returns the renderer of the layer `conflicts` or `changes`; of conflicts also the form, in which only the
+    decision is edited.
     """
     if name == "changes":
         symbols = {change: _symbol("marker", _outline(*look), 1.0) for change, look in _CHANGES.items()}
@@ -115,7 +115,7 @@ def _renderer(kind: str) -> Element:
 
 
 def _categories(attribute: str, drawn: Mapping[str, Element]) -> Element:
-    """A symbol for each value of an attribute."""
+    """Returns a symbol for each value of an attribute."""
     renderer = Element("renderer-v2", type="categorizedSymbol", attr=attribute, symbollevels="0", enableorderby="0",
                        forceraster="0")  # fmt: skip
     categories = SubElement(renderer, "categories")
@@ -133,7 +133,7 @@ def _marker(shape: str, colour: str, size_mm: float) -> dict[str, str]:
 
 
 def _outline(shape: str, colour: str, size_mm: float) -> dict[str, str]:
-    """The same without a fill: the asset shows through."""
+    """Returns the same without a fill, so that the asset shows through."""
     edge = {"outline_color": f"{colour},255", "outline_width": "0.8", "outline_width_unit": "MM"}
     return _marker(shape, colour, size_mm) | edge | {"color": f"{colour},0"}
 

@@ -1,1 +1,1 @@
-"""Surfaces: triangulation, smoothing, holes, coarse heights, colours."""
+"""Kernels of surfaces: triangulation, smoothing, holes, coarse heights, colours."""

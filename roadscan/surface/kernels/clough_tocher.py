@@ -22,23 +22,23 @@ from __future__ import annotations
 from roadscan.compute.kernel_options import inlined, inner, kernel
 from roadscan.compute.kernels.patch_heights import BY_CORNER, BY_EDGE, CENTRE, CORNER, EDGE, INNER
 
-ALONG, ACROSS, SLOPE = 0, 1, 2
+ALONG, ACROSS, SLOPE = 0, 1, 2  # Columns of `halves`: position along and across an edge, and slope across it.
 THIN = 0.25
-"""A triangle is thin beside another if its corner lies nearer to their edge by this factor."""
+"""A triangle is thin relative to its neighbour if its corner is nearer to their edge by this factor."""
 LEAST_SHARE = 0.05
-"""Of the slope across the middle of an edge in what a thin triangle's corner says (1.5 above the middle, 0 at an end).
+"""Least weight of the slope across an edge's middle in a thin triangle's equation (1.5 above the middle, 0 at an end).
 """
 
 
 @inlined
 def third_of_slope(gradients, i, dx, dy):
-    """A third of the derivative at vertex i along (dx, dy): from a vertex to its control point (eq. 7-9)."""
+    """Returns a third of the derivative at vertex i along (dx, dy): from a vertex to its control point (eq. 7-9)."""
     return (gradients[i, 0] * dx + gradients[i, 1] * dy) / 3.0
 
 
 @kernel
 def cross_slopes(x, y, z, gradients, triangles, halves):
-    """What each triangle knows of the slope across its edges.
+    """Compute the slope across its edges that each triangle implies.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def cross_slopes(x, y, z, gradients, triangles, halves):
 
 @inlined
 def misfits(x, y, z, gradients, lo, hi, a):
-    """Where corner a lies along and across an edge, and what its height and slopes say beyond what the edge knows.
+    """Returns the position of corner a along and across an edge, and the misfit of its height and slopes to the edge.
 
     Returns
     -------
@@ -89,11 +89,11 @@ def misfits(x, y, z, gradients, lo, hi, a):
 
 @inner
 def slope_beside_thin(x, y, z, gradients, lo, hi, wide, thin, seen_wide, seen_thin):
-    """Slope across the middle of an edge beside a thin triangle, from what the cubic through the wide one has to meet.
+    """Returns the slope across the middle of an edge beside a thin triangle, by least squares of two equations.
 
-    Two equations for it: the slope at the thin corner, and the rule of Foley & Opitz times the small distance of that
-    corner (`seen_wide`, `seen_thin`: the slopes of :func:`cross_slopes`). They are solved by least squares; where the
-    thin corner lies at an end of the edge it tells nothing of the middle, and the mean of the ends is taken.
+    The equations: the slope at the thin corner, and the rule of Foley & Opitz times the small distance of that
+    corner (`seen_wide`, `seen_thin`: the slopes of :func:`cross_slopes`). Where the thin corner lies over an end of
+    the edge it does not determine the middle, and the mean of the ends is taken.
     """
     s, t, height, along, across = misfits(x, y, z, gradients, lo, hi, wide)
     thin_s, thin_t, _, _, thin_across = misfits(x, y, z, gradients, lo, hi, thin)
@@ -112,7 +112,7 @@ def slope_beside_thin(x, y, z, gradients, lo, hi, wide, thin, seen_wide, seen_th
 
 @kernel
 def control_points(x, y, z, gradients, triangles, opposite, halves, patches):
-    """Control points of each triangle.
+    """Compute the control points of each triangle.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def control_points(x, y, z, gradients, triangles, opposite, halves, patches):
 
 @inlined
 def split(patch):
-    """From the inner point of each edge to the control points of three cubics that meet smoothly (Clough–Tocher)."""
+    """Compute from the inner point of each edge the control points of three smoothly joined cubics (Clough–Tocher)."""
     centre = 0.0
     for k in range(3):
         near, far = patch[EDGE + 2 * k], patch[EDGE + 2 * k + 1]

@@ -1,4 +1,4 @@
-"""Coarse surface: a cubic spline along each profile to even steps across the road, and a 3 × 3 median."""
+"""Coarse surface: a cubic spline along each profile, sampled at even steps across the road, and a 3 × 3 median."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NOTHING, MEASURED, INTERPOLATED, FILLED = 0, 1, 2, 3
 
 @kernel
 def natural_spline(x, z, first, end, bend, work):
-    """Second derivatives `bend` of the natural cubic spline through knots `first` to `end` − 1.
+    """Compute second derivatives `bend` of the natural cubic spline through knots `first` to `end` − 1.
 
     The tridiagonal system of the spline's moments (de Boor 1978, *A Practical Guide to Splines*, chapter IV), solved by
     elimination without pivoting: it is strictly diagonally dominant.
@@ -41,7 +41,7 @@ def natural_spline(x, z, first, end, bend, work):
 
 @kernel
 def knots_of(across, height, classes, first_node, per_m, sums, x, z, low, high, node):
-    """Knots of one profile: the mean of the road readings nearest to each node.
+    """Find the knots of one profile: the mean of the road readings nearest to each node.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def knots_of(across, height, classes, first_node, per_m, sums, x, z, low, high, 
 
 @inlined
 def end_level(z, first, end):
-    """Mean height of the knots `first` to `end` − 1."""
+    """Returns the mean height of the knots `first` to `end` − 1."""
     total = 0.0
     for i in range(first, end):
         total += z[i]
@@ -88,7 +88,7 @@ def end_level(z, first, end):
 
 @kernel
 def spline_profiles(across, height, classes, every, first_node, spacing, reach, fill, surface, origin):
-    """Heights of profiles at even steps across the road.
+    """Compute heights of profiles at even steps across the road.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def spline_piece(x, z, bend, node, begin, end, first_node, spacing, surface, ori
 
 @inner
 def median_of_rows(above, here, below, out):
-    """Medians of 3 × 3 neighbourhoods (K − 2,) of three rows (K,), where all nine are there.
+    """Compute medians of 3 × 3 neighbourhoods (K − 2,) of three rows (K,) where all nine are present.
 
     Columns are sorted first; the median of nine is that of the largest lowest, the middle middle and the smallest
     highest (Smith 1996, *Implementing median filters in XC4000E FPGAs*).
@@ -189,7 +189,7 @@ def median_of_rows(above, here, below, out):
 
 @inner
 def median_of_some(surface, p, k, some):
-    """Median of those of the 3 × 3 nodes around (p, k) that there are; of an even number the mean of the middle two.
+    """Returns the median of those of the 3 × 3 nodes around (p, k) that exist; of an even number the mean of two.
 
     some : (9,) float64, scratch.
     """
@@ -209,7 +209,7 @@ def median_of_some(surface, p, k, some):
 
 @kernel
 def median_filter(surface, out):
-    """3 × 3 median of a surface (n, K); NaN stays NaN and does not count in the others' medians."""
+    """Apply a 3 × 3 median to a surface (n, K); NaN stays NaN and does not count in other medians."""
     n, nodes = surface.shape
     some, quick = np.empty(9), np.empty(nodes)
     gaps = np.zeros(nodes + 2, np.int32)
@@ -229,7 +229,7 @@ def median_filter(surface, out):
 
 @inner
 def count_gaps(above, here, below, gaps):
-    """How many of the three nodes of each column (K,) there are not."""
+    """Count the missing ones of the three nodes of each column (K,)."""
     for k in range(gaps.size):
         gaps[k] = np.isnan(above[k]) + np.isnan(here[k]) + np.isnan(below[k])
 
@@ -286,22 +286,22 @@ class Profiles(NamedTuple):
     """Profiles of a coarse surface on the map."""
 
     east_m: npt.NDArray[np.float64]
-    """(n,) where each profile has offset 0."""
+    """(n,) easting of each profile's offset 0."""
     north_m: npt.NDArray[np.float64]
-    """(n,)"""
+    """(n,) northing of it."""
     right_east: npt.NDArray[np.float64]
     """(n,) unit vector along the profile, to the right."""
     right_north: npt.NDArray[np.float64]
     """(n,)"""
     first_node: int
-    """Node k lies at (first_node + k) · spacing_m."""
+    """Number of the first node: node k lies at (first_node + k) · spacing_m."""
     spacing_m: float
     height_m: npt.NDArray[np.float64]
     """(n, K) of the nodes, NaN where there is nothing."""
     origin: npt.NDArray[np.uint8]
     """(n, K) of the nodes."""
     links: npt.NDArray[np.bool_]
-    """(n,) whether profile p and p + 1 bound a surface."""
+    """(n,) whether the surface continues from profile p to p + 1."""
 
 
 class CellSums(NamedTuple):
@@ -317,7 +317,7 @@ class CellSums(NamedTuple):
 
 @kernel
 def rasterise(profiles, corner, cell, pieces_per_m, quanta_per_m, found):
-    """Spread the nodes of profiles over the cells of one square of the map.
+    """Add the nodes of profiles to the cells of one square of the map.
 
     Between profiles that are linked, nodes are interpolated along the road, in steps of less than a cell.
 

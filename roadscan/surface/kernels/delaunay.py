@@ -1,4 +1,4 @@
-"""Delaunay's condition, decided exactly.
+"""Exact decisions for the Delaunay triangulation.
 
 Positions are int64 on the lattice of ``surfaces.sites`` (2⁻³⁶ m), so differences are exact and every decision is the
 same whatever else is triangulated. Triangles are (n, 3) int64 indices, counter-clockwise; column k of `across` is the
@@ -12,14 +12,14 @@ import numpy as np
 from roadscan.compute.kernel_options import inlined, inner, kernel
 
 ERROR_BOUND = 2.0**-49
-"""Of the determinant in floating point, of the sum of its terms' sizes (Shewchuk 1997: 1.1e-15, here 1.8e-15)."""
-LOW = np.uint64(0xFFFFFFFF)
-HALF = np.uint64(32)
+"""Bound of the determinant's rounding error, relative to the sum of its terms' sizes (Shewchuk 1997: 1.1e-15)."""
+LOW = np.uint64(0xFFFFFFFF)  # Mask of the low 32 bits.
+HALF = np.uint64(32)  # Bits of half a word.
 
 
 @inlined
 def product_128(a, b):
-    """Product modulo 2¹²⁸ of numbers (high, low) of two uint64."""
+    """Returns the product modulo 2¹²⁸ of numbers (high, low) of two uint64."""
     a0, a1, b0, b1 = a[1] & LOW, a[1] >> HALF, b[1] & LOW, b[1] >> HALF
     low, m1, m2 = a0 * b0, a1 * b0, a0 * b1
     middle = (low >> HALF) + (m1 & LOW) + (m2 & LOW)
@@ -29,39 +29,39 @@ def product_128(a, b):
 
 @inlined
 def sum_128(a, b):
-    """Sum modulo 2¹²⁸."""
+    """Returns the sum modulo 2¹²⁸."""
     low = a[1] + b[1]
     return a[0] + b[0] + (np.uint64(1) if low < a[1] else np.uint64(0)), low
 
 
 @inlined
 def negative_128(a):
-    """Two's complement."""
+    """Returns the two's complement."""
     low = ~a[1] + np.uint64(1)
     return ~a[0] + (np.uint64(1) if low == np.uint64(0) else np.uint64(0)), low
 
 
 @inlined
 def wide(value):
-    """An int64 as a number of 128 bits."""
+    """Returns an int64 as a number of 128 bits."""
     return (~np.uint64(0) if value < 0 else np.uint64(0)), np.uint64(value)
 
 
 @inlined
 def lift(x, y):
-    """x² + y²."""
+    """Returns x² + y²."""
     return sum_128(product_128(wide(x), wide(x)), product_128(wide(y), wide(y)))
 
 
 @inlined
 def cross(ax, ay, bx, by):
-    """ax·by - ay·bx."""
+    """Returns ax·by - ay·bx."""
     return sum_128(product_128(wide(ax), wide(by)), negative_128(product_128(wide(ay), wide(bx))))
 
 
 @inner
 def in_circle_exactly(ax, ay, bx, by, cx, cy):
-    """Sign of the determinant where floating point could not tell.
+    """Returns the sign of the determinant where floating point cannot decide.
 
     It is then smaller than 2¹²⁷ for differences below 2⁴³ lattice steps (128 m), so arithmetic modulo 2¹²⁸ holds it.
     """
@@ -76,7 +76,7 @@ def in_circle_exactly(ax, ay, bx, by, cx, cy):
 
 @kernel
 def in_circle(x, y, a, b, c, d):
-    """1 where point `d` lies inside the circle of the counter-clockwise triangle, 0 on it, -1 outside."""
+    """Returns 1 where point `d` lies inside the circle of the counter-clockwise triangle, 0 on it, -1 outside."""
     ax, ay, bx, by, cx, cy = x[a] - x[d], y[a] - y[d], x[b] - x[d], y[b] - y[d], x[c] - x[d], y[c] - y[d]
     value, size = 0.0, 0.0
     fax, fay, fbx, fby = np.float64(ax), np.float64(ay), np.float64(bx), np.float64(by)
@@ -95,7 +95,7 @@ def in_circle(x, y, a, b, c, d):
 
 @kernel
 def turn(x, y, a, b, c):
-    """1 where the corners go counter-clockwise, 0 on a line, -1 clockwise."""
+    """Returns 1 where the corners run counter-clockwise, 0 on a line, -1 clockwise."""
     abx, aby, acx, acy = x[b] - x[a], y[b] - y[a], x[c] - x[a], y[c] - y[a]
     one, two = np.float64(abx) * np.float64(acy), np.float64(aby) * np.float64(acx)
     if abs(one - two) > ERROR_BOUND * (abs(one) + abs(two)):
@@ -108,7 +108,7 @@ def turn(x, y, a, b, c):
 
 @kernel
 def rename(across, triangle, old, new):
-    """Give a triangle its new neighbour, if there is such a triangle."""
+    """Update the neighbour of a triangle, if the triangle exists."""
     for k in range(3):
         if triangle >= 0 and across[triangle, k] == old:
             across[triangle, k] = new
@@ -116,7 +116,7 @@ def rename(across, triangle, old, new):
 
 @kernel
 def flip_edges(x, y, triangles, across):
-    """Flip edges until every one is Delaunay's; of four points on a circle, the edge with the first of them stays.
+    """Flip edges until all are Delaunay; of four points on a circle, the edge with the first of them stays.
 
     That rule is Delaunay's triangulation with the points moved symbolically (the first by most), so the outcome is
     the same from every start (Lawson 1977; Edelsbrunner & Mücke 1990). An edge is left where a triangle beside it is

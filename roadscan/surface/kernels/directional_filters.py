@@ -1,4 +1,4 @@
-"""Which directional filter acts at each cell of a surface."""
+"""Choice of the directional filter at each cell of a surface."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from roadscan.compute.kernel_options import inner, kernel
 
 @inner
 def choose_row(surface, measured, i, limit, chosen, own, residual):
-    """Filter, its weight of the cell itself and its residual, for the cells of one row.
+    """Choose the filter, its weight of the cell itself and its residual, for the cells of one row.
 
-    C5 where it finds no more than `limit`; else that of C1 to C4 that finds least, if that is no more; else none.
+    C5 if its response is within `limit`; else the one of C1 to C4 with the least response, if within it; else none.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def choose_row(surface, measured, i, limit, chosen, own, residual):
 
 @kernel
 def choose_filters(surface, measured, limit, chosen, own, residual):
-    """As :func:`choose_row` for a whole grid.
+    """Apply :func:`choose_row` to a whole grid.
 
     surface, measured : (rows + 4, columns + 4) float64; chosen, own, residual : (rows, columns) float32, out.
     """

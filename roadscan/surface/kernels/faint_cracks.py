@@ -1,4 +1,4 @@
-"""Faint cracks, too shallow for single cells to show: candidates from three lines end to end, then fits of a strip."""
+"""Faint cracks, too shallow to show in single cells: candidates from three lines end to end, then fits of a strip."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ import numpy as np
 from roadscan.compute.kernel_options import inlined, inner, kernel
 
 HALF_LENGTH = 10
-"""Rows (or columns) of cells to each side that a strip is fitted to."""
+"""Rows (or columns) of cells to each side to which a strip is fitted."""
 HALF_BREADTH = 3
-"""Cells to each side of its axis."""
+"""Cells to each side of a strip's axis to which it is fitted."""
 HALF_DRAWN = 8
-"""Rows (or columns) to each side that it is drawn over."""
+"""Rows (or columns) to each side over which a strip is drawn."""
 SLOPES, SLOPE_STEP = 15, 0.05
-"""Slopes that are tried about that of the candidate."""
-STEEPEST = 1.0 + SLOPE_STEP * (SLOPES // 2)
+"""Number of slopes tried about that of the candidate, and their step (cells across per cell along)."""
+STEEPEST = 1.0 + SLOPE_STEP * (SLOPES // 2)  # Steepest slope of a strip (cells across per cell along).
 HALF_CUT = 26
-"""Cells across that the steepest strip takes part of: 1.35 · 10, its axis up to 4 aside, and 8 beside that."""
+"""Cells across that the steepest strip needs: 1.35 · 10, its axis up to 4 aside, and 8 beside that."""
 NEXT_FROM, NEXT_TO, NEXT_ASIDE = 11, 18, 24
-"""Cells along a strip between which another goes on, and how far aside of its peak that may lie."""
+"""Cells along a strip between which another continues it, and how far aside of its peak that may lie."""
 FIELDS = 8
-"""Of a strip: significance (σ), down (1) or along (0) the columns, slope, axis, width (cells), volume, level (σ), and
-the sum of squared shares that the volume rests on."""
-LAGS = 3
+"""Fields of a strip: significance (σ), down (1) or along (0) the columns, slope, axis, width (cells), volume, level
+(σ), and the sum of squared shares that determine the volume."""
+LAGS = 3  # Greatest lag (cells) of the products that measure correlated noise.
 ASIDE_FROM, ASIDE_TO = 4, 8
-"""Cells from the axis where the noise is looked at."""
+"""Distances (cells) from the axis between which the noise is measured."""
 
 
 @inlined
 def larger(a, b):
-    """The larger."""
+    """Returns the larger one."""
     return a if a > b else b
 
 
 @inner
 def depth_row(ground, median, count, least, scale, absent, depth):
-    """Of each median of a line how deep it lies below the ground, times `scale`; 0 of too few heights. All (n,)."""
+    """Compute the depth of each median of a line below the ground, times `scale`; 0 of too few heights. All (n,)."""
     for j in range(depth.size):
         sound = (count[j] >= least) & (ground[j] < absent)
         depth[j] = np.float32((ground[j] - median[j]) * scale) if sound else np.float32(0.0)
@@ -43,7 +43,7 @@ def depth_row(ground, median, count, least, scale, absent, depth):
 
 @kernel
 def line_depths(ground, median, count, least, scale, absent, margin, depth):
-    """As :func:`depth_row`; (rows, columns), `depth` float32 with a margin that is left as it is."""
+    """Apply :func:`depth_row` to a grid; (rows, columns), `depth` float32 with an untouched margin."""
     rows, n = ground.shape
     for i in range(rows):
         depth_row(ground[i], median[i], count[i], least, scale, absent, depth[i + margin, margin : margin + n])
@@ -51,7 +51,7 @@ def line_depths(ground, median, count, least, scale, absent, margin, depth):
 
 @inner
 def chain_row(middle, a, b, c, d, e, f, direction, best, best_direction):
-    """Depth of a line with the deepest of three before it and of three behind it, kept where it is the most so far."""
+    """Add to a line's depth the deepest of three before it and of three behind it; store it if it is the largest."""
     for j in range(best.size):
         depth = (middle[j] + larger(larger(a[j], b[j]), c[j])) + larger(larger(d[j], e[j]), f[j])
         better = depth > best[j]
@@ -61,7 +61,7 @@ def chain_row(middle, a, b, c, d, e, f, direction, best, best_direction):
 
 @inlined
 def moved(depth, margin, down, right, i, n):
-    """Row i, moved by so many cells."""
+    """Returns row i, shifted by so many cells."""
     return depth[i + margin + down, margin + right : margin + right + n]
 
 
@@ -93,7 +93,7 @@ def chain_lines(depth, margin, down, right, aside_down, aside_right, direction, 
 
 @inlined
 def is_peak(chain, contrast, strongest, i, j):
-    """Whether a cell has the deepest chain of 5 × 5, of equal ones the first, and nothing strong in 7 × 7."""
+    """Returns whether a cell has the deepest chain of 5 × 5, of equal ones the first, and nothing strong in 7 × 7."""
     if contrast[i, j] > strongest:
         return False
     own = chain[i, j]
@@ -122,20 +122,20 @@ def mark_peaks(row, column, chain, contrast, strongest, peak):
 
 @inlined
 def covered(away, width):
-    """Share of a strip's width that lies in a cell `away` from its axis (cells)."""
+    """Returns the share of a strip's width that lies in a cell `away` from its axis (cells)."""
     low, high = max(-0.5, away - 0.5 * width), min(0.5, away + 0.5 * width)
     return max(high - low, 0.0) / width
 
 
 @inlined
 def cell_at(row, column, along, across, steep):
-    """The cell so far along a strip and across it."""
+    """Returns the cell so far along a strip and across it."""
     return (row + along, column + across) if steep else (row + across, column + along)
 
 
 @inlined
 def cut_out(values, row, column, steep, slope, half, absent, height, there):
-    """Copy the cells that strips about a peak may see, so that they run down; what is absent is 0 and not `there`.
+    """Copy the cells that strips about a peak may use, so that they run down; absent ones are 0 and not `there`.
 
     half : cells to each side of the first slope's line.
     """
@@ -151,9 +151,9 @@ def cut_out(values, row, column, steep, slope, half, absent, height, there):
 
 @inlined
 def best_axis(height, slope, total):
-    """Slope and axis of the line, one or two cells wide, that lies lowest; how low (σ of its mean).
+    """Returns slope and axis of the lowest line, one or two cells wide, and its depth (σ of its mean).
 
-    What is not there counts as level ground.
+    Missing cells count as level ground.
 
     height : (2 HALF_LENGTH + 1, 2 HALF_CUT + 1); total : (2 HALF_BREADTH + 1,) float32, scratch.
     """
@@ -178,9 +178,9 @@ def best_axis(height, slope, total):
 
 @inlined
 def fit_strip(height, there, slope, axis, width):
-    """Volume, level and gain of a strip of given axis and width, by least squares.
+    """Returns volume, level and gain of a strip of given axis and width, by least squares.
 
-    Heights (σ) are level − volume · share of the strip in the cell. Gain² is what it takes off the sum of squares.
+    Heights (σ) are level − volume · share of the strip in the cell. Gain² is the reduction of the sum of squares.
     """
     n, k, kk, r, kr = 0.0, 0.0, 0.0, 0.0, 0.0
     for along in range(2 * HALF_LENGTH + 1):
@@ -202,7 +202,7 @@ def fit_strip(height, there, slope, axis, width):
 
 @inlined
 def try_axes(height, there, slope, axis, quarters, width, strip):
-    """Keep the best of three slopes and of axes up to so many quarters of a cell aside, if it gains more."""
+    """Store the best of three slopes and of axes up to so many quarters of a cell aside, if it gains more."""
     for a in range(-1, 2):
         tried = min(max(slope + SLOPE_STEP * a, -STEEPEST), STEEPEST)
         for b in range(-quarters, quarters + 1):
@@ -214,7 +214,7 @@ def try_axes(height, there, slope, axis, quarters, width, strip):
 
 @inlined
 def variance_of_lines(height, there, slope, axis):
-    """Variance of the mean of two lines beside a strip, over what independent cells of σ = 1 would have.
+    """Returns the variance of the mean of two lines beside a strip, relative to that of independent cells of σ = 1.
 
     From products of cells up to LAGS apart along the line and one across, on both sides of the strip.
     """
@@ -280,7 +280,7 @@ def fit_strips(values, margin, row, column, steep, slope, widths, least, noted, 
 
 @inlined
 def goes_on(row, column, strips, t, number):
-    """Whether another strip's axis lies within two cells of the axis of strip t, before or behind it."""
+    """Returns whether another strip's axis lies within two cells of the axis of strip t, before or behind it."""
     steep, slope, axis = strips[t, 1] > 0.5, strips[t, 2], strips[t, 3]
     for distance in range(NEXT_FROM, NEXT_TO + 1):
         for side in range(-1, 2, 2):
@@ -300,7 +300,7 @@ def goes_on(row, column, strips, t, number):
 
 @kernel
 def confirm_strips(row, column, strips, number, alone, confirmed):
-    """Mark the strips that gain `alone`, and those that go on in another.
+    """Mark the strips that gain `alone`, and those that another one continues.
 
     number : (rows + 2 NEXT_ASIDE, columns + 2 NEXT_ASIDE) int32, which strip that may confirm another has its peak
     there, −1 for none; confirmed : (n,) bool, out. Others as of :func:`fit_strips`.
@@ -315,7 +315,7 @@ def confirm_strips(row, column, strips, number, alone, confirmed):
 
 @kernel
 def draw_strips(row, column, strips, confirmed, gain, level, share):
-    """Draw the strips that are confirmed; where two overlap the one that gains more.
+    """Draw the confirmed strips; where two overlap the one that gains more.
 
     gain, level, share : (rows, columns) float32, in/out: gain (0 where none), height above the ground (σ), and the
     share of a cell in its own height.

@@ -1,4 +1,4 @@
-"""Ground about a hole in a grid of blocks: its height in every direction, and how it goes on from there.
+"""Ground about a hole in a grid of blocks: its height in every direction, and its continuation from there.
 
 Rays from a block are its profiles: heights above a plane of the ground's slope through the block.
 """
@@ -12,35 +12,35 @@ import numpy as np
 from roadscan.compute.kernel_options import inner, kernel
 
 _SLOPES = 401
-"""Classes of a slope …"""
+"""Number of classes of a slope …"""
 _STEEPEST = 0.4
-"""… from this downwards to this upwards (m/m)."""
+"""… between this slope downwards and upwards (m/m)."""
 _FLAT_M, _FLAT = 0.005, 0.2
-"""A rim is where the two blocks that follow are as high as these two, within this, or this share of the wall's rise."""
-_SHARE = 0.25
+"""A rim is where the next two blocks are as high as these two, within this (m), or this share of the wall's rise."""
+_SHARE = 0.25  # A rim may be lower than the surroundings of a hole by this share of the hole's depth …
 _LEAST_M, _MOST_M = 0.004, 0.015
-"""A rim may be lower than what stands about a hole by this share of the hole's depth, within limits."""
+"""… within these limits (m)."""
 _STEP_M = 0.015
-"""Rays that tell a ground higher by more than the lower quartile of all end on other ground, such as that behind a
+"""Rays whose ground is higher by more than this (m) than the lower quartile end on other ground, such as that behind a
 kerb."""
 _APART = 4
-"""Blocks whose heights tell the slope beyond a rim are this far apart."""
+"""Distance (blocks) of the blocks that show the slope beyond a rim."""
 _STEEPEST_M = 0.02
-"""Of that slope, a block."""
+"""Steepest slope beyond a rim (m a block)."""
 _DAMPED = 8.0
-"""A slope counts half that is told by so many pairs of blocks."""
+"""Number of pairs of blocks with which a slope counts half."""
 
 
 @inner
 def slope_class(slope, steepest):
-    """Class of a slope, from 0 for -steepest up."""
+    """Returns the class of a slope, from 0 for -steepest up."""
     share = (slope + steepest) / (2.0 * steepest)
     return int(min(max(share, 0.0), 1.0) * (_SLOPES - 1) + 0.5)
 
 
 @inner
 def median_slope(counts, steepest):
-    """Median of slopes of which each class (401,) holds so many; 0 of none."""
+    """Returns the median of slopes from the count of each class (401,); 0 of none."""
     n = 0
     for k in range(_SLOPES):
         n += counts[k]
@@ -54,9 +54,9 @@ def median_slope(counts, steepest):
 
 @inner
 def slope_towards(heights, i, j, half, way, step_m, counts):
-    """Median slope (m/m) about block (i, j), from blocks `way` (rows, columns), `step_m`, apart.
+    """Returns the median slope (m/m) about block (i, j), from blocks `way` (rows, columns), `step_m`, apart.
 
-    heights : (rows, columns) float64, NaN where none; half : blocks to all sides that are looked at, every third;
+    heights : (rows, columns) float64, NaN where none; half : reach in blocks to all sides, every third is used;
     way : (2,) int64; counts : (401,) int64, working space.
     """
     counts[:] = 0
@@ -71,7 +71,7 @@ def slope_towards(heights, i, j, half, way, step_m, counts):
 
 @kernel
 def slopes(heights, row, column, half, ways, step_m, out):
-    """:func:`slope_towards` each of some ways at each of some blocks.
+    """Compute :func:`slope_towards` for some ways at each of some blocks.
 
     row, column : (n,) int64; ways : (k, 2) int64; out : (n, k) float64.
     """
@@ -83,7 +83,7 @@ def slopes(heights, row, column, half, ways, step_m, out):
 
 @kernel
 def profile(heights, i, j, away, north, east, out):
-    """Heights along a ray from block (i, j), less those of a plane through it; NaN where there is none.
+    """Compute heights along a ray from block (i, j), less those of a plane through it; NaN where there is none.
 
     away : (n, 2) int64, rows and columns from the block; north, east : the plane's rise a block; out : (n,) float64.
     """
@@ -112,7 +112,7 @@ def highest(along):
 
 @kernel
 def steepest(along, start, level):
-    """Greatest rise over three blocks along a profile (n,) that begins at height `start`, up to where it reaches
+    """Returns the greatest rise over three blocks along a profile (n,) that begins at `start`, up to where it reaches
     `level`.
     """
     found, before = 0.0, start
@@ -128,9 +128,9 @@ def steepest(along, start, level):
 
 @inner
 def level_about(heights, i, j, away, north, east, rise, along):
-    """What stands about block (i, j) in every direction: the lowest of the highest along rays.
+    """Returns the level about block (i, j): the lowest, over all rays, of the highest along the ray.
 
-    -inf where a ray holds none, or as soon as one does not stand `rise` above the block.
+    -inf where a ray is empty, or as soon as one does not rise `rise` above the block.
     away : (rays, n, 2) int64; along : (n,) float64, working space; other arguments as of :func:`profile`.
     """
     level = np.inf
@@ -144,7 +144,7 @@ def level_about(heights, i, j, away, north, east, rise, along):
 
 @kernel
 def depths(heights, slope, away, least, wall, out):
-    """Depth of each block that lies `least` or more below all that stands about it and has steep walls.
+    """Compute the depth of each block that lies `least` or more below all of its surroundings and has steep walls.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def depths(heights, slope, away, least, wall, out):
 
 @kernel
 def rim(along, level, slack):
-    """First place of a profile (n,) that reaches `level` less `slack`, and from where ground is flat; -1: none."""
+    """Returns the first place of a profile (n,) that reaches `level` less `slack` and begins flat ground; -1: none."""
     wall = 0.0
     for k in range(along.size - 3):
         here, ahead = 0.5 * (along[k] + along[k + 1]), 0.5 * (along[k + 2] + along[k + 3])
@@ -183,7 +183,7 @@ def rim(along, level, slack):
 
 @inner
 def slope_beyond(along, start, counts):
-    """Median rise over a block of a profile (n,) from place `start` on, damped where it goes on for few blocks."""
+    """Returns the median rise over a block of a profile (n,) from place `start` on, damped where few blocks follow."""
     counts[:] = 0
     n = 0
     for k in range(start, along.size - _APART):
@@ -196,7 +196,7 @@ def slope_beyond(along, start, counts):
 
 @inner
 def mean_below(height, weight, step):
-    """Weighted mean of heights (n,) that are no more than `step` above their lower quartile; NaN of none."""
+    """Returns the weighted mean of heights (n,) no more than `step` above their lower quartile; NaN of none."""
     n = height.size
     low = np.inf
     for k in range(n):
@@ -215,9 +215,9 @@ def mean_below(height, weight, step):
 
 @kernel
 def grounds(heights, slope, away, row, column, out):
-    """Ground at each of some blocks: that about the hole that they lie in, as it goes on from where rays meet its rim.
+    """Compute the ground at some blocks, extrapolated from the rim of the hole in which they lie.
 
-    Each ray tells it from the height of the rim and the slope beyond; near rims count more.
+    Each ray gives it from the height of the rim and the slope beyond; near rims count more.
     row, column : (n,) int64; out : (n,) float64, NaN where no rim is seen; other arguments as of :func:`depths`.
     """
     rays, steps = away.shape[0], away.shape[1]

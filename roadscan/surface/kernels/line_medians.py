@@ -1,6 +1,6 @@
 """Medians and means of seven cells in a line, and sums over small windows, each over a whole grid.
 
-Every loop runs along a row of a grid with a margin, so that it needs no look at the borders. The order of operations
+Every loop runs along a row of a grid with a margin, so that it needs no border checks. The order of operations
 at a cell is the same whatever the grid around it.
 """
 
@@ -11,18 +11,18 @@ import numpy as np
 from roadscan.compute.kernel_options import inlined, inner, kernel
 
 CELLS = 7
-"""Cells of a line, its middle among them."""
+"""Cells of a line, including its middle."""
 
 
 @inlined
 def put_in_order(a, b):
-    """The smaller, the larger."""
+    """Returns the smaller, then the larger."""
     return (a if a < b else b), (b if a < b else a)
 
 
 @inlined
 def middle_two(v0, v1, v2, v3, v4, v5, v6, absent):
-    """The middle two of up to seven heights, and how many there are; of an odd number the median twice.
+    """Returns the middle two of up to seven heights, and their number; of an odd number the median twice.
 
     Those below `absent` count. A sorting network of 16 exchanges (Knuth 1998, The Art of Computer Programming 3,
     section 5.3.4) puts the others last. `absent` where there is none.
@@ -53,7 +53,7 @@ def middle_two(v0, v1, v2, v3, v4, v5, v6, absent):
 
 @inner
 def median_row(a, b, c, d, e, f, g, absent, median, count, own):
-    """Of each place of seven rows (n,) the median, how many heights it is of, and the share of `d` in it.
+    """Compute for each place of seven rows (n,) the median, the number of its heights, and the share of `d` in it.
 
     Of an even number the median is the mean of the middle two; `absent` where there is none.
     """
@@ -66,15 +66,15 @@ def median_row(a, b, c, d, e, f, g, absent, median, count, own):
 
 @inlined
 def or_mirrored(value, opposite, middle, absent):
-    """The value, or if it is absent the one that lies with its opposite and the middle in one straight line."""
+    """Returns the value, or if absent, its extrapolation from the opposite and the middle one."""
     return value if value < absent else (2.0 * middle - opposite if opposite < absent else absent)
 
 
 @inner
 def mirrored_median_row(a, b, c, d, e, f, g, middle, absent, median):
-    """As :func:`median_row`; where one side has two heights more than the other, the other's are mirrored.
+    """Apply :func:`median_row`, with mirrored heights where one side has two heights fewer than the other.
 
-    So the median at a border has no lean to one side of a slope. What is missing here and there stays missing: in a
+    So the median at a border is not biased on a slope. Where heights miss here and there, none is mirrored: in a
     crack, a mirrored height would lie far below it.
 
     middle : (n,) float64, a height of the place itself or `absent`; see :func:`or_mirrored`.
@@ -99,14 +99,14 @@ def mirrored_median_row(a, b, c, d, e, f, g, middle, absent, median):
 
 @inlined
 def row_of_line(values, margin, line, k, i, n):
-    """The k-th cells of the lines through the n cells of row i."""
+    """Returns the k-th cells of the lines through the n cells of row i."""
     first = margin + line[k, 1]
     return values[i + margin + line[k, 0], first : first + n]
 
 
 @inlined
 def rows_of_line(values, margin, line, i, n):
-    """The seven cells of these lines, a row (n,) each."""
+    """Returns the seven cells of these lines, a row (n,) each."""
     return (
         row_of_line(values, margin, line, 0, i, n),
         row_of_line(values, margin, line, 1, i, n),
@@ -120,11 +120,11 @@ def rows_of_line(values, margin, line, i, n):
 
 @kernel
 def line_medians(values, margin, line, absent, median, count, own):
-    """Median of the seven cells of a line through each cell.
+    """Compute the median of the seven cells of a line through each cell.
 
     Parameters
     ----------
-    values : (rows + 2 margin, columns + 2 margin) float64; cells that hold nothing are `absent`, above all others.
+    values : (rows + 2 margin, columns + 2 margin) float64; empty cells are `absent`, above all others.
     line : (7, 2) int64, rows and columns from the cell, none beyond `margin`.
     median, count : (rows, columns) float64, out; own : the same, float32, out; see :func:`median_row`.
     """
@@ -141,7 +141,7 @@ def line_medians(values, margin, line, absent, median, count, own):
 
 @kernel
 def mirrored_line_medians(values, margin, line, middle, absent, median):
-    """The same at borders and holes without a lean to one side of a slope; see :func:`mirrored_median_row`.
+    """Compute the same without bias at borders and holes of a slope; see :func:`mirrored_median_row`.
 
     middle : (rows, columns) float64, a height of the cell itself; the others as of :func:`line_medians`.
     """
@@ -157,7 +157,7 @@ def mirrored_line_medians(values, margin, line, middle, absent, median):
 
 @inner
 def mean_row(a, b, c, d, e, f, g, absent, mean):
-    """Of each place of seven rows (n,) the mean of the middle one `d` and of the pairs about it; see `line_means`."""
+    """Compute for each place of seven rows (n,) the mean of the middle one `d` and of the pairs about it."""
     for j in range(mean.size):
         v = d[j] if d[j] < absent else 0.0
         far, mid, near = max(a[j], g[j]) < absent, max(b[j], f[j]) < absent, max(c[j], e[j]) < absent
@@ -170,10 +170,10 @@ def mean_row(a, b, c, d, e, f, g, absent, mean):
 
 @kernel
 def line_means(values, margin, line, absent, mean):
-    """Mean of the seven cells of a line through each cell; arguments as of :func:`line_medians`.
+    """Compute the mean of the seven cells of a line through each cell; arguments as of :func:`line_medians`.
 
     A cell counts if its mirror image does, so that the mean of a slope is the slope's height at borders and holes as
-    well. What holds nothing has no mean.
+    well. Empty cells have no mean.
     """
     rows, n = mean.shape
     for i in range(rows):
@@ -186,7 +186,7 @@ def line_means(values, margin, line, absent, mean):
 
 @inner
 def judge_row(heights, ground, median, count, own, least, sigma, limit, absent, contrast, risk):
-    """How far medians along a line lie from the ground and from the heights; all (n,), see :func:`judge_lines`."""
+    """Compute the distance of medians along a line from ground and heights; all (n,), see :func:`judge_lines`."""
     for j in range(risk.size):
         there = heights[j] < absent
         away = abs(median[j] - ground[j]) * np.sqrt(count[j]) if there & (count[j] >= least) else 0.0
@@ -197,7 +197,7 @@ def judge_row(heights, ground, median, count, own, least, sigma, limit, absent, 
 
 @kernel
 def judge_lines(heights, ground, median, count, own, least, sigma, limit, absent, contrast, risk):
-    """Rate the medians along the lines of one direction.
+    """Compute contrast and risk of the medians along the lines of one direction.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def judge_lines(heights, ground, median, count, own, least, sigma, limit, absent
 
 @kernel
 def keep_better(risk, median, own, direction, least_risk, best, best_own, best_direction):
-    """Keep the medians whose risk is less than the least so far; (n,) each, the last four in/out."""
+    """Store the medians whose risk is less than the least so far; (n,) each, the last four in/out."""
     for j in range(risk.size):
         better = risk[j] < least_risk[j]
         least_risk[j] = risk[j] if better else least_risk[j]
@@ -232,7 +232,7 @@ def add_row(values, total):
 
 @kernel
 def window_sums(values, half, across, total):
-    """Sums over the (2 half + 1)² cells around each cell.
+    """Compute sums over the (2 half + 1)² cells around each cell.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""Clough–Tocher patches on a regular grid, triangle by triangle: no point is ever searched for.
+"""Evaluation of Clough–Tocher patches on a regular grid, triangle by triangle, without any search for a point.
 
-The nodes of a triangle are noted row by row, then their heights are computed side by side (``simd.patch_heights``).
+The nodes of a triangle are collected row by row, then their heights are computed together (``simd.patch_heights``).
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from roadscan.compute.kernels.patch_heights import AT_ONCE, POINTS, SCALE, heigh
 ROOM = 64
 """Nodes of a triangle that are collected before their heights are computed."""
 SHORT = 4
-"""Nodes that are noted at once: most rows of a triangle have fewer, and a loop over them would end unforeseen."""
+"""Nodes that are collected at once: most rows of a triangle have fewer, and a loop over them would be mispredicted."""
 MARGIN = 1e-6
-"""Of a cell: more than the rounding of where an edge meets a row. Nodes are then asked exactly."""
+"""Margin (cells) above the rounding error of an edge's crossing of a row: nodes within it are tested exactly."""
 
 
 @inlined
 def edge_line(x, y, i, j):
-    """An edge as (x, y, dx, dy) from its lower end, turned so that the triangle lies where dx·Δy - dy·Δx ≥ 0.
+    """Returns an edge as (x, y, dx, dy) from its lower end, turned so that the triangle lies where dx·Δy - dy·Δx ≥ 0.
 
     Both triangles of an edge get the same numbers but for the sign, so they agree exactly on which side a node lies.
     """
@@ -31,21 +31,21 @@ def edge_line(x, y, i, j):
 
 @inlined
 def bound(line):
-    """How an edge bounds a row: dx / dy, and what is added to where it meets the row as a lower and an upper bound."""
+    """Returns dx / dy of an edge, and the offsets of its crossing of a row that make it a lower and an upper bound."""
     lean = line[2] / line[3] if line[3] != 0.0 else 0.0
     return lean, (0.0 if line[3] < 0.0 else -np.inf), (0.0 if line[3] > 0.0 else np.inf)
 
 
 @inlined
 def narrowed(line, bounds, up, low, high):
-    """Narrow a span of x on the row at height `up` to the triangle's side of an edge."""
+    """Returns a span of x on the row at height `up`, narrowed to the triangle's side of an edge."""
     meets = line[0] + bounds[0] * (up - line[1])
     return max(low, meets + bounds[1]), min(high, meets + bounds[2])
 
 
 @bare_inner
 def write_heights(edges, patches, patch, nodes, count, heights):
-    """Heights of a triangle at the nodes that are noted; each is asked exactly whether it lies in the triangle.
+    """Write heights of a triangle at the collected nodes that an exact test finds within it.
 
     edges, patches, patch : as in ``heights_of_eight``; nodes : tuple of x, y : (ROOM + AT_ONCE,) float64 (m), places :
     (ROOM + AT_ONCE,) int64, of the first `count` nodes in `heights`, and scratch : as x.
@@ -60,7 +60,7 @@ def write_heights(edges, patches, patch, nodes, count, heights):
 
 @kernel
 def evaluate(x, y, triangles, patches, node_x, node_y, cell_x, cell_y, heights):
-    """Heights of the patches at the nodes of a grid.
+    """Compute heights of the patches at the nodes of a grid.
 
     A node on an edge or a vertex belongs to the last of its triangles, in the order given.
 

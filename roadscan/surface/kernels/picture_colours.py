@@ -1,8 +1,8 @@
-"""The picture that shows a point best, and the point's colour in it.
+"""The picture with the finest resolution at a point, and the point's colour in it.
 
 A picture is a pinhole with Brown–Conrady distortion (Brown 1971; signs and axes of OpenCV: x right, y down, z along
 the optical axis), or equirectangular: longitude to the right and latitude downwards in even steps (Snyder 1987, plate
-carrée). Points are looked at one by one, so what comes out for one does not depend on the others.
+carrée). Points are processed one by one, so the result for one does not depend on the others.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import numpy as np
 from roadscan.compute.kernel_options import kernel
 
 FOCAL_X, FOCAL_Y, CENTRE_X, CENTRE_Y, K1, K2, P1, P2, K3, FOLD, WIDTH, HEIGHT, AROUND = range(13)
-"""Places in the parameters of a lens; FOLD: square of the tangent up to which its radius grows; AROUND: 1 for a picture
+"""Indices of a lens's parameters; FOLD: square of the tangent up to which its radius grows; AROUND: 1 for a picture
 of 360°, whose focal length is in pixels a radian."""
 REACH, SINE, BORDER = range(3)
-"""Places in the limits: square of the farthest distance (m²), sine of the least angle, pixels of the border."""
-LEAST_AHEAD_M = 0.1
+"""Indices of the limits: square of the farthest distance (m²), sine of the least angle, pixels of the border."""
+LEAST_AHEAD_M = 0.1  # Least depth of a point in front of the camera (m).
 
 
 @kernel
 def take_better(point_m, eye_m, turn, up, lens, limits, hidden, number, best, chosen, pixel):
-    """Give points to a picture where it shows them better than those before it.
+    """Assign to a picture the points that it shows better than those before it.
 
     Better is finer: less distance over focal length, distance²/(fx · fy). Of equals the first stays.
 
@@ -33,10 +33,10 @@ def take_better(point_m, eye_m, turn, up, lens, limits, hidden, number, best, ch
     eye_m : (3,) where the camera was.
     turn : (3, 3) camera axes (x right, y down, z ahead) from world.
     up : (3,) unit vector.
-    lens : (13,) parameters, see above.
-    limits : (3,) see above.
-    hidden : (height, width) bool, pixels that are not to be taken; (0, 0) where there are none.
-    number : what stands for the picture in `chosen`.
+    lens : (13,) parameters in the order above.
+    limits : (3,) in the order above.
+    hidden : (height, width) bool, pixels that are not used; (0, 0) where there are none.
+    number : the picture's number in `chosen`.
     best : (n,) float64, read and written; inf where no picture shows a point.
     chosen : (n,) int32, written.
     pixel : (n, 2) float64, u and v from the centre of the upper left pixel; written.
@@ -85,7 +85,7 @@ def take_better(point_m, eye_m, turn, up, lens, limits, hidden, number, best, ch
 
 @kernel
 def sample(picture, pixel, colour):
-    """Bilinear values of a picture, to the nearest whole number.
+    """Compute bilinear values of a picture, to the nearest whole number.
 
     Parameters
     ----------

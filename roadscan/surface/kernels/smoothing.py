@@ -12,14 +12,14 @@ import numpy as np
 from roadscan.compute.kernel_options import inner, kernel
 
 REACH = 4
-"""Cells that a step sees to each side: a filter and its transpose."""
+"""Cells to each side on which a step depends: a filter and its transpose."""
 _NONE, _TWELFTH, _SIXTEENTH, _FIFTY_SIXTH = (np.float32(v) for v in (0.0, 1.0 / 12.0, 1.0 / 16.0, 1.0 / 56.0))
-_TWO, _C1, _C2, _C3, _C4, _C5 = (np.float32(v) for v in (2.0, 1.0, 2.0, 3.0, 4.0, 5.0))
+_TWO, _C1, _C2, _C3, _C4, _C5 = (np.float32(v) for v in (2.0, 1.0, 2.0, 3.0, 4.0, 5.0))  # as float32
 
 
 @inner
 def residual_row(u, i, chosen, own, fixed, residual):
-    """Residual of the chosen filter at the cells of one row.
+    """Compute the residual of the chosen filter at the cells of one row.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def residual_row(u, i, chosen, own, fixed, residual):
 
 @inner
 def spread_row(chosen, residual, near, down, along, right, left, around):
-    """The residuals (n,) times the weight that their filters give to each kind of neighbour.
+    """Compute the residuals (n,) times the weight that their filters give to each kind of neighbour.
 
     near, down, along, right, left, around : (n,) float32, out: the four nearest, those two cells away up and down, to
         both sides, those on each diagonal, the eight at a knight's move.
@@ -66,7 +66,7 @@ def spread_row(chosen, residual, near, down, along, right, left, around):
 
 @inner
 def descent_row(ring, first, own, before, pull, aim, push, after):
-    """One row's step against the gradient.
+    """Compute one row's step against the gradient.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def descent_row(ring, first, own, before, pull, aim, push, after):
 
 @kernel
 def descend(correction, chosen, own, fixed, pull, aim, push, ring, after):
-    """One step of the smoothing over a whole grid.
+    """Compute one step of the smoothing over a whole grid.
 
     Parameters
     ----------

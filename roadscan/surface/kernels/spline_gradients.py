@@ -1,4 +1,4 @@
-"""Gradients of local splines at the vertices of a triangulation; why these stands in ``surfaces.normals``.
+"""Gradients of local splines at the vertices of a triangulation; ``surfaces.normals`` gives the reasons.
 
 Of a vertex's neighbourhood, itself included, let A be the covariances of heights with noise on the diagonal, P the
 monomials, z the heights and f the covariances of heights with a slope at the vertex. The best linear prediction of that
@@ -25,24 +25,24 @@ from roadscan.surface.kernels.vertex_neighbourhoods import MOST
 
 TERMS, HEIGHTS, ALONG_U, ALONG_V, SIDES = 6, 6, 7, 8, 9
 """Rows below the covariances: 1, u², u v, v², u, v; then heights; then covariances with the slopes at the centre."""
-WIDTH = MOST + 1 + SIDES
+WIDTH = MOST + 1 + SIDES  # Columns of the system: points, the vertex, and the sides.
 WORK = (3, WIDTH + TOGETHER, WIDTH, LANES)
-"""Shape of what the kernel works in."""
+"""Shape of the kernel's working array."""
 QUIET, NOISY = 1e-3, 3.0
 """Variances of noise between which the heights decide."""
 LEAST_PIVOT = 1e-2
-"""Of the terms' normal matrix with unit diagonal: one over the variance inflation of a term."""
+"""Least pivot of the terms' normal matrix with unit diagonal: one over the variance inflation of a term."""
 MOST_LIKELY = 700.0
-"""Logarithm of a ratio of likelihoods; of more there is no exponential."""
+"""Greatest logarithm of a ratio of likelihoods; above it the exponential overflows."""
 LEAST_MISFIT = 1e-14
-"""Of the heights' squares: rounding."""
+"""Least misfit, as a share of the heights' squares: rounding."""
 
 
 @kernel
 def load(x, y, z, first, order, begin, members, counts, axes, present, offsets, system):
-    """A batch of neighbourhoods, a lane each: offsets in their units, and the sides of their systems.
+    """Load a batch of neighbourhoods, a lane each: offsets in their units, and the sides of their systems.
 
-    Points that are not there lie far from all others, and their sides are 0.
+    Missing points are placed far from all others, and their sides are 0.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def load(x, y, z, first, order, begin, members, counts, axes, present, offsets, 
 
 @bare_inner
 def set_diagonal(system, present, size, variance):
-    """Variances of the points; one where a point is not there."""
+    """Set the variances of the points; one for a missing point."""
     for k in range(size):
         row, there = system[k, k], present[k]
         for lane in range(LANES):
@@ -86,7 +86,7 @@ def set_diagonal(system, present, size, variance):
 
 @bare
 def clear(rows, first, last, begin, end):
-    """Zeros from one row and column up to another, which are not meant any more."""
+    """Set stale entries to zero, from one row and column up to another."""
     for a in range(first, last):
         for b in range(begin, end):
             for lane in range(LANES):
@@ -95,7 +95,7 @@ def clear(rows, first, last, begin, end):
 
 @kernel
 def read(root, size, lane, count, product, found):
-    """Gradient of one spline in its units, and how likely its heights are; False where the points do not bear it.
+    """Compute the gradient of one spline in its units, and the likelihood of its heights; False if ill-conditioned.
 
     Parameters
     ----------
@@ -122,15 +122,15 @@ def read(root, size, lane, count, product, found):
 
 @kernel
 def spline_gradients(x, y, z, first, order, members, counts, axes, work, fitted, gradients, sources):
-    """Gradients of the splines of neighbourhoods; others are left as they are.
+    """Compute the gradients of the splines of neighbourhoods; others are left unchanged.
 
     Parameters
     ----------
     x, y, z : (m,) float64 (m), differences of x and y exact.
     first, members, counts, axes : of :func:`roadscan.surface.kernels.vertex_neighbourhoods.neighbourhoods`.
-    order : (k,) int64: those that are wanted, by ascending count.
+    order : (k,) int64: the wanted ones, by ascending count.
     work : WORK, float64; faster at a multiple of 64 bytes.
-    fitted : what `sources` says of those that are found.
+    fitted : value of `sources` for the gradients found.
     gradients : (m, 2) float64, out; sources : (m,) uint8, out.
     """
     present, offsets = np.empty((MOST + 1, LANES)), np.empty((2, MOST + 1, LANES))

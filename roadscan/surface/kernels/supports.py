@@ -1,4 +1,4 @@
-"""Heights of single cells over several supports, and which of these has the least risk."""
+"""Heights of single cells over several supports, and the support of least risk."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from roadscan.compute.kernel_options import inlined, kernel
 
 SUPPORTS = 6
-"""The median of seven along the line, means of 3 and of 13 along it, paraboloids over 7 × 7 and 9 × 9, a strip."""
+"""Supports: median of seven along the line, means of 3 and 13 along it, paraboloids of 7 × 7 and 9 × 9, a strip."""
 
 
 class CrackCells(NamedTuple):
@@ -23,7 +23,7 @@ class CrackCells(NamedTuple):
     middle_m: npt.NDArray[np.float64]
     """(n,) median height along the cell's line."""
     own_of_middle: npt.NDArray[np.floating]
-    """(n,) share of the cell itself in it."""
+    """(n,) share of the cell itself in that median."""
     direction: npt.NDArray[np.uint8]
     """(n,) of the line."""
 
@@ -39,7 +39,7 @@ class Shapes(NamedTuple):
 
 @inlined
 def along_line(heights, i, j, line, first, last, middle, absent, total, n):
-    """Sum over the pairs `first` to `last` of a line, less the middle, and their cells, added to those of before."""
+    """Sum over the pairs `first` to `last` of a line, less the middle, and their number, added to those before."""
     for k in range(first, last):
         a, b = heights[i + line[k, 0], j + line[k, 1]], heights[i - line[k, 0], j - line[k, 1]]
         whole = max(a, b) < absent
@@ -74,8 +74,8 @@ def with_pairs(heights, i, j, pairs, first, last, middle, absent, sums):
 def heights_by_support(heights, margin, cells, choice, shapes, absent, off, own):
     """Fit the heights around each cell over each support.
 
-    A cell counts only together with its mirror image about the middle, so that a slope has no say. Of a paraboloid
-    there is then nothing to estimate but its height and the sum of its curvatures. Where less than half of a support
+    A cell counts only together with its mirror image about the middle, so that a slope has no effect. Of a paraboloid
+    only its height and the sum of its curvatures remain to be estimated. Where less than half of a support
     counts, the fit is the middle.
 
     Parameters

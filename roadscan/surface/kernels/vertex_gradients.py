@@ -10,12 +10,12 @@ from roadscan.compute.kernel_options import kernel
 from roadscan.surface.kernels.vertex_rings import MOST_RINGS, grow, is_narrow, whitening
 
 FITTED, PLANE, LEVEL = 0, 1, 2
-"""What a gradient was taken from: the polynomial asked for, a plane, or nothing."""
-LINEAR_TERMS, QUADRATIC_TERMS = 2, 5
+"""Sources of a gradient: the polynomial asked for, a plane, or nothing."""
+LINEAR_TERMS, QUADRATIC_TERMS = 2, 5  # Numbers of coefficients of a plane and of a quadratic through a vertex.
 LEAST = 6
-"""Neighbours, fewer than which another ring is taken."""
+"""With fewer neighbours another ring is added."""
 LEAST_PIVOT = 1e-2
-"""Of a normal matrix with unit diagonal: one over the variance inflation of a term."""
+"""Least pivot of a normal matrix with unit diagonal: one over the variance inflation of a term."""
 
 
 @kernel
@@ -35,7 +35,7 @@ def normal_equations(x, y, z, i, ring, count, terms, white, row, normal):
 
 @kernel
 def solve(normal, terms, scale, solution):
-    """Solve with the diagonal scaled to one; False where a term is nearly a sum of the others."""
+    """Solve with the diagonal scaled to one; False where a term is nearly a linear combination of the others."""
     for a in range(terms):
         if not normal[a, a] > 0.0:
             return False
@@ -63,7 +63,7 @@ def solve(normal, terms, scale, solution):
 
 @kernel
 def fit(x, y, z, i, ring, count, terms, work, gradient):
-    """Fit a polynomial through a vertex to its ring and take its gradient; False where the ring does not bear it."""
+    """Fit a polynomial through a vertex to its ring and store its gradient; False where the ring is too narrow."""
     white, row, normal, solution = work[0], work[1], work[2:-1], work[-1]
     if not whitening(x, y, i, ring, count, white):
         return False
@@ -77,7 +77,7 @@ def fit(x, y, z, i, ring, count, terms, work, gradient):
 
 @kernel
 def vertex_gradients(x, y, z, starts, neighbours, wanted, gradients, sources):
-    """Gradient of a quadratic polynomial at vertices.
+    """Compute the gradient of a quadratic polynomial at vertices.
 
     Parameters
     ----------

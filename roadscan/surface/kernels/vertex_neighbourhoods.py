@@ -1,4 +1,4 @@
-"""Neighbourhoods of the vertices of a triangulation for local splines: who belongs to them, and what is near."""
+"""Neighbourhoods of the vertices of a triangulation for local splines: their members and their units of length."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from roadscan.compute.kernel_options import inner, kernel
 from roadscan.surface.kernels.vertex_rings import MOST_RINGS, grow, is_narrow, offset_squares, whitening
 
 RINGS, FEWEST, LEAST, MOST = 2, 10, 20, 32
-"""Rings that are taken; neighbours without which there is no spline, fewer than which another ring is taken, and kept.
+"""Rings taken; least neighbours for a spline; neighbours below which another ring is added; most neighbours kept.
 """
 UNIT_COUNT = 18.0
-"""Neighbours whose mean square offset along each axis is the unit of length: those of two rings."""
+"""Number of neighbours whose mean square offset along each axis is the unit of length: those of two rings."""
 STRETCH = 3.0
-"""By how much a neighbourhood may be longer than wide before its length is counted in smaller units."""
+"""Ratio of length to width above which a neighbourhood's length is counted in larger units."""
 
 
 @inner
 def keep_nearest(x, y, i, ring, count, white, far):
-    """Sort a ring by whitened distance from its vertex; what is equally far keeps its order."""
+    """Sort a ring by whitened distance from its vertex; equally far neighbours keep their order."""
     for k in range(count):
         j = ring[k]
         u = (x[j] - x[i]) / white[0]
@@ -34,9 +34,9 @@ def keep_nearest(x, y, i, ring, count, white, far):
 
 @kernel
 def units(x, y, i, ring, count, axes):
-    """Lower triangular 2 × 2 factor that turns offsets into units of their spread.
+    """Compute the lower triangular 2 × 2 factor that turns offsets into units of their spread.
 
-    They are the same in all directions, so that the ground is as rough along as across, but for what the ring is
+    The units are the same in all directions, so that the ground is as rough along as across, except where the ring is
     longer than `STRETCH` times its width.
     """
     xx, xy, yy = offset_squares(x, y, i, ring, count)
@@ -56,7 +56,7 @@ def units(x, y, i, ring, count, axes):
 
 @kernel
 def neighbourhoods(x, y, starts, neighbours, first, ring, seen, members, counts, axes):
-    """Neighbourhoods of the vertices from `first` on.
+    """Find the neighbourhoods of the vertices from `first` on.
 
     Rings are added (up to MOST_RINGS) while neighbours are too few or narrow; then the nearest are kept.
 

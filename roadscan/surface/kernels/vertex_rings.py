@@ -1,4 +1,4 @@
-"""Rings of neighbours around the vertices of a triangulation, and how they are spread."""
+"""Rings of neighbours around the vertices of a triangulation, and the spread of their offsets."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import math
 
 from roadscan.compute.kernel_options import inlined, kernel
 
-MOST_RINGS = 4
+MOST_RINGS = 4  # Rings that are added at most.
 NARROWEST = 1.0 / 8.0**2
-"""Squared ratio of the spreads of a ring across and along, below which it is not wide enough to tell a slope."""
+"""Squared ratio of a ring's spreads across and along below which it does not determine a slope across."""
 
 
 @kernel
 def grow(starts, neighbours, ring, first, count, seen, centre):
-    """Add the neighbours of ``ring[first:count]`` that are not in it yet; return how many there are."""
+    """Add the neighbours of ``ring[first:count]`` that are not in it yet; return their total number."""
     total = count
     for k in range(first, count):
         for e in range(starts[ring[k]], starts[ring[k] + 1]):
@@ -27,7 +27,7 @@ def grow(starts, neighbours, ring, first, count, seen, centre):
 
 @inlined
 def offset_squares(x, y, i, ring, count):
-    """Sums of dx², dx · dy and dy² over the offsets from a vertex to a ring."""
+    """Returns sums of dx², dx · dy and dy² over the offsets from a vertex to a ring."""
     xx, xy, yy = 0.0, 0.0, 0.0
     for k in range(count):
         dx, dy = x[ring[k]] - x[i], y[ring[k]] - y[i]
@@ -39,14 +39,14 @@ def offset_squares(x, y, i, ring, count):
 
 @kernel
 def is_narrow(x, y, i, ring, count):
-    """Whether points lie so nearly on a line with a vertex that their scatter would pass for the slope across."""
+    """Whether points are so nearly collinear with a vertex that their scatter would pass for the slope across."""
     xx, xy, yy = offset_squares(x, y, i, ring, count)
     return xx * yy - xy * xy < NARROWEST * (xx + yy) ** 2
 
 
 @kernel
 def whitening(x, y, i, ring, count, white):
-    """Lower triangular 2 × 2 factor of the mean square of the offsets to a ring; False where they lie on a line."""
+    """Lower triangular 2 × 2 factor of the mean square offset of a ring; False where the ring is collinear."""
     xx, xy, yy = offset_squares(x, y, i, ring, count)
     white[0] = math.sqrt(xx / count)
     if not white[0] > 0.0:

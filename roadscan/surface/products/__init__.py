@@ -1,1 +1,1 @@
-"""Files of the reconstructed surface, a tile or the whole survey."""
+"""Files of the reconstructed surface, by tile or for the whole survey."""

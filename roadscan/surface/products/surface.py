@@ -21,10 +21,10 @@ SurfaceBand = Literal["height", "raw_height", "origin", "intensity"]
 Float32 = npt.NDArray[np.float32]
 
 HEIGHT_STEP: Final = 2.0**-15
-"""Heights are whole multiples of this, in the unit of the map's heights, as those of `geotiff`."""
+"""Heights are whole multiples of this, in the unit of the map's heights, as in `geotiff`."""
 
-_OVERVIEWS: Final = (4, 16)
-_SMALLEST_OVERVIEW: Final = 32
+_OVERVIEWS: Final = (4, 16)  # Edges (cells) of the pixels of overviews.
+_SMALLEST_OVERVIEW: Final = 32  # Overviews have at least this many pixels a side.
 
 
 class SurfaceOptions(Strict):
@@ -50,7 +50,7 @@ class Surface(SurfaceProduct):
     options: ClassVar[type[Strict]] = SurfaceOptions
 
     def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:
-        """Write the tile's bands; only blocks that hold a height are made."""
+        """Write the tile's bands; only blocks that contain a height are written."""
         names = cast(SurfaceOptions, options).bands
         bands = [_band(name, surface, context) for name in names]
         images = [dense_image(bands)]
@@ -67,7 +67,7 @@ class Surface(SurfaceProduct):
 
 
 def surface_band(name: SurfaceBand, context: ProductContext) -> Band:
-    """Name and unit of a band, as the files state them."""
+    """Returns name and unit of a band, as the files state them."""
     unit = height_unit(context.map)
     return {
         "height": Band("height", unit),
@@ -78,7 +78,7 @@ def surface_band(name: SurfaceBand, context: ProductContext) -> Band:
 
 
 def _band(name: SurfaceBand, surface: SurfaceTile, context: ProductContext) -> Float32:
-    """(rows, columns) of the tile itself, north up."""
+    """Returns (rows, columns) of the tile itself, north up."""
     known = surface.origin[surface.inner] != EMPTY
     if name in ("height", "raw_height"):
         heights = surface.height_m if name == "height" else surface.raw_m
@@ -92,7 +92,7 @@ def _band(name: SurfaceBand, surface: SurfaceTile, context: ProductContext) -> F
 
 
 def _reduced(band: Float32, factor: int, best: bool) -> Float32:
-    """Means of `factor` squared pixels, or their least; NaN where none is known."""
+    """Returns means of `factor` squared pixels, or their least; NaN where none is known."""
     rows, columns = (-(-n // factor) for n in band.shape)
     whole = np.full((rows * factor, columns * factor), np.nan, np.float32)
     whole[: band.shape[0], : band.shape[1]] = band
@@ -107,7 +107,7 @@ def _reduced(band: Float32, factor: int, best: bool) -> Float32:
 
 
 def _place(surface: SurfaceTile, context: ProductContext) -> Affine:
-    """Map position, in the CRS's own unit, of a (column, row) counted from the north-west corner."""
+    """Returns the map position, in the CRS's unit, of a (column, row) counted from the north-west corner."""
     box, unit_m = surface.window.grown(-surface.halo).bounds(), context.map.horizontal_unit_m
     east, north = (edge / unit_m for edge in surface.cell_m)
     return Affine(east, 0.0, box.easting_min_m / unit_m, 0.0, -north, box.northing_max_m / unit_m)

@@ -1,4 +1,4 @@
-"""The files of `surface` of many tiles as one raster: where each tile lies in it, and its pixels."""
+"""The `surface` files of many tiles as one raster: the position of each tile in it, and its pixels."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from roadscan.tiles.products.raster import CellBox
 
 READS: Final = ("surface",)
 
-_SHEET_CELLS: Final = 20_000
+_SHEET_CELLS: Final = 20_000  # Default edge of a sheet (cells).
 
 
 def need_bands(product: str, wanted: Iterable[SurfaceBand], read: Mapping[str, Strict]) -> None:
-    """Raise :class:`ConfigError` unless the files of `surface` hold the bands that a product is made of."""
+    """Raise :class:`ConfigError` unless the files of `surface` contain the bands of which a product is made."""
     held = SurfaceOptions.parse(read[READS[0]].model_dump()).bands
     missing = [band for band in wanted if band not in held]
     if missing:
@@ -39,19 +39,19 @@ def need_bands(product: str, wanted: Iterable[SurfaceBand], read: Mapping[str, S
 
 
 def cells_m(context: ProductContext) -> tuple[float, float]:
-    """Edges (m) of a cell of the surface, east and north."""
+    """Returns the edges of a cell of the surface, east and north (m)."""
     if context.surface_cell_m is None:
         raise ConfigError("the survey has no reconstructed surface", change="add the section [surface]")
     return context.surface_cell_m
 
 
 def sheet_edge_m(stated_m: float | None, context: ProductContext) -> float:
-    """Edge of a sheet (m): as stated, or 20,000 cells of the surface."""
+    """Returns the edge of a sheet (m): as stated, or 20,000 cells of the surface."""
     return stated_m or _SHEET_CELLS * max(cells_m(context))
 
 
 def surface_box(tiles: Iterable[TileId], context: ProductContext) -> CellBox:
-    """Smallest box of the surface's cells that holds `tiles` (at least one)."""
+    """Returns the smallest box of the surface's cells that covers `tiles` (at least one)."""
     columns, rows = zip(*((t.column, t.row) for t in tiles), strict=True)
     first = context.grid.bounds(TileId(min(columns), min(rows)))
     last = context.grid.bounds(TileId(max(columns), max(rows)))
@@ -64,7 +64,7 @@ def surface_box(tiles: Iterable[TileId], context: ProductContext) -> CellBox:
 
 @dataclass(frozen=True)
 class SurfaceFiles:
-    """Files of `surface`, read one after another: none is kept."""
+    """Files of `surface`, read one after another without a cache."""
 
     load: LoadCells
     context: ProductContext
@@ -75,7 +75,7 @@ class SurfaceFiles:
         return own.west - box.west, box.north - own.north, own.width, own.height
 
     def image(self, tile: TileId, band: SurfaceBand, part: Window | None = None) -> npt.NDArray[np.float32] | None:
-        """(rows, columns) of a band, or of a part of it, north up; None where the tile has no surface.
+        """Returns (rows, columns) of a band, or of a part of it, north up; None where the tile has no surface.
 
         Raises
         ------
@@ -101,7 +101,7 @@ class SurfaceFiles:
         return pixels.astype(np.float32, copy=False)
 
     def heights_around(self, tile: TileId, known: frozenset[TileId]) -> npt.NDArray[np.float64] | None:
-        """(rows + 2, columns + 2) heights (m) of a tile and of the cells around it, NaN where there is none.
+        """Returns heights (rows + 2, columns + 2) (m) of a tile and of the cells around it, NaN where there is none.
 
         None where the tile has no surface; of its neighbours among `known` only the border is decoded.
         """
@@ -119,7 +119,7 @@ class SurfaceFiles:
         return around * self.context.map.vertical_unit_m
 
     def _border(self, other: TileId, right: int, up: int, around: npt.NDArray[np.float64]) -> None:
-        """Put the pixels of a neighbour that touch a tile into its rim."""
+        """Copy the pixels of a neighbour that touch a tile into its rim."""
         size = surface_box((other,), self.context)
         column, width = {-1: (size.width - 1, 1), 0: (0, size.width), 1: (0, 1)}[right]
         row, height = {1: (size.height - 1, 1), 0: (0, size.height), -1: (0, 1)}[up]

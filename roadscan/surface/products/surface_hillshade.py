@@ -1,4 +1,4 @@
-"""``surface_hillshade``: the reconstructed surface as light from the north-west would show it."""
+"""``surface_hillshade``: a shaded relief of the reconstructed surface with light from the north-west."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ class SurfaceHillshade(SurveyProduct):
     reads: ClassVar[tuple[str, ...]] = READS
 
     def check_reads(self, options: Strict, read: Mapping[str, Strict]) -> None:
-        """The heights have to be in the files of `surface`."""
+        """Raise where the files of `surface` have no heights."""
         need_bands(self.name, ("height",), read)
 
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
-        """Sheets, the index that joins them, and the picture."""
+        """Returns sheets, the index that joins them, and the picture."""
         edge_m = sheet_edge_m(cast(HillshadeOptions, options).sheet_m, context)
         everything = tuple(sorted(t.tile for t in tiles))
         sheets = cut_sheets(_STEM, everything, edge_m, context.grid)

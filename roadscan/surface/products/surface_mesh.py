@@ -17,7 +17,7 @@ from roadscan.surface.views import PictureRule
 from roadscan.tiles.product import ProductContext, SurfaceProduct
 from roadscan.tiles.products.mesh import mesh_of
 
-_UNKNOWN_GREY = 128
+_UNKNOWN_GREY = 128  # Grey of vertices without an intensity.
 
 
 class SurfaceMeshOptions(Strict):
@@ -72,11 +72,11 @@ class SurfaceMesh(SurfaceProduct):
     options: ClassVar[type[Strict]] = SurfaceMeshOptions
 
     def suffix_for(self, options: Strict) -> str:
-        """``.glb`` or ``.ply``."""
+        """Returns ``.glb`` or ``.ply``."""
         return f".{cast(SurfaceMeshOptions, options).format}"
 
     def picture_rule(self, options: Strict) -> PictureRule | None:
-        """Those of the settings, where colours of cameras are asked for."""
+        """Returns the rule of the settings if they ask for colours of cameras."""
         settings = cast(SurfaceMeshOptions, options)
         if settings.colours != "camera":
             return None
@@ -85,7 +85,7 @@ class SurfaceMesh(SurfaceProduct):
         )
 
     def coloured_nodes(self, surface: SurfaceTile, options: Strict) -> tuple[range, range]:
-        """The mesh's lattice."""
+        """Returns the mesh's lattice."""
         return _lattice(surface, cast(SurfaceMeshOptions, options))
 
     def write(self, surface: SurfaceTile, options: Strict, context: ProductContext, path: Path) -> None:
@@ -112,7 +112,7 @@ class SurfaceMesh(SurfaceProduct):
 
 
 def surface_mesh(surface: SurfaceTile, options: SurfaceMeshOptions, origin_m: tuple[float, float, float]) -> Mesh:
-    """Mesh of a tile and of the first vertices beyond it, in metres from `origin_m` (easting, northing, height)."""
+    """Returns the mesh of a tile and of the next vertices, in metres from `origin_m` (easting, northing, height)."""
     row, column = _lattice(surface, options)
     easting_m, northing_m = surface.window.nodes_m()
     picked = np.ix_(row, column)
@@ -128,7 +128,7 @@ def surface_mesh(surface: SurfaceTile, options: SurfaceMeshOptions, origin_m: tu
 
 
 def _lattice(surface: SurfaceTile, options: SurfaceMeshOptions) -> tuple[range, range]:
-    """Rows and columns of the vertices in the arrays."""
+    """Returns rows and columns of the vertices in the arrays."""
     window, rows_columns = surface.window, surface.height_m.shape
     steps = [max(1, math.floor(options.spacing_m / edge + 1e-9)) for edge in surface.cell_m]
     return (
@@ -138,6 +138,6 @@ def _lattice(surface: SurfaceTile, options: SurfaceMeshOptions) -> tuple[range, 
 
 
 def _multiples(first: int, count: int, halo: int, step: int) -> range:
-    """Places in the arrays of the multiples of `step` in the tile, and of the first one beyond it."""
+    """Returns the indices of the multiples of `step` in the tile, and of the first one beyond it."""
     own, end = first + halo, first + count - halo
     return range(-(-own // step) * step - first, -(-end // step) * step - first + 1, step)

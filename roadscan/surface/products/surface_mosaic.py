@@ -55,11 +55,11 @@ class SurfaceMosaic(SurveyProduct):
     reads: ClassVar[tuple[str, ...]] = READS
 
     def check_reads(self, options: Strict, read: Mapping[str, Strict]) -> None:
-        """The bands have to be in the files of `surface`."""
+        """Raise where the files of `surface` lack a band."""
         need_bands(self.name, cast(SurfaceMosaicOptions, options).bands, read)
 
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
-        """Sheets of each band, followed by the index that joins them."""
+        """Returns the sheets of each band, followed by the index that joins them."""
         settings = cast(SurfaceMosaicOptions, options)
         edge_m = sheet_edge_m(settings.sheet_m, context)
         found: list[Output] = []

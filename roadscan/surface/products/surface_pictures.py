@@ -18,7 +18,7 @@ from roadscan.tiles.products.hillshade import shade
 
 Grey = npt.NDArray[np.uint8]
 
-_GAP_PX: Final = 16
+_GAP_PX: Final = 16  # Gap between the halves (pixels).
 
 
 class SurfacePicturesOptions(Strict):
@@ -61,7 +61,7 @@ class SurfacePictures(SurfaceProduct):
 
 
 def _shaded(heights_m: npt.NDArray[np.float64], surface: SurfaceTile, light: SurfacePicturesOptions) -> Grey:
-    """Shade of the part of the tile that holds heights, north up, in square pixels."""
+    """Returns the shade of the part of the tile that has heights, north up, in square pixels."""
     rows, columns = _seen(surface)
     part = heights_m[rows.start - 1 : rows.stop + 1, columns.start - 1 : columns.stop + 1][::-1]
     east_m, north_m = surface.cell_m
@@ -71,7 +71,7 @@ def _shaded(heights_m: npt.NDArray[np.float64], surface: SurfaceTile, light: Sur
 
 
 def _seen(surface: SurfaceTile) -> tuple[slice, slice]:
-    """Rows and columns of the arrays: the smallest box of the tile's own cells with a height."""
+    """Returns row and column slices of the smallest box of the tile's cells with a height."""
     known = surface.origin[surface.inner] != EMPTY
     spans = [np.flatnonzero(known.any(axis=axis)) + surface.halo for axis in (1, 0)]
     rows, columns = (slice(int(s[0]), int(s[-1]) + 1) for s in spans)

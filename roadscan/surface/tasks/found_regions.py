@@ -1,7 +1,7 @@
-"""Regions of interest that the coarse model finds: looked for in pieces of each drive, kept in the table ``regions``.
+"""Regions of interest that the coarse model finds: searched in pieces of each drive, stored in the table ``regions``.
 
 A piece is a span of GPS time at whole multiples of its own length, with the profiles of a few seconds before and after
-it. So a region has the same corners however the readings lie in files, and whichever worker looks for it.
+it. So a region has the same corners however the readings lie in files, and whichever worker searches it.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ from roadscan.tiles.tasks.wanted_products import product_context
 REGIONS: Final = "regions"
 
 _READINGS: Final = 1_500_000
-"""Readings of a piece, about: its working arrays hold a hundred bytes each."""
-_LONGEST_S: Final = 64
-_MARGIN_NS: Final = 4 * NS_PER_S
+"""Approximate readings of a piece: its working arrays need a hundred bytes each."""
+_LONGEST_S: Final = 64  # Longest piece (s).
+_MARGIN_NS: Final = 4 * NS_PER_S  # Time before and after a piece whose profiles are used too (ns).
 _EVERY_NS: Final = 2_500_000
-"""Of denser profiles one in each such span of time is looked at: at 50 km/h every 35 mm."""
-_CHUNK_ROWS: Final = 4_000
-_BUNDLE: Final = 20_000_000
+"""Of denser profiles one in each such span (ns) is used: at 50 km/h every 35 mm."""
+_CHUNK_ROWS: Final = 4_000  # Rows of profiles converted at a time.
+_BUNDLE: Final = 20_000_000  # Readings of a bundle of pieces, about.
 
 
 @dataclass(frozen=True)
 class RegionPiece:
-    """A span of a sensor's profiles in one run; it holds no data."""
+    """A span of a sensor's profiles in one run; it carries no data."""
 
     store: Store
     ground: MapSettings
@@ -62,21 +62,21 @@ class RegionPiece:
     settings: RegionSettings
     source: ReadingSource
     slices: tuple[RawSlice, ...]
-    """Row groups that may hold profiles of the span and its margins."""
+    """Row groups that may contain profiles of the span and its margins."""
     start_gps_ns: int
     end_gps_ns: int
     readings: int
-    """About how many."""
+    """Approximate number of readings."""
     key: str
 
     @property
     def unit(self) -> str:
-        """Its name in the manifest."""
+        """Returns its name in the manifest."""
         return f"{self.source.run}/{self.source.sensor}/{self.start_gps_ns // NS_PER_S}"
 
 
 def searched_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFile, ...]]]:
-    """Profiles whose coarse model is looked at, with their files; none where the survey does not ask for it.
+    """Returns profiles whose coarse model is searched, with their files; none where the survey does not ask for it.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def searched_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFi
 
 
 def region_pieces(plan: SurveyPlan) -> list[RegionPiece]:
-    """All pieces of the drives that are searched; errors as of :func:`searched_sources`."""
+    """Returns all pieces of the drives that are searched; errors as of :func:`searched_sources`."""
     config, sources = SurfaceConfig.stated(plan.survey), searched_sources(plan)
     if config is None or not sources:
         return []
@@ -152,13 +152,13 @@ def _pieces(
 
 
 def _numbers(spans: npt.NDArray[np.int64], length: int) -> list[list[int]]:
-    """First and last number of the pieces that spans (k, 2) may touch with their margins."""
+    """Returns first and last number of the pieces that spans (k, 2) may touch with their margins."""
     found: list[list[int]] = ((spans + np.array([-_MARGIN_NS, _MARGIN_NS])) // length).tolist()
     return found
 
 
 def _length_ns(readings_a_second: float) -> int:
-    """Length of pieces: the longest power of two of seconds whose readings fit."""
+    """Returns the length of pieces: the longest power of two of seconds whose readings fit (ns)."""
     length_s = 1
     while length_s < _LONGEST_S and 2 * length_s * readings_a_second <= _READINGS:
         length_s *= 2
@@ -168,7 +168,7 @@ def _length_ns(readings_a_second: float) -> int:
 def find_due_regions(
     plan: SurveyPlan, manifest: Manifest, compute: Compute, report: Callable[[int, int], None] = lambda _a, _b: None
 ) -> list[tuple[str, str]]:
-    """Look for regions in the pieces that are missing or stale; returns what failed."""
+    """Search regions in the pieces that are missing or stale; returns what failed."""
     due = _due(region_pieces(plan), manifest)
     failed = run_bundles(regions_of_piece, due, lambda p: p.readings, _BUNDLE, manifest, compute, report)
     return [(f"{REGIONS} {piece.unit}", reason) for piece, reason in failed]
@@ -202,7 +202,7 @@ def regions_of_piece(piece: RegionPiece) -> OutputRecord:
 
 
 def _found(piece: RegionPiece) -> list[Region]:
-    """Regions of a piece, from its coarse model: those that reach into its span, so that margins are told of once."""
+    """Returns regions of a piece that reach into its span: those in margins belong to its neighbours."""
     placer = Georeferencer(piece.store, piece.ground, piece.slices)
     placement = placer.placement(piece.source)
     points = _profiles(piece, placement)
@@ -225,7 +225,7 @@ def _found(piece: RegionPiece) -> list[Region]:
 
 
 def _profiles(piece: RegionPiece, placement: Placement) -> ProfilePoints:
-    """Profiles of the span and its margins by their epochs, one in each :data:`_EVERY_NS`."""
+    """Returns profiles of the span and its margins by their epochs, one in each :data:`_EVERY_NS`."""
     geometry = geometry_of(piece.source)
     if geometry is None:
         raise ConfigError(f"{piece.source.run}/{piece.source.sensor} has no profiles", expected="scans")
@@ -251,24 +251,24 @@ def _at(points: ProfilePoints, rows: npt.NDArray[Any]) -> ProfilePoints:
 
 
 def _polygons(one: Region) -> list[Any]:
-    """An outline as sound polygons: it may cross itself where the vehicle turned on the spot."""
+    """Returns an outline as valid polygons: it may cross itself where the vehicle turned on the spot."""
     parts = shapely.get_parts(shapely.make_valid(one.polygon))
     return [p for p in shapely.get_parts(parts) if p.geom_type == "Polygon" and p.area > 0.0]
 
 
 @dataclass(frozen=True)
 class FoundRegions:
-    """What the pieces of all drives say."""
+    """Regions found in the pieces of all drives."""
 
     regions: Regions
-    """Of the pieces that are current."""
+    """Regions of the pieces that are current."""
     due: tuple[RegionPiece, ...]
-    """Pieces that were not looked at yet, or failed."""
+    """Pieces that were not searched yet, or failed."""
     gone: tuple[OutputRecord, ...]
-    """Records of pieces there are no more."""
+    """Records of pieces that no longer exist."""
 
     def waiting(self, footprints: FootprintRanges) -> set[TileId]:
-        """Tiles in which a piece that is due may have readings."""
+        """Returns tiles in which a piece that is due may have readings."""
         f = footprints
         touched = np.zeros(f.tile_row.size, bool)
         for piece in self.due:
@@ -278,7 +278,7 @@ class FoundRegions:
 
 
 def load_found_regions(plan: SurveyPlan, manifest: Manifest) -> FoundRegions:
-    """Regions that were found, of the readings as they are."""
+    """Returns regions that were found in the current readings."""
     pieces = region_pieces(plan)
     due = _due(pieces, manifest)
     current = {p.unit for p in pieces} - {p.unit for p in due}

@@ -1,4 +1,4 @@
-"""Colours of points of the ground from pictures, which are read one by one and kept while there is room."""
+"""Colours of points of the ground from pictures, which are read one by one and cached in bounded memory."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ UInt8 = npt.NDArray[np.uint8]
 Float64 = npt.NDArray[np.float64]
 
 _KEPT_BYTES: Final = 160 << 20
-"""Decoded pictures that stay in memory for the tiles that follow; one does whatever its size."""
-_POINTS_AT_ONCE: Final = 1 << 18
+"""Decoded pictures cached for the following tiles (bytes); one is cached whatever its size."""
+_POINTS_AT_ONCE: Final = 1 << 18  # Points coloured at a time.
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,13 @@ class PointColours:
     seen: npt.NDArray[np.bool_]
     """(m,)."""
     pictures: int
-    """How many pictures gave a colour."""
+    """Number of pictures that gave a colour."""
     unreadable: tuple[str, ...]
-    """Pictures that would have, and cannot be read: name and reason."""
+    """Pictures that would have given a colour but cannot be read: name and reason."""
 
 
 class ColourSource:
-    """Gives points their colours. What a point gets depends on it and on the survey's pictures, on nothing else."""
+    """A source of colours for points; a colour depends only on the point and on the survey's pictures."""
 
     def __init__(self, pictures: Pictures) -> None:
         self._kept: OrderedDict[str, UInt8] = OrderedDict()
@@ -66,7 +66,7 @@ class ColourSource:
         return PointColours(colour, seen, len(used), told)
 
     def picture(self, pictures: Pictures, number: int) -> UInt8 | None:
-        """A picture (height, width, 3), red first; None where it cannot be read."""
+        """Returns a picture (height, width, 3), red first; None where it cannot be read."""
         name = pictures.name(number)
         if name in self._unreadable:
             return None
@@ -84,7 +84,7 @@ class ColourSource:
 
 
 def _shown(pictures: Pictures, enh_m: Float64, without: Collection[int]) -> Shown:
-    """Which picture shows points of the map best, and where."""
+    """Returns the picture that shows each point best, and where."""
     parts = []
     for start in range(0, len(enh_m), _POINTS_AT_ONCE):
         part = enh_m[start : start + _POINTS_AT_ONCE]
@@ -94,18 +94,18 @@ def _shown(pictures: Pictures, enh_m: Float64, without: Collection[int]) -> Show
 
 
 def world_places(pictures: Pictures, world: str, enh_m: Float64) -> Float64:
-    """Points (m, 3) of the map in a world frame."""
-    if len(enh_m) == 1:  # NumPy multiplies one row in another order than several
+    """Returns points (m, 3) of the map in a world frame."""
+    if len(enh_m) == 1:  # NumPy multiplies a single row in another order than several
         return world_places(pictures, world, np.repeat(enh_m, 2, axis=0))[:1]
     return np.ascontiguousarray(pictures.map.world_from_map(world, enh_m))
 
 
 def _read(pictures: Pictures, number: int) -> UInt8:
-    """Decode a picture as the chip has it, whichever way up a viewer would show it."""
+    """Returns a decoded picture in the orientation of the sensor, whatever its orientation tag."""
     path = pictures.path(number)
     lens = pictures.views.lenses[pictures.views.lens[number]].parameters
     expected = round(lens[WIDTH]), round(lens[HEIGHT])
-    size = image_size(path)  # tells files that are cut short, which a decoder fills up
+    size = image_size(path)  # detects truncated files, which a decoder would fill up
     if (size.width_px, size.height_px) != expected:
         raise ImageError(f"{size.width_px} × {size.height_px} pixels, not {expected[0]} × {expected[1]}")
     content = np.frombuffer(path.read_bytes(), np.uint8)

@@ -1,4 +1,4 @@
-"""Which pictures a survey's ground can take its colours from: their poses, and which of them a tile may need."""
+"""Pictures from which a survey's ground can take its colours: their poses, and those that a tile may need."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _PIECE_NS: Final = 600 * NS_PER_S
-"""Poses of so long a time are loaded at once."""
+"""Poses of this long (ns) are loaded at once."""
 _CURVED: Final = 1.01
-"""The map's scale changes by far less within a picture's reach."""
+"""Margin for the change of the map's scale, which is far smaller within a picture's reach."""
 _WITHOUT: Final = 'set colours = "intensity" in the settings of the product'
 
 
@@ -48,17 +48,17 @@ class PictureLog:
 
 @dataclass(frozen=True)
 class Pictures:
-    """n pictures with what places them, in order of time. Sent to workers: it holds no picture."""
+    """n pictures with their poses, in order of time. Sent to workers: it carries no image."""
 
     rule: PictureRule
     map: MapFrame
     worlds: tuple[str, ...]
-    """World frames that the views count."""
+    """World frames to which the views refer by number."""
     views: Views
     place_m: Float64
     """(n, 2) easting and northing of the cameras."""
     reach_m: Float64
-    """(n,) how far the rule's reach is on the map."""
+    """(n,) reach of the rule on the map."""
     logs: tuple[PictureLog, ...]
     log: Int64
     """(n,) number of each picture's log."""
@@ -69,23 +69,23 @@ class Pictures:
     lens_key: str
     """Hash of the lenses and of what they hide."""
     notes: tuple[str, ...] = ()
-    """What of the survey's pictures is left out, and why."""
+    """Notes on pictures that are left out, and why."""
 
     def __len__(self) -> int:
-        """Pictures."""
+        """Returns the number of pictures."""
         return len(self.files)
 
     def path(self, number: int) -> Path:
-        """File of a picture."""
+        """Returns the file of a picture."""
         return Path(self.logs[self.log[number]].folder, self.files[number])
 
     def name(self, number: int) -> str:
-        """What a picture is called in messages."""
+        """Returns the name of a picture in messages."""
         log = self.logs[self.log[number]]
         return f"{log.run}/{log.sensor}/{self.files[number]}"
 
     def near(self, *boxes: Bounds) -> Pictures:
-        """Those that may show a point in one of some boxes of the map, in the same order."""
+        """Returns those that may show a point in one of some boxes of the map, in the same order."""
         if not len(self) or not boxes:
             return self._picked(np.zeros(0, np.int64))
         own = np.array([[b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m] for b in boxes])
@@ -97,7 +97,7 @@ class Pictures:
         return self._picked(np.unique(picture[far <= self.reach_m[picture]]))
 
     def key(self) -> str:
-        """Hash of all that the colours that come from these pictures depend on, beside the rule."""
+        """Returns a hash of all that colours from these pictures depend on, except the rule."""
         digest = hashlib.blake2b(self.lens_key.encode(), digest_size=8)
         views = self.views
         for values in (views.eye_world_m, views.opencv_from_world, views.up_world, views.lens):
@@ -119,13 +119,13 @@ class Pictures:
 
 
 def check_pictures(plan: SurveyPlan, rule: PictureRule) -> None:
-    """Raise where the survey has no pictures that the rule could take colours from; reads no pose and no picture."""
+    """Raise where the survey has no pictures from which the rule could take colours; reads no pose and no picture."""
     for camera, taken in _camera_logs(plan, rule):
         _fits(camera, taken)
 
 
 def check_folders(plan: SurveyPlan, rule: PictureRule) -> None:
-    """Raise where the files of pictures are not there: the tables say when they were taken, and do not hold them."""
+    """Raise where the files of pictures are missing: the tables contain their times only."""
     for _, taken in _camera_logs(plan, rule):
         folder = plan.survey.resolve(Path(taken.record.path))
         if not folder.exists():
@@ -138,7 +138,7 @@ def check_folders(plan: SurveyPlan, rule: PictureRule) -> None:
 
 
 def plan_pictures(plan: SurveyPlan, rule: PictureRule) -> Pictures:
-    """Place the survey's pictures.
+    """Returns the survey's pictures with their poses.
 
     Raises
     ------
@@ -197,12 +197,12 @@ class _Placed:
 
     @property
     def names(self) -> tuple[str, str]:
-        """What decides among pictures of one epoch."""
+        """Returns the keys that order pictures of one epoch."""
         return self.log.run, self.log.sensor
 
 
 def _camera_logs(plan: SurveyPlan, rule: PictureRule) -> list[tuple[Sensor, TakenPictures]]:
-    """Logs of pictures with their cameras."""
+    """Returns logs of pictures with their cameras."""
     cameras = rule_cameras(plan.survey.rig, rule)
     found = [(c, taken) for name, c in cameras for taken in taken_pictures(plan.store, plan.records, name)]
     usable = [(c, taken) for c, taken in found if taken.files and not _is_video(taken)]
@@ -223,7 +223,7 @@ def _is_video(taken: TakenPictures) -> bool:
 
 
 def rule_cameras(rig: Rig, rule: PictureRule) -> list[tuple[str, Sensor]]:
-    """Cameras of a rig that a rule takes; each has an interior orientation. ConfigError where there are none."""
+    """Returns cameras of a rig that a rule uses; each has an interior orientation. ConfigError where there are none."""
     known = {name: sensor for name, sensor in rig.sensors.items() if sensor.kind == "camera"}
     for name in rule.cameras:
         if name not in known:
@@ -259,7 +259,7 @@ def _lens_key(cameras: Sequence[tuple[str, Sensor]]) -> str:
 
 
 def _placed(plan: SurveyPlan, camera: Sensor, taken: TakenPictures, rule: PictureRule) -> _Placed:
-    """Poses of a log's pictures; those without one, or of another size than the lens is for, are left out."""
+    """Returns poses of a log's pictures; those without one, or of another size than the lens is for, are left out."""
     record = taken.record
     log = PictureLog(record.key, record.run, record.sensor, plan.survey.resolve(Path(record.path)))
     source = trajectory_source(record.run, plan.records)
@@ -278,7 +278,7 @@ def _placed(plan: SurveyPlan, camera: Sensor, taken: TakenPictures, rule: Pictur
 
 
 def _fits(camera: Sensor, taken: TakenPictures) -> npt.NDArray[np.bool_]:
-    """(n,) pictures of the size that the interior orientation holds for; raises where there are none."""
+    """Mask (n,) of pictures of the size for which the interior orientation holds; raises where there are none."""
     if camera.interior is None:
         raise ConfigError("a camera has no interior orientation")
     size = camera.interior.width_px, camera.interior.height_px
@@ -295,7 +295,7 @@ def _fits(camera: Sensor, taken: TakenPictures) -> npt.NDArray[np.bool_]:
 
 
 def _poses(plan: SurveyPlan, source: TrajectorySource, epochs_gps_ns: Int64) -> Iterator[Poses]:
-    """Poses of the body, piece by piece, at epochs (n,) in order."""
+    """Yields poses of the body, piece by piece, at epochs (n,) in order."""
     pieces = epochs_gps_ns // _PIECE_NS
     for part in np.split(epochs_gps_ns, np.flatnonzero(np.diff(pieces)) + 1):
         span = (int(part[0]), int(part[-1]))
@@ -303,7 +303,7 @@ def _poses(plan: SurveyPlan, source: TrajectorySource, epochs_gps_ns: Int64) -> 
 
 
 def _eyes(poses: Poses, mountings: Mountings) -> tuple[Float64, Float64]:
-    """Projection centres (n, 3) in the world frame, and turns (n, 3, 3) from it to the camera's axes."""
+    """Returns projection centres (n, 3) in the world frame, and rotations (n, 3, 3) from it to the camera's axes."""
     eye, turn = np.empty_like(poses.position_world_m), np.empty_like(poses.world_from_body)
     for part, mounting in mountings.pieces(poses.epochs_gps_ns):
         rotation, lever = mounting.arrays()
@@ -316,7 +316,7 @@ def _eyes(poses: Poses, mountings: Mountings) -> tuple[Float64, Float64]:
 
 
 def _reach(frame: MapFrame, world: str, eye_m: Float64, reach_m: float) -> tuple[Float64, Float64]:
-    """Easting and northing (n, 2) of cameras, and how far (n,) a distance around them is on the map."""
+    """Returns easting and northing (n, 2) of cameras, and the length (n,) of a distance around them on the map."""
     axes = world_from_ned(world, eye_m)
     places = [frame.map_from_world(world, eye_m + reach_m * axes[:, :, k])[:, :2] for k in (0, 1)]
     middle = frame.map_from_world(world, eye_m)[:, :2]

@@ -1,4 +1,4 @@
-"""Colours of the survey's pictures for products of the surface: planned, painted, and told of."""
+"""Colours of the survey's pictures for products of the surface: planned, applied, and reported."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from roadscan.tiles.tasks.tile_files import WantedSurface
 from roadscan.tiles.tasks.wanted_products import product_context, wanted_products, wanted_surface_products
 
 COLOURS: Final = "colours"
-"""Where a tile's record keeps the figures of its colours."""
-_NAMED: Final = 5
+"""Key of a tile's record for the figures of its colours."""
+_NAMED: Final = 5  # Unreadable pictures that are named.
 
 
 def check_cameras(survey: Survey) -> None:
-    """Raise where products of the surface want colours, and the rig has no camera for them; reads no log."""
+    """Raise where products of the surface want colours and the rig has no camera for them; reads no log."""
     for product, options in wanted_products(survey) if survey.has("surface") else ():
         rule = product.picture_rule(options) if isinstance(product, SurfaceProduct) else None
         if rule is not None:
@@ -35,7 +35,7 @@ def check_cameras(survey: Survey) -> None:
 
 
 def check_colours(plan: SurveyPlan, *, folders: bool = False) -> None:
-    """Raise where products of the surface want colours that the survey cannot give; `folders`: looks for the files."""
+    """Raise where products of the surface want colours that the survey cannot give; `folders`: checks the files too."""
     for wanted in wanted_surface_products(plan.survey, product_context(plan)):
         rule = wanted.product.picture_rule(wanted.options)
         if rule is not None:
@@ -43,14 +43,14 @@ def check_colours(plan: SurveyPlan, *, folders: bool = False) -> None:
 
 
 def plan_colours(plan: SurveyPlan, products: Iterable[WantedSurface]) -> dict[str, Pictures]:
-    """Pictures of the survey, by the product that wants their colours."""
+    """Returns pictures of the survey, by the product that wants their colours."""
     rules = {w.product.name: w.product.picture_rule(w.options) for w in products}
     placed = {rule: plan_pictures(plan, rule) for rule in dict.fromkeys(rules.values()) if rule is not None}
     return {name: placed[rule] for name, rule in rules.items() if rule is not None}
 
 
 def shown_box(grid: SurfaceGrid, tile: TileId) -> Bounds:
-    """Box of all that products see of a tile and its neighbours."""
+    """Returns the box of all that products read of a tile and its neighbours."""
     box, (east, north) = grid.tiles.bounds(tile), grid.cell_m
     beyond = (grid.shown + 1) * east, (grid.shown + 1) * north
     return Bounds(
@@ -60,14 +60,14 @@ def shown_box(grid: SurfaceGrid, tile: TileId) -> Bounds:
 
 
 class Painter:
-    """Gives surfaces the colours that products want."""
+    """Adds to surfaces the colours that products want."""
 
     def __init__(self, pictures: Mapping[str, Pictures]) -> None:
         self._pictures = pictures
         self._sources = {name: ColourSource(one) for name, one in pictures.items()}
 
     def paint(self, wanted: WantedSurface, surface: SurfaceTile) -> tuple[SurfaceTile, dict[str, Any]]:
-        """The surface with colours for a product, and figures for the tile's record; none for one that wants none."""
+        """Returns the surface with colours for a product, and figures for the tile's record; none if it wants none."""
         name = wanted.product.name
         if name not in self._sources:
             return surface, {}
@@ -91,7 +91,7 @@ class Painter:
 
 
 def colour_notes(pictures: Mapping[str, Pictures], made: Iterable[OutputRecord]) -> list[str]:
-    """What became of the colours of surfaces, by their records; each damaged picture is told of once."""
+    """Returns notes on the colours of surfaces, from their records; each damaged picture is reported once."""
     figures = [record.figures() for record in made]
     notes: list[str] = []
     for name, placed in pictures.items():

@@ -1,4 +1,4 @@
-"""What the stage `surfaces` has to do: keys of surfaces, which are stale, and tasks of neighbouring tiles."""
+"""Plan of the stage `surfaces`: keys of surfaces, stale ones, and tasks of neighbouring tiles."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from roadscan.tiles.tasks.tile_files import WantedSurface, surface_file_names
 from roadscan.tiles.tasks.tile_plan import TILE, TilePlan, TileTask
 
 SURFACE = "surfaces"
-"""Manifest name of a tile's surface as a whole; it has no file of its own."""
+"""Manifest name of a tile's surface as a whole; it has no separate file."""
 
 _MOST_SMOOTHED = 500
-"""Cells on each side that smoothing may depend on: the window of a tile of 2,000 cells is twice its size."""
+"""Cells on each side on which smoothing may depend: the window of a tile of 2,000 cells is twice its size."""
 
 _BLOCK_TILES = 4
 """Edge of the largest block of tiles whose surface is made from cells: each tile's cells are read once or twice."""
@@ -40,7 +40,7 @@ _BLOCK_TILES = 4
 
 @dataclass(frozen=True)
 class SurfaceTask:
-    """Everything a worker needs to make the surface of some tiles; it holds no data."""
+    """Everything that a worker needs to make the surface of some tiles; it carries no data."""
 
     store: Store
     grid: SurfaceGrid
@@ -48,9 +48,9 @@ class SurfaceTask:
     keys: tuple[str, ...]
     """Key of each tile's surface."""
     cells: tuple[OutputRecord, ...]
-    """Records of the cells in reach, where the surface is made of cells."""
+    """Records of the cells in reach, where the surface is made from cells."""
     readings: TileTask | None
-    """What places the points in reach, where it is made of points."""
+    """Source of the points in reach, where it is made from points."""
     regions: Regions | None
     """Polygons or found regions in reach; None where the surface is made everywhere."""
     pictures: Mapping[str, Pictures]
@@ -63,12 +63,12 @@ class SurfaceTask:
 
 @dataclass(frozen=True)
 class SurfacePlan:
-    """Tiles whose surface is due, and what it is made of."""
+    """Tiles whose surface is due, and the sources of it."""
 
     tiles: TilePlan
     grid: SurfaceGrid
     cells: Mapping[TileId, OutputRecord]
-    """Records of the tiles that hold cells."""
+    """Records of the tiles that have cells."""
     regions: Regions | None
     products: tuple[WantedSurface, ...]
     keys: Mapping[TileId, str]
@@ -76,7 +76,7 @@ class SurfacePlan:
     pictures: Mapping[str, Pictures]
     """Pictures of the survey, by the product that wants their colours."""
     waiting: frozenset[TileId] = frozenset()
-    """Tiles whose surface depends on cells that are missing or out of date: what there is of it stays."""
+    """Tiles whose surface depends on missing or outdated cells: its files stay as they are."""
 
     def stale(self, manifest: Manifest) -> dict[TileId, str]:
         """Tiles whose surface is missing or out of date, or lacks a product, each with the reason."""
@@ -84,12 +84,12 @@ class SurfacePlan:
         return {tile: why for tile, why in reasons if why}
 
     def near(self, chosen: Iterable[TileId]) -> set[TileId]:
-        """Tiles whose surface depends on one of the chosen."""
+        """Returns tiles whose surface depends on one of the chosen."""
         seen = {t for tile in chosen for t in self._in_reach(tile)}
         return seen & set(self.keys)
 
     def tasks(self, chosen: Sequence[TileId], workers: int = 1) -> list[SurfaceTask]:
-        """Tasks over the chosen tiles, in blocks of neighbours."""
+        """Returns tasks over the chosen tiles, in blocks of neighbours."""
         config = self.tiles.plan.survey.config.tiles
         if self.grid.config.method == "points":
             numbers = self.tiles.tiles.number
@@ -101,11 +101,11 @@ class SurfacePlan:
         return [self.task(b.tiles) for b in blocks]
 
     def singly(self, chosen: Sequence[TileId]) -> list[SurfaceTask]:
-        """A task for each tile."""
+        """Returns a task for each tile."""
         return [self.task((tile,)) for tile in chosen]
 
     def task(self, tiles: tuple[TileId, ...]) -> SurfaceTask:
-        """A task over some tiles."""
+        """Returns a task over some tiles."""
         block = Block(tiles, self.grid.rings())
         reach = sorted({t for tile in tiles for t in self._in_reach(tile)})
         of_points = self.grid.config.method == "points"
@@ -145,7 +145,7 @@ def plan_surfaces(
     found: FoundRegions,
     pictures: Mapping[str, Pictures],
 ) -> SurfacePlan:
-    """Surfaces that are due: of all tiles that hold cells, of points those between them too, or of those of them that a
+    """Returns surfaces that are due: of all tiles that have cells, of points those between them too, or those that a
     polygon or a found region touches.
     """
     grid, regions = checked_surface(tiles.plan.survey, config)
@@ -180,7 +180,7 @@ def plan_surfaces(
 
 
 def checked_surface(survey: Survey, config: SurfaceConfig) -> tuple[SurfaceGrid, Regions | None]:
-    """Grid and polygons of a survey's surface; ConfigError where its settings do not fit the tiles."""
+    """Returns grid and polygons of a survey's surface; ConfigError where its settings do not fit the tiles."""
     tiles = TileGrid(survey.config.tiles.size_m, survey.config.tiles.cell_m)
     grid = SurfaceGrid(tiles, config)
     if grid.smoothed > _MOST_SMOOTHED:
@@ -198,7 +198,7 @@ def checked_surface(survey: Survey, config: SurfaceConfig) -> tuple[SurfaceGrid,
 
 
 def _beside(regions: Regions, config: SurfaceConfig, tiles: Sequence[TileId], grid: SurfaceGrid) -> ConfigError:
-    """The error for polygons that touch no tile."""
+    """Returns the error for polygons that touch no tile."""
     boxes = [grid.tiles.bounds(tile) for tile in tiles]
     survey = (
         min(b.easting_min_m for b in boxes), min(b.northing_min_m for b in boxes),
@@ -213,16 +213,16 @@ def _beside(regions: Regions, config: SurfaceConfig, tiles: Sequence[TileId], gr
 
 
 def files_without_surface(manifest: Manifest) -> list[OutputRecord]:
-    """Files of tiles that turned out to have no surface."""
+    """Returns files of tiles that turned out to have no surface."""
     empty = {unit for unit, r in manifest.of(SURFACE).items() if not r.figures()["cells"]}
     return [r for name in surface_file_names() for unit, r in manifest.of(name).items() if unit in empty]
 
 
 def bridged_tiles(cells: Collection[TileId]) -> set[TileId]:
-    """Tiles without cells across whose corner a triangle may reach.
+    """Returns tiles without cells across whose corner a triangle may reach.
 
     Its corners lie in tiles on two adjoining sides: were they in one, or in one and the tile at its corner, a straight
-    line would part the triangle from this tile.
+    line would separate the triangle from this tile.
     """
     beside = {side for t in cells for side in _sides(t)}
     return {
@@ -238,6 +238,6 @@ def _sides(tile: TileId) -> list[TileId]:
 
 
 def _date(tile: TileId, cells: Mapping[TileId, OutputRecord]) -> dt.date:
-    """UTC date of a tile's first reading; of one that holds none, of the first in the tiles on its sides."""
+    """Returns the UTC date of a tile's first reading; of an empty one, of the first in the tiles on its sides."""
     own = [tile] if tile in cells else [t for t in _sides(tile) if t in cells]
     return utc_from_gps_ns(min(cells[t].figures()["first_epoch_gps_ns"] for t in own)).date()

@@ -1,4 +1,4 @@
-"""Polygons inside which the surface of points is made, those of the survey file: read once a run."""
+"""Polygons of the survey file inside which the surface of points is made; they are read once a run."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ _POLYGONS: Final = (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLY
 
 @dataclass(frozen=True)
 class Regions:
-    """Where the surface is made: (n,) polygons on the map (m)."""
+    """Regions in which the surface is made: (n,) polygons on the map (m)."""
 
     shapes: npt.NDArray[Any]
 
     def near(self, *boxes: Bounds) -> Regions:
-        """Those that share ground with one of some boxes."""
+        """Returns those that intersect one of some boxes."""
         own = [shapely.box(b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m) for b in boxes]
         touch = shapely.intersects(self.shapes[:, None], np.array(own, object)[None, :])
         return Regions(self.shapes[touch.any(axis=1)])
 
     def key(self) -> list[str]:
-        """What of them shapes a surface: their corners."""
+        """Returns a key of their corners, all that affects a surface."""
         return sorted(one.hex() for one in shapely.to_wkb(self.shapes))
 
     def holds(self, window: GridWindow) -> npt.NDArray[np.bool_]:
-        """(rows, columns) cells of a window whose centre lies in one of them."""
+        """Returns a mask (rows, columns) of the cells of a window whose centre lies in one of them."""
         easting_m, northing_m = np.meshgrid(*window.nodes_m())
         inside = np.zeros(easting_m.shape, bool)
         for shape in self.shapes:
@@ -57,7 +57,7 @@ class Regions:
 
 
 def stated_regions(survey: Survey) -> Regions | None:
-    """Polygons that the survey file names, on its map; None where the surface is made everywhere.
+    """Returns polygons that the survey file names, on its map; None where the surface is made everywhere.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def _shapes(path: Path) -> npt.NDArray[Any]:
             change="mend the feature, or take it out of the layer",
             file=path,
         )
-    shapes = shapes[holds_ground]  # a feature without ground costs itself
+    shapes = shapes[holds_ground]  # a feature without area is skipped
     if not shapes.size:
         raise ConfigError("the layer has no polygon", expected="at least one", file=path)
     return np.asarray(shapes)

@@ -1,4 +1,4 @@
-"""What the stage `surfaces` has to do: the surfaces there are against those there should be."""
+"""Work of the stage `surfaces`: the existing surfaces compared with those that are wanted."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from roadscan.tiles.tasks.wanted_products import product_context, wanted_surface
 
 @dataclass(frozen=True)
 class SurfaceWork:
-    """What the stage `surfaces` has to do."""
+    """Work of the stage `surfaces`."""
 
     planned: SurfacePlan | None
     """None where no surface is asked for."""
@@ -36,9 +36,9 @@ class SurfaceWork:
 
 
 def plan_surface_work(session: Session) -> SurfaceWork:
-    """Compare the surfaces there are with those there should be, once the tiles are done.
+    """Returns the difference between existing and wanted surfaces, once the tiles are done.
 
-    With a selection of tiles, these, and of those that depend on them the stale ones.
+    With a selection of tiles, it is these, and of those that depend on them the stale ones.
     """
     survey, manifest, selection = session.survey, session.manifest, session.selection
     names = {SURFACE, REGIONS, *surface_file_names()}

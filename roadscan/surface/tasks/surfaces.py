@@ -1,4 +1,4 @@
-"""Surfaces: cells or points of a tile and its surroundings → its surface → files. One task a block of tiles."""
+"""Surfaces: cells or points of a tile and its surroundings → its surface → files. One task is a block of tiles."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from roadscan.tiles.tasks.tile_points import load_points
 from roadscan.tiles.tasks.tiles import TaskResult
 
 _CELLS_KEPT = 24_000_000
-"""Cells that stay in memory for the tiles that follow: six tiles full of 5 mm, 700 MB."""
+"""Cells cached for the following tiles: six full tiles with cells of 5 mm, 700 MB."""
 
 
 def compute_surfaces(task: SurfaceTask) -> TaskResult:
@@ -51,19 +51,19 @@ def compute_surfaces(task: SurfaceTask) -> TaskResult:
 
 
 class Source(Protocol):
-    """What the surface is made of."""
+    """Source of the heights of a surface."""
 
     def patch(self, tile: TileId, wanted: npt.NDArray[np.bool_] | None) -> Patch:
-        """Heights of a tile and its surroundings before smoothing; `wanted` are the cells that will be kept."""
+        """Returns heights of a tile and its surroundings before smoothing; `wanted` are the cells that are kept."""
 
 
 def source_of(task: SurfaceTask) -> Source:
-    """Cells or points of a task, as it says."""
+    """Returns the cells or points of a task, as it states."""
     return _Cells(task) if task.readings is None else _Points(task.grid, task.readings)
 
 
 class _Cells:
-    """Cells of finished tiles, read once and kept while there is room."""
+    """Cells of finished tiles, read once and cached in bounded memory."""
 
     def __init__(self, task: SurfaceTask) -> None:
         self._task = task
@@ -71,7 +71,7 @@ class _Cells:
         self._kept: OrderedDict[TileId, TileCells] = OrderedDict()
 
     def patch(self, tile: TileId, wanted: npt.NDArray[np.bool_] | None) -> Patch:
-        """What the cells say of a tile and its surroundings."""
+        """Returns a tile and its surroundings from cells."""
         grid = self._task.grid
         near = [t for t in grid.tiles.tiles_in(grid.reach(tile)) if t in self._records]
         return patch_of_cells(grid.window(tile), map(self._read, near))
@@ -87,14 +87,14 @@ class _Cells:
 
 
 class _Points:
-    """Points of a block and its surroundings, placed at once."""
+    """Points of a block and its surroundings, georeferenced at once."""
 
     def __init__(self, grid: SurfaceGrid, readings: TileTask) -> None:
         self._grid = grid
         self._points: dict[TileId, TilePoints] = dict(load_points(readings))
 
     def patch(self, tile: TileId, wanted: npt.NDArray[np.bool_] | None) -> Patch:
-        """The detailed model of a tile and its surroundings."""
+        """Returns the detailed model of a tile and its surroundings."""
         near = self._grid.tiles.tiles_in(self._grid.reach(tile))
         own = [self._points[t] for t in near if t in self._points]
         return patch_of_points(self._grid.window(tile), own, self._grid, wanted)
@@ -103,7 +103,7 @@ class _Points:
 def _write(
     task: SurfaceTask, key: str, surface: SurfaceTile, context: ProductContext, painter: Painter
 ) -> list[OutputRecord]:
-    """Files of a surface; its own record comes last, so that a tile is current only with all its files."""
+    """Write the files of a surface; its record comes last, so that a tile is current only with all its files."""
     unit, figures = str(surface.tile), _figures(surface)
     records: list[OutputRecord] = []
     with task.store.scratch() as folder:

@@ -14,10 +14,10 @@ from roadscan.assets.pictures.reader import ColourPlaces
 
 Float64 = npt.NDArray[np.float64]
 
-_STEP_M: Final = 0.5
-_MOST_PLACES: Final = 400
+_STEP_M: Final = 0.5  # Distance of places along a line (m).
+_MOST_PLACES: Final = 400  # Places of a line, at most.
 _BESIDE_M: Final = 0.35
-"""From the edge of the paint to the places on the surface."""
+"""Distance from the edge of the paint to the places on the surface (m)."""
 
 
 class LaneLineReader(PaintReader):
@@ -26,7 +26,7 @@ class LaneLineReader(PaintReader):
     name = "lane_line"
 
     def places(self, one: AssetObject) -> ColourPlaces:
-        """Each half metre of the line; of a long line 400 places."""
+        """Returns a place each half metre of the line; of a long line 400 places."""
         length = float(shapely.length(one.geometry))
         count = min(max(int(length / _STEP_M), 1), _MOST_PLACES)
         at = (np.arange(count) + 0.5) * length / count

@@ -14,9 +14,9 @@ from roadscan.assets.pictures.reader import ColourPlaces
 
 Float64 = npt.NDArray[np.float64]
 
-_INSIDE_M: Final = 0.05
-_BESIDE_M: Final = 0.3
-_MOST_PLACES: Final = 200
+_INSIDE_M: Final = 0.05  # Places lie this far within the outline (m).
+_BESIDE_M: Final = 0.3  # Distance from the outline to the places on the surface (m).
+_MOST_PLACES: Final = 200  # Places of a marking, at most.
 
 
 class RoadMarkingReader(PaintReader):
@@ -25,7 +25,7 @@ class RoadMarkingReader(PaintReader):
     name = "road_marking"
 
     def places(self, one: AssetObject) -> ColourPlaces:
-        """A grid of 0.1 m or more within the outline; the same number of places around it."""
+        """Returns a grid of 0.1 m or more within the outline, and places around it."""
         flat = shapely.force_2d(one.geometry)
         inner = flat.buffer(-_INSIDE_M)
         inner = flat if inner.is_empty else inner
@@ -43,7 +43,7 @@ class RoadMarkingReader(PaintReader):
 
 
 def _with_heights(places_m: Float64, one: AssetObject) -> Float64:
-    """Places (n, 3) with the height of the plane through the outline's corners."""
+    """Returns places (n, 3) with the height of the plane through the outline's corners."""
     corners = shapely.get_coordinates(one.geometry, include_z=True)
     middle = corners.mean(axis=0)
     plane = np.linalg.lstsq(corners[:, :2] - middle[:2], corners[:, 2] - middle[2], rcond=None)[0]

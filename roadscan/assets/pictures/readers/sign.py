@@ -17,16 +17,16 @@ from roadscan.assets.pictures.reader import CutOut, CutOutReader, Recognition, S
 
 Float64 = npt.NDArray[np.float64]
 
-_BOX: Final = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+_BOX: Final = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])  # Corners of a plate of 1 by 1: right, up.
 
 
 class SignReader(CutOutReader):
-    """Signs: the outline of a plate follows from its middle, size, shape, facing and tilt."""
+    """Reader of signs: the outline of a plate follows from its middle, size, shape, facing and tilt."""
 
     name = "sign"
 
     def sight(self, one: AssetObject) -> Sight:
-        """The middle and the corners of the plate, from the front."""
+        """Returns the middle and the corners of the plate, from the front."""
         middle, (facing_deg, tilt_deg) = np.array(reference_point(one.geometry)), _turn(one)
         if one.attributes.get("facing_deg") is None:
             return Sight(np.repeat(middle[None], 5, axis=0))
@@ -34,7 +34,7 @@ class SignReader(CutOutReader):
         return Sight(np.vstack([middle, corners]), plate_axes(facing_deg, tilt_deg)[2])
 
     def outline_m(self, one: AssetObject) -> Float64 | None:
-        """Corners of the bounding box, then the outline of the shape; nothing of a plate whose facing is not known."""
+        """Returns corners of the bounding box, then the outline of the shape; None for a plate of unknown facing."""
         if one.attributes.get("facing_deg") is None or not _size(one).all():
             return None
         middle, turn = np.array(reference_point(one.geometry)), _turn(one)
@@ -42,7 +42,7 @@ class SignReader(CutOutReader):
         return np.vstack([on_plate(_BOX * _size(one), middle, *turn), on_plate(shape, middle, *turn)])
 
     def read(self, one: AssetObject, cut_outs: Sequence[CutOut], recognition: Recognition) -> Mapping[str, Any]:
-        """Columns colour, shape, message and type, each with its probability as far as it is told."""
+        """Returns columns colour, shape, message and type, each with its probability where it is known."""
         told: dict[str, Any] = {}
         shape, probability = shape_of(cut_outs, one.attributes.get("shape") or "other", *_size(one).tolist())
         told |= {"shape": shape, "shape_probability": probability}
@@ -58,15 +58,15 @@ class SignReader(CutOutReader):
 
 
 def _within_shape(one: CutOut) -> CutOut:
-    """A cut-out with the outline of the shape alone."""
+    """Returns a cut-out with the outline of the shape alone."""
     return CutOut(one.pixels, one.outline_px[4:], one.resolution_m, one.is_grey)
 
 
 def _size(one: AssetObject) -> Float64:
-    """Width and height (m); 0 where they are not known."""
+    """Returns width and height (m); 0 where they are not known."""
     return np.array([one.attributes.get("width_m") or 0.0, one.attributes.get("plate_height_m") or 0.0])
 
 
 def _turn(one: AssetObject) -> tuple[float, float]:
-    """Facing and tilt (degrees)."""
+    """Returns facing and tilt (degrees)."""
     return one.attributes.get("facing_deg") or 0.0, one.attributes.get("tilt_deg") or 0.0

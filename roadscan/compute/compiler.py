@@ -1,4 +1,4 @@
-"""How a loop is compiled: with which options, for which types, where it is kept, and by which process.
+"""Compiles loops with Numba: options, argument types, the cache on disk, and locks between processes.
 
 Compiled code is cached on disk, in a folder named after the hash of the sources that it was made from: Numba itself
 looks only at the file a function stands in, and would keep one whose inlined parts have changed elsewhere.
@@ -104,14 +104,14 @@ def cache_folder(kind: str, sources: Iterable[Path]) -> str:
 
 
 class _Part(CPUDispatcher):  # type: ignore[misc]
-    """A piece of compiled functions. Called from Python, where it has no entry, it would end the process."""
+    """A piece of compiled functions. A Python call would end the process, since it has no entry for one."""
 
     def __call__(self, *_: object, **__: object) -> None:
         raise TypeError(f"{self.py_func.__name__} is compiled for its callers only; Python calls a kernel")
 
 
 class _PartLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """Bitcode of a part for its callers to take in: no machine code, so no address and no environment at one."""
+    """Bitcode of a part, which its callers link: it has no machine code, so no address and no environment at one."""
 
     def _optimize_final_module(self) -> None:
         manager, builder = self._codegen._module_pass_manager(
@@ -143,7 +143,7 @@ class _PartCompiler(Compiler):  # type: ignore[misc]
 
 
 def _read_parts_as_bitcode() -> None:
-    """Let Numba's cache give back parts as what they were stored."""
+    """Make Numba's cache restore parts as the bitcode that was stored."""
     read_code = JITCPUCodegen.unserialize_library
 
     def read(codegen: Any, stored: tuple[str, str, Any]) -> Any:
@@ -159,7 +159,7 @@ def _read_parts_as_bitcode() -> None:
 
 
 def _compile_once(dispatcher: Any, folder: str, *, counted: bool) -> None:
-    """Let a function compile, or load what is compiled, with a lock of its own in the folder.
+    """Make a function compile, or load its compiled code, under a lock in the folder.
 
     A literal number counts as its type: Numba would compile a function, and all that it calls, once for a `0` that is
     written out and once more for the variable that it grows into.
@@ -191,7 +191,7 @@ def _compile_once(dispatcher: Any, folder: str, *, counted: bool) -> None:
 
 
 def _holds_array(kind: Any) -> bool:
-    """Whether a value of a type is an array, or a tuple with one."""
+    """Return whether a value of a type is an array, or a tuple with one."""
     if isinstance(kind, numba.types.BaseTuple):
         return any(_holds_array(part) for part in kind)
     return isinstance(kind, numba.types.Array)
@@ -207,7 +207,7 @@ def _locked(path: str) -> Iterator[None]:
 
 
 def _use_whole_registers() -> None:
-    """Let the compiler use all 512 bits of a register where there are that many; it prefers 256 for old machines.
+    """Let the compiler use 512-bit registers where the processor has them; for old machines it prefers 256 bits.
 
     The processor is part of every compiled function's key, and settled when a process decorates its first one.
     """
@@ -224,7 +224,7 @@ def _number_apart() -> None:
 
 
 def _keep_answers_of_types() -> None:
-    """Let a function of Numba keep the signature that it found for types of arguments, under the options of now."""
+    """Cache the signature that a Numba function resolves for argument types, under the current options."""
     find_signature: Callable[..., Any] = BaseFunction.get_call_type
     kept_answers: WeakKeyDictionary[Any, dict[Any, Any]] = WeakKeyDictionary()
 

@@ -1,4 +1,4 @@
-"""The kinds of kernels there are; parallelism comes from Dask over blocks, never from inside a kernel."""
+"""The kinds of kernels. Parallelism comes from Dask over blocks, never from inside a kernel."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ Kernel = Callable[..., Any]
 
 
 def kernel(function: Kernel) -> Kernel:
-    """Compile a loop over arrays."""
+    """Compile a loop over arrays into a kernel that Python calls."""
     return compiled(function, _folder_of(function), counted=True)
 
 
 def inner(function: Kernel) -> Kernel:
-    """Compile a loop that kernels alone call: an entry for Python takes as long to make as a small function."""
+    """Compile a loop that kernels alone call: an entry for Python would take as long to make as a small function."""
     return compiled(function, _folder_of(function), counted=True, entry=False)
 
 
 def bare(function: Kernel) -> Kernel:
-    """Compile a kernel that makes no array and hands none back: it counts no references to those that it is given.
+    """Compile a kernel that creates and returns no array: it does not count references to its arguments.
 
     To count a reference to and fro takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
     take as long for that as for the readings.
@@ -50,7 +50,7 @@ def bare_inlined(function: Kernel) -> Kernel:
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The same array, not to be written to.
+    """Return a read-only view of the array.
 
     What Arrow decoded is so already, what NumPy computed is not; a kernel that can get either, array by array, would
     be compiled for each mixture.
@@ -66,7 +66,7 @@ def _folder_of(function: Kernel) -> str:
 
 @functools.cache
 def _folder_of_source(source: str) -> str:
-    """Folder for the compiled kernels of a source file: it changes with the file and the kernels that it imports."""
+    """Return the folder for a source file's compiled kernels; it changes with the file and the kernels it imports."""
     unseen, seen = [Path(source), Path(__file__)], set[Path]()
     while unseen:
         file = unseen.pop()
@@ -78,7 +78,7 @@ def _folder_of_source(source: str) -> str:
 
 @functools.cache
 def _imported_kernels(file: Path) -> list[Path]:
-    """Kernel files of roadscan (in folders named `kernels`) that a file imports, anywhere in it, in any form."""
+    """Return the kernel files of roadscan (in folders named `kernels`) that a file imports, anywhere in it."""
     library = Path(__file__).parents[1]
     within = ("roadscan", *file.parent.relative_to(library).parts) if file.is_relative_to(library) else ()
     found = []
@@ -91,7 +91,7 @@ def _imported_kernels(file: Path) -> list[Path]:
 
 
 def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """All statements below a node. Expressions, which hold no import, are most of a tree, and are passed over."""
+    """Yield all statements below a node. Expressions are skipped: they are most of a tree and hold no import."""
     for below in ast.iter_child_nodes(node):
         if isinstance(below, ast.stmt | ast.excepthandler | ast.match_case):
             yield below
@@ -99,7 +99,7 @@ def _statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _imported_names(node: ast.AST, within: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """What a statement may import, as parts of dotted names: modules, and what may be one inside them.
+    """Yield what a statement may import, as parts of dotted names: modules, and names that may be modules in them.
 
     within : package that relative imports start from.
     """

@@ -1,4 +1,4 @@
-"""Heights of the sixteen slots of a group as a table with a column a cell, and what their headers say.
+"""Turns the sixteen slots of a group into a table of heights with a column a cell, and reads their headers.
 
 A slot is a cell's; statistics want rows that hold heights of every cell. So the slots are turned in registers, two
 heights at a time.
@@ -30,7 +30,7 @@ _LINE = ir.VectorType(I32, LANES)
 
 
 def _turned(b, rows):
-    """Transpose 16 rows: to put every row between those of eight rows further on, four times."""
+    """Transpose 16 rows by interleaving every row with the one eight rows further on, four times."""
     halves = [[n for k in range(8) for n in (first + k, LANES + first + k)] for first in (0, LANES // 2)]
     for _ in range(4):
         rows = [picked(b, rows[k], rows[k + 8], half) for k in range(8) for half in halves]

@@ -1,4 +1,4 @@
-"""Canonical order of a tile's points, so that equal readings give equal files."""
+"""Canonical order of a tile's points: equal readings give equal files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def canonical_order(
     whole_profiles: npt.NDArray[np.bool_],
     content: Callable[[], list[npt.NDArray[Any]]],
 ) -> npt.NDArray[np.int64] | None:
-    """Order by source, epoch and, where epochs repeat, by content; None where the points are in order.
+    """Return the order by source, epoch and, where epochs repeat, content; None where the points are in order.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What observations of mountings look like, whatever they come from.
+"""The observations of mountings, to which every kind of evidence is reduced.
 
 Every kind of evidence ends as one of three observations:
 
@@ -27,7 +27,7 @@ Int64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Seen:
-    """Places as a sensor on the vehicle saw them, each with the pose of its epoch."""
+    """Places that a sensor on the vehicle saw, each with the pose of its epoch."""
 
     sensor: str
     point_sensor_m: Float64
@@ -37,25 +37,25 @@ class Seen:
     world_from_body: Float64
     """(n, 3, 3)."""
     traverse: Int64
-    """(n,) which drive over the place: readings of one traverse share the error of its poses."""
+    """(n,) number of the traverse; readings of one traverse share the error of its poses."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """Places that no sensor's mounting moves: of a reference scan, of control points, of a calibration object."""
+    """Places that do not depend on a mounting: of a reference scan, of control points, of a calibration object."""
 
     point_m: Float64
     """(n, 3) world, or in the object's own frame."""
     object: str | None = None
-    """Calibration object whose pose in the world is estimated too; None: coordinates are world."""
+    """Calibration object whose pose in the world is estimated too; None where coordinates are world."""
 
 
 @dataclass(frozen=True)
 class Ties:
-    """Pairs of places that are one: weight @ (p_first − p_second) has unit variance."""
+    """Pairs of observations of the same place: weight @ (p_first − p_second) has unit variance."""
 
     kind: str
-    """What found them, for the report: "loops", "object", "reference" …"""
+    """Origin of the ties, for the report: "loops", "object", "reference" …"""
     first: Seen
     second: Seen | Known
     weight: Float64
@@ -82,7 +82,7 @@ class Directions:
 
 @dataclass(frozen=True)
 class AttitudeInfluence:
-    """How much of an orientation's error comes from errors of the trajectory's attitude, over one piece of a run."""
+    """Share of an orientation's error that comes from the trajectory's attitude errors, over one piece of a run."""
 
     epoch_gps_ns: Int64
     """(k,) ascending."""
@@ -96,7 +96,7 @@ class AttitudeInfluence:
 
 @dataclass(frozen=True)
 class Orientation:
-    """The rotation of a sensor, found by itself."""
+    """The rotation of a sensor, estimated separately."""
 
     kind: str
     sensor: str
@@ -118,7 +118,7 @@ class Traverse:
 
     run: str
     epoch_gps_ns: int
-    """Its middle."""
+    """Epoch of its middle."""
     sigma_north_east_down_m: tuple[float, float, float]
     """1 σ of the poses' position."""
     sigma_roll_pitch_heading_rad: tuple[float, float, float]

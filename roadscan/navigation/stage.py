@@ -39,7 +39,7 @@ class Navigate(Stage):
             renew_reports(store, say)
         finally:
             session.forget(records_of)
-            session.forget(manifest_of)  # pictures were recorded beside it
+            session.forget(manifest_of)  # pictures were recorded meanwhile
 
     def state(self, session: Session) -> StageState:
         """Computed trajectories, estimated clocks, calibrated mountings."""
@@ -51,5 +51,5 @@ class Navigate(Stage):
         return StageState(len(found.trajectories) - waiting, waiting, lines=lines)
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """What computed trajectories, held against their own measurements, are doubted for."""
+        """Return computed trajectories that their measurements contradict."""
         return trajectory_findings(records)

@@ -1,4 +1,4 @@
-"""Pictures of condition: a strip chart of each lane and kilometre, and its cross-sections at two ruts."""
+"""Pictures of condition: a strip chart for each lane and kilometre, and cross-sections at two of its ruts."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ PICTURES: Final = "condition_pictures"
 STRIP: Final = "strip"
 CROSS_SECTION: Final = "cross_section"
 _SURE: Final = 2.0
-"""Where few readings lie, σ is several times that of the lane; elsewhere it varies by a third."""
+"""Largest σ relative to the lane's: it is several times as large where few readings lie; else it varies by a third."""
 RUT_M: Final = 5.0
-"""A rut goes on for longer than this; a pothole is shorter than half of it, so that a median over it passes it by."""
+"""Length of the median over cross-sections: a rut is longer; a pothole is shorter than half of it."""
 _DEPTHS: Final = ("rut_depth_left_mm", "rut_depth_right_mm")
 
 
@@ -52,7 +52,7 @@ class PictureTask:
 
 
 def plan_pictures(tasks: Sequence[GroupTask], manifest: Manifest) -> list[PictureTask]:
-    """Both pictures of each group whose values are there."""
+    """Return both pictures of each group whose values exist."""
     held = manifest.of(VALUES)
     code = code_digest("roadscan.condition.tasks.pictures:draw_picture")
     drawn = {name: one.drawn for name, one in condition_indices().items()}
@@ -69,7 +69,7 @@ def plan_pictures(tasks: Sequence[GroupTask], manifest: Manifest) -> list[Pictur
 
 
 def due_pictures(tasks: Sequence[PictureTask], manifest: Manifest) -> list[PictureTask]:
-    """Those that are missing or stale."""
+    """Return those that are missing or stale."""
     return [t for t in tasks if not manifest.is_current(PICTURES, t.unit, t.key)]
 
 
@@ -114,7 +114,7 @@ def _of_quantity(rows: pa.Table, name: str) -> Strip:
 
 
 def _crossing(path: Path, task: GroupTask, values: pa.Table) -> bool:
-    """The cross-sections at the typical and at the deepest rut; False where none is known."""
+    """Draw the cross-sections at the typical and at the deepest rut; return False where none is known."""
     lane: LaneData = load_lane(task)
     whole = WholeSections.of(lane)
     if not whole.rows.size:
@@ -143,7 +143,7 @@ def _crossing(path: Path, task: GroupTask, values: pa.Table) -> bool:
 def chosen_ruts(
     station_m: npt.NDArray[np.float64], depths_mm: npt.NDArray[np.float64], sigmas_mm: npt.NDArray[np.float64]
 ) -> dict[str, tuple[int, npt.NDArray[np.float64]]]:
-    """Numbers of the cross-sections to be shown, with both depths (2,) as medians over `RUT_M`; none without a depth.
+    """Return the cross-sections to show, with both depths (2,) as medians over `RUT_M`; empty without a depth.
 
     `typical` is where the deeper rut is as deep as in the median, `deepest` where it is deepest. Both are the
     cross-section there whose own depths are nearest to the medians: one through a pothole is not. Where σ is more

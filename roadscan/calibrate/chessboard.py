@@ -2,8 +2,8 @@
 
 Corners are found (Duda and Frese 2018, `findChessboardCornersSB`) and refined to a fraction of a pixel; focal lengths,
 principal point and distortion are adjusted together with the board's pose in each picture (Zhang 2000,
-`calibrateCameraExtended`), with their σ. What pictures cannot tell is refused in words: too few of them, too similar,
-boards in the middle only, boards never tilted.
+`calibrateCameraExtended`), with their σ. Pictures that do not suffice are rejected with a reason: too few of them, too
+similar, boards in the middle only, boards never tilted.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def find_corners(grey: Grey, board: Board) -> npt.NDArray[np.float32] | None:
 def _refined(grey: Grey, corners: npt.NDArray[np.float32], board: Board) -> npt.NDArray[np.float32]:
     """Refine corners by the gradients around them (Förstner and Gülch 1987); those that would move too far stay.
 
-    The finder's own places are biased by up to 0.08 px where the board is seen at a slant; these are not.
+    Unrefined corners are biased by up to 0.08 px where the board is seen at a slant; refined ones are not.
     """
     grid = corners.reshape(board.rows, board.columns, 2)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]

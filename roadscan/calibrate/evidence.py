@@ -6,7 +6,7 @@ Every kind of evidence ends as one of three observations:
   difference W (p_first − p_second) has unit variance. Rows of W say what is known: one row nᵀ/σ for two readings of
   one plane with normal n, three for a place known in all directions.
 - **Directions**: the same vector seen by the sensor and by the body (gravity, acceleration, the Earth's field), each
-  with an error of its own.
+  with an independent error.
 - **Orientation**: the whole rotation of a sensor with its covariance, from a solution whose errors are not independent.
 
 Poses have errors too. A **Traverse** is a piece of a drive within which they are one shift and one small rotation.
@@ -45,7 +45,7 @@ class Known:
     """Places that do not depend on a mounting: of a reference scan, of control points, of a calibration object."""
 
     point_m: Float64
-    """(n, 3) world, or in the object's own frame."""
+    """(n, 3) world, or in the object's frame."""
     object: str | None = None
     """Calibration object whose pose in the world is estimated too; None where coordinates are world."""
 

@@ -97,7 +97,7 @@ class Observability:
     def updated(self, information: Float64, unknowns: Unknowns) -> Observability:
         """Return the same split with the covariance from information at another point.
 
-        Directions that are held are wrong by their prior σ; what that does to the others is part of their covariance
+        Directions that are kept fixed err by their prior σ; the effect on the others is part of their covariance
         (Schmidt's consider covariance).
         """
         reduced = eliminated(information, unknowns.mounting_size)
@@ -163,7 +163,7 @@ def _plain_basis(projector: Float64, count: int) -> Float64:
 def _cleared(basis: Float64) -> Float64:
     """Return the same directions (n, u) without negligible components, so that the remaining ones are fixed exactly.
 
-    To hold a slightly other direction costs what is determined a part in ten thousand; the covariance knows.
+    Fixing a slightly different direction adds a part in ten thousand to the others' errors, within the covariance.
     """
     if not basis.size:
         return basis

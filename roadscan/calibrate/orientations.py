@@ -1,8 +1,8 @@
 """Orientations of sensors as observations, with their covariances and the errors that several share.
 
-An orientation is the solution of an adjustment of its own. It is not one of many alike, of which most are right: with a
-σ far below that of the other evidence it seems an outlier wherever the others have not come near yet. So it counts in
-full while the mountings are found, and is tested then, by what its residual may be beside the others: that has the
+An orientation is the solution of a separate adjustment. It is not one of many similar observations, most of them right:
+with a σ far below that of the other evidence it seems an outlier until the others have converged. So it has full weight
+while the mountings are estimated, and is tested afterwards against the other evidence: its residual has the
 covariance Q_r = Q − A C Aᵀ, and T = rᵀ Q_r⁻¹ r is χ² (Baarda 1968, "A testing procedure for use in geodetic networks").
 """
 

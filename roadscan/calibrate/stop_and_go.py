@@ -1,12 +1,12 @@
 """Estimates the orientation of a sensor head from the IMU inside it and the trajectory, in stop-and-go driving.
 
 While the vehicle stands, gravity gives roll and pitch of the head, as well as the biases of its accelerometers allow.
-When it turns, the vector of the angular rate gives both without them; gravity then tells the biases; and braking and
+When it turns, the vector of the angular rate gives both without them; gravity then gives the biases; and braking and
 driving through curves give the heading. All of it is one least-squares adjustment over short windows:
 
 - **Force.** Over 2 T with triangular weights, the mean acceleration of the head is a second difference of its
-  positions, (x(t + T) − 2 x(t) + x(t − T)) / T², and needs no derivative of the trajectory. It is held against the mean
-  of the specific forces, each turned by the attitude of its own epoch.
+  positions, (x(t + T) − 2 x(t) + x(t − T)) / T², and needs no derivative of the trajectory. It is compared with the
+  mean of the specific forces, each turned by the attitude of its epoch.
 - **Rotation.** Between two epochs, the head's rotation vector is the body's in other axes, exactly, if the rates are
   composed with coning and the body's rotation counts against inertial space.
 
@@ -49,7 +49,7 @@ _TURN_S: Final = 0.2
 """Length of a window of rotations: short compared with the body's motion on its springs."""
 _KNOT_S: Final = 2.0
 """Slow errors are linear between knots this far apart: as they wander between knots, windows of one curve err alike,
-which their residuals do not tell."""
+which their residuals do not show."""
 _PIECE_S: Final = 150.0
 """Longer runs are cut into pieces whose slow errors are independent."""
 _CLOCK_SIGMA_S: Final = 0.01

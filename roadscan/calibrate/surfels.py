@@ -113,9 +113,9 @@ class Surfels:
     def _steadied(self) -> Self:
         """Return patches with normals averaged over neighbours that could lie on one even surface.
 
-        Ground whose patches are tilted a little, by noise or by its own roughness, would seem to hold a vehicle in
-        its place: each tilt resists a shift. That is deceptive, because with the next patch the tilt is another one.
-        What the normals scatter counts as the plane's uncertainty, and its mean's as that of the normal.
+        Ground whose patches are tilted a little, by noise or by roughness, would seem to determine horizontal shifts,
+        which each tilt resists. That is deceptive, because the tilt of the next patch differs. The scatter of the
+        normals counts as the plane's uncertainty, and that of their mean as the normal's.
         """
         variance = np.trace(self.slopes, axis1=1, axis2=2) / 2.0
         pairs, sign = self._alike(variance)

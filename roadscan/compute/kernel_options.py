@@ -28,8 +28,8 @@ def inner(function: Kernel) -> Kernel:
 def bare(function: Kernel) -> Kernel:
     """Compile a kernel that creates and returns no array: it does not count references to its arguments.
 
-    To count a reference to and fro takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
-    take as long for that as for the readings.
+    Counting a reference up and down takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
+    spend as long on that as on the readings.
     """
     return compiled(function, _folder_of(function), counted=False)
 
@@ -52,7 +52,7 @@ def bare_inlined(function: Kernel) -> Kernel:
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return a read-only view of the array.
 
-    What Arrow decoded is so already, what NumPy computed is not; a kernel that can get either, array by array, would
+    Arrays that Arrow decoded are read-only already, those that NumPy computed are not; a kernel that gets either would
     be compiled for each mixture.
     """
     view = array.view()

@@ -68,7 +68,7 @@ def matched_sections(earlier: npt.NDArray[Any], later: npt.NDArray[Any]) -> tupl
 def change_of(earlier: float, later: float, sigma_earlier: float, sigma_later: float, level: float = 0.05) -> Change:
     """Return the change of a quantity, and whether it exceeds the errors of both surveys, two-sided.
 
-    `level` : a change whose probability without any change is below this is told as one.
+    `level` : a change whose probability without any change is below this is significant.
     """
     change, sigma = later - earlier, math.hypot(sigma_earlier, sigma_later)
     if not (math.isfinite(change) and sigma > 0.0):  # also for NaN

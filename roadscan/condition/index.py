@@ -117,9 +117,9 @@ def by_section(
 
     `spacing_m` is their distance, that of the lane's cross-sections by default.
 
-    A section of which too few cross-sections have a value has none. The standard deviation of a mean takes the
-    cross-sections' errors as alike, since neighbours share the vehicle's motion: it is their root mean square. That of
-    the greatest value is its own.
+    A section in which too few cross-sections have a value has none. The standard deviation of a mean is the root mean
+    square of the cross-sections' σ, since neighbours share the vehicle's motion and so their errors. The greatest value
+    keeps its σ.
     """
     config = lane.config
     for from_m, to_m in lane.sections_m:

@@ -18,7 +18,7 @@ _WRITTEN: Final = "2000-01-01T00:00:00.000Z"
 
 
 def write_layer(path: Path, table: pa.Table, shapes_m: npt.NDArray[Any], context: ProductContext) -> None:
-    """Write rows with their lines (n,) on the map (m) as one layer, named as the file, in the CRS's own unit."""
+    """Write rows with their lines (n,) on the map (m) as one layer, named as the file, in the CRS's unit."""
     import pyogrio  # slow to import
 
     shapes = in_crs_unit(shapes_m, context)

@@ -1,7 +1,7 @@
 """Reference lines of roads and the lanes along them: stations, offsets and map positions.
 
-Station counts metres along the reference line from its start; offset is positive to the right of it. A lane has its own
-frame as well: left and right are those of its direction of travel.
+Station counts metres along the reference line from its start; offset is positive to the right of it. A lane also has
+a frame: left and right are those of its direction of travel.
 """
 
 from __future__ import annotations

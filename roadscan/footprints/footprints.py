@@ -1,7 +1,7 @@
 """Footprints record which row groups of raw data touch which tile; one task indexes about eight km of data.
 
-Profiles and returns are not placed for it: bounds (``georeference/reach.py``) name every tile that a row group
-may touch. Clouds, whose points are placed already, are read.
+Profiles and returns are not georeferenced for it: bounds (``georeference/reach.py``) name every tile that a row group
+may touch. Clouds, whose points are georeferenced already, are read.
 """
 
 from __future__ import annotations
@@ -247,7 +247,7 @@ def load_ranges(
 ) -> FootprintRanges:
     """Load the current footprints of some data files (default: all) in some tiles (default: all).
 
-    A data file without any is left out (its indexing failed); one that does not come near the window is not opened.
+    A data file without footprints is left out (its indexing failed); one outside the window is not opened.
     """
     slices = sorted(
         plan.slices(), key=lambda s: (s.source.run, s.source.sensor, s.source.key, s.spans[0] if s.spans else (0, 0))

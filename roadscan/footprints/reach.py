@@ -59,7 +59,7 @@ def group_spans(one: RawSlice, file: pq.ParquetFile) -> npt.NDArray[np.int64]:
 def _reach(store: Store, ground: MapSettings, one: RawSlice) -> Reach | None:
     """Return the poses around a slice and the distance up to which its readings count; None without any pose.
 
-    They are those of the minutes that it lies in, and kept for the next slice: files may hold seconds.
+    Poses of whole minutes are loaded and kept for the next slice, since a file may contain only seconds.
     """
     spans = [(a // _WINDOW_NS * _WINDOW_NS, -(-b // _WINDOW_NS) * _WINDOW_NS) for a, b in one.spans]
     wanted = (store.root, one.source.key, one.source.allowance, ground, spans)

@@ -22,7 +22,7 @@ Float64 = npt.NDArray[np.float64]
 
 BOX_M = 200.0  # Edge of a box: within 300 m of its centre an expansion errs by less than 2 µm.
 STEP_M = 100.0
-"""Step of the finite differences; truncation is far below PROJ's own 1 nm."""
+"""Step of the finite differences; truncation is far below the 1 nm of PROJ."""
 
 _MOST_BOXES = 1 << 27
 """Most boxes of the table (0.5 GB): the box of a drive over 100 km across all axes."""

@@ -22,7 +22,7 @@ def canonical_order(
     source : (n,) number of the sensor and run, ascending as loaded.
     epoch_gps_ns : (n,).
     whole_profiles : (n,) True where equal epochs mean readings of one profile, already in their order.
-    content : gives arrays (n, …) that tell points of equal epoch apart, asked only where there are any;
+    content : gives arrays (n, …) that distinguish points of equal epoch, called only where there are any;
         points equal in all of them are interchangeable.
     """
     same = source[1:] == source[:-1]

@@ -228,7 +228,7 @@ class Placement:
     ) -> tuple[Int32, Int64]:
         """Return the tiles (n, 2) of all points of a batch, and the counts of its readings; `geometry` for scans.
 
-        `marked`: tiles of those too that a filter leaves out. The road is not told from what is beside it.
+        `marked`: include tiles of filtered readings. Profiles are not segmented.
         """
         work = replace(self, road=None)._work(batch, geometry, EVERYWHERE, marked)
         return work.tiles, work.fates

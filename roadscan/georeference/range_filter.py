@@ -37,7 +37,7 @@ def crossing_limits(path_m: Float64, heading_rad: Float64, settings: RangeFilter
 
     Parameters
     ----------
-    path_m : (n,) position of each profile along the sensor's own path (m), not decreasing.
+    path_m : (n,) position of each profile along the sensor's path (m), not decreasing.
     heading_rad : (n,) heading of each profile, clockwise positive; whole turns do not matter.
     """
     return limits_of_turns(*_arc_and_turn(path_m, heading_rad, settings.base_m), settings)

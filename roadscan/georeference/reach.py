@@ -175,7 +175,7 @@ class Reach:
 def profile_pieces(geometry: ScanGeometry, size: int, block: int) -> Float64:
     """Return the pieces (p, 9) of a profile, of `size` readings at most, each in one block of `block` readings.
 
-    Columns as ``kernels.georeferencing.reach.SpannedProfiles`` states them.
+    Columns as ``georeference.kernels.reach.SpannedProfiles`` states them.
     """
     edges = range(0, geometry.readings, block)
     first = np.concatenate([np.arange(a, min(a + block, geometry.readings), size) for a in edges])

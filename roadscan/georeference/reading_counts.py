@@ -47,8 +47,8 @@ def _counts(fates: npt.NDArray[np.int64]) -> dict[str, int]:
 def counts_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
     """Sum readings by outcome over the records of tiles and footprints, by the key of their log.
 
-    Footprints tell of clouds, which are placed for these, and of row groups that touch no tile. Tiles of older versions
-    do not say which log it was; theirs stand under "".
+    Footprints report clouds, which are read for them, and row groups that touch no tile. Tiles of older versions do not
+    name the log; their readings have the key "".
     """
     logs: dict[str, dict[str, int]] = defaultdict(lambda: dict.fromkeys(FATE_NAMES, 0))
     for record in records:

@@ -91,7 +91,7 @@ def segmented(
 
 
 def _numbers(s: SegmentationConfig) -> tuple[float, ...]:
-    """Return the settings in the order of ``kernels.road.carriageway.SETTINGS``."""
+    """Return the settings in the order of ``georeference.kernels.carriageway.SETTINGS``."""
     return (
         s.bin_m, s.share, s.gate_m, s.scatter_factor, float(s.scatter_readings), math.radians(s.grazing_deg),
         s.chord_m, s.step_m, s.noise_factor, s.slope, s.window_m, float(s.window_readings), s.bridge_m,

@@ -25,7 +25,7 @@ _MOST_TICKS: Final = 20_000_000
 def sensor_places(trajectory: Trajectory, frame: MapFrame, mountings: Mountings, epochs_gps_ns: Int64) -> Float64:
     """Return (n, 3) easting, northing and height (m) of a sensor's origin at epochs (n,); NaN without a pose.
 
-    A place depends on its own epoch alone, not on the others that are asked for.
+    A position depends on its epoch alone, not on the other epochs.
     """
     if not epochs_gps_ns.size:
         return np.zeros((0, 3))

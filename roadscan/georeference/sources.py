@@ -74,7 +74,7 @@ class ReadingSource:
     clock: ClockCorrection | None = None
     """Estimated correction of the ingested epochs; None where the sensor's clock is right as ingested."""
     road: RoadSegmentation | None = None
-    """How the road is told in profiles, so that nothing else counts; None where all readings do. Not in `key`: it
+    """Segmentation of profiles, after which only road readings count; None where all count. Not in `key`: it
     belongs to the keys of tiles."""
     geoid: Geoid | None = None
     """Grid that a cloud's orthometric heights refer to."""

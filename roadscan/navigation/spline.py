@@ -2,7 +2,7 @@
 
 "The trajectory appears rugged mostly at places where there is a GPS signal outage. We smooth the trajectory by creating
 a piecewise polynomial function": a cubic B-spline with time as its parameter (the mobile-mapping paper, 3.2, 3.2.1).
-Three things make a trajectory rugged, and each is mended by its own cubic:
+A trajectory is rugged for three reasons, and each is corrected by a different cubic:
 
 - **Steps**: through an outage the solution drifts, and leaps back when GNSS returns. Value and slope of the leap fix a
   cubic c(t) with c = c' = 0 where the outage begins, which is added to the poses before the leap. Errors that grow with
@@ -200,8 +200,8 @@ def _leaps(
 ) -> list[tuple[int, int, slice]]:
     """Return steps in time: the pose before each, the pose at which its drift began, and undisturbed poses beside it.
 
-    Within an outage every step (a standstill, a constraint) corrects the drift since its begin; elsewhere what came
-    before the step before is not its concern.
+    Within an outage every step (a standstill, a constraint) corrects the drift since the outage began; elsewhere it
+    corrects only the drift since the step before.
     """
     surprise = np.linalg.norm(np.nan_to_num(_surprises(trajectory)), axis=1)
     usual = float(np.median(surprise))

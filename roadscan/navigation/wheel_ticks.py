@@ -1,6 +1,6 @@
 """Compares stamps of a sensor that counts wheel ticks with the distance that the poses travel in the same time.
 
-Both measure one motion, each by a clock of its own. Where one clock steps, ticks and distance disagree across a single
+Both measure one motion, but by different clocks. Where one clock steps, ticks and distance disagree across a single
 link, by speed times step. Where one is off as a whole, they disagree wherever the speed changes.
 """
 

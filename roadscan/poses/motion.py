@@ -2,8 +2,8 @@
 
 A vehicle drives along its body's forward axis. So its heading is the course over ground where it drives straight, its
 pitch follows the slope of its path, and the velocities that a log states are the change of its positions. A real
-instrument never gives one value for long. Poses that are far apart say less of the path between them than their σ: how
-much less, poses that are left out show.
+instrument never gives one value for long. The path between poses that are far apart is less certain than their σ: the
+additional error is estimated by leaving poses out.
 """
 
 from __future__ import annotations

@@ -34,8 +34,8 @@ class Allowance(NamedTuple):
         Between its knots the corrected trajectory is not the recorded one with a correction that is linear in time: it
         is interpolated through corrected knots. With even knots that swings over by at most 3/8 of the largest
         correction (cubic Hermite with slopes through five knots: |slope| ≤ 1.5 per knot, times u (1 − u) ≤ 1/4), with
-        uneven ones by more, where corrections change from one knot to the next by as much as they are. So twice the
-        correction is left room for.
+        uneven ones by more, where corrections change from one knot to the next by their own size. So the bound is twice
+        the correction.
         """
         return 2.0 * (self.shift_m + self.turn_rad * arm_m)
 
@@ -46,7 +46,7 @@ NO_CORRECTION: Final = Allowance(0.0, 0.0)  # Bounds hold for the recorded poses
 def allowance_for(corrections: Corrections | None, mounting: tuple[float, float] = (0.0, 0.0)) -> Allowance:
     """Return the smallest allowance that covers the corrections, in steps of four from 0.05 m and 0.5 mrad on.
 
-    The first step is left room for where there are none yet: most corrections to come stay within it.
+    Without corrections it is the first step, within which most later corrections stay.
 
     Parameters
     ----------

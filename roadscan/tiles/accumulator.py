@@ -54,7 +54,7 @@ class TileEvidence:
 
 
 class Pool:
-    """Memory for the heights of cells (``kernels.cells.accumulate``); it grows and never shrinks."""
+    """Memory for the heights of cells (``tiles.kernels.accumulate``); it grows and never shrinks."""
 
     def __init__(self) -> None:
         self.held = np.zeros(2, np.int64)
@@ -129,8 +129,8 @@ def _aligned(size: int, kind: type[np.generic]) -> npt.NDArray[Any]:
 class Accumulator:
     """Counts readings into the cells of the active tiles.
 
-    Tiles are activated before readings of theirs come, and finished once all have; what falls outside the active
-    tiles is not counted. A finished tile does not depend on the order of the readings, nor on what else was active.
+    Tiles are activated before their first reading, and finished after their last one; readings outside the active
+    tiles are not counted. A finished tile does not depend on the order of the readings, nor on what else was active.
     """
 
     def __init__(
@@ -212,8 +212,8 @@ class Accumulator:
     def fill(self, kernel: Callable[[ActiveTiles, Buckets, int], int], items: int, blocks: int) -> None:
         """Call `kernel` with the active tiles, the buckets and the first item until all items are done.
 
-        The kernel stops before an item for which there may be too few free `blocks`. Then the buckets get more memory;
-        where they have their share, what lies in them is counted.
+        The kernel stops before an item for which there may be too few free `blocks`. Then the buckets get more memory,
+        up to their share; beyond it, their readings are counted to free them.
         """
         buckets, done = self._pool.buckets, 0
         while True:
@@ -228,7 +228,7 @@ class Accumulator:
     def finish(self, tile: TileId) -> tuple[TileCells, TileEvidence] | None:
         """Deactivate a tile and return its cells; None where no reading fell into it.
 
-        The next tile that is finished overwrites them: fresh memory would cost as much as the statistics.
+        The next finished tile overwrites them, since allocating memory would take as long as the statistics.
         """
         row, along, across = self._row(tile), tile.row - self._south, tile.column - self._west
         taken, most_slots = find_groups(self._groups[row], self._pool.chain, self._found)

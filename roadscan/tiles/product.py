@@ -157,7 +157,7 @@ class TileFiles(ABC):
     def companions(self, options: Strict) -> dict[str, str]:
         """Return small files that belong beside each file, such as a world file: suffix by name.
 
-        They are written with the file, under its path with their suffix instead of its own; the names do not
+        They are written with the file, under its path with another suffix; the names do not
         depend on the settings.
         """
         return {}
@@ -233,7 +233,7 @@ class SurveyProduct(ABC):
     """True for a product that needs the directions of the lanes."""
 
     def check_reads(self, options: Strict, read: Mapping[str, Strict]) -> None:
-        """Raise :class:`ConfigError` where settings of the products that it `reads`, by name, do not fit its own."""
+        """Raise :class:`ConfigError` where settings of the products that it `reads`, by name, do not fit this one's."""
         return
 
     @abstractmethod

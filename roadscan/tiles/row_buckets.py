@@ -1,4 +1,4 @@
-"""Memory for buckets of readings by row of cells (``kernels.cells.row_buckets``)."""
+"""Memory for buckets of readings by row of cells (``tiles.kernels.row_buckets``)."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def calibrate_interior(
     Raises
     ------
     ConfigError
-        where the sensor is no camera, the pictures tell too little, or the rig file cannot be changed safely.
+        where the sensor is no camera, the pictures do not suffice, or the rig file cannot be changed safely.
     """
     _camera(Rig.load(rig_file), sensor, rig_file)
     files = _picture_files(pictures)

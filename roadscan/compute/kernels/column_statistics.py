@@ -1,6 +1,6 @@
 """Statistics of the columns of a small table, sixteen cells at a time, in vector registers.
 
-Numba's own loops over such a table stay scalar: the compiler cannot know that two rows do not overlap. So the rows are
+Numba's loops over such a table stay scalar: the compiler cannot know that two rows do not overlap. So the rows are
 loaded into registers here and everything is written out as instructions: medians by a sorting network (Batcher 1968,
 "Sorting networks and their applications", odd-even mergesort). Without the compiler NumPy does the same.
 """

@@ -1,7 +1,7 @@
 """Edges of a road in a raster of stations and offsets: steps and bends across it, and the best path along it.
 
-The slope across tells the edge (P. Kumar et al. 2013, who let a snake find its way over slope, reflectance and pulse
-width). Here the evidence is a difference over its σ, and the path is the best of all by dynamic programming.
+The slope across shows the edge (P. Kumar et al. 2013, who fit a snake to slope, reflectance and pulse width). Here the
+evidence is a difference over its σ, and dynamic programming finds the best path of all.
 """
 
 from __future__ import annotations

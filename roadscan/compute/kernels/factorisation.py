@@ -1,7 +1,7 @@
 """Factorises eight small symmetric matrices at once: a matrix a lane, the lanes innermost.
 
 A vector register then holds the same element of eight matrices, and each matrix has the bits that it has alone, however
-small it is. Numba's own loops keep no sums in registers here: the compiler cannot know that two rows do not overlap.
+small it is. Numba's loops keep no sums in registers here: the compiler cannot know that two rows do not overlap.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A slot has 64 bytes, as long as a line of the cache: SLOT_HEIGHTS differences from the slot's base, and a header with
 their number, the sum of their intensities and the passes they are from.
 
-Written as instructions: Numba's own stores stay one by one, and it knows no way to fetch.
+Written as instructions, because Numba stores numbers one by one and cannot prefetch.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Heights of a Clough–Tocher patch at eight nodes at once, in vector registers.
 
-Numba's own loop over the nodes stays scalar, and which third a node lies in is a branch that no processor foresees.
+Numba's loop over the nodes stays scalar, and the third that contains a node is a branch that no processor predicts.
 Here the control points of its third are chosen for all nodes at once. Without the compiler NumPy does the same.
 """
 

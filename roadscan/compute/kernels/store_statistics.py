@@ -63,4 +63,4 @@ store_group: Kernel = _stored_by_numpy if numba.config.DISABLE_JIT else _stored
 """store_group(out, counts, first_column, row_number, cell, written, pass_id, columns): statistics of sixteen cells.
 
 out : (6, 16) float64; counts : (16,) int32; first_column, row_number : uint16; cell : uint64, where the sixteen go in
-the columns; written : int32, where their passes go; pass_id : uint16; columns : ``cells.cell_columns.CellColumns``."""
+the columns; written : int32, where their passes go; pass_id : uint16; columns : ``CellColumns`` (`tiles`)."""

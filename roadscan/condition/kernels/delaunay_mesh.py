@@ -1,8 +1,8 @@
 """Delaunay triangulation of scattered points by insertion, with exact decisions.
 
-Each point takes away the triangles whose circle holds it and is joined to the rim of the hole (Bowyer 1981; Watson
+Each point removes the triangles whose circle contains it and is joined to the rim of the hole (Bowyer 1981; Watson
 1981). Beyond each edge of the hull lies a triangle with the corner `beyond`, so points outside the hull need no special
-treatment. Positions are whole numbers, and every decision is that of :mod:`roadscan.surface.kernels.delaunay`.
+treatment. Positions are integers, and every decision is that of :mod:`roadscan.surface.kernels.delaunay`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Texture of squares of a lane from their cells: the scatter of heights within small blocks.
 
-A block of 50 mm has a plane of its own, so that slopes, ruts and holes that are wider than it count nothing. The
-scatter of the readings within the cells is added to that of the cells, so that waves shorter than a cell are in it.
+Heights are taken from a plane through each block of 50 mm, so that wider slopes, ruts and holes do not count. The
+scatter of the readings within the cells is added to that of the cells, to include waves shorter than a cell.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def plane(sums, b, slopes):
 def bent_slopes(found, count, base, half, sums, blocks, slopes):
     """Write slopes of blocks with too few cells for a plane, from a surface of second degree through the square.
 
-    A rut bends, so a plane through the whole square has another slope than its cells. Where the cells do not tell the
-    surface, it is that of the plane, which stands in the last row. slopes : (blocks² + 1, 2).
+    A rut bends, so a plane through the whole square has another slope than its cells. Where the cells do not determine
+    the surface, the slope is that of the plane, in the last row. slopes : (blocks² + 1, 2).
     """
     last = blocks * blocks
     for b in range(last):
@@ -90,7 +90,7 @@ def bent_slopes(found, count, base, half, sums, blocks, slopes):
 def block_scatter(sums, b, slopes, cell_m):
     """Return the variance of the heights of block b about its plane (m²): of cells, plus of readings within them.
 
-    NaN where neither tells it. slopes : (blocks² + 1, 2) of the blocks, and of the whole square in the last row.
+    NaN where neither is known. slopes : (blocks² + 1, 2) of the blocks, and of the whole square in the last row.
     """
     n = sums[b, N]
     if n < 1.0:

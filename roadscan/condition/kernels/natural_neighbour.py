@@ -1,9 +1,9 @@
 """Exact natural-neighbour interpolation (Sibson 1981) of scattered points onto a raster.
 
-A place put among the points would take its Voronoi cell from those of its natural neighbours; the areas taken are
-their weights. The circles of the Delaunay triangles that hold the place (Watson 1992) name the neighbours, and the
-centres of these circles, with those of the circles through the place and the edges around them, are the corners of
-what is taken. With the slopes of the field at the points the values have a continuous slope themselves (Sibson's C1).
+A query point inserted among the points would take its Voronoi cell from those of its natural neighbours; the areas
+taken are their weights. The Delaunay triangles whose circles contain the point (Watson 1992) give the neighbours, and
+the centres of these circles, with those of the circles through the point and the edges around them, are the corners of
+these areas. With the slopes of the field at the points the values have a continuous slope themselves (Sibson's C1).
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def linear(mesh, t, value):
 def sibson(mesh, centres, value, slopes, weight, arriving, t, question):
     """Return Sibson's value at the query point in triangle t; slopes: (n, 2) of the field at the points, or (0, 2).
 
-    Each side of the area taken from one neighbour is a side of the next one's, the other way round, so the doubled
-    areas are summed up side by side, in any order.
+    Each side of the area taken from one neighbour is a side of the next one's in the opposite direction, so the doubled
+    areas are summed up over sides, in any order.
     """
     q = mesh.x.size - 1
     many, edges = dig(mesh, t, q, question)

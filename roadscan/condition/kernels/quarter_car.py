@@ -1,9 +1,9 @@
 """Rolls a linear quarter car over a profile of any spacing, with the exact solution from sample to sample.
 
-The profile is linear between its samples. The tyre envelops it: the slope that the car feels over a step is that of the
-profile's moving average at the middle of the step, held over the step, as World Bank Technical Paper 46 (Sayers,
-Gillespie, Paterson 1986) has it for steps of 250 mm. Under a held slope s each of the car's two pairs of
-conjugate modes follows its own equation, whose solution over a step d is c ← exp(p·d)·(c + w·s) − w·s.
+The profile is linear between its samples. The tyre envelops it: the slope under the car is constant over a step, that
+of the profile's moving average at the middle of the step, as World Bank Technical Paper 46 (Sayers, Gillespie, Paterson
+1986) has it for steps of 250 mm. Under a constant slope s each of the car's two pairs of conjugate modes follows a
+separate equation, whose solution over a step d is c ← exp(p·d)·(c + w·s) − w·s.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def stretched_wire(x, h, out):
     x : (m,) float64, ascending, m, 0 in the middle; h : (n, m) float64, heights, finite, m.
     out : (n, 2, 5) float64, out, of the left and the right half: greatest depth, normal to the wire (m); width over
         which the depth is more than a tenth of that (m); area between wire and road (m²); place of the greatest depth
-        (m); and the variance of the depth for heights of variance 1 that err apart.
+        (m); and the variance of the depth for independent heights of variance 1.
     """
     m = x.size
     hull, gap = np.empty(m, np.int64), np.zeros(m)
@@ -101,8 +101,8 @@ def width(x, gap, deepest):
 def straightedge(x, h, length, out):
     """Compute the greatest depth below a straightedge anywhere across the road, in its left and right half.
 
-    The edge rests on the two points beside its own middle that it touches; beyond the ends of the cross-section it
-    hangs in the air.
+    The edge rests on the two points on both sides of its middle that it touches; beyond the ends of the cross-section
+    it is unsupported.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Heights of the road at given places, from a local surface through nearby cells of the tiles around.
 
-Cells are visited by row and column of the map, whatever the tiles that they came in, so that a height has the same
-bits for any choice of tiles that holds its cells.
+Cells are visited by row and column of the map, whatever their tiles, so that a height has the same bits for any set of
+tiles that contains its cells.
 """
 
 from __future__ import annotations

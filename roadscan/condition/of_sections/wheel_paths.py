@@ -1,11 +1,11 @@
 """Wheel paths of a section for indices of roughness: with a lead, bridged gaps, and simulated noise.
 
-A height is a mean over a window, which takes short waves, and it holds noise, which adds roughness. The profile gets
-back what the same window takes of it again (van Cittert's iteration, twice), and the power of the noise alone is taken
-from that of an index (:func:`without_noise`).
+A height is a mean over a window, which dampens short waves, and it contains noise, which adds roughness. The waves are
+restored by van Cittert's iteration (twice), and the power of the noise alone is subtracted from that of an index
+(:func:`without_noise`).
 
-Where neighbouring heights differ as at a wall, it is not known where between them it stands. In the draws it stands
-anywhere: half a sample to each side of a pothole is some per cent of its share in the roughness.
+Where neighbouring heights differ as at a wall, the place of the wall between them is unknown. In the simulations it is
+drawn at random: half a sample on each side of a pothole is some per cent of its share in the roughness.
 """
 
 from __future__ import annotations
@@ -148,8 +148,8 @@ def wheel_paths(lane: LaneData, from_m: float, to_m: float) -> dict[str, WheelPa
 def _well_measured(part: Profile, gap_m: float) -> Profile:
     """Remove both ends of the profile where σ is far larger than in most of it, as where a lidar alone reached.
 
-    What is short between such stretches is left out with them. Within the profile all heights stay: those on the walls
-    of a pothole have a great σ, too.
+    Short parts between such stretches are left out as well. Inside the profile all heights stay, since those on the
+    walls of a pothole have a large σ too.
     """
     known = np.flatnonzero(np.isfinite(part.sigma_m))
     if known.size < 2:

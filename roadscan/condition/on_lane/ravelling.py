@@ -105,12 +105,12 @@ def ravelled_section(
 ) -> RavelledSection:
     """Return the patches of a section whose squares (n, m) are given.
 
-    The logarithm of a square's texture is held against the median of its section and the spread of its lower half,
+    The logarithm of a square's texture is compared with the median of its section and the spread of its lower half,
     which patches do not widen. Where more than half of a section has lost stones, that median is of lost stones: so
-    where it is coarser than the lane, and half of the rows across the lane hold some squares that are like the lane,
-    squares are held against the lane. Where rows are coarser from border to border, the surface is another one as far
-    as can be told: the section's own median counts, and a remark says so.
-    A patch ends halfway between its own texture and that of sound squares, and with its section.
+    where it is coarser than the lane, and half of the rows across the lane contain some squares that are like the lane,
+    squares are compared with the lane. Where rows are coarser from border to border, the surface seems to be another
+    one: squares are compared with the section's median, and a remark says so.
+    A patch ends halfway between its texture and that of undamaged squares, and with its section.
 
     inside : (n, m) squares that lie on the road; lane : of :func:`lane_levels`.
     """

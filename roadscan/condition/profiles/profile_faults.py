@@ -71,8 +71,8 @@ class SoundHeights(NamedTuple):
     def rounded_again(self) -> Floats:
         """Return (2, n) heights with simulated errors of as much rounding, within half a step up and down (m).
 
-        In the first, each sample has its own error; in the second, samples that were rounded to one height, one after
-        the other, share theirs. Errors are so where a road changes by more than a step a sample, and by less.
+        In the first, errors of samples are independent, as where a road changes by more than a step a sample; in the
+        second, successive samples of one rounded height share an error, as where it changes by less.
         """
         shared = np.concatenate([[0], np.cumsum(np.diff(self.height_m) != 0.0)])
         drawn = self.step_m * np.random.default_rng(1).uniform(-0.5, 0.5, shared.size)

@@ -175,8 +175,8 @@ def _judged(kinds: Float64, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64
 def smoothed(away_m: Float64, known: Bool, kind: npt.NDArray[np.int8]) -> tuple[Float64, Float64]:
     """Return distances (s,) smoothed along runs of one kind of edge, and their standard deviations.
 
-    The standard deviation is that of the single places about the smooth line, as their median difference within 10 m
-    tells it, and that of a cell's width.
+    The standard deviation combines that of the single places about the smooth line, from their median difference
+    within 10 m, and that of a cell's width.
     """
     out, sigma = np.array(away_m), np.full(away_m.size, np.nan)
     group = np.where(known, kind.astype(np.int64) + 1, 0)

@@ -88,7 +88,7 @@ def road_edges(
     ----------
     points : of the tiles on its way, on the map; piece : the stretch, its line and lanes longer by :data:`LEAD_M`.
     reach_beyond_m : how far beyond the outermost lane's border an edge is sought; largest_sigma_m : edges with a larger
-        standard deviation are not told.
+        standard deviation are left out.
     polygons : the road's surface on the map, where it is stated: its borders are the edges.
     """
     between = (piece.from_m - LEAD_M, piece.to_m + LEAD_M)

@@ -145,10 +145,9 @@ def chosen_ruts(
 ) -> dict[str, tuple[int, npt.NDArray[np.float64]]]:
     """Return the cross-sections to show, with both depths (2,) as medians over `RUT_M`; empty without a depth.
 
-    `typical` is where the deeper rut is as deep as in the median, `deepest` where it is deepest. Both are the
-    cross-section there whose own depths are nearest to the medians: one through a pothole is not. Where σ is more
-    than `_SURE` times that of the lane, as where a drive ends and few readings lie, noise makes depths: none is chosen
-    there.
+    `typical` is where the deeper rut has its median depth, `deepest` where it is deepest. Of the cross-sections there,
+    the one whose depths are nearest to the medians is taken, which leaves out potholes. None is chosen where σ is more
+    than `_SURE` times that of the lane, as at the end of a drive with few readings, since noise then makes depths.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ SETTINGS = (
     "bin", "share", "gate", "scatter_factor", "scatter_readings", "grazing", "chord", "step", "noise_factor", "slope",
     "window", "window_readings", "bridge",
 )  # fmt: skip
-"""Order of the `settings` tuple; lengths in metres, angles in radians (``model.segmentation``)."""
+"""Order of the `settings` tuple; lengths in metres, angles in radians (``georeference.segmentation``)."""
 (
     BIN, SHARE, GATE, SCATTER_FACTOR, SCATTER_READINGS, GRAZING, CHORD, STEP, NOISE_FACTOR, SLOPE,
     WINDOW, WINDOW_READINGS, BRIDGE,

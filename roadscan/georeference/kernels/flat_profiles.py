@@ -1,7 +1,7 @@
 """Georeferences profiles whose readings are taken at one instant near the sensor.
 
 All readings of such a profile have one pose and lie in one plane, a few metres across. There the map is linear to a
-few µm (``points.flat_profiles`` holds the reach to that), so each map coordinate is
+few µm (``georeference.flat_profiles`` limits the reach accordingly), so each map coordinate is
 
     value = anchor + p + q · y + r · z
 

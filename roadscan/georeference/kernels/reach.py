@@ -1,7 +1,7 @@
 """Bounds where readings can lie on the map from poses alone: the tiles that a row group may touch.
 
-What a sensor may have seen at one instant is a box in its own frame: of a profile the rectangle from its nearest to
-its farthest range, of a lidar the box around its returns. Between two instants of an unbroken trajectory,
+What a sensor may have seen at one instant is a box in its frame: of a profile the rectangle from its nearest to its
+farthest range, of a lidar the box around its returns. Between two instants of an unbroken trajectory,
 
     map(p, t) ∈ (1 − s) A₀(p) + s A₁(p) ⊕ margin,   s = (t − t₀) / (t₁ − t₀)
 

@@ -1,7 +1,7 @@
 """Finds the readings of a profile that hit the road: histogram threshold, height, second derivative, angle, connection.
 
 The steps and how each is read are described in :mod:`roadscan.georeference.segmentation`. All of it happens in the
-plane of the profile, in the sensor's own axes: y across, *up* = −z.
+plane of the profile, in the sensor's axes: y across, *up* = −z.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
 """Map coordinates of readings with an epoch each: returns of a spinning lidar, readings of a rotating mirror.
 
-Poses are not evaluated a reading. Each interval between two knots of the trajectory is cut into equal *pose
+Poses are not evaluated for each reading. An interval between two knots of the trajectory is cut into equal *pose
 steps* no longer than :data:`STEP_NS`; the exact pose is taken at four epochs of a step, a third of it apart, and
 sensor origin, sensor axes and the body's height run between them as cubics in time. A cubic through four points
 d apart departs from its function f by at most d⁴ max|f⁗| / 24 (Lagrange's remainder). Positions between knots are
 cubics, so they stay exact. A point at distance r of a body that turns at ω with the angular acceleration α and
 the angular jerk β has |f⁗| ≤ r (ω⁴ + 6 ω² α + 3 α² + 4 ω β). For 100 m, 300 °/s and 5 rad/s² that is
-1.65·10⁵ m/s⁴, and with d = 1.7 ms the departure is 0.05 µm, whatever the body's own acceleration; 1 µm is reached
+1.65·10⁵ m/s⁴, and with d = 1.7 ms the departure is 0.05 µm, whatever the body's acceleration; 1 µm is reached
 at β = 1,400 rad/s³, more than a sudden change of α by 5 rad/s² makes of the trajectory's interpolation.
 
-Steps hang on the trajectory's knots alone, never on the readings: a point does not depend on which others are
-placed with it, no step crosses a knot, and gaps begin and end exactly where they do. A step's chart is that of
+Steps depend on the trajectory's knots alone, never on the readings: a point does not depend on which others are
+georeferenced with it, no step crosses a knot, and gaps begin and end exactly where they do. A step's chart is that of
 its middle: in 5 ms the vehicle goes far less than the margin of a chart.
 """
 

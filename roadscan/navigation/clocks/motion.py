@@ -73,7 +73,7 @@ def clock_from_motion(felt: Felt, motion: Motion, *, search_s: float, drift: Dri
     Raises
     ------
     NavigationError
-        where the motion does not tell the lag: too little of it, periodic, or an offset beyond `search_s`.
+        where the motion does not determine the lag: too little of it, periodic, or an offset beyond `search_s`.
     """
     _check_units(felt, motion, what)
     start = _start(felt, motion, search_s, drift, what)

@@ -54,7 +54,7 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 WITHHELD_S: Final = 10.0
-"""Length of a stretch of GNSS that is withheld, where the run has no outages of its own."""
+"""Length of a stretch of GNSS that is withheld, where the run has no outages."""
 _LENGTHS_S: Final = (5.0, 20.0)
 """Shortest and longest withheld stretch."""
 _BETWEEN_S: Final = 5.0
@@ -204,7 +204,7 @@ def _measured(
 def withheld(epochs: Int64) -> Int64:
     """Return the number (m,) of the stretch in which a solution is withheld, −1 for those that are used.
 
-    Stretches are as long as the run's own outages usually are: their noise is the one that has to be right.
+    Stretches have the usual length of the run's outages, for which the noise has to be right.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ def _settled(epochs: Int64, gnss: Int64) -> Bool:
 def lasting_sigma(residuals: Float64) -> float:
     """Return the σ of white noise with the same variance of long means as residuals (n, c), of the worst column.
 
-    Values far out are drawn in: half of all may be wrong by chance, not by rule.
+    Outlying values are clipped.
     """
     worst = 0.0
     for column in residuals.T:
@@ -337,8 +337,8 @@ def _try(solution: Solution, gnss: GnssSolutions, stretch: Int64, trial: Smoothe
 def _next_factor(tried: Sequence[_Tried]) -> float:
     """Return the next factor on the IMU's noise to try.
 
-    Where the ratio did not answer to the last change, something else than the IMU's noise is the cause: the first
-    factor comes back.
+    Where the ratio did not respond to the last change, the IMU's noise is not the cause, and the first factor is
+    returned.
     """
     for before, after in itertools.pairwise(tried):
         change = np.log(after.factor / before.factor)

@@ -81,7 +81,7 @@ def align(
     Raises
     ------
     NavigationError
-        where no motion tells the heading, or there is no GNSS.
+        where no motion determines the heading, or there is no GNSS.
     """
     motion = _Motion.of(imu, gnss, still, vehicle, instant=instant)
     if motion.epochs.size < 3:

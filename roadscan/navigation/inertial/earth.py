@@ -1,6 +1,6 @@
 """The Earth's level axes, normal gravity and rotation (WGS 84).
 
-WGS 84; other datums differ by far less than an accelerometer can tell.
+WGS 84; other datums differ by far less than an accelerometer resolves.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Checks whether a smoothed trajectory follows the measurements that it was computed from.
 
-Some wrong inputs no comparison of motions can tell beforehand (a horizontal gyroscope with the wrong sign on an even
-road). They leave their mark on the result: the smoother has to trust either the IMU or GNSS, and they disagree.
+Some wrong inputs cannot be detected by comparing motions beforehand (a horizontal gyroscope with the wrong sign on an
+even road). They show in the result: the smoother has to trust either the IMU or GNSS, and they disagree.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def figures_of(solution: Solution) -> list[KindFigures]:
 def warnings_of(solution: Solution) -> list[str]:
     """Describe the kinds of measurement with many outliers, or with large innovations.
 
-    A receiver that errs often does that as well as a trajectory that is wrong: :func:`check_outcome` tells which.
+    Both a poor receiver and a wrong trajectory cause this: :func:`check_outcome` distinguishes them.
     """
     said = []
     for one in figures_of(solution):

@@ -1,6 +1,6 @@
 """Computes the trajectories of a survey from its logs, and stores them beside these.
 
-A computed trajectory is held like a log of its own (sensor ``navigation``): its key names the logs, the rig, the
+A computed trajectory is stored like a separate log (sensor ``navigation``): its key names the logs, the rig, the
 settings and the code that it was made from, and it is replaced when one of them changes.
 """
 

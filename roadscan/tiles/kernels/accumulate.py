@@ -1,9 +1,9 @@
 """Counts readings into cells in one pass, keeping only each reading's height until its tile is finished.
 
-What is kept, and where, depends on the order of the readings only until it is sorted (``cells.cell_statistics``).
+The order of the readings affects the layout in memory, but not the statistics (``tiles.kernels.cell_statistics``).
 
-Neighbouring readings of a profile mostly lie in one cell, so readings are counted in *streaks*: what has to be looked
-up is looked up once a streak, and the heights of a streak are stored as one vector.
+Neighbouring readings of a profile mostly lie in one cell, so readings are counted in *streaks*: the cell is looked up
+once per streak, and the heights of a streak are stored as one vector.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Computes statistics of a tile's cells from its buckets, bit-identical to those of ``cells.cell_statistics``.
+"""Computes statistics of a tile's cells from its buckets, bit-identical to ``tiles.kernels.cell_statistics``.
 
-Cells of about as many readings are put side by side, wherever they lie: sixteen of up to 8, of up to 32 and of up to 64
-readings go through ``simd.column_statistics`` together. Fuller ones are taken one by one.
+Cells with similar numbers of readings are grouped wherever they lie: sixteen of up to 8, of up to 32 and of up to 64
+readings go through ``compute.kernels.column_statistics`` together. Fuller ones are processed one by one.
 """
 
 from __future__ import annotations

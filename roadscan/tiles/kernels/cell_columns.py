@@ -39,7 +39,7 @@ class CellColumns(NamedTuple):
 
 @bare_inlined
 def write_statistics(out, lane, cell, columns):
-    """Write a lane of `out`, see ``simd.column_statistics.statistics_of``, as the statistics of a cell."""
+    """Write a lane of `out`, see ``column_statistics.statistics_of``, as the statistics of a cell."""
     columns.height_mean_m[cell], columns.height_robust_m[cell] = out[0, lane], out[1, lane]
     columns.height_min_m[cell], columns.height_max_m[cell] = out[2, lane], out[3, lane]
     columns.height_std_m[cell], columns.intensity_mean[cell] = np.float32(out[4, lane]), np.float32(out[5, lane])

@@ -109,7 +109,7 @@ def slopes_of(heights, corner, edge, side, steps):
 
     Returns
     -------
-    east, north, and whether both could be told.
+    east, north, and whether both are determined.
     """
     east, north = 0.0, 0.0
     east_known, north_known = False, False

@@ -49,7 +49,7 @@ def sums_of(heights, middle, reach):
 
 @bare
 def statistics_of_full(heights, light, floor, quantum_m, select, out, lane):
-    """Write the statistics of one cell of n readings, as ``simd.column_statistics.statistics_of``, into out[:, lane].
+    """Write the statistics of one cell of n readings, as ``column_statistics.statistics_of``, into out[:, lane].
 
     heights : (n,) int32; light : int64, sum of intensities; select : work, see :func:`select_arrays`.
     """

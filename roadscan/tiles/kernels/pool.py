@@ -1,9 +1,9 @@
 """Pool of memory for the heights of cells: slots of 64 bytes, allocated sixteen at a time.
 
-The heights of a cell stand in a *slot* (``simd.height_slots``). The cells of a tile are taken sixteen at a time, side
-by side along a row: a *group*. When the first reading falls into a group, it gets an *element* of the pool: a slot for
-each of its cells. A cell with more readings, or with heights too far from the base for 16 bits, or of more passes than
-a header has bits for, chains spare slots behind its own.
+The heights of a cell are stored in a *slot* (``compute.kernels.height_slots``). Sixteen adjacent cells along a row of a
+tile form a *group*. With its first reading, a group gets an *element* of the pool: a slot for each of its cells. A cell
+with more readings, or with heights too far from the base for 16 bits, or of more passes than a header has bits for,
+chains spare slots behind its first one.
 """
 
 from __future__ import annotations

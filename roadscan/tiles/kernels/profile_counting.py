@@ -18,7 +18,7 @@ class Plane(NamedTuple):
     """Map positions of a profile's readings in 32 bits, relative to its anchor."""
 
     maps: tuple[tuple[float, ...], ...]
-    """Planes (p, q, r) of easting, northing and height, see ``georeferencing.flat_profiles``."""
+    """Planes (p, q, r) of easting, northing and height, see ``georeference.kernels.flat_profiles``."""
     rests: tuple[float, float]
     """Remainders of easting and northing from :func:`whole_cells`."""
     first: tuple[int, int, int]

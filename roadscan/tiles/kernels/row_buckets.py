@@ -1,9 +1,9 @@
 """Buckets collect readings by row of cells until their tile is finished.
 
-A turning mirror or a lidar looks elsewhere with every reading: counted into cells as they come, each reading would wait
+Successive readings of a rotating mirror or a lidar fall into distant cells: counted one by one, each reading would wait
 for its cell's memory. So readings are first put into the bucket of their row of cells in their tile: buckets grow at
-their ends only, and the ends of all rows stay in the second cache. A finished tile is taken row by row
-(``cells.bucket_statistics``).
+their ends only, and the ends of all rows stay in the second-level cache. A finished tile is processed row by row
+(``tiles.kernels.bucket_statistics``).
 
 A bucket is a chain of *blocks* of `BLOCK` readings of one pass. A reading is a number of 64 bits, from the lowest: its
 column in the tile (16), its intensity (16), its height in quanta (32).

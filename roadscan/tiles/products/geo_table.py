@@ -29,7 +29,7 @@ def write_geo_table(
     *,
     counterclockwise: bool = False,
 ) -> None:
-    """Write rows with their geometry, in the CRS's own unit.
+    """Write rows with their geometry, in the CRS's unit.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ class WantedFiles:
 
     @functools.cached_property
     def files(self) -> dict[str, str]:
-        """Suffix of each file by its name in the manifest; the product's own file is the last."""
+        """Suffix of each file by its name in the manifest; that of the product itself is the last."""
         beside = self.product.companions(self.options)
         named = {f"{self.product.name}.{name}": suffix for name, suffix in beside.items()}
         return {**named, self.product.name: self.product.suffix_for(self.options)}

@@ -62,7 +62,7 @@ class Direction:
     determined: bool
     sigma_ratio: float
     """σ from the evidence alone over prior σ; infinite where the evidence has no information. For a determined one
-            the other determined ones are unknown, for others all else is known."""
+    the other determined ones are unknown, for others all else is known."""
     parts: tuple[Part, ...]
     """Largest first."""
 

@@ -1,11 +1,11 @@
 """Weights of observations: Huber weights, rejection, variance factor by kind.
 
-All of it takes many observations of a kind, most of them right; orientations are not such
+This requires many observations of a kind, most of them right; orientations are treated separately
 (:mod:`roadscan.calibrate.orientations`).
 
 The variance factor of a kind is that of an M-estimator (Huber 1981, eq. 7.6.5): mean square of the clipped residuals
 over the squared share of those that are not clipped. It is applied where it is significantly above 1, never below:
-residuals that are better than stated may have errors in common that they do not show.
+residuals that are smaller than stated may share errors that they do not show.
 """
 
 from __future__ import annotations

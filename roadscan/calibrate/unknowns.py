@@ -1,7 +1,7 @@
 """The unknowns of a calibration with their priors: mountings, errors of poses, poses of calibration objects.
 
 All unknowns are one vector in units of prior σ: x = root · z with z ~ N(0, 1), so that a part without any uncertainty
-never moves and information of 1 is as much as the prior knows.
+never moves and information of 1 equals that of the prior.
 """
 
 from __future__ import annotations

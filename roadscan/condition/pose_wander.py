@@ -1,8 +1,8 @@
 """Estimates the random walk of a trajectory's heights from the trajectory itself.
 
-A vehicle's body moves slowly: at 2 Hz, where it swings most, a fourth difference of poses 5 ms apart keeps 2 · 10⁻⁵ of
-the movement, at 10 Hz, where its wheels hop, 1 %. What is left is the random walk of the poses, whose fourth difference
-has 20 times the variance of its steps. A walk has the spectrum of a road of waviness 2, so it adds to roughness.
+A vehicle's body moves slowly: at 2 Hz, its main frequency, a fourth difference of poses 5 ms apart keeps 2 · 10⁻⁵ of
+the movement, at 10 Hz, the frequency of the wheels, 1 %. The rest is the random walk of the poses, whose fourth
+difference has 20 times the variance of its steps. Its spectrum is that of a road of waviness 2: it adds to roughness.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ def _heights(
 ) -> Float64:
     """Return heights (n, 3) at places, see :func:`roadscan.condition.kernels.sampling.sample`.
 
-    Neighbours of a reconstructed surface err alike, so how they scatter says nothing of their errors.
+    Errors of neighbours on a reconstructed surface are correlated, so their scatter does not show the errors.
     """
     values = np.empty((len(places), 3))
     sample(table, places, *half_m, bend, values)

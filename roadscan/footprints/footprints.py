@@ -61,7 +61,7 @@ class FootprintTask:
 
     @property
     def work(self) -> int:
-        """Cost in row groups that have a bound; each reading of a cloud is georeferenced."""
+        """Cost in row groups that have a bound; clouds are read reading by reading."""
         return len(self.slice.groups) * (_CLOUD_GROUPS if self.slice.source.table == "cloud" else 1)
 
 

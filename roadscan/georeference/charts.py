@@ -73,7 +73,7 @@ def _table(boxes: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
     """Return the (nx, ny, nz) table with the number of each box (b, 3) at its indices modulo the shape; −1 elsewhere.
 
     The shape is that of all boxes. Where poses step by hundreds of kilometres it is smaller, such that no two boxes
-    share a place: what is between them is never looked at.
+    share a place: positions between them are never looked up.
     """
     whole = (boxes.max(axis=0) + 1).tolist()
     shapes = [whole] if math.prod(whole) <= _MOST_BOXES else [[edge] * 3 for edge in _FOLDED]

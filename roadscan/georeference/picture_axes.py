@@ -16,9 +16,9 @@ def camera_from_map(
 ) -> tuple[Float64, Float64]:
     """Return map positions (n, 3; m) of cameras, and matrices (n, 3, 3) from map differences to camera axes.
 
-    The matrix is the turn from the world to the camera times the inverse of the map's derivative at the camera, taken
-    over a metre; so convergence and scale of the map are in it. What the map's curvature adds stays below 1 mm within
-    100 m.
+    The matrix is the rotation from world to camera times the inverse of the map's derivative at the camera, taken
+    over a metre; so it includes convergence and scale of the map. The effect of the map's curvature stays below 1 mm
+    within 100 m.
 
     Parameters
     ----------

@@ -239,7 +239,7 @@ class Placement:
         Returns
         -------
         (n,) for returns, (n · readings,) profile by profile for scans, of ``READING_CLASSES``; passes and centre
-        lines are not looked at.
+        lines are ignored.
         """
         classes = np.zeros(_readings(batch, geometry), np.uint8)
         self._filtered(batch, geometry, EVERYWHERE, classes)

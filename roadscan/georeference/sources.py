@@ -220,7 +220,7 @@ class Georeferencer:
     def classified(self, one: RawSlice) -> Iterator[tuple[pa.RecordBatch, npt.NDArray[np.uint8], Placed]]:
         """Yield rows of a slice, chunk by chunk, with the class of every reading in order, and the points kept.
 
-        Passes and centre lines are not looked at.
+        Passes and centre lines are ignored.
         """
         for groups in _chunks(one):
             for batch in read_rows(self._store, one.source, one.file, groups).combine_chunks().to_batches():

@@ -1,4 +1,4 @@
-"""Where successive profiles cross in turns of a trajectory (Yu and others 2007, eq. 3; see ``georeference.range_filter``).
+"""Crossings of successive profiles in turns of a trajectory (Yu et al. 2007, eq. 3; see ``georeference.range_filter``).
 
 The trajectory is looked at every :data:`TICK_NS`, at whole multiples of it. From tick to tick, Δs is how far the
 sensor goes along the body's x axis, and Δθ how far the body turns about its own z axis: the planes of two profiles

@@ -53,7 +53,7 @@ def cut_blocks(readings: Mapping[TileId, int], edge_tiles: int, max_readings: in
     ----------
     readings : readings expected in each tile to be computed.
     edge_tiles : edge of the largest block; blocks lie on the lattice of that edge.
-    max_readings : a block with more is quartered, down to single tiles.
+    max_readings : a block with more is divided into four, down to single tiles.
     """
     groups: dict[tuple[int, int], list[TileId]] = {}
     for tile in sorted(readings, key=lambda t: (t.row, t.column)):

@@ -41,7 +41,7 @@ class LaneDirections:
         return cls((path[:-1] + 0.5 * step)[own], np.arctan2(step[own, 0], step[own, 1]))
 
     def at(self, places_m: npt.ArrayLike) -> Float64:
-        """Return directions (n,) at places (n, 2), those of the nearest steps; NaN where none is near."""
+        """Return directions (n,) at places (n, 2), from the nearest steps; NaN where none is near."""
         places = np.asarray(places_m, np.float64).reshape(-1, 2)
         if not len(self.place_m) or not len(places):
             return np.full(len(places), np.nan)

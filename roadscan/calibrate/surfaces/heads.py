@@ -1,7 +1,7 @@
 """Ties between two heads that see the same strip in one drive, and the agreement of their heights.
 
-The strip where the profiles of two heads overlap is narrow, and both see it with one trajectory: what they differ by
-there is their mounting's, and nothing else's.
+The strip where the profiles of two heads overlap is narrow, and both see it with one trajectory: any difference there
+comes from their mountings alone.
 """
 
 from __future__ import annotations

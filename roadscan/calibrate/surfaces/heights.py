@@ -1,9 +1,9 @@
 """Ties from heights: patches of a surface that profilers saw in several drives are matched with one another.
 
 Readings become height images, one a sensor and drive. Where two images overlap, small patches are shifted against each
-other until their heights agree (Lucas and Kanade 1981). A patch with relief or texture gives all three directions, an
-even one the height alone: which it is, the patch's own normal equations say. Cells are coarse at first and fine once
-the mountings have come near.
+other until their heights agree (Lucas and Kanade 1981). A patch with relief or texture determines all three directions,
+an even one the height alone, as its normal equations show. Cells are coarse at first and fine once the mountings are
+close.
 """
 
 from __future__ import annotations
@@ -370,7 +370,7 @@ def rows_of(
 
     Returns
     -------
-    (n, 1, 3) and (n, 2, 3), 1/m; NaN where a patch knows nothing, zero rows for directions that are noise.
+    (n, 1, 3) and (n, 2, 3), 1/m; NaN where a patch has no information, zero rows for directions that are noise.
     """
     n = len(mean)
     upright, level = np.full((n, 1, 3), np.nan), np.full((n, 2, 3), np.nan)

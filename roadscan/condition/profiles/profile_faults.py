@@ -99,8 +99,8 @@ class SoundHeights(NamedTuple):
 def sound_heights(x_m: Floats, height_m: Floats, *, spikes: bool = True) -> SoundHeights:
     """Return heights of a profile without repeated ones and without spikes.
 
-    A height repeats itself where so many samples have it, one after the other, that heights elsewhere change by ten
-    steps over a third of them. Where most of the others lie on straight lines, as in a drawn check profile, none does.
+    A height counts as repeated where a run of samples has it, and heights elsewhere change by ten steps over a third of
+    that length. Where most of the others lie on straight lines, as in a drawn check profile, none does.
     A spike is one sample that rises or falls by more than 15 mm and by ten times the usual scatter, steeper than 0.3,
     between neighbours that agree; it is sought where samples lie within 0.1 m.
 

@@ -91,7 +91,7 @@ def write_erd(
     Raises
     ------
     ProfileError
-        where stations are not even, or a height is missing: the format knows neither.
+        where stations are not even, or a height is missing: the format supports neither.
     """
     x = stations_of(x_m)
     heights = heights_of(height_m, x.size)

@@ -68,7 +68,7 @@ class Ride:
     def accuracy_class(self, segments: Segments) -> npt.NDArray[np.int64]:
         """Return (segments,) class of the World Bank by the widest step of a segment: 1 to 0.25 m, 2 to 0.5 m.
 
-        The class says nothing of how well heights were measured.
+        The class does not depend on the accuracy of the heights.
         """
         wide = np.sort(np.concatenate([broken.wide_m for broken in self.breaks]))
         first, behind = (np.searchsorted(wide, ends) for ends in segments)

@@ -73,7 +73,7 @@ def clusters_of(
 ) -> tuple[list[Cluster], int]:
     """Return clusters of cells up to an 8-bit value, from the first row on, and the number of those below an area.
 
-    among : clusters whose cells alone are looked at.
+    among : clusters; only their cells are used.
     """
     dim = raster.measured & (raster.values <= dim_below)
     if among is not None:

@@ -5,7 +5,7 @@ XLII-1/W1, section 2): road surface, rotation by the mean heading, first level o
 raster by natural neighbours, 8 bits, closing, three-class Otsu thresholds, connected dim cells, convex hulls, filters
 by density and by the deviation of heights, rotation back.
 
-Beyond the paper: heights are judged against the section's road surface, so that a grade counts nothing; thresholds are
+Beyond the paper: heights are judged against the section's road surface, so that a grade has no effect; thresholds are
 taken from cells on that surface, so that vehicles do not move them; a region has to be dimmer than the road around it,
 and its edge runs where the intensity is halfway between both; a cluster that is no dimmer is the road itself, and its
 cells are parted again, so that a small patch is found on a road without another; and a region's roughness is measured

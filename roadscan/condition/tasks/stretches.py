@@ -1,7 +1,6 @@
 """Samples stretches of lanes from cells: profiles, cross-sections, texture and painted lines.
 
-What a row says depends on the cells around its place and on the line there, so it has the same bits whatever the
-stretches.
+A row depends on the cells around its place and on the line there, so it has the same bits however the lane is divided.
 """
 
 from __future__ import annotations

@@ -59,8 +59,8 @@ class KnownCorrections:
     def digests(self, source: ReadingSource, spans_gps_ns: Int64, max_gap_s: float) -> UInt64:
         """Return a digest (n,) of the corrections that affect readings of spans (n, 2) of time; 0 where there are none.
 
-        It is that of the mounting, and the sum of the digests of the knots around each span, with as much beyond it as
-        interpolation looks at.
+        It combines that of the mounting and the sum of the digests of the knots in each span, and beyond it as far as
+        interpolation uses them.
         """
         own = self.by_run.get(source.run)
         mounted = np.uint64(0) if source.trajectory is None else self._mounting_digest(source.run, source.sensor)

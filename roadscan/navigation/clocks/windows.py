@@ -169,8 +169,8 @@ class _Samples:
 def _solved(s: _Samples, line: Line, keep: float) -> Lags | None:
     """Return the lag of each window from white samples.
 
-    The lever is what the smoothed motion lets a shift change, less what a wrong A would change as well: noise of F is
-    in the residuals, but not in the lever, so it neither draws the lag nor makes it look better known.
+    The lever is the effect of a shift on the smoothed motion, less what a wrong A would change as well: noise of F is
+    in the residuals, but not in the lever, so it neither biases the lag nor lowers its σ.
     """
     mixing, left, noise, weight = _explained(s)
     shadow = _mixing(s.f, s.z, s.dz @ mixing, weight)

@@ -15,7 +15,7 @@ GNSS
     the identification of variances and adaptive Kalman filtering"). Multipath in a tenth of the time hardly moves it.
 IMU
     Positions that the solution did not see against those that it predicts, over the σ that it states
-    (cross-validation). Innovations of a fifth of a second say nothing of the noise that matters in an outage: that of
+    (cross-validation). Innovations over a fifth of a second do not show the noise that matters in an outage: that of
     biases that vibration shifts within seconds. The ratio, horizontal and vertical, becomes a factor of the IMU's
     noise.
 

@@ -401,7 +401,7 @@ def _check_lag(felt: Felt, ok: Flags, signs: Float64, vehicle: VehicleSensors) -
 def _check_tilt(felt: Felt, signs: Float64, vehicle: VehicleSensors) -> None:
     """Compare roll and pitch of the gyroscopes with the tilt from gravity: axes and signs that no turn shows.
 
-    Within blocks of `_LEAST_S`; a road that tilts the vehicle by less than `_TILTED_RAD` says nothing.
+    Within blocks of `_LEAST_S`; a road that tilts the vehicle by less than `_TILTED_RAD` does not count.
     """
     w = felt.windows
     sense = np.where(signs < 0, -1.0, 1.0)

@@ -1,9 +1,9 @@
 """Noise of readings. GNSS: as the log states it, or by quality where it states none.
 
-A position's error has a part that is new at each epoch and a part that changes slowly. Taken as new at each epoch, the
-slow part would let a standing receiver know its place to a millimetre after a minute. It is a state of the filter
+A position's error has a part that is independent between epochs and a part that changes slowly. If the slow part were
+taken as independent too, a standing receiver's σ would fall to a millimetre after a minute. It is a state of the filter
 instead: a Gauss–Markov process of the stated σ (Bar-Shalom, Li and Kirubarajan 2001, section 8.2, "coloured measurement
-noise"). It starts anew when the quality of the solution changes.
+noise"). It restarts when the quality of the solution changes.
 
 IMU: the noise of its data sheet, and a share of what it trembles at the upper end of its band. Vibration of engine and
 road lies largely above half the rate of the samples and folds back into what is integrated; where samples are polled

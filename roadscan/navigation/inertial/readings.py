@@ -98,7 +98,7 @@ class Solution:
     """(n, 3) 1 σ of roll, pitch, heading."""
     states: dict[str, tuple[Float64, Float64]] = field(default_factory=dict)
     """Other estimated states, by name with frame and unit (``…_imu``: the IMU's axes, ``…_body``: the body's): value
-            (j,) or (j, k) and its 1 σ, at `state_epochs_gps_ns`."""
+    (j,) or (j, k) and its 1 σ, at `state_epochs_gps_ns`."""
     state_epochs_gps_ns: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
     innovations: Innovations | None = None
     pieces: tuple[tuple[int, int], ...] = ()

@@ -42,7 +42,7 @@ def load_trajectory(
 ) -> Trajectory:
     """Load poses of a run around spans of time, with corrections.
 
-    As much is read beyond each span as interpolation looks at, so poses do not depend on what was asked for.
+    Poses beyond each span are read as far as interpolation uses them, so the result does not depend on the spans.
     """
     return load_recorded(store, source, spans, max_gap_s).corrected(load_corrections(store, source.run))
 

@@ -1,9 +1,9 @@
 """Checks whether the survey's cells have enough readings, and which cell size would, from the finished tiles.
 
-The rule: a cell of the road that holds a reading should hold :data:`ENOUGH` of them, so that its robust height is a
-median and not the reading itself. What counts is the median over the cells of the fullest tiles, those that together
-hold half of all readings: a lidar sees far beside the road, too. Larger cells are put together from the cells that are
-there, so the numbers are counted and not modelled; no reading is read again.
+The rule: a cell of the road with a reading should have :data:`ENOUGH` of them, so that its robust height is a median
+and not the reading itself. The criterion is the median over the cells of the fullest tiles, which together have half of
+all readings: a lidar also sees far beside the road. Larger cells are joined from the existing cells, so the numbers are
+counted and not modelled; no reading is read again.
 """
 
 from __future__ import annotations

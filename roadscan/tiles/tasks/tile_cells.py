@@ -1,8 +1,8 @@
 """Counts raw readings into the cells of a task's tiles: each row group is read once, and no point is written.
 
-Tiles are finished one after another, in the order of the drive. For the next one, the row groups that may touch it
-and have not been read yet are counted, into all tiles of the task that they touch. So a row group is read once, and
-what memory holds at any time are the cells of the few tiles that are begun and not finished.
+Tiles are finished one after another, in driving order. For the next tile, the row groups that may touch it and have not
+been read yet are counted into all tiles of the task that they touch. So a row group is read once, and memory contains
+only the cells of the few tiles that are started and not finished.
 """
 
 from __future__ import annotations

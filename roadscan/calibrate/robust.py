@@ -109,7 +109,7 @@ def loss(one: Weighed, scales: Scales, *, reject: bool) -> float:
 
 
 def independent_share(weighed: Sequence[Weighed], most: float) -> dict[str, float]:
-    """Return by kind the share of the weighted observations that gives at most so many independent ones."""
+    """Return for each kind the factor that limits its sum of weights to `most` independent observations."""
     counted: dict[str, float] = {}
     for one in weighed:
         counted[one.kind] = counted.get(one.kind, 0.0) + float(one.weight.sum())

@@ -106,7 +106,7 @@ class Condition(Stage):
         session.failed(self.name, run_units(function, tasks, session.manifest, session.compute, session.bar(title)))
 
     def check(self, survey: Survey) -> list[RoadscanError]:
-        """Layers of lines and polygons can be opened as stated; there is a surface where its heights are asked for."""
+        """Check that layers open as stated, and that a surface is made where its heights are requested."""
         try:
             check_layer(survey)
             check_surface_cells(survey)

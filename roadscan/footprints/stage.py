@@ -29,7 +29,7 @@ def faults_of_plan(session: Session) -> list[tuple[str, str]]:
 
 
 class Footprints(Stage):
-    """One record a data file, from bounds; readings are placed only where there are none."""
+    """Records the tiles of each data file, from bounds; without bounds its readings are georeferenced."""
 
     name = "footprints"
     title = "which raw block touches which tile"
@@ -47,7 +47,7 @@ class Footprints(Stage):
         session.failed(self.name, [*found, *unplaced_logs(plan, manifest)])
 
     def state(self, session: Session) -> StageState:
-        """Data files of which it is not known, or not known any more, which tiles they touch."""
+        """Return the numbers of data files with current footprints, and of those without."""
         stale, current = len(stale_footprints(plan_of(session), session.manifest)), len(session.manifest.of(PRODUCT))
         state = StageState(current - stale, stale, next_run={"footprints": stale})
         state.notes = outdated_calibrations(plan_of(session))

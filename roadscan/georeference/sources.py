@@ -92,7 +92,7 @@ class ReadingSource:
 
     @property
     def adjusted_mountings(self) -> Mountings:
-        """Return the mountings with the adjustment's change: they go with corrected poses."""
+        """Return the mountings with the adjustment's change, for use with corrected poses."""
         if self.mounting_change is None:
             return self.mountings
         return self.mounting_change.applied(self.mountings, parallel=self.has_parallel_beams)

@@ -19,7 +19,7 @@ from roadscan.store.manifest import Manifest
 
 
 class Navigate(Stage):
-    """Computed trajectories are logs of their own; clocks are a small table."""
+    """Computes trajectories, which are stored like logs, and clocks, which are a small table."""
 
     name = "navigate"
     title = "trajectories from GNSS, IMU and odometer, clocks from shared motion"

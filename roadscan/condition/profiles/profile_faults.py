@@ -177,7 +177,7 @@ def _is_measured(h: Floats, lag: int, step_m: float) -> bool:
 
 
 def _alone(x_m: Floats, h: Floats) -> Bool:
-    """Return samples that stand alone."""
+    """Return samples that are spikes: higher or lower than both neighbours."""
     if h.size < _LEAST_OTHERS:
         return np.zeros(h.size, np.bool_)
     wide = np.maximum(np.diff(x_m)[:-1], np.diff(x_m)[1:])

@@ -79,8 +79,8 @@ def load_buffer(stated: CentreLines, frame: MapFrame) -> CentreLineBuffer:
     Raises
     ------
     FormatError, ConfigError, CrsError
-        if the layer cannot be read as stated, if it has no line, or if a feature cannot be used: the road along it
-        would be cut away without a word.
+        if the layer cannot be read as stated, if it has no line, or if a feature cannot be used: points along it would
+        be removed silently.
     """
     options = RoadLinesOptions.model_validate_json(stated.options)
     layer = LineLayer.of(stated.path, options, stated.crs)

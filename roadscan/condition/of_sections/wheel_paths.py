@@ -168,9 +168,9 @@ def _well_measured(part: Profile, gap_m: float) -> Profile:
 
 
 def walls_of(measured_m: Float64, height_m: Float64, spacing_m: float) -> tuple[slice, ...]:
-    """Return where heights differ as at a wall from the one measured before, in the direction in which they continue.
+    """Return the runs of heights that rise or fall as steeply as a wall, each in one direction.
 
-    A wall may hide the floor at its foot from the sensor, up to half a metre of it a metre of height: heights there are
+    A wall may hide the floor at its foot from the sensor, up to half a metre per metre of height: heights there are
     those of the ground beyond, so the wall may stand that much farther out.
 
     measured_m, height_m : (n,) heights with their gaps, and with these bridged; NaN where there is none (m).

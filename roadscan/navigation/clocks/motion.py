@@ -26,7 +26,7 @@ _SOME: Final = 0.1
 """A shift that explains a smaller share of the variance is not used."""
 _ROUNDS: Final = 25  # Most rounds of the adjustment.
 _LEARNING: Final = 2
-"""Number of rounds after which the noise is estimated."""
+"""Number of rounds in which the noise is estimated; then it is kept."""
 _SETTLED_S: Final = 1e-7  # The estimate is final when it moves by less than this …
 _SETTLED: Final = 0.02
 """… or by less than this share of its σ."""

@@ -113,7 +113,7 @@ class _Constraint:
     """Name of the quantity, for the user."""
 
 
-_CONSTRAINTS: Final = (
+_CONSTRAINTS: Final = (  # Constraints whose σ is measured; 1.0 is the factor from residual to setting.
     _Constraint("non-holonomic", (1,), "sideways_m_per_s", 1.0, "velocity to the side"),
     _Constraint("non-holonomic", (2,), "upwards_m_per_s", 1.0, "velocity upwards"),
     _Constraint("odometer", (0,), "odometer_sigma_m_per_s", 1.0, "speed of the odometer"),

@@ -64,7 +64,7 @@ def parts_of_edge(values, corner, edge):
 
 @inlined
 def _voxel(steps, point, shift, bits):
-    """Return the number of a point's voxel of 2^shift parts among 2^bits an edge, and twice its distance squared."""
+    """Return a point's voxel of 2^shift parts among 2^bits an edge, and its distance² from the centre, times 4."""
     size, mask = np.int64(1) << shift, (np.int64(1) << bits) - 1
     number, square = np.int64(0), np.int64(0)
     for place in (np.int64(steps.x[point]), np.int64(steps.y[point]), np.int64(steps.z[point])):

@@ -95,7 +95,7 @@ def reach_of_kept(column, height):
 
 @bare_inlined
 def note_pose(epoch, sigmas, active, touched):
-    """Record the epoch and σ of a profile with the tiles that it touched, and reset those."""
+    """Record the epoch and σ of a profile with the tiles that it touched; clear `touched`."""
     for tile in range(touched.size):
         if touched[tile]:
             touched[tile] = 0

@@ -2,8 +2,8 @@
 
 Weighted, robust Gauss–Newton over mountings, errors of poses and poses of calibration objects, each with its prior
 (Triggs, McLauchlan, Hartley and Fitzgibbon 2000, "Bundle adjustment – a modern synthesis", sections 3 and 4). Poses and
-objects are eliminated; what remains tells which directions of the mountings the evidence determines
-(:mod:`roadscan.calibrate.observability`). Directions that it does not determine keep their prior value.
+objects are eliminated; the remaining information shows which directions of the mountings the evidence determines
+(:mod:`roadscan.calibrate.observability`). The other directions keep their prior value.
 """
 
 from __future__ import annotations

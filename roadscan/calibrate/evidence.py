@@ -62,8 +62,8 @@ class Ties:
     """(n, k, 3), 1/m, world axes (the object's axes where `second` lies on one)."""
     normal_sigma_rad: Float64 | None = None
     """(n,) 1 σ of the direction of a tie's rows, where they are normals of a surface that were estimated. A wrong
-    normal seems to tell where in the surface a place lies; what the normals' errors alone would tell is not taken for
-    information when it is decided what is determined."""
+    normal seems to locate a place within the surface; when it is decided what is determined, the apparent information
+    from the normals' errors is subtracted."""
 
 
 @dataclass(frozen=True)

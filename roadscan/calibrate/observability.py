@@ -1,9 +1,9 @@
 """Finds which directions of the mountings the evidence determines, and which it does not.
 
-Poses and objects are eliminated from the information of the evidence (Schur complement, with their own priors); what
-remains, M, is in units of the prior's information. Its eigenvalues λ compare the two: along an eigenvector the evidence
-alone has the σ 1/√λ of the prior's. Where that is no small share of the prior's σ, the direction is not determined, and
-its prior value is kept as it is instead of noise.
+Poses and objects are eliminated from the information of the evidence (Schur complement, with their priors); the
+remaining matrix M is in units of the prior's information. Along an eigenvector with eigenvalue λ, the σ of the evidence
+alone is 1/√λ times that of the prior. Where that is no small share of the prior's σ, the direction is not determined,
+and keeps its prior value instead of noise.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Estimates the mounting of a scanning sensor from a reference scan: registration, then ties of readings to planes.
 
-A terrestrial scanner's cloud shows where walls and ground are; the mobile sensor saw the same ones. The mounting that
-brings each reading, with the pose of its own epoch, onto the planes of the reference is the sought one: for a standing
-vehicle that is one rigid transformation (Mandli, Nagarajan and others 2016, section 3.1.2), for a driving one there is
+A terrestrial scanner's cloud contains walls and ground that the mobile sensor saw too. The mounting is estimated that
+brings each reading, with the pose of its epoch, onto the planes of the reference: for a standing vehicle that is one
+rigid transformation (Mandli, Nagarajan and others 2016, section 3.1.2), for a driving one there is
 a transformation for each reading. The search goes from coarse to fine: a standing scan is first registered with
 generalized ICP (`small_gicp`; Segal, Hähnel and Thrun 2009); then plane patches are looked up again while the mounting
 improves (point-to-plane ICP over the six parameters of the mounting; Chen and Medioni 1992).

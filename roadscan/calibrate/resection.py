@@ -1,9 +1,9 @@
 """Estimates the mounting of a camera by resection on control points, in all pictures at once.
 
 Each measurement is a ray of the camera that has to pass through a control point (collinearity equations; Kraus 2007,
-Photogrammetry, section 4.2). With the poses of the body the pictures share one unknown mounting. It goes to the
-estimator of all mountings as ties that know nothing along their ray, so that poses have their σ, directions that the
-points do not determine are said, and other evidence may join.
+Photogrammetry, section 4.2). With the poses of the body the pictures share one unknown mounting. The
+estimator of all mountings gets ties without information along their ray, so that poses have their σ, directions that
+the points do not determine are reported, and other evidence can be added.
 
 Sensor axes of a camera are forward along the optical axis, right, down; OpenCV's are right, down, forward.
 """

@@ -1,7 +1,7 @@
 """Index of row groups by tile: which groups a block of tiles needs, and which tile reports on their readings.
 
-Row groups of all data files are numbered through, with a gap after each file, so that runs of numbers are runs of row
-groups of one file. A survey of a day has millions of them: nothing here loops over row groups or tiles.
+Row groups of all data files are numbered consecutively, with a gap after each file, so that a run of numbers is a run
+of row groups of one file. A survey of a day has millions of them, so nothing here loops over row groups or tiles.
 """
 
 from __future__ import annotations

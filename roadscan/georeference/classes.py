@@ -1,7 +1,7 @@
 """Classes of readings: kept, or the filter that left a reading out.
 
 The classes are those of the filters of 3.3.1 in Sairam, Nagarajan, Ornitz 2016: readings outside the scanner's
-range, unrealistic heights, and what lies off the road; beside readings that have no place at all.
+range, unrealistic heights, and what lies off the road; in addition, readings without a return or a pose.
 """
 
 from __future__ import annotations

@@ -69,8 +69,8 @@ class ReadingSource:
     range_min_m: float
     range_max_m: float
     key: str
-    """Hash of all that places the readings: recorded poses, mounting, clock, range limits, map, grid. Corrections of
-    the poses belong to the keys of what lies in their span of time, the code to the keys of what it makes."""
+    """Hash of all that georeferences the readings: recorded poses, mounting, clock, range limits, map, grid. Pose
+    corrections are part of the keys of outputs in their span of time, the code of the keys of its outputs."""
     clock: ClockCorrection | None = None
     """Estimated correction of the ingested epochs; None where the sensor's clock is right as ingested."""
     road: RoadSegmentation | None = None

@@ -1,7 +1,7 @@
 """Crossings of successive profiles in turns of a trajectory (Yu et al. 2007, eq. 3; see ``georeference.range_filter``).
 
-The trajectory is looked at every :data:`TICK_NS`, at whole multiples of it. From tick to tick, Δs is how far the
-sensor goes along the body's x axis, and Δθ how far the body turns about its own z axis: the planes of two profiles
+The trajectory is sampled at whole multiples of :data:`TICK_NS`. From tick to tick, Δs is the distance of the
+sensor along the body's x axis, and Δθ the rotation of the body about its z axis: the planes of two profiles
 that lie across the body cross at Δs / sin Δθ beside the sensor, on the right where the vehicle turns right (and on the
 left where it turns right backwards). A profile has the limits of the tick nearest to it, from the ticks around it over
 `base_m` of path, at most :data:`WINDOW_NS` before and after. A vehicle that does not go half as far in that time

@@ -1,10 +1,10 @@
 """Detects poses that no vehicle can have taken: short leaps away and back, and steps after which the drive continues.
 
-Three things must exclude a pose together: its neighbours, the motion of a vehicle, and the σ that the log states. Each
+A pose is excluded only if its neighbours, the motion of a vehicle, and the σ that the log states all contradict it. A
 link between two poses is compared with the velocities just before and just after it, with a polynomial of degree four
 through three poses on each side, and with the integral of the velocities that the log states. A link that contradicts
 them by more than a vehicle's acceleration explains is cut, and what lies between two cuts is a segment. The explanation
-of least cost says which segments are the drive: to leave out a pose costs 1, to believe that positions step costs
+of least cost determines which segments are the drive: a pose left out costs 1, a step that is accepted costs
 `STEP_COST`. So a short burst between two pieces that fit each other is left out, and where two long pieces do not fit,
 both stay: nothing shows which of them is right.
 """

@@ -1,6 +1,6 @@
 """Blocks: neighbouring tiles that one task computes, with the halo around them.
 
-What a tile contains never depends on the block it was computed in.
+The content of a tile never depends on the block it was computed in.
 """
 
 from __future__ import annotations

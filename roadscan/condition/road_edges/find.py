@@ -1,11 +1,11 @@
 """Edges of a road's surface on one side of its lanes, from heights and intensities beside them.
 
 After P. Kumar, C. P. McElhinney, P. Lewis and T. McCarthy, *An automated algorithm for extracting road edges from
-terrestrial mobile LiDAR data* (ISPRS Journal 85, 2013): the slope across the road tells its edge, and intensity and
-pulse width where the slope does not. They let a snake find its way over rasters of the three; here each change across
+terrestrial mobile LiDAR data* (ISPRS Journal 85, 2013): the slope across the road shows its edge, and intensity and
+pulse width where the slope does not. They fit a snake to rasters of the three; here each change across
 the road is measured in standard deviations, and the best path is found by dynamic programming
 (:mod:`roadscan.compute.edges.across`). Pulse widths are in no table of roadscan. Where neither heights nor intensities
-tell an edge, the line painted along the border of the lane stands for it.
+show an edge, the line painted along the border of the lane is used.
 """
 
 from __future__ import annotations

@@ -62,9 +62,9 @@ def clock_from_motion(felt: Felt, motion: Motion, *, search_s: float, drift: Dri
         felt(e) = A · F(e + offset + drift · (e − reference)) + b + noise,
 
     where the matrix A (orientation, scale, lever arms) and a constant b a window of time are not known. Gauss–Newton
-    steps: each window gives the lag that its residuals ask for, with the σ that its noise and motion allow; a robust
+    steps: each window gives a lag from its residuals, with a σ from its noise and motion; a robust
     line through the lags corrects offset and drift. At the end the lags scatter about zero, and their scatter is
-    held against their σ.
+    compared with their σ.
 
     Parameters
     ----------

@@ -1,15 +1,15 @@
 """Estimates noise from the run itself, before the smoother relies on it.
 
-A constraint of a vehicle does not hold for whatever carries the sensors, receivers state σ of their own, and an IMU
-errs by more than its data sheet says. Stated too small, each of them makes the σ of a trajectory too small, and sound
-measurements outliers. So a run is first solved with stretches of GNSS withheld, and three things are measured there:
+Constraints of a vehicle do not fit every carrier of the sensors equally, receivers state σ by different rules, and an
+IMU errs by more than its data sheet says. Stated too small, each of them makes the σ of a trajectory too small, and
+good measurements outliers. So a run is first solved with stretches of GNSS withheld, where three things are measured:
 
 Constraints
     The innovations of each (velocity to the side and upwards, of the odometer, standing) must not scatter more than
-    stated. Errors that last for a while count more than ones that are new each time: the variance of a mean of n
+    stated. Correlated errors count more than independent ones: the variance of a mean of n
     correlated values is C₀ + 2 Σ Cₖ over n (Geyer 1992, "Practical Markov chain Monte Carlo", section 3.3, whose
-    initial positive sequence ends the sum). A constraint that fails is measured once more while it counts for next to
-    nothing, so that it does not pull at what it is measured by, and holds for what comes out.
+    initial positive sequence ends the sum). A constraint that fails is measured once more with almost no weight, so
+    that it does not affect the solution by which it is measured, and then gets the measured σ.
 GNSS
     The median of the normalised innovations against that of χ²/ν: a robust variance component (compare Mehra 1970, "On
     the identification of variances and adaptive Kalman filtering"). Multipath in a tenth of the time hardly moves it.

@@ -1,1 +1,1 @@
-"""Mountings from evidence: one estimator, several kinds of observations."""
+"""Calibration: one estimator finds mountings from several kinds of observations."""

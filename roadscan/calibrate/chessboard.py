@@ -2,8 +2,8 @@
 
 Corners are found (Duda and Frese 2018, `findChessboardCornersSB`) and refined to a fraction of a pixel; focal lengths,
 principal point and distortion are adjusted together with the board's pose in each picture (Zhang 2000,
-`calibrateCameraExtended`), with their σ. What pictures cannot tell is refused in words: too few of them, too similar,
-boards in the middle only, boards never tilted.
+`calibrateCameraExtended`), with their σ. Pictures that do not suffice are rejected with a reason: too few of them, too
+similar, boards in the middle only, boards never tilted.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Grey = npt.NDArray[np.uint8]
 _PARAMETERS: Final = 9
 """fx, fy, cx, cy, k1, k2, p1, p2, k3."""
 _COVER: Final = (6, 4)
-"""Columns and rows of the cells that coverage is counted in."""
+"""Columns and rows of the cells by which coverage is counted."""
 _WINDOW: Final = 0.3
 """Half the window that a corner is refined in, as a share of the least distance between corners."""
 _LEAP_PX: Final = 1.0
@@ -74,12 +74,12 @@ class InteriorOptions(Strict):
     outlier: float = Field(default=3.0, gt=1.0)
     """Pictures with an RMS of more than this many times the usual one are left out."""
     radial: Literal[1, 2, 3] | None = None
-    """How many radial terms are estimated; where left out, k3 only if it differs significantly from 0."""
+    """Number of radial terms that are estimated; if omitted, k3 only if it differs significantly from 0."""
 
 
 @dataclass(frozen=True)
 class UsedPicture:
-    """A picture that the orientation rests on."""
+    """A picture that the orientation is estimated from."""
 
     name: str
     rms_px: float
@@ -101,7 +101,7 @@ class RejectedPicture:
 
 @dataclass(frozen=True)
 class InteriorReport:
-    """An interior orientation and what it rests on."""
+    """An interior orientation and the pictures that it is estimated from."""
 
     interior: Interior
     used: tuple[UsedPicture, ...]
@@ -109,7 +109,7 @@ class InteriorReport:
     coverage: float
     """Share of the picture's cells with corners in them."""
     reach: float
-    """Farthest corner from the principal point, as a share of the picture's farthest."""
+    """Distance of the farthest corner from the principal point, as a share of that of the picture's farthest point."""
 
 
 @dataclass(frozen=True)
@@ -141,9 +141,9 @@ def find_corners(grey: Grey, board: Board) -> npt.NDArray[np.float32] | None:
 
 
 def _refined(grey: Grey, corners: npt.NDArray[np.float32], board: Board) -> npt.NDArray[np.float32]:
-    """Corners by the gradients around them (Förstner and Gülch 1987); those that would leap stay.
+    """Refine corners by the gradients around them (Förstner and Gülch 1987); those that would move too far stay.
 
-    The finder's own places are biased by up to 0.08 px where the board is seen at a slant; these are not.
+    Unrefined corners are biased by up to 0.08 px where the board is seen at a slant; refined ones are not.
     """
     grid = corners.reshape(board.rows, board.columns, 2)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
@@ -160,7 +160,7 @@ def interior_from_pictures(
     options: InteriorOptions | None = None,
     date: dt.date | None = None,
 ) -> InteriorReport:
-    """Interior orientation from pictures of a chessboard.
+    """Estimate the interior orientation from pictures of a chessboard.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def interior_from_pictures(
 def _views(
     pictures: Iterable[tuple[str, Grey | None]], board: Board, options: InteriorOptions
 ) -> tuple[list[_View], tuple[int, int], list[RejectedPicture]]:
-    """Different views of the board, width and height of the pictures, and the pictures left out."""
+    """Return different views of the board, width and height of the pictures, and the pictures left out."""
     views: list[_View] = []
     rejected: list[RejectedPicture] = []
     size: tuple[int, int] | None = None
@@ -225,7 +225,7 @@ def _views(
 
 
 def _twin(corners: npt.NDArray[np.float32], views: Sequence[_View], least_px: float) -> str | None:
-    """Name of a picture that shows the board at the same place, whichever way its corners are counted."""
+    """Return the name of a picture that shows the board at the same place, whichever way its corners are counted."""
     for view in views:
         for order in (corners, corners[::-1]):
             if float(np.linalg.norm(order - view.corners_px, axis=1).mean()) < least_px:
@@ -250,7 +250,7 @@ def _check_count(
 
 
 def _fitted(views: Sequence[_View], board: Board, size: tuple[int, int], options: InteriorOptions) -> _Fit:
-    """With k3 where it is asked for, or where it differs from 0 by more than chance."""
+    """Fit with k3 if requested, or if it differs significantly from 0."""
     if options.radial is not None:
         return _fit(views, board, size, options.radial)
     full = _fit(views, board, size, 3)
@@ -289,7 +289,7 @@ def _fit(views: Sequence[_View], board: Board, size: tuple[int, int], radial: in
 
 
 def _coverage(views: Sequence[_View], size: tuple[int, int], fit: _Fit) -> tuple[float, float]:
-    """Share of the picture's cells with corners in them, and how far out corners lie as a share of the farthest."""
+    """Return the share of the picture's cells with corners, and the reach of the corners as a share of the farthest."""
     corners = np.concatenate([view.corners_px for view in views]).astype(np.float64)
     cells = np.clip((corners + 0.5) / size * _COVER, 0, np.array(_COVER) - 1).astype(np.int64)
     share = len(np.unique(cells, axis=0)) / (_COVER[0] * _COVER[1])

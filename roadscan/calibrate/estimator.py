@@ -1,9 +1,9 @@
-"""Mountings by least squares over all evidence at once.
+"""Estimates mountings by least squares over all evidence at once.
 
 Weighted, robust Gauss–Newton over mountings, errors of poses and poses of calibration objects, each with its prior
 (Triggs, McLauchlan, Hartley and Fitzgibbon 2000, "Bundle adjustment – a modern synthesis", sections 3 and 4). Poses and
-objects are eliminated; what remains tells which directions of the mountings the evidence determines
-(:mod:`roadscan.calibrate.observability`). Directions that it does not determine keep their prior value.
+objects are eliminated; the remaining information shows which directions of the mountings the evidence determines
+(:mod:`roadscan.calibrate.observability`). The other directions keep their prior value.
 """
 
 from __future__ import annotations
@@ -61,20 +61,20 @@ __all__ = [
 Float64 = npt.NDArray[np.float64]
 
 Finder = Callable[[Estimate], Sequence[Evidence]]
-"""Finds the evidence anew with better mountings: correspondences change."""
+"""Searches for evidence with improved mountings, by which correspondences change."""
 
 _CONVERGED: Final = 0.01
 """A step below this share of every mounting's σ ends the iteration."""
 _STAYED: Final = 0.2
-"""Mountings stay where they are if evidence that is found anew moves them by less than this share of their σ."""
-_HALVINGS: Final = 6
+"""Mountings count as settled if evidence found again moves them by less than this share of their σ."""
+_HALVINGS: Final = 6  # A Gauss–Newton step that increases the cost is halved at most this many times.
 _SEEMING: Final = 2.0
-"""What errors of normals would tell is taken off this many times: their σ is an estimate, too."""
+"""Factor on the apparent information from errors of normals that is subtracted, since their σ is an estimate too."""
 
 
 @dataclass(frozen=True)
 class Calibrated:
-    """The mounting of one sensor."""
+    """The calibrated mounting of one sensor."""
 
     before: Mounting
     mounting: Mounting
@@ -86,7 +86,7 @@ class Calibrated:
     range_offset_m: float
     range_offset_sigma_m: float
     not_determined: tuple[str, ...]
-    """Directions in words; they kept their prior value. Empty where the evidence determines all."""
+    """Directions in words that kept their prior value. Empty where the evidence determines all."""
 
     @property
     def sigma(self) -> Float64:
@@ -102,11 +102,11 @@ class Figures:
     sensors: str
     count: int
     rejected: int
-    """Beyond the reject limit with the final mountings: they count for nothing."""
+    """Number beyond the reject limit with the final mountings; they have no weight."""
     unusable: int
-    """Not finite."""
+    """Number of residuals that are not finite."""
     rms_before: float
-    """Of unit variance where residuals are as large as their σ says; with the mountings of the rig file."""
+    """RMS with the mountings of the rig file: 1 where residuals are as large as their σ states."""
     rms_after: float
     rms_before_m: float | None
     """None for angles."""
@@ -115,22 +115,22 @@ class Figures:
 
 @dataclass(frozen=True)
 class KindFigures:
-    """What all observations of one kind tell of their stated σ."""
+    """Statistics of all observations of one kind, against their stated σ."""
 
     kind: str
     count: int
     rejected: int
     down_weighted: int
-    """Beyond the robust limit, within the reject limit."""
+    """Number beyond the robust limit and within the reject limit."""
     variance_factor: float
-    """1: residuals are as their σ says; else the variances of this kind were multiplied by it."""
+    """Factor by which the variances of this kind were multiplied; 1 where residuals agree with their σ."""
     counted_as: float
-    """Independent observations it was counted as."""
+    """Number of independent observations that they count as."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Mountings, their covariance, and what the evidence says of itself."""
+    """Mountings, their covariance, and statistics of the evidence."""
 
     sensors: dict[str, Calibrated]
     covariance: Float64
@@ -144,9 +144,9 @@ class Calibration:
     """(6,) 1 σ of them, m and rad."""
     objects: dict[str, ObjectPose]
     rounds: int
-    """How often the evidence was found."""
+    """Number of times that the evidence was searched for."""
     iterations: int
-    """Linearisations in all."""
+    """Total number of linearisations."""
     converged: bool
 
     @property
@@ -198,10 +198,10 @@ class _Adjustment:
     iterations: int = 0
     found: list[Observations] = field(default_factory=list)
     rejected: set[tuple[str, str]] = field(default_factory=set)
-    """Kind and sensor of orientations that contradict all else."""
+    """Kind and sensor of orientations that contradict all other evidence."""
 
     def run(self) -> Calibration:
-        """All stages: with all directions free, then with those held that the evidence does not determine."""
+        """Run all stages: with all directions free, then with those fixed that the evidence does not determine."""
         z, converged = self._free(np.zeros(self.unknowns.size))
         system = self._linearised(z, reject=True)
         seen = observe(system.told(), self.unknowns, self.settings.determined_below)
@@ -209,7 +209,7 @@ class _Adjustment:
         return self._result(z, seen, converged=converged and settled)
 
     def _free(self, z: Float64) -> tuple[Float64, bool]:
-        """Solve with all orientations, then without those that contradict all else, the worst first."""
+        """Solve with all orientations, then without those that contradict all other evidence, the worst first."""
         z, settled = self._stay(z)
         while (worst := self._contradicting(z)) is not None:
             self.rejected.add((worst.kind, worst.sensor))
@@ -217,7 +217,7 @@ class _Adjustment:
         return z, settled
 
     def _contradicting(self, z: Float64) -> Contradiction | None:
-        """The orientation that lies farthest beyond the limit."""
+        """Return the orientation that exceeds the limit by most."""
         system = self._linearised(z, reject=True)
         derivative = system.now.derivative
         covariance = derivative @ system.covariance @ derivative.T
@@ -231,9 +231,9 @@ class _Adjustment:
         return max(tested, key=lambda one: one.length, default=None)
 
     def _stay(self, z: Float64) -> tuple[Float64, bool]:
-        """Find the evidence and solve, until the mountings stay where they are."""
+        """Find the evidence and solve, until the mountings settle."""
         self._find(z)
-        # What is far off at first may come near: nothing is rejected before.
+        # What is far off at first may come near, so nothing is rejected yet.
         z, _ = self._solve(z, None, reject=False)
         z, settled = self._solve(z, None, reject=True)
         if not callable(self.evidence):
@@ -254,7 +254,7 @@ class _Adjustment:
         return z, settled
 
     def _again(self, z: Float64, free: Float64 | None) -> tuple[Float64, bool, bool]:
-        """Find the evidence with better mountings and solve: whether that converged, and whether they stayed."""
+        """Find the evidence with improved mountings and solve; return whether that converged, and whether they stay."""
         self._find(z)
         found, settled = self._solve(z, free, reject=True)
         return found, settled, self._small(found - z, self._linearised(found, reject=True), share=_STAYED)
@@ -265,9 +265,9 @@ class _Adjustment:
         self.rounds += 1
 
     def _solve(self, z: Float64, free: Float64 | None, *, reject: bool) -> tuple[Float64, bool]:
-        """Gauss–Newton with the evidence at hand; a step that makes things worse is halved."""
+        """Run Gauss–Newton with the present evidence; a step that increases the cost is halved."""
         if free is not None:
-            # Off directions that are held, which may well make things worse: no step of the descent does that.
+            # Setting fixed directions to zero may increase the cost, which no descent step does.
             z = np.concatenate([free @ (free.T @ z[: len(free)]), z[len(free) :]])
         system = self._linearised(z, reject=reject)
         for _ in range(self.settings.iterations_max):
@@ -297,7 +297,7 @@ class _Adjustment:
 
     def _result(self, z: Float64, seen: Observability, *, converged: bool) -> Calibration:
         system = self._linearised(z, reject=True)
-        # The split into directions stays that of the solution; their σ are those at the end.
+        # The split into directions stays that of the solution; σ are computed for the final mountings.
         seen = seen.updated(system.told(), self.unknowns)
         estimate = self.unknowns.estimate(z)
         before = self.unknowns.geometry(np.zeros_like(z))
@@ -339,7 +339,7 @@ class _Adjustment:
 
 
 def _figures(weighed: Sequence[Weighed], before: Geometry) -> tuple[Figures, ...]:
-    """Residuals of each kind and pair of sensors."""
+    """Return statistics of the residuals of each kind and pair of sensors."""
     pairs: dict[tuple[str, str], list[Weighed]] = {}
     for one in weighed:
         pairs.setdefault((one.kind, one.observations.label), []).append(one)
@@ -368,7 +368,7 @@ def _pair_figures(kind: str, label: str, members: Sequence[Weighed], before: Geo
 
 
 def _rms(values: Sequence[Float64 | None], used: Sequence[npt.NDArray[np.bool_]]) -> float | None:
-    """Root mean square over what is used; None where nothing has such a value."""
+    """Return the root mean square of the used values; None where there is none."""
     known = [v[u].ravel() for v, u in zip(values, used, strict=True) if v is not None]
     if not known:
         return None
@@ -378,7 +378,7 @@ def _rms(values: Sequence[Float64 | None], used: Sequence[npt.NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class _System:
-    """Normal equations at one place, whitened by the prior."""
+    """Normal equations at one point, whitened by the prior."""
 
     z: Float64
     now: Geometry
@@ -400,7 +400,7 @@ class _System:
         *,
         reject: bool,
     ) -> _System:
-        """Linearise."""
+        """Linearise at z."""
         now = unknowns.geometry(z)
         residuals = [one.residuals(now) for one in found]
         scales = scales_of(found, residuals, settings)
@@ -434,12 +434,12 @@ class _System:
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
     def cost(self, scales: Scales) -> float:
-        """What is minimised, with the weights of another place."""
+        """Return the cost that is minimised, with the weights of another point."""
         of_evidence = sum(scales.gain(one.kind) * loss(one, scales, reject=self.reject) for one in self.weighed)
         return float(of_evidence + self.z @ self.z)
 
     def solution(self, free: Float64 | None) -> Float64:
-        """Solution z (P,) of the normal equations, with the mountings in the space of `free` (M, d)."""
+        """Return the solution z (P,) of the normal equations, with the mountings in the space of `free` (M, d)."""
         right = self.information @ self.z - self.slope
         if free is None:
             return self.covariance @ right
@@ -449,7 +449,7 @@ class _System:
         return np.asarray(basis @ cho_solve(inner, basis.T @ right))
 
     def kind_figures(self) -> tuple[KindFigures, ...]:
-        """What each kind says of its σ."""
+        """Return statistics of each kind against its stated σ."""
         return tuple(
             KindFigures(
                 kind=kind,
@@ -471,7 +471,7 @@ def _by_kind(weighed: Sequence[Weighed]) -> dict[str, list[Weighed]]:
 
 
 def _normal_equations(weighed: Sequence[Weighed], now: Geometry) -> dict[str, tuple[Float64, Float64]]:
-    """Information and slope of each kind, in units of prior σ."""
+    """Return information and slope of each kind, in units of prior σ."""
     size = len(now.derivative)
     found = {}
     for kind, members in _by_kind(weighed).items():
@@ -488,7 +488,7 @@ def _settled(
     by_kind: Mapping[str, tuple[Float64, Float64]],
     settings: CalibrationSettings,
 ) -> Scales:
-    """Weights of the kinds: their variance factors, with the unknowns that each determines, and their limit."""
+    """Set the weights of the kinds: variance factors, number of unknowns that each determines, and limits."""
     if not by_kind:
         return scales
     share = independent_share(weighed, settings.independent_ties)
@@ -504,5 +504,5 @@ def _settled(
 
 
 def _inverse(matrix: Float64) -> Float64:
-    """Of a positive definite matrix."""
+    """Return the inverse of a positive definite matrix."""
     return np.asarray(cho_solve(cho_factor(0.5 * (matrix + matrix.T)), np.eye(len(matrix))))

@@ -1,4 +1,4 @@
-"""What observations of mountings look like, whatever they come from.
+"""The observations of mountings, to which every kind of evidence is reduced.
 
 Every kind of evidence ends as one of three observations:
 
@@ -6,7 +6,7 @@ Every kind of evidence ends as one of three observations:
   difference W (p_first − p_second) has unit variance. Rows of W say what is known: one row nᵀ/σ for two readings of
   one plane with normal n, three for a place known in all directions.
 - **Directions**: the same vector seen by the sensor and by the body (gravity, acceleration, the Earth's field), each
-  with an error of its own.
+  with an independent error.
 - **Orientation**: the whole rotation of a sensor with its covariance, from a solution whose errors are not independent.
 
 Poses have errors too. A **Traverse** is a piece of a drive within which they are one shift and one small rotation.
@@ -27,7 +27,7 @@ Int64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Seen:
-    """Places as a sensor on the vehicle saw them, each with the pose of its epoch."""
+    """Places that a sensor on the vehicle saw, each with the pose of its epoch."""
 
     sensor: str
     point_sensor_m: Float64
@@ -37,33 +37,33 @@ class Seen:
     world_from_body: Float64
     """(n, 3, 3)."""
     traverse: Int64
-    """(n,) which drive over the place: readings of one traverse share the error of its poses."""
+    """(n,) number of the traverse; readings of one traverse share the error of its poses."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """Places that no sensor's mounting moves: of a reference scan, of control points, of a calibration object."""
+    """Places that do not depend on a mounting: of a reference scan, of control points, of a calibration object."""
 
     point_m: Float64
-    """(n, 3) world, or in the object's own frame."""
+    """(n, 3) world, or in the object's frame."""
     object: str | None = None
-    """Calibration object whose pose in the world is estimated too; None: coordinates are world."""
+    """Calibration object whose pose in the world is estimated too; None where coordinates are world."""
 
 
 @dataclass(frozen=True)
 class Ties:
-    """Pairs of places that are one: weight @ (p_first − p_second) has unit variance."""
+    """Pairs of observations of the same place: weight @ (p_first − p_second) has unit variance."""
 
     kind: str
-    """What found them, for the report: "loops", "object", "reference" …"""
+    """Origin of the ties, for the report: "loops", "object", "reference" …"""
     first: Seen
     second: Seen | Known
     weight: Float64
     """(n, k, 3), 1/m, world axes (the object's axes where `second` lies on one)."""
     normal_sigma_rad: Float64 | None = None
     """(n,) 1 σ of the direction of a tie's rows, where they are normals of a surface that were estimated. A wrong
-    normal seems to tell where in the surface a place lies; what the normals' errors alone would tell is not taken for
-    information when it is decided what is determined."""
+    normal seems to locate a place within the surface; when it is decided what is determined, the apparent information
+    from the normals' errors is subtracted."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Directions:
 
 @dataclass(frozen=True)
 class AttitudeInfluence:
-    """How much of an orientation's error comes from errors of the trajectory's attitude, over one piece of a run."""
+    """Share of an orientation's error that comes from the trajectory's attitude errors, over one piece of a run."""
 
     epoch_gps_ns: Int64
     """(k,) ascending."""
@@ -96,7 +96,7 @@ class AttitudeInfluence:
 
 @dataclass(frozen=True)
 class Orientation:
-    """The rotation of a sensor, found by itself."""
+    """The rotation of a sensor, estimated separately."""
 
     kind: str
     sensor: str
@@ -118,7 +118,7 @@ class Traverse:
 
     run: str
     epoch_gps_ns: int
-    """Its middle."""
+    """Epoch of its middle."""
     sigma_north_east_down_m: tuple[float, float, float]
     """1 σ of the poses' position."""
     sigma_roll_pitch_heading_rad: tuple[float, float, float]

@@ -1,4 +1,4 @@
-"""A calibration in words and as rows of the table ``mountings``."""
+"""Reports a calibration as text and as rows of the table ``mountings``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from roadscan.core.frames import quaternion_from_rotation
 def mounting_rows(
     calibration: Calibration, *, run: str, valid_from_gps_ns: int, estimated_at: str, key: str
 ) -> list[dict[str, Any]]:
-    """Rows of the table ``mountings``, one a sensor (``schemas/mountings.toml``).
+    """Return rows of the table ``mountings``, one for each sensor (``schemas/mountings.toml``).
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def _row(one: Calibrated) -> dict[str, Any]:
 
 
 def report(calibration: Calibration) -> str:
-    """The calibration as a page of text: what changed, what is not determined, what the residuals say."""
+    """Return the calibration as a page of text: changes, undetermined directions, residuals."""
     return "\n".join([*_sensors(calibration), "", *_undetermined(calibration), "", *_kinds(calibration)]) + "\n"
 
 

@@ -1,9 +1,9 @@
-"""What the evidence determines of the mountings, and what it does not.
+"""Finds which directions of the mountings the evidence determines, and which it does not.
 
-Poses and objects are eliminated from the information of the evidence (Schur complement, with their own priors); what
-remains, M, is in units of the prior's information. Its eigenvalues λ compare the two: along an eigenvector the evidence
-alone has the σ 1/√λ of the prior's. Where that is no small share of the prior's σ, the direction is not determined, and
-its prior value is kept as it is instead of noise.
+Poses and objects are eliminated from the information of the evidence (Schur complement, with their priors); the
+remaining matrix M is in units of the prior's information. Along an eigenvector with eigenvalue λ, the σ of the evidence
+alone is 1/√λ times that of the prior. Where that is no small share of the prior's σ, the direction is not determined,
+and keeps its prior value instead of noise.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ AXES: Final = (
 )
 """Names of a sensor's unknowns, in their order."""
 _NAMED_SHARE: Final = 0.15
-"""Parts of a direction smaller than this share of the largest, in units of prior σ, are not named."""
+"""Parts of a direction smaller than this share of the largest, in units of prior σ, are not reported."""
 
 _NOTHING: Final = 0.01
-"""Parts of a held direction smaller than this share of the largest are taken out of it."""
+"""Parts of a fixed direction smaller than this share of the largest are set to 0."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """One part of a direction."""
+    """One component of a direction."""
 
     sensor: str
     axis: int
@@ -61,27 +61,27 @@ class Direction:
 
     determined: bool
     sigma_ratio: float
-    """σ from the evidence alone to prior σ; infinite where the evidence says nothing. Of a determined direction with
-    the other determined ones unknown, of others with all else known."""
+    """σ from the evidence alone over prior σ; infinite where the evidence has no information. For a determined one
+    the other determined ones are unknown, for others all else is known."""
     parts: tuple[Part, ...]
     """Largest first."""
 
     @property
     def words(self) -> str:
-        """Such as "heading of 'left' together with the forward lever arm of 'left' (17.1 mm a degree)"."""
+        """Words such as "heading of 'left' together with the forward lever arm of 'left' (17.1 mm a degree)"."""
         return _words(self.parts)
 
 
 @dataclass(frozen=True)
 class Observability:
-    """How the mountings' unknowns split into what is determined and what is not."""
+    """The split of the mountings' unknowns into determined and undetermined directions."""
 
     directions: tuple[Direction, ...]
-    """Those not determined first."""
+    """All directions, the undetermined ones first."""
     free: Float64
-    """(M, d) basis of what is determined, in units of prior σ."""
+    """(M, d) basis of the determined directions, in units of prior σ."""
     held: Float64
-    """(M, u) basis of what is not."""
+    """(M, u) basis of the undetermined directions."""
     covariance: Float64
     """(M, M) in units of prior σ: of the evidence with the prior where determined, of the prior elsewhere."""
 
@@ -91,13 +91,13 @@ class Observability:
         return tuple(d.words for d in self.directions if not d.determined)
 
     def not_determined(self, sensor: str) -> tuple[str, ...]:
-        """Those of them that a sensor has part in."""
+        """Return those of them in which a sensor has a part."""
         return tuple(d.words for d in self.directions if not d.determined and any(p.sensor == sensor for p in d.parts))
 
     def updated(self, information: Float64, unknowns: Unknowns) -> Observability:
-        """The same split with the covariance of information at another place.
+        """Return the same split with the covariance from information at another point.
 
-        Directions that are held are wrong by their prior σ; what that does to the others is part of their covariance
+        Directions that are kept fixed err by their prior σ; the effect on the others is part of their covariance
         (Schmidt's consider covariance).
         """
         reduced = eliminated(information, unknowns.mounting_size)
@@ -109,14 +109,14 @@ class Observability:
 
 
 def eliminated(information: Float64, size: int) -> Float64:
-    """Information (size, size) of the first unknowns alone, with the others and their prior (1 each) eliminated."""
+    """Information (size, size) of the first unknowns, with the others and their prior (1 each) eliminated."""
     mixed = information[size:, :size]
     reduced = information[:size, :size] - mixed.T @ _inverse(information[size:, size:] + np.eye(len(mixed))) @ mixed
     return np.asarray(0.5 * (reduced + reduced.T))
 
 
 def observe(information: Float64, unknowns: Unknowns, determined_below: float) -> Observability:
-    """Split the mountings' unknowns.
+    """Split the mountings' unknowns into determined and undetermined directions.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def observe(information: Float64, unknowns: Unknowns, determined_below: float) -
 
 
 def _plain_basis(projector: Float64, count: int) -> Float64:
-    """(n, count) orthonormal basis of the space that (n, n) projects on, with few parts a vector.
+    """Return an orthonormal basis (n, count) of the space that (n, n) projects on, with few components a vector.
 
     Its vectors are columns of the projector, the largest first (Cholesky's factors with pivots).
     """
@@ -161,9 +161,9 @@ def _plain_basis(projector: Float64, count: int) -> Float64:
 
 
 def _cleared(basis: Float64) -> Float64:
-    """The same directions (n, u) without parts that are next to nothing: what is held then is held exactly.
+    """Return the same directions (n, u) without negligible components, so that the remaining ones are fixed exactly.
 
-    To hold a slightly other direction costs what is determined a part in ten thousand; the covariance knows.
+    Fixing a slightly different direction adds a part in ten thousand to the others' errors, within the covariance.
     """
     if not basis.size:
         return basis
@@ -209,7 +209,7 @@ def _name(part: Part) -> str:
 
 
 def _rate(part: Part, first: Part) -> str:
-    """How much of a part goes with one degree or ten millimetres of the first."""
+    """Return how much of a part corresponds to one degree or ten millimetres of the first."""
     per = np.radians(1.0) if first.is_angle else 0.01
     value = part.amount / first.amount * per
     unit = "a degree" if first.is_angle else "for 10 mm"

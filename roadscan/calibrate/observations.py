@@ -1,4 +1,4 @@
-"""Residuals and normal equations of the evidence: what each observation says of the unknowns.
+"""Residuals and normal equations of each kind of observation.
 
 A reading's place is p = t + s + R E (B (p_sensor + o u) + l): lever arm l and rotation B of the mounting, range offset
 o along the beam u, shift s and small rotation E of the traverse. A row w of a tie's weight gives, with c = Eᵀ Rᵀ w,
@@ -30,8 +30,8 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _CHUNK: Final = 65_536
-"""Ties linearised at once: 26 derivatives a row stay within the cache's reach."""
-_ABSENT: Final = -1
+"""Ties linearised at once: 26 derivatives a row then fit the cache."""
+_ABSENT: Final = -1  # Index of a missing sensor or body.
 
 
 class Observations(Protocol):
@@ -41,25 +41,25 @@ class Observations(Protocol):
     label: str
     """Sensors concerned, for the report."""
     fixed_weight: float | None
-    """What each counts, where its residual does not decide on that."""
+    """Weight of every observation, where it does not depend on the residual."""
 
     @property
     def count(self) -> int:
-        """Observations."""
+        """Number of observations."""
 
     @property
     def rows(self) -> int:
-        """Numbers that one observation gives."""
+        """Number of residuals of one observation."""
 
     @property
     def unusable(self) -> int:
-        """Observations that are not finite; they are left out."""
+        """Number of observations that are not finite; they are left out."""
 
     def residuals(self, now: Geometry) -> Float64:
-        """(count, rows), unit variance."""
+        """Return residuals (count, rows) of unit variance."""
 
     def metres(self, residuals: Float64) -> Float64 | None:
-        """Lengths (count,) of residuals in metres; None where they are angles."""
+        """Return lengths (count,) of residuals in metres; None where they are angles."""
 
     def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
         """Add Jᵀ diag(weight) J (P, P) and Jᵀ diag(weight) r (P,), by :class:`Geometry`'s local changes."""
@@ -104,7 +104,7 @@ class _Side:
     """One end of n ties."""
 
     sensor: int
-    """−1: no sensor."""
+    """Index of the sensor; −1: no sensor."""
     body: Int64
     """(n,) traverse or object; −1: none."""
     point_m: Float64
@@ -114,10 +114,10 @@ class _Side:
     rotation: Float64
     """(n, 3, 3), or (1, 3, 3)."""
     beam_axis: Float64
-    """(3,), zero: away from the sensor."""
+    """(3,) beam direction; zero: away from the sensor."""
 
     def taken(self, index: Int64 | slice) -> _Side:
-        """Some of them."""
+        """Return some of the ends."""
         return replace(
             self,
             body=self.body[index],
@@ -131,11 +131,11 @@ class _Side:
         return self.sensor == _ABSENT
 
     def arrays(self) -> tuple[Int64, Float64, Float64, Float64]:
-        """As the kernels take it."""
+        """The side in the form that kernels take."""
         return self.body, self.point_m, self.position_m, self.rotation
 
     def mounting(self, now: Geometry) -> tuple[tuple[float, ...], tuple[float, ...], float, tuple[float, ...]]:
-        """As the kernels take it; without a sensor, one that changes nothing."""
+        """Return the mounting in the form that kernels take; without a sensor, the identity."""
         if self.sensor == _ABSENT:
             return tuple(np.eye(3).ravel().tolist()), (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0)
         return (
@@ -146,7 +146,7 @@ class _Side:
         )
 
     def finite(self) -> npt.NDArray[np.bool_]:
-        """(n,) whether all numbers are."""
+        """(n,) whether all numbers are finite."""
         good = (
             np.isfinite(self.point_m).all(1)
             & np.isfinite(self.position_m).all(1)
@@ -177,27 +177,27 @@ class TieObservations:
 
     @property
     def count(self) -> int:
-        """Observations."""
+        """Number of observations."""
         return len(self._weight)
 
     @property
     def rows(self) -> int:
-        """Numbers that one observation gives."""
+        """Number of residuals of one observation."""
         return int(self._weight.shape[1])
 
     @property
     def unusable(self) -> int:
-        """Observations that are not finite; they are left out."""
+        """Number of observations that are not finite; they are left out."""
         return self._unusable
 
     def residuals(self, now: Geometry) -> Float64:
-        """(count, rows), unit variance."""
+        """Return residuals (count, rows) of unit variance."""
         residual = np.empty((self.count, self.rows))
         tie_residuals(*self._ends(slice(None), now), self._weight, self._on_object, residual)
         return residual
 
     def metres(self, residuals: Float64) -> Float64 | None:
-        """(count,) root mean square over a tie's rows, each divided by its weight."""
+        """Return (count,) root mean square over a tie's rows, each divided by its weight."""
         scale = np.maximum(np.linalg.norm(self._weight, axis=2), 1e-300)
         length: Float64 = np.sqrt(np.mean((residuals / scale) ** 2, axis=1))
         return length
@@ -222,7 +222,7 @@ class TieObservations:
                 used = where >= 0
                 local = rows.T @ rows
                 slope = rows.T @ residual[start - part.start : end - part.start].ravel()
-                # Both ends may share a sensor or traverse: places repeat, and add.at sums them.
+                # Both ends may share a sensor or traverse, so places repeat and need add.at.
                 np.add.at(information, np.ix_(where[used], where[used]), local[np.ix_(used, used)])
                 np.add.at(gradient, where[used], slope[used])
 
@@ -230,25 +230,25 @@ class TieObservations:
         return (slice(begin, min(begin + _CHUNK, self.count)) for begin in range(0, self.count, _CHUNK))
 
     def _pairs(self, part: slice) -> Iterator[tuple[int, int]]:
-        """Spans of ties in a chunk that share both traverses."""
+        """Return spans of ties in a chunk that share both traverses."""
         inside = self._changes[(self._changes > part.start) & (self._changes < part.stop)].tolist()
         return pairwise([part.start, *inside, part.stop])
 
     @cached_property
     def _changes(self) -> Int64:
-        """Ties whose traverses differ from those before."""
+        """Return the ties whose traverses differ from those before."""
         first, second = self._first.body, self._second.body
         return np.flatnonzero((np.diff(first) != 0) | (np.diff(second) != 0)) + 1
 
     def _ends(self, part: slice, now: Geometry) -> tuple[object, ...]:
-        """Both ends, and the errors of poses with an exact one at the end, as the kernels take them."""
+        """Return both ends, and the errors of poses followed by an exact one, in the form that kernels take."""
         first, second = self._first.taken(part), self._second.taken(part)
         shift = np.concatenate([now.shift_world_m, np.zeros((1, 3))])
         turn = np.concatenate([now.turn, np.eye(3)[None]])
         return first.arrays(), first.mounting(now), second.arrays(), second.mounting(now), shift, turn
 
     def _places(self, first_body: int, second_body: int) -> Int64:
-        """(26,) among all unknowns; −1: none."""
+        """Return the columns (26,) among all unknowns; −1: none."""
         where = np.full(2 * (MOUNTING + BODY), _ABSENT, dtype=np.int64)
         for half, sensor, body in ((0, self._first.sensor, first_body), (1, self._second.sensor, second_body)):
             begin = half * (MOUNTING + BODY)
@@ -260,7 +260,7 @@ class TieObservations:
 
 
 def _cross(a: Float64, b: Float64) -> Float64:
-    """(n, k, 3) of vectors a (n, 3) and b (n, k, 3)."""
+    """Return cross products (n, k, 3) of vectors a (n, 3) and b (n, k, 3)."""
     x, y, z = (a[:, None, i] for i in range(3))
     return np.stack(
         [y * b[..., 2] - z * b[..., 1], z * b[..., 0] - x * b[..., 2], x * b[..., 1] - y * b[..., 0]], axis=-1
@@ -318,7 +318,7 @@ def _check_shapes(ties: Ties) -> None:
 
 
 class DirectionObservations:
-    """Directions: two numbers each, the angle across the direction in the body."""
+    """Observations of directions: two angles each, across the direction in the body."""
 
     fixed_weight: float | None = None
 
@@ -337,25 +337,25 @@ class DirectionObservations:
 
     @property
     def count(self) -> int:
-        """Observations."""
+        """Number of observations."""
         return len(self._across)
 
     @property
     def rows(self) -> int:
-        """Numbers that one observation gives."""
+        """Number of residuals of one observation."""
         return 2
 
     @property
     def unusable(self) -> int:
-        """Observations that are not finite; they are left out."""
+        """Number of observations that are not finite; they are left out."""
         return self._unusable
 
     def residuals(self, now: Geometry) -> Float64:
-        """(count, rows), unit variance."""
+        """Return residuals (count, rows) of unit variance."""
         return np.asarray(np.einsum("nki,ni->nk", self._across, self._turned(now)))
 
     def metres(self, residuals: Float64) -> Float64 | None:
-        """Angles have no length."""
+        """Return None, since angles have no length."""
         return None
 
     def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
@@ -375,7 +375,7 @@ class DirectionObservations:
 
 
 def _slanted(weight: Float64, normal_sigma_rad: Float64) -> Float64:
-    """(n, 2 k, 3) what rows (n, k, 3) that are off by their σ (n,) hold beside themselves."""
+    """Return the parts (n, 2 k, 3) that rows (n, k, 3) gain when their directions err by their σ (n,)."""
     length = np.linalg.norm(weight, axis=2)
     unit = weight / np.maximum(length, 1e-300)[..., None]
     across = _across(unit.reshape(-1, 3)) * (length * normal_sigma_rad[:, None]).reshape(-1, 1, 1)
@@ -383,7 +383,7 @@ def _slanted(weight: Float64, normal_sigma_rad: Float64) -> Float64:
 
 
 def _across(direction: Float64) -> Float64:
-    """(n, 2, 3) unit vectors at right angles to unit vectors (n, 3) and to each other."""
+    """Return (n, 2, 3) unit vectors perpendicular to unit vectors (n, 3) and to each other."""
     least = np.argmin(np.abs(direction), axis=1)
     first = np.cross(direction, np.eye(3)[least])
     first /= np.linalg.norm(first, axis=1, keepdims=True)

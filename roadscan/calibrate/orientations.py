@@ -1,8 +1,8 @@
-"""Orientations of sensors as observations: each with its covariance, and with the errors that several share.
+"""Orientations of sensors as observations, with their covariances and the errors that several share.
 
-An orientation is the solution of an adjustment of its own. It is not one of many alike, of which most are right: with a
-σ far below that of the other evidence it seems an outlier wherever the others have not come near yet. So it counts in
-full while the mountings are found, and is tested then, by what its residual may be beside the others: that has the
+An orientation is the solution of a separate adjustment. It is not one of many similar observations, most of them right:
+with a σ far below that of the other evidence it seems an outlier until the others have converged. So it has full weight
+while the mountings are estimated, and is tested afterwards against the other evidence: its residual has the
 covariance Q_r = Q − A C Aᵀ, and T = rᵀ Q_r⁻¹ r is χ² (Baarda 1968, "A testing procedure for use in geodetic networks").
 """
 
@@ -25,18 +25,18 @@ from roadscan.core.gpstime import NS_PER_S
 Float64 = npt.NDArray[np.float64]
 
 _TESTED: Final = 1e-4
-"""Directions in which the others know less than this share of what the orientation knows cannot contradict it: the
-iteration ends at 1 % of σ, which moves √T by 1 there."""
+"""Directions in which the other evidence has less than this share of the orientation's information cannot contradict
+it: the iteration ends at 1 % of σ, which moves √T by 1 there."""
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """An orientation and what speaks against it."""
+    """An orientation that contradicts the other evidence, and its test statistic."""
 
     kind: str
     sensor: str
     length: float
-    """√T: as that of `rows` standard normal numbers."""
+    """Test statistic √T, distributed as the length of `rows` standard normal numbers."""
     rows: int
 
 
@@ -58,25 +58,25 @@ class OrientationObservations:
 
     @property
     def count(self) -> int:
-        """Observations."""
+        """Number of observations."""
         return len(self._sensors)
 
     @property
     def rows(self) -> int:
-        """Numbers that one observation gives."""
+        """Number of residuals of one observation."""
         return 3
 
     @property
     def unusable(self) -> int:
-        """Observations that are not finite; they are left out."""
+        """Number of observations that are not finite; they are left out."""
         return 0
 
     def residuals(self, now: Geometry) -> Float64:
-        """(count, rows), unit variance, free of the errors shared with those before."""
+        """Return residuals (count, rows) of unit variance, decorrelated from those before."""
         return np.asarray((self._whitening @ self._away(now).ravel()).reshape(-1, 3))
 
     def metres(self, residuals: Float64) -> Float64 | None:
-        """Angles have no length."""
+        """Return None, since angles have no length."""
         return None
 
     def add(self, now: Geometry, weight: Float64, information: Float64, gradient: Float64) -> None:
@@ -90,7 +90,7 @@ class OrientationObservations:
         """Add nothing: these have no normals."""
 
     def contradictions(self, now: Geometry, covariance: Float64) -> list[Contradiction]:
-        """What the other evidence says against each; none of those that do not count.
+        """Test each orientation that has weight against the other evidence.
 
         Parameters
         ----------
@@ -113,12 +113,12 @@ class OrientationObservations:
         return found
 
     def _away(self, now: Geometry) -> Float64:
-        """(count, 3) small rotations from what was observed."""
+        """Return the small rotations (count, 3) from what was observed."""
         pairs = zip(self._sensors, self._observed, strict=True)
         return np.array([logarithm(now.body_from_sensor[s] @ observed.T) for s, observed in pairs])
 
     def _jacobian(self, now: Geometry, size: int) -> Float64:
-        """(3 count, size) of the residuals."""
+        """Return the Jacobian (3 count, size) of the residuals."""
         derivative = np.zeros((3 * self.count, size))
         for index, (sensor, away) in enumerate(zip(self._sensors, self._away(now), strict=True)):
             begin = MOUNTING * sensor + 3
@@ -127,7 +127,7 @@ class OrientationObservations:
 
 
 def joint_covariance(members: Sequence[Orientation]) -> Float64:
-    """(3 n, 3 n) covariance (rad²) of orientations that share errors of the trajectory's attitude."""
+    """Return the (3 n, 3 n) covariance (rad²) of orientations that share errors of the trajectory's attitude."""
     size = 3 * len(members)
     covariance = np.zeros((size, size))
     for i, first in enumerate(members):
@@ -141,7 +141,7 @@ def joint_covariance(members: Sequence[Orientation]) -> Float64:
 
 
 def _shared(first: AttitudeInfluence, second: AttitudeInfluence) -> Float64:
-    """(3, 3) covariance that two orientations have from the same piece of a trajectory; 0 of others."""
+    """Return the (3, 3) covariance of two orientations from the same piece of a trajectory; 0 for others."""
     a, b = first.epoch_gps_ns, second.epoch_gps_ns
     if a[0] > b[-1] or b[0] > a[-1]:
         return np.zeros((3, 3))

@@ -1,4 +1,4 @@
-"""Picture of a calibration: how the mountings changed, how well they are known, what the residuals say."""
+"""Draws a calibration: changes of the mountings, their σ, and the residuals."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _LEVER: Final = ("forward", "right", "down")
 _ANGLES: Final = ("roll", "pitch", "heading")
 _COLOURS: Final = ("#1f5fa8", "#d1495b", "#2e8b3d", "#e07a00", "#7b2d8b", "#555555")
 _HELD: Final = 0.9
-"""σ above this share of the prior's: not determined."""
+"""A direction with σ above this share of the prior's is not determined."""
 
 
 @dataclass(frozen=True)
 class SensorChange:
-    """How the mounting of a sensor changed: six numbers each, lever arm (m), then boresight (rad)."""
+    """Change of a sensor's mounting: six numbers each, lever arm (m), then boresight (rad)."""
 
     change: npt.NDArray[np.float64]
     sigma: npt.NDArray[np.float64]
@@ -35,7 +35,7 @@ class SensorChange:
 
 @dataclass(frozen=True)
 class CalibrationPicture:
-    """What is drawn: it can be kept as JSON and drawn again."""
+    """The content of the picture, which can be stored as JSON and drawn again."""
 
     title: str
     undetermined: tuple[str, ...]
@@ -45,19 +45,19 @@ class CalibrationPicture:
 
     @classmethod
     def of(cls, calibration: Calibration, title: str) -> CalibrationPicture:
-        """What is drawn of a calibration."""
+        """Collect the content for a calibration."""
         sensors = {n: SensorChange(_change(one), one.sigma, one.prior_sigma) for n, one in calibration.sensors.items()}
         return cls(title, tuple(calibration.observability.undetermined), sensors, calibration.figures)
 
     def as_values(self) -> dict[str, Any]:
-        """Numbers, texts and lists of them."""
+        """Return the content as numbers, texts and lists."""
         sensors = {n: {k: v.tolist() for k, v in vars(one).items()} for n, one in self.sensors.items()}
         figures = [asdict(one) for one in self.figures]
         return {"title": self.title, "undetermined": self.undetermined, "sensors": sensors, "figures": figures}
 
     @classmethod
     def of_values(cls, values: dict[str, Any]) -> CalibrationPicture:
-        """The inverse of :meth:`as_values`."""
+        """Rebuild the content; the inverse of :meth:`as_values`."""
         sensors = {n: SensorChange(**{k: np.array(v) for k, v in s.items()}) for n, s in values["sensors"].items()}
         figures = tuple(Figures(**one) for one in values["figures"])
         return cls(values["title"], tuple(values["undetermined"]), sensors, figures)
@@ -140,6 +140,6 @@ def _words(one: Figures) -> str:
 
 
 def _change(one: Calibrated) -> np.ndarray:
-    """(6,) m and rad, from the rig file's mounting to the calibrated one."""
+    """Return the change (6,), m and rad, from the rig file's mounting to the calibrated one."""
     (before, lever), (after, arm) = one.before.arrays(), one.mounting.arrays()
     return np.concatenate([arm - lever, logarithm(after @ before.T)])

@@ -1,8 +1,8 @@
-"""Mounting of a scanning sensor from a reference scan: registration, then exact ties of readings to planes.
+"""Estimates the mounting of a scanning sensor from a reference scan: registration, then ties of readings to planes.
 
-A terrestrial scanner's cloud shows where walls and ground are; the mobile sensor saw the same ones. The mounting that
-brings each reading, with the pose of its own epoch, onto the planes of the reference is the sought one: for a standing
-vehicle that is one rigid transformation (Mandli, Nagarajan and others 2016, section 3.1.2), for a driving one there is
+A terrestrial scanner's cloud contains walls and ground that the mobile sensor saw too. The mounting is estimated that
+brings each reading, with the pose of its epoch, onto the planes of the reference: for a standing vehicle that is one
+rigid transformation (Mandli, Nagarajan and others 2016, section 3.1.2), for a driving one there is
 a transformation for each reading. The search goes from coarse to fine: a standing scan is first registered with
 generalized ICP (`small_gicp`; Segal, Hähnel and Thrun 2009); then plane patches are looked up again while the mounting
 improves (point-to-plane ICP over the six parameters of the mounting; Chen and Medioni 1992).
@@ -35,44 +35,44 @@ Bool = npt.NDArray[np.bool_]
 KIND: Final = "reference"
 
 _FINEST: Final = (0.004, 0.0005)
-"""What the search takes the mounting to be known to at its end (m, rad)."""
+"""Uncertainty of the mounting assumed at the end of the search (m, rad)."""
 _STEP: Final = 0.45
-"""From level to level the mounting's uncertainty falls to this share."""
+"""Factor by which the mounting's assumed uncertainty falls from level to level."""
 _ROUGH_RAD: Final = 0.03
-"""From a start that is less sure than this, generalized ICP goes first."""
-_ICP_SHARES: Final = (1.0, 0.4, 0.15)
-_STRETCHES: Final = 5
-_STRETCH_M: Final = 0.6
+"""From a start with a larger uncertainty, generalized ICP runs first."""
+_ICP_SHARES: Final = (1.0, 0.4, 0.15)  # Shares of the search distance in successive runs of generalized ICP.
+_STRETCHES: Final = 5  # Number of stretches of a scan that are registered.
+_STRETCH_M: Final = 0.6  # Length of such a stretch along the path.
 _COARSE_CELLS: Final = 4.0
-"""Cells of the first levels, in final cells."""
-_COARSE_READINGS: Final = 6_000
-_FINE_READINGS: Final = 40_000
-_MOST_LOOKED_UP: Final = 200_000
-_STEPS: Final = 8
-_FINAL_STEPS: Final = 12
+"""Edge of the first levels' cells, as a multiple of the final edge."""
+_COARSE_READINGS: Final = 6_000  # Number of readings on all levels but the last.
+_FINE_READINGS: Final = 40_000  # Number of readings on the last level.
+_MOST_LOOKED_UP: Final = 200_000  # Most readings for which a plane is looked up at the end.
+_STEPS: Final = 8  # Most Gauss–Newton steps of a level.
+_FINAL_STEPS: Final = 12  # Most Gauss–Newton steps of the last level.
 _GATE: Final = 2.0
-"""A plane is within reach at this many σ of where the mounting's uncertainty may put the reading."""
+"""A plane is within reach up to this many σ of the position error caused by the mounting's uncertainty."""
 _FARTHEST_GATE_M: Final = 1.5
 """Readings that the mounting's uncertainty may displace farther than this wait for a finer level …"""
 _AT_LEAST: Final = 0.25
-"""… but for the nearest ones, this share of all."""
-_USUAL_NOISE_M: Final = 0.01
-_WORST_NOISE_M: Final = 0.04
-_LEAST_RANGE_SIGMA_M: Final = 2e-4
-_SQUARELY: Final = 0.7
-_LEAST_USED: Final = 50
-_CAUCHY: Final = 2.0
+"""… except the nearest ones, this share of all."""
+_USUAL_NOISE_M: Final = 0.01  # σ of a reading where the options state none; four times it widens the search for planes.
+_WORST_NOISE_M: Final = 0.04  # A larger estimated σ of the ranges is an error: these are other planes.
+_LEAST_RANGE_SIGMA_M: Final = 2e-4  # Least σ estimated for a reading.
+_SQUARELY: Final = 0.7  # Cosine of the angle of incidence above which readings estimate the σ along the beam.
+_LEAST_USED: Final = 50  # With fewer usable readings there is no solution.
+_CAUCHY: Final = 2.0  # Residuals of this many σ get half weight (Cauchy).
 _OUTLIER: Final = 3.5
 """Readings farther from their plane than this many σ are no ties."""
 _PATCH_OUTLIER: Final = 3.0
-"""A patch whose readings lie this many σ off on the median is another surface by now."""
+"""A patch whose readings have a median beyond this many σ is another surface by now."""
 _BY_NOISE: Final = 5.0
-"""Information of less than this many times what the noise of the normals brings is none."""
+"""Information below this multiple of what the noise of the normals contributes counts as none."""
 _FARTHEST: Final = 5.0
-"""An end farther from the start than this many σ of it is another place that looks alike."""
-_NEARLY: Final = 0.05
+"""A result farther from the start than this many of its σ is rejected: it is another place that looks alike."""
+_NEARLY: Final = 0.05  # A step below this share of the level's uncertainty ends a level other than the last.
 _CONVERGED: Final = 0.005
-"""A step below this share of the level's uncertainty is the last."""
+"""A step below this share of the level's uncertainty ends the last level."""
 
 
 class ReferenceOptions(Strict):
@@ -104,10 +104,10 @@ class Level:
 
     cell_m: float
     sigma_lever_m: float
-    """What the mounting was taken to be known to."""
+    """Assumed uncertainty of the mounting."""
     sigma_boresight_deg: float
     used: int
-    """Readings that met a plane within reach."""
+    """Number of readings with a plane within reach."""
     rms_m: float
     """RMS of their distances from the planes, outliers weighted down."""
 
@@ -117,7 +117,7 @@ class Registration:
     """A sensor's readings tied to a reference scan."""
 
     mounting: Mounting
-    """Where the search ended; the ties hold about it."""
+    """Mounting at the end of the search; the ties are linearised about it."""
     ties: Ties
     residual_m: Float64
     """(k,) distance of each tied reading from its plane, at that mounting."""
@@ -127,7 +127,7 @@ class Registration:
     """1 σ of a reading along its beam, as stated or as the residuals show it."""
     levels: tuple[Level, ...]
     fates: dict[str, int]
-    """What became of the readings: tied, near, no_plane, grazing, outlier, changed (the surface moved), spare."""
+    """Counts of readings by outcome: tied, near, no_plane, grazing, outlier, changed (the surface moved), spare."""
 
     @property
     def rms_m(self) -> float:
@@ -166,7 +166,7 @@ def register(
 
 
 def _best(searches: Sequence[_Search], planes: tuple[Surfels, Surfels], uncertainty: tuple[float, float]) -> _Search:
-    """The search, run to its end, in which most readings came to lie on planes."""
+    """Run all searches; return the one in which most readings lie on planes."""
     failures: list[ConfigError] = []
     done: list[_Search] = []
     for search in searches:
@@ -181,7 +181,7 @@ def _best(searches: Sequence[_Search], planes: tuple[Surfels, Surfels], uncertai
 
 
 def _local(reference_m: Float64) -> tuple[Float64, Float64]:
-    """Origin (3,) amid the reference scan, and its points from there."""
+    """Return an origin (3,) within the reference scan, and its points relative to it."""
     cloud = np.asarray(reference_m, np.float64)
     if cloud.ndim != 2 or cloud.shape[1:] != (3,) or len(cloud) == 0 or not np.isfinite(cloud).all():
         raise ConfigError(f"a reference scan of shape {cloud.shape}", expected="finite coordinates (n, 3), metres")
@@ -190,7 +190,7 @@ def _local(reference_m: Float64) -> tuple[Float64, Float64]:
 
 
 def _levels(lever_m: float, boresight_rad: float) -> Iterator[tuple[float, float]]:
-    """Uncertainties of the mounting (m, rad) from coarse to fine."""
+    """Return uncertainties of the mounting (m, rad) from coarse to fine."""
     while True:
         yield max(lever_m, _FINEST[0]), max(boresight_rad, _FINEST[1])
         if lever_m <= _FINEST[0] and boresight_rad <= _FINEST[1]:
@@ -207,7 +207,7 @@ def _coarse(local: Float64, cell_m: float, fine: Surfels) -> Surfels:
 
 @dataclass(frozen=True)
 class _Pose:
-    """Mounting as arrays."""
+    """A mounting as arrays."""
 
     rotation: Float64
     """(3, 3) body from sensor."""
@@ -219,12 +219,12 @@ class _Pose:
         return cls(*mounting.arrays())
 
     def moved(self, step: Float64) -> Self:
-        """After a step (6,): lever arm, then a small rotation about the body's axes."""
+        """Return the mounting after a step (6,): lever arm, then a small rotation about the body's axes."""
         turn = Rotation.from_rotvec(step[3:]).as_matrix()
         return type(self)(turn @ self.rotation, self.lever_m + step[:3])
 
     def since(self, start: _Pose) -> Float64:
-        """The step (6,) that leads here from `start`."""
+        """Return the step (6,) from `start` to this mounting."""
         turn = Rotation.from_matrix(self.rotation @ start.rotation.T).as_rotvec()
         return np.concatenate([self.lever_m - start.lever_m, turn])
 
@@ -236,7 +236,7 @@ class _Pose:
 
 @dataclass(frozen=True)
 class _Readings:
-    """Readings far enough from the vehicle, from the reference's origin."""
+    """Readings outside the vehicle, relative to the reference's origin."""
 
     index: Int64
     """(n,) in the scan given."""
@@ -245,7 +245,7 @@ class _Readings:
     world_from_body: Float64
     range_m: Float64
     given: int
-    """Readings of the scan, near ones too."""
+    """Number of readings of the scan, including near ones."""
 
     @classmethod
     def of(cls, scan: Seen, origin: Float64, range_min_m: float) -> Self:
@@ -268,7 +268,7 @@ class _Readings:
         )
 
     def thinned(self, most: int, wanted: Bool | None = None) -> _Readings:
-        """Some readings, drawn at random: an even step would pick the same beams again and again."""
+        """Draw some readings at random: an even step would select the same beams again and again."""
         chosen = np.arange(self.index.size) if wanted is None else np.flatnonzero(wanted)
         if chosen.size > most:
             chosen = np.sort(np.random.default_rng(0).permutation(chosen)[:most])
@@ -285,13 +285,13 @@ class _Readings:
         )
 
     def placed(self, pose: _Pose) -> tuple[Float64, Float64]:
-        """Places (n, 3) in the world, and the sensor's origin (n, 3)."""
+        """Return positions (n, 3) in the world, and the sensor's origin (n, 3)."""
         turned = self.point_sensor_m @ pose.rotation.T
         origin = self.position_m + self.world_from_body @ pose.lever_m
         return origin + np.einsum("nij,nj->ni", self.world_from_body, turned), origin
 
     def ways(self, pose: _Pose) -> Float64:
-        """Derivatives (n, 3, 6) of the places by a step of the mounting."""
+        """Return derivatives (n, 3, 6) of the positions by a step of the mounting."""
         turned = self.point_sensor_m @ pose.rotation.T
         turns = np.stack([np.cross(axis, turned) for axis in np.eye(3)], axis=-1)
         return np.concatenate([self.world_from_body, self.world_from_body @ turns], axis=-1)
@@ -299,7 +299,7 @@ class _Readings:
 
 @dataclass(frozen=True)
 class _Met:
-    """Readings that met a plane."""
+    """Readings with a plane within reach."""
 
     readings: _Readings
     patch: Int64
@@ -322,14 +322,14 @@ class _Search:
         self._prior = np.diag(1.0 / np.square(sigma))
 
     def run(self, planes: tuple[Surfels, Surfels], uncertainty: tuple[float, float]) -> None:
-        """All levels, on coarse planes and then on fine ones."""
+        """Run all levels, on coarse planes and then on fine ones."""
         coarse, fine = planes
         for sigma_m, sigma_rad in _levels(*uncertainty):
             surfels = coarse if _GATE * sigma_m > 0.5 * fine.cell_m else fine
             self.levels.append(self.improve(surfels, sigma_m, sigma_rad))
 
     def improve(self, surfels: Surfels, sigma_m: float, sigma_rad: float) -> Level:
-        """Gauss–Newton steps with planes within reach of what the mounting may be wrong."""
+        """Run Gauss–Newton steps with planes within the mounting's uncertainty."""
         gate = self._gate_m(self._readings, sigma_m, sigma_rad)
         reached = gate <= max(_FARTHEST_GATE_M, float(np.quantile(gate, _AT_LEAST)))
         is_last = (sigma_m, sigma_rad) == _FINEST
@@ -353,7 +353,7 @@ class _Search:
         return Level(surfels.cell_m, sigma_m, float(np.degrees(sigma_rad)), used, rms)
 
     def finish(self, surfels: Surfels, scan: Seen, origin: Float64) -> Registration:
-        """Ties at the mounting found."""
+        """Return the ties at the mounting found."""
         options = self._options
         self._check_way()
         readings = self._readings.thinned(_MOST_LOOKED_UP)
@@ -379,7 +379,7 @@ class _Search:
         kept = np.flatnonzero(~changed & ~outlier)
         chosen = kept[_capped(met.patch[kept], options.readings_a_patch, options.most_ties)]
         fates |= {"spare": kept.size - chosen.size, "tied": chosen.size}
-        # k readings of one plane share its error: each gets k times its variance, their mean then has it once.
+        # k readings of a plane share its error: k times the variance for each gives their mean the plane's variance.
         sharing = np.bincount(met.patch[chosen], minlength=len(surfels))[met.patch[chosen]]
         sigma = np.sqrt(variance[chosen] + sharing * plane_variance[chosen])
         index = met.readings.index[chosen]
@@ -402,7 +402,7 @@ class _Search:
         )
 
     def _check_way(self) -> None:
-        """Refuse an end that is farther from the start than its stated σ allows."""
+        """Reject a result farther from the start than its stated σ allows."""
         lever, turn = (float(np.linalg.norm(part)) for part in np.split(self._pose.since(self._start), 2))
         options = self._options
         sigma_m, sigma_deg = options.start_lever_sigma_m, options.start_boresight_sigma_deg
@@ -414,7 +414,7 @@ class _Search:
             )
 
     def _gate_m(self, readings: _Readings, sigma_m: float, sigma_rad: float) -> Float64:
-        """How far (n,) a reading may lie from its plane: by the mounting's uncertainty, and by its own noise."""
+        """How far (n,) a reading may lie from its plane, from the mounting's uncertainty and the reading's noise."""
         noise_m = 4.0 * (self._options.range_sigma_m or _USUAL_NOISE_M)
         return np.asarray(_GATE * (sigma_m + sigma_rad * readings.range_m) + noise_m)
 
@@ -427,7 +427,7 @@ class _Search:
         return _Met(readings[good], patch[good], distance[good], cosine[good], place[good])
 
     def _step(self, met: _Met, surfels: Surfels) -> tuple[Float64, float]:
-        """One Gauss–Newton step (6,) with Cauchy weights, and the weighted RMS before it (m)."""
+        """Return one Gauss–Newton step (6,) with Cauchy weights, and the weighted RMS before it (m)."""
         scale = max(scatter_about(met.distance_m, 0.0), 1e-4)
         weight = 1.0 / (1.0 + (met.distance_m / (_CAUCHY * scale)) ** 2)
         sigma = scale / np.sqrt(weight)
@@ -441,7 +441,7 @@ class _Search:
 
 
 def _insensitive(readings: _Readings, pose: _Pose, normal: Float64, wobble: Float64, sigma_m: Float64) -> Float64:
-    """Normals (n, 3) that say nothing of directions of the mounting which only the noise of the normals speaks of.
+    """Return normals (n, 3) without directions of the mounting that only the noise of the normals seems to determine.
 
     On flat ground each patch is tilted a little by the noise of its points, and many such tilts seem to hold the
     vehicle where it is. Directions whose information is no more than a few times what such noise brings are taken
@@ -462,7 +462,7 @@ def _insensitive(readings: _Readings, pose: _Pose, normal: Float64, wobble: Floa
 
 
 def _range_sigma(met: _Met, other_variance: Float64) -> float:
-    """σ along the beam that explains the residuals of readings that meet a surface squarely."""
+    """Return the σ along the beam that explains the residuals of readings near normal incidence."""
     square = met.cosine > _SQUARELY if (met.cosine > _SQUARELY).sum() >= _LEAST_USED else met.cosine > 0.0
     spread = scatter_about(met.distance_m[square], 0.0)
     rest = spread**2 - float(np.median(other_variance[square]))
@@ -470,7 +470,7 @@ def _range_sigma(met: _Met, other_variance: Float64) -> float:
 
 
 def _changed_patches(patch: Int64, whitened: Float64, patches: int) -> Bool:
-    """Patches (m,) whose readings lie off on the whole: what stood there in one scan stood elsewhere in the other."""
+    """Return the patches (m,) whose readings are off as a whole, since objects moved between the two scans."""
     order = np.lexsort((whitened, patch))
     count = np.bincount(patch, minlength=patches)
     middle = np.cumsum(count) - count + count // 2
@@ -481,7 +481,7 @@ def _changed_patches(patch: Int64, whitened: Float64, patches: int) -> Bool:
 
 
 def _capped(patch: Int64, a_patch: int, most: int) -> Int64:
-    """Readings (k,) in their order: no more than `a_patch` of each patch, spread evenly, and `most` in all."""
+    """Select readings (k,) in order: at most `a_patch` of each patch, spread evenly, and `most` in all."""
     rng = np.random.default_rng(0)
     shuffled = rng.permutation(patch.size)
     order = shuffled[np.argsort(patch[shuffled], kind="stable")]
@@ -495,7 +495,7 @@ def _capped(patch: Int64, a_patch: int, most: int) -> Int64:
 
 
 def _stretches(readings: _Readings) -> list[_Readings]:
-    """Up to five stretches of readings, spread over the scan, in which the vehicle moved little; deskewed later."""
+    """Return up to five short stretches of readings, spread over the scan; they are deskewed later."""
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(readings.position_m, axis=0), axis=1))])
     if path[-1] <= _STRETCH_M:
         return [readings]
@@ -505,7 +505,7 @@ def _stretches(readings: _Readings) -> list[_Readings]:
 
 
 def _leap(readings: _Readings, local: Float64, start: _Pose, uncertainty: tuple[float, float]) -> _Pose | None:
-    """From a rough start: generalized ICP of stretches in which the vehicle hardly moved, and their median."""
+    """Improve a rough start by generalized ICP of short stretches, and their median."""
     found = [_generalized_icp(one, local, start, uncertainty) for one in _stretches(readings)]
     steps = np.array([pose.since(start) for pose in found if pose is not None])
     return start.moved(np.median(steps, axis=0)) if len(steps) else None
@@ -514,7 +514,7 @@ def _leap(readings: _Readings, local: Float64, start: _Pose, uncertainty: tuple[
 def _generalized_icp(
     readings: _Readings, local: Float64, pose: _Pose, uncertainty: tuple[float, float]
 ) -> _Pose | None:
-    """Mounting by registering one stretch as if the vehicle stood at its middle; None where it does not converge."""
+    """Register one stretch as if the vehicle stood at its middle; None where it does not converge."""
     few = readings.thinned(4 * _COARSE_READINGS)
     place, _ = few.placed(pose)
     middle = few.index.size // 2

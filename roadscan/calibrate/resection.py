@@ -1,9 +1,9 @@
-"""Mounting of a camera by resection on control points, in all pictures at once.
+"""Estimates the mounting of a camera by resection on control points, in all pictures at once.
 
 Each measurement is a ray of the camera that has to pass through a control point (collinearity equations; Kraus 2007,
-Photogrammetry, section 4.2). With the poses of the body the pictures share one unknown mounting. It goes to the
-estimator of all mountings as ties that know nothing along their ray, so that poses have their σ, directions that the
-points do not determine are said, and other evidence may join.
+Photogrammetry, section 4.2). With the poses of the body the pictures share one unknown mounting. The
+estimator of all mountings gets ties without information along their ray, so that poses have their σ, directions that
+the points do not determine are reported, and other evidence can be added.
 
 Sensor axes of a camera are forward along the optical axis, right, down; OpenCV's are right, down, forward.
 """
@@ -34,13 +34,13 @@ Bool = npt.NDArray[np.bool_]
 
 KIND: Final = "resection"
 SENSOR_FROM_OPENCV: Final[Float64] = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Forward, right, down from right, down, forward."""
+"""Rotation from OpenCV's axes (right, down, forward) to sensor axes (forward, right, down)."""
 
-_LEAST_MEASURED: Final = 3
-_LEAST_OF_A_PICTURE: Final = 4
+_LEAST_MEASURED: Final = 3  # Least number of usable measurements.
+_LEAST_OF_A_PICTURE: Final = 4  # Least number of measurements in a picture from which a start is computed.
 _START_GATE: Final = 0.02
-"""Measurements within this share of the focal length speak for a start."""
-_START_GATE_PX: Final = 8.0
+"""A measurement supports a start if it lies within this share of the focal length."""
+_START_GATE_PX: Final = 8.0  # Least such distance, and the limit for outliers in RANSAC.
 _REACH: Final = 3.0
 """With the rig file's mounting measurements may lie off by this many of its σ."""
 _RANSAC_ROUNDS: Final = 500
@@ -65,7 +65,7 @@ class Exposure:
     world_from_body: Float64
     """(3, 3)."""
     error: Traverse
-    """How far the pose may be wrong."""
+    """Error model of the pose."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Measured:
-    """A control point in a picture."""
+    """A control point measured in a picture."""
 
     picture: str
     point: str
@@ -93,16 +93,16 @@ class Measured:
 
 @dataclass(frozen=True)
 class Residual:
-    """What is left of a measurement."""
+    """Residual of a measurement."""
 
     measured: Measured
     du_px: float
     """Observed − computed."""
     dv_px: float
     normalised: float
-    """Its length in units of its σ, per coordinate."""
+    """Length of the residual in units of its σ, per coordinate."""
     used: bool
-    """False: left out as an outlier."""
+    """False where it was left out as an outlier."""
 
 
 @dataclass(frozen=True)
@@ -113,11 +113,11 @@ class Resection:
     calibration: Calibration
     residuals: tuple[Residual, ...]
     start: str
-    """What the search began with: the rig file, or a picture."""
+    """Start of the search: the rig file, or a picture."""
 
     @property
     def found(self) -> Calibrated:
-        """Mounting with covariance, and what is not determined."""
+        """Mounting with covariance, and undetermined directions."""
         return self.calibration.sensors[self.sensor]
 
     @property
@@ -138,7 +138,7 @@ class Resection:
 
 
 def project(interior: Interior, point_sensor_m: Float64) -> Float64:
-    """Pixels (n, 2: u, v) of points (n, 3) in sensor axes; NaN behind the camera."""
+    """Return pixels (n, 2: u, v) of points (n, 3) in sensor axes; NaN behind the camera."""
     opencv_axes = np.ascontiguousarray(point_sensor_m @ SENSOR_FROM_OPENCV)
     ahead = opencv_axes[:, 2] > _BEHIND_M
     pixels = np.full((len(opencv_axes), 2), np.nan)
@@ -149,7 +149,7 @@ def project(interior: Interior, point_sensor_m: Float64) -> Float64:
 
 
 def tangents(interior: Interior, pixel: Float64) -> Float64:
-    """Tangents (n, 2: right and down per metre ahead) of pixels (n, 2); NaN where the distortion has no inverse."""
+    """Return tangents (n, 2: right and down per metre ahead) of pixels (n, 2); NaN where distortion has no inverse."""
     matrix, distortion = _opencv(interior)
     settled = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ROUNDS, _SETTLED)
     found = cv2.undistortPoints(pixel.reshape(-1, 1, 2), matrix, distortion, criteria=settled).reshape(-1, 2)
@@ -169,7 +169,7 @@ def resect(
     sigma_px: float = 0.5,
     settings: CalibrationSettings | None = None,
 ) -> Resection:
-    """Mounting of a camera by least squares over all pictures.
+    """Estimate the mounting of a camera by least squares over all pictures.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ def _opencv(interior: Interior) -> tuple[Float64, Float64]:
 
 @dataclass(frozen=True)
 class _Poses:
-    """Poses of the body, one a measurement."""
+    """Poses of the body, one for each measurement."""
 
     position_m: Float64
     """(n, 3) world."""
@@ -236,7 +236,7 @@ class _Block:
 
     @cached_property
     def pixel(self) -> Float64:
-        """(n, 2)."""
+        """(n, 2) measured pixels."""
         return np.array([(m.u_px, m.v_px) for m in self.measured], dtype=np.float64)
 
     @cached_property
@@ -258,14 +258,14 @@ class _Block:
 
     @cached_property
     def stated(self) -> _Poses:
-        """Of the body, as the trajectory has them."""
+        """Poses of the body as stated in the trajectory."""
         return _Poses(
             np.array([e.position_world_m for e in self.exposures])[self.picture],
             np.array([e.world_from_body for e in self.exposures])[self.picture],
         )
 
     def corrected(self, calibration: Calibration) -> _Poses:
-        """With the errors that the estimator found in them."""
+        """Return the poses corrected by the errors that the estimator found."""
         position, attitude = self.stated.position_m.copy(), self.stated.world_from_body.copy()
         for k, correction in calibration.corrections.items():
             own = self.picture == k
@@ -275,11 +275,11 @@ class _Block:
 
     @cached_property
     def tangent(self) -> Float64:
-        """(n, 2)."""
+        """(n, 2) tangents of the pixels."""
         return tangents(self.interior, self.pixel)
 
     def check(self) -> None:
-        """Refuse measurements that cannot be used."""
+        """Reject measurements that cannot be used."""
         pictures, points = {e.name for e in self.exposures}, {t.name for t in self.targets}
         for m in self.measured:
             if m.picture not in pictures:
@@ -312,13 +312,13 @@ class _Block:
             )
 
     def in_sensor(self, mounting: Mounting, poses: _Poses) -> Float64:
-        """Control points (n, 3) in sensor axes."""
+        """Return the control points (n, 3) in sensor axes."""
         rotation, lever = mounting.arrays()
         body = np.einsum("nji,nj->ni", poses.world_from_body, self.point_m - poses.position_m)
         return np.asarray((body - lever) @ rotation)
 
     def best_start(self, nominal: Mounting) -> tuple[str, Mounting]:
-        """The mounting that most measurements agree with: what one picture says by itself, or the rig file's."""
+        """Return the mounting that most measurements support: computed from one picture, or the rig file's."""
         starts = [("the rig file", nominal)]
         for k, exposure in enumerate(self.exposures):
             own = np.flatnonzero(self.picture == k)
@@ -328,20 +328,20 @@ class _Block:
         return max(starts, key=lambda start: int(self.plausible(start[1]).sum()))
 
     def reach_px(self, prior: Prior) -> Float64:
-        """How far (n,) measurements may lie from where the rig file's mounting has them."""
+        """Return how far (n,) measurements may lie from their positions with the rig file's mounting."""
         depth = np.maximum(self.in_sensor(prior.mounting, self.stated)[:, 0], 1.0)
         lever, boresight = np.linalg.norm(prior.lever_arm_sigma_m), np.linalg.norm(prior.boresight_sigma_rad)
         return np.asarray(_REACH * float(np.mean(self.interior.focal_px)) * (lever / depth + boresight))
 
     def plausible(self, mounting: Mounting, reach_px: npt.ArrayLike = 0.0) -> Bool:
-        """Measurements (n,) near where this mounting has them."""
+        """Return the measurements (n,) that are close to their positions with this mounting."""
         near = max(_START_GATE * float(np.mean(self.interior.focal_px)), _START_GATE_PX)
         gate = np.maximum(near, reach_px)
         away = np.linalg.norm(project(self.interior, self.in_sensor(mounting, self.stated)) - self.pixel, axis=1)
         return np.asarray(away < gate)
 
     def _alone(self, own: Int64) -> Mounting | None:
-        """Mounting from the measurements of one picture, robust against wrong ones."""
+        """Compute the mounting from the measurements of one picture, robust against wrong ones."""
         origin = self.stated.position_m[own[0]]
         cv2.setRNGSeed(0)
         found, turn, shift, _ = cv2.solvePnPRansac(
@@ -365,7 +365,7 @@ class _Block:
         return Mounting((float(lever[0]), float(lever[1]), float(lever[2])), rows)
 
     def solved(self, prior: Prior, use: Bool, settings: CalibrationSettings | None) -> Calibration:
-        """The estimator's mounting from the measurements in use."""
+        """Return the estimator's mounting from the measurements in use."""
         if use.sum() < _LEAST_MEASURED:
             raise ConfigError(
                 f"{int(use.sum())} of {use.size} measurements agree with one mounting",
@@ -381,7 +381,7 @@ class _Block:
         return calibrate({self.sensor: prior}, ties, traverses, settings)
 
     def _ties(self, mounting: Mounting, chosen: Int64) -> Ties:
-        """Each ray at the depth of its point; its rows see no movement along it."""
+        """Return ties with each ray at the depth of its point; their rows have no component along the ray."""
         depth, rows, covariance = self._rows(mounting, self.stated, chosen)
         ray = np.column_stack([np.ones(chosen.size), self.tangent[chosen]]) * depth[:, None]
         whiten = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -390,21 +390,21 @@ class _Block:
         return Ties(KIND, seen, Known(self.point_m[chosen]), whiten @ rows)
 
     def _rows(self, mounting: Mounting, poses: _Poses, chosen: Int64) -> tuple[Float64, Float64, Float64]:
-        """Depths (k,) of points; of their tangents derivatives (k, 2, 3) by their places, and covariance (k, 2, 2)."""
+        """Return depths (k,), derivatives (k, 2, 3) of the tangents by the points, and their covariance (k, 2, 2)."""
         depth = np.maximum(self.in_sensor(mounting, poses)[chosen, 0], _BEHIND_M)
         own = np.zeros((chosen.size, 2, 3))
         own[:, 0, 1] = own[:, 1, 2] = 1.0
         own[:, :, 0] = -self.tangent[chosen]
         world_from_sensor = poses.world_from_body[chosen] @ mounting.arrays()[0]
         rows = own @ world_from_sensor.transpose(0, 2, 1) / depth[:, None, None]
-        # k pictures of one point share its error: each gets k times its variance, their mean then has it once.
+        # k pictures of a point share its error: k times the variance for each gives their mean the point's variance.
         sharing = np.bincount(self.target[chosen], minlength=len(self.targets))[self.target[chosen]]
         point = np.array([t.covariance_m2 for t in self.targets])[self.target[chosen]] * sharing[:, None, None]
         of_pixel = np.diag((self.sigma_px / np.array(self.interior.focal_px)) ** 2)
         return depth, rows, rows @ point @ rows.transpose(0, 2, 1) + of_pixel
 
     def _away(self, calibration: Calibration) -> tuple[Float64, Float64]:
-        """Observed − computed (n, 2: px), with the poses as corrected, and their length by their σ, per coordinate."""
+        """Return observed − computed (n, 2: px) with corrected poses, and their length by their σ, per coordinate."""
         mounting = calibration.sensors[self.sensor].mounting
         poses = self.corrected(calibration)
         away = self.pixel - project(self.interior, self.in_sensor(mounting, poses))
@@ -414,12 +414,12 @@ class _Block:
         return away, np.sqrt(np.where(np.isfinite(squared), squared, np.inf))
 
     def normalised(self, calibration: Calibration) -> Float64:
-        """(n,) residuals by their σ, which grows with that of the measurements in use."""
+        """Return (n,) residuals by their σ, which grows with that of the measurements in use."""
         (kind,) = calibration.kinds
         return self._away(calibration)[1] / float(np.sqrt(max(kind.variance_factor, 1.0)))
 
     def worst_by_picture(self, normalised: Float64, use: Bool) -> Bool:
-        """The worst outlier (n,) of each picture: it may have drawn the others out of place."""
+        """Return the worst outlier (n,) of each picture: it may have made others outliers."""
         worst = np.zeros(use.size, dtype=bool)
         for k in np.unique(self.picture):
             own = np.flatnonzero(use & (self.picture == k) & (normalised > _OUTLIER))
@@ -428,7 +428,7 @@ class _Block:
         return worst
 
     def residuals(self, calibration: Calibration, use: Bool) -> tuple[Residual, ...]:
-        """Of all measurements."""
+        """Return the residuals of all measurements."""
         away, _ = self._away(calibration)
         normalised = self.normalised(calibration)
         return tuple(

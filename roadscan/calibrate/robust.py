@@ -1,11 +1,11 @@
-"""How much each observation counts: Huber weights, rejection, variance factor by kind.
+"""Weights of observations: Huber weights, rejection, variance factor by kind.
 
-All of it takes many observations of a kind, most of them right; orientations are not such
+This requires many observations of a kind, most of them right; orientations are treated separately
 (:mod:`roadscan.calibrate.orientations`).
 
 The variance factor of a kind is that of an M-estimator (Huber 1981, eq. 7.6.5): mean square of the clipped residuals
 over the squared share of those that are not clipped. It is applied where it is significantly above 1, never below:
-residuals that are better than stated may have errors in common that they do not show.
+residuals that are smaller than stated may share errors that they do not show.
 """
 
 from __future__ import annotations
@@ -25,39 +25,39 @@ from roadscan.core.settings.calibration import CalibrationSettings
 Float64 = npt.NDArray[np.float64]
 
 _ENOUGH: Final = 30
-"""Observations from which on their median tells how large they are."""
-_SIGNIFICANT: Final = 0.95
+"""Least number of observations from whose median their spread is estimated."""
+_SIGNIFICANT: Final = 0.95  # A variance factor is applied if its χ² exceeds this quantile.
 
 
 @dataclass(frozen=True)
 class Scales:
-    """How large the residuals of each kind are, and how much the kind counts."""
+    """Spread of the residuals of each kind, and weight of the kind."""
 
     spread: Mapping[str, float]
-    """In units of the stated σ, at least 1; limits are multiples of it."""
+    """Spread in units of the stated σ, at least 1; limits are multiples of it."""
     variance_factor: Mapping[str, float]
     share: Mapping[str, float]
-    """Independent observations to observations."""
+    """Number of independent observations over number of observations."""
     robust_limit: float
     reject_limit: float
 
     def gain(self, kind: str) -> float:
-        """What the normal equations of a kind are multiplied by."""
+        """Return the factor on the normal equations of a kind."""
         return self.share[kind] / self.variance_factor[kind]
 
     def limits(self, kind: str, rows: int) -> tuple[float, float]:
-        """Robust and reject limit of the length of `rows` residuals: as rare as those of one."""
+        """Return robust and reject limit for the length of `rows` residuals, as rarely exceeded as those for one."""
         spread = self.spread[kind]
         return spread * length_limit(self.robust_limit, rows), spread * length_limit(self.reject_limit, rows)
 
     def with_factors(self, factors: Mapping[str, float], share: Mapping[str, float]) -> Scales:
-        """The same limits with other weights of the kinds."""
+        """Return the same limits with other weights of the kinds."""
         return replace(self, variance_factor=dict(factors), share=dict(share))
 
 
 @dataclass(frozen=True)
 class Weighed:
-    """Observations with their residuals at one place, and what each counts."""
+    """Observations with their residuals at one point, and their weights."""
 
     observations: Observations
     residuals: Float64
@@ -74,7 +74,7 @@ class Weighed:
 
 
 def scales_of(found: Sequence[Observations], residuals: Sequence[Float64], settings: CalibrationSettings) -> Scales:
-    """Spread of each kind from the median of its residuals, robust against half of them."""
+    """Return the spread of each kind from the median of its residuals, robust against half of them."""
     normed: dict[str, list[Float64]] = {}
     for one, residual in zip(found, residuals, strict=True):
         normed.setdefault(one.kind, []).append(np.sum(residual**2, axis=1) / _median(one.rows))
@@ -88,7 +88,7 @@ def scales_of(found: Sequence[Observations], residuals: Sequence[Float64], setti
 
 
 def weigh(one: Observations, residuals: Float64, scales: Scales, *, reject: bool) -> Weighed:
-    """Huber's weights; with `reject`, nothing beyond the reject limit."""
+    """Compute Huber's weights; with `reject`, observations beyond the reject limit get 0."""
     robust, limit = scales.limits(one.kind, one.rows)
     length = np.linalg.norm(residuals, axis=1)
     if one.fixed_weight is not None:
@@ -100,7 +100,7 @@ def weigh(one: Observations, residuals: Float64, scales: Scales, *, reject: bool
 
 
 def loss(one: Weighed, scales: Scales, *, reject: bool) -> float:
-    """Sum of Huber's function, constant beyond the reject limit with `reject`."""
+    """Return the sum of Huber's function, constant beyond the reject limit with `reject`."""
     if one.observations.fixed_weight is not None:
         return float((one.weight * one.length**2).sum())
     robust, limit = scales.limits(one.kind, one.observations.rows)
@@ -109,7 +109,7 @@ def loss(one: Weighed, scales: Scales, *, reject: bool) -> float:
 
 
 def independent_share(weighed: Sequence[Weighed], most: float) -> dict[str, float]:
-    """By kind: at most so many independent observations, as a share of those that count."""
+    """Return for each kind the factor that limits its sum of weights to `most` independent observations."""
     counted: dict[str, float] = {}
     for one in weighed:
         counted[one.kind] = counted.get(one.kind, 0.0) + float(one.weight.sum())
@@ -117,7 +117,7 @@ def independent_share(weighed: Sequence[Weighed], most: float) -> dict[str, floa
 
 
 def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: float) -> float:
-    """Factor of one kind's variances.
+    """Return the factor on one kind's variances.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: floa
     squares = rows = whole = used = total_weight = 0.0
     for one in weighed:
         if one.observations.fixed_weight is not None:
-            # A handful of numbers that the solution mostly follows has no spread of its own to be told.
+            # No spread can be estimated from a few residuals that the solution mostly follows.
             continue
         k = one.observations.rows
         kept = one.weight > 0
@@ -142,20 +142,20 @@ def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: floa
         return 1.0
     if squares <= 2.0 * gammaincinv(redundancy / 2.0, _SIGNIFICANT):
         return 1.0
-    # Normal equations hold the mean weight where Huber's formula has the squared share of whole residuals.
+    # Normal equations contain the mean weight, Huber's formula the squared share of unclipped residuals.
     clipped = (total_weight / used) / (whole / used) ** 2
     return max(1.0, squares / redundancy * clipped)
 
 
 @cache
 def length_limit(limit: float, rows: int) -> float:
-    """Length of `rows` standard normal numbers that is exceeded as rarely as `limit` by one."""
-    # Farther out probabilities have no number.
+    """Return the length of `rows` standard normal numbers that is exceeded as rarely as `limit` by one."""
+    # Farther out, probabilities underflow.
     usual = min(limit, 30.0)
     return float(np.sqrt(chdtri(rows, chdtrc(1, usual**2)))) + limit - usual
 
 
 @cache
 def _median(rows: int) -> float:
-    """Median of the squared length of `rows` standard normal numbers."""
+    """Return the median of the squared length of `rows` standard normal numbers."""
     return float(2.0 * gammaincinv(rows / 2.0, 0.5))

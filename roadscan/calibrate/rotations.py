@@ -11,7 +11,7 @@ Float64 = npt.NDArray[np.float64]
 
 
 def cross_matrix(vector: Float64) -> Float64:
-    """(…, 3, 3) with cross_matrix(v) @ w = v × w, of vectors (…, 3)."""
+    """Return (…, 3, 3) with cross_matrix(v) @ w = v × w, of vectors (…, 3)."""
     x, y, z = np.moveaxis(vector, -1, 0)
     zero = np.zeros_like(x)
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
@@ -19,7 +19,7 @@ def cross_matrix(vector: Float64) -> Float64:
 
 
 def exponential(vector: Float64) -> Float64:
-    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3), rad. Rodrigues' formula."""
+    """Return rotation matrices (…, 3, 3) of rotation vectors (…, 3), rad. Rodrigues' formula."""
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
     turn = cross_matrix(vector)
     rotation: Float64 = (
@@ -29,7 +29,7 @@ def exponential(vector: Float64) -> Float64:
 
 
 def logarithm(rotation: Float64) -> Float64:
-    """Rotation vectors (…, 3), rad, of rotation matrices (…, 3, 3), the shorter way round."""
+    """Return rotation vectors (…, 3), rad, of rotation matrices (…, 3, 3), the shorter way round."""
     quaternion = quaternion_from_rotation(rotation)
     sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
     small = sine < 1e-12
@@ -39,7 +39,7 @@ def logarithm(rotation: Float64) -> Float64:
 
 
 def left_jacobian(vector: Float64) -> Float64:
-    """J (3, 3) with exp(v + dv) ≈ exp(J dv) exp(v), for a vector (3,) of less than a turn.
+    """Return J (3, 3) with exp(v + dv) ≈ exp(J dv) exp(v), for a vector (3,) of less than a turn.
 
     Barfoot (2017), State Estimation for Robotics, eq. 7.77a; J(−v) is the right Jacobian.
     """

@@ -1,12 +1,12 @@
-"""Orientation of a sensor head from the IMU inside it, held against the trajectory: stop and go.
+"""Estimates the orientation of a sensor head from the IMU inside it and the trajectory, in stop-and-go driving.
 
 While the vehicle stands, gravity gives roll and pitch of the head, as well as the biases of its accelerometers allow.
-When it turns, the vector of the angular rate gives both without them; gravity then tells the biases; and braking and
+When it turns, the vector of the angular rate gives both without them; gravity then gives the biases; and braking and
 driving through curves give the heading. All of it is one least-squares adjustment over short windows:
 
 - **Force.** Over 2 T with triangular weights, the mean acceleration of the head is a second difference of its
-  positions, (x(t + T) − 2 x(t) + x(t − T)) / T², and needs no derivative of the trajectory. It is held against the mean
-  of the specific forces, each turned by the attitude of its own epoch.
+  positions, (x(t + T) − 2 x(t) + x(t − T)) / T², and needs no derivative of the trajectory. It is compared with the
+  mean of the specific forces, each turned by the attitude of its epoch.
 - **Rotation.** Between two epochs, the head's rotation vector is the body's in other axes, exactly, if the rates are
   composed with coning and the body's rotation counts against inertial space.
 
@@ -44,34 +44,34 @@ Int64 = npt.NDArray[np.int64]
 KIND: Final = "stop and go"
 
 _FORCE_S: Final = 1.0
-"""Half the width of a window of forces: twice differenced positions become exact with its power 1.5."""
+"""Half the width of a window of forces: the error of a second difference falls with its power 1.5."""
 _TURN_S: Final = 0.2
-"""Length of a window of rotations: short enough for the body's motion on its springs."""
+"""Length of a window of rotations: short compared with the body's motion on its springs."""
 _KNOT_S: Final = 2.0
 """Slow errors are linear between knots this far apart: as they wander between knots, windows of one curve err alike,
-which their residuals do not tell."""
+which their residuals do not show."""
 _PIECE_S: Final = 150.0
 """Longer runs are cut into pieces whose slow errors are independent."""
 _CLOCK_SIGMA_S: Final = 0.01
-"""1 σ of the time by which stamps are late: half a sample, and what is left after the clocks' estimate."""
-_CLOCK_STEP_NS: Final = 5_000_000
+"""1 σ of the delay of stamps: half a sample, and what is left after the clocks' estimate."""
+_CLOCK_STEP_NS: Final = 5_000_000  # Step of the numerical derivative by the delay of stamps.
 _UNKNOWN_RAD: Final = 1.0
-"""Prior σ of the orientation: none."""
-_ROUNDS: Final = 12
-_HUBER: Final = 3.0
-_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
-_LOCAL_GRAVITY_SIGMA_M_PER_S2: Final = 0.03
+"""Prior σ of the orientation, which stands for no prior."""
+_ROUNDS: Final = 12  # Most rounds of the adjustment.
+_HUBER: Final = 3.0  # Residuals beyond this many times the robust scale get less weight.
+_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # Also gravity in local frames.
+_LOCAL_GRAVITY_SIGMA_M_PER_S2: Final = 0.03  # Of gravity in local frames.
 _LOCAL_RATE_SIGMA_RAD_PER_S: Final = 7.3e-5
-"""In a local frame, gravity and the Earth's rotation are not known better; the biases take them up."""
-_STANDING_M_PER_S: Final = 0.05
-_FAR_OFF_RAD: Final = np.radians(20.0)
+"""In a local frame the Earth's rotation is not known better; it is added to the gyroscopes' bias."""
+_STANDING_M_PER_S: Final = 0.05  # Below this speed a window counts as standing.
+_FAR_OFF_RAD: Final = np.radians(20.0)  # Largest change of the nominal orientation.
 
 _SHARED: Final = 6
-"""Unknowns of all runs: orientation (3), lever arm (3)."""
+"""Unknowns that all runs share: orientation (3), lever arm (3)."""
 _SLOW: Final = 9
 """Unknowns of a knot: bias of the accelerometers (3), of the gyroscopes (3), attitude error (3)."""
 _FIXED: Final = 7
-"""Unknowns of a run: scales of accelerometers (3) and gyroscopes (3), time (1)."""
+"""Unknowns of a run: scales of accelerometers (3) and gyroscopes (3), delay (1)."""
 
 _Rows = tuple[Float64, Float64, csr_matrix]
 
@@ -81,7 +81,7 @@ class HeadRun:
     """One run with the samples of a head's IMU."""
 
     readings: ImuReadings
-    """Samples; epochs are instants here."""
+    """Samples; their epochs are instants."""
     trajectory: Trajectory
     sigma_roll_pitch_heading_rad: tuple[float, float, float]
     """1 σ of the trajectory's attitude."""
@@ -91,12 +91,12 @@ class HeadRun:
 
 @dataclass(frozen=True)
 class HeadOrientation:
-    """Orientation of a head's IMU, and how it was found."""
+    """Orientation of a head's IMU, with statistics of its estimation."""
 
     body_from_imu: Float64
     """(3, 3)"""
     covariance_rad2: Float64
-    """(3, 3) of a small rotation about the body's axes that follows it."""
+    """(3, 3) of a small rotation about the body's axes that follows `body_from_imu`."""
     correction_rad: Float64
     """(3,) from the nominal orientation to this one."""
     force_residual_m_per_s2: Float64
@@ -104,17 +104,17 @@ class HeadOrientation:
     turn_residual_rad: Float64
     """(3,)"""
     windows: int
-    """Windows of forces."""
+    """Number of windows of forces."""
     standing: int
-    """Those during which the vehicle stood."""
+    """Number of those during which the vehicle stood."""
     late_s: tuple[float, ...]
-    """By run (pieces of long ones): the stamps of the head's IMU are late by so much."""
+    """Delay of the stamps of the head's IMU, by run (pieces of long ones)."""
     accelerometer_bias_m_per_s2: Float64
     """(runs or pieces, 3) mean over each, IMU axes."""
     gyroscope_bias_rad_per_s: Float64
     """(runs or pieces, 3)"""
     attitude: tuple[AttitudeInfluence, ...] = ()
-    """By run or piece: what of its error is that of the trajectory, which other heads share."""
+    """By run or piece: the part of the error that comes from the trajectory, which other heads share."""
 
     @property
     def sigma_rad(self) -> Float64:
@@ -122,7 +122,7 @@ class HeadOrientation:
         return np.sqrt(np.diag(self.covariance_rad2))
 
     def evidence(self, sensor: str, sensor_nominal: Mounting, imu_nominal: Mounting) -> Orientation:
-        """Orientation of the sensor in whose head the IMU sits, turned to it as the rig file states."""
+        """Return the orientation of the sensor in whose head the IMU sits, through the rig file's relative rotation."""
         body_from_sensor, _ = sensor_nominal.arrays()
         body_from_imu, _ = imu_nominal.arrays()
         imu_from_sensor = body_from_imu.T @ body_from_sensor
@@ -136,7 +136,7 @@ def find_orientation(
     lever_arm_sigma_m: tuple[float, float, float],
     errors: ImuErrors,
 ) -> HeadOrientation:
-    """Orientation of a head's IMU.
+    """Estimate the orientation of a head's IMU.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def find_orientation(
 
 
 def _pieces(run: HeadRun) -> Iterator[HeadRun]:
-    """A run in pieces of some minutes at most."""
+    """Cut a run into pieces of `_PIECE_S` at most."""
     epochs = run.readings.epochs_gps_ns
     if not epochs.size:
         return
@@ -187,7 +187,7 @@ def _pieces(run: HeadRun) -> Iterator[HeadRun]:
 
 
 class _Run:
-    """The windows of one run, as far as they do not depend on the orientation."""
+    """Windows of one run, with what does not depend on the orientation."""
 
     def __init__(self, run: HeadRun, nominal: Mounting, errors: ImuErrors) -> None:
         self._run = run
@@ -208,7 +208,7 @@ class _Run:
 
     @property
     def count(self) -> int:
-        """Windows of forces."""
+        """Number of windows of forces."""
         return len(self.force_centres)
 
     def _force_windows(self, world_from_body: Float64) -> None:
@@ -234,7 +234,7 @@ class _Run:
         self.felt_by_time = (later - earlier) / (2 * _CLOCK_STEP_NS / NS_PER_S)
 
     def _posed(self, samples: Int64, around_ns: int) -> npt.NDArray[np.bool_]:
-        """Which samples have poses at themselves and to both sides."""
+        """Return which samples have poses at their epochs and on both sides."""
         whole = np.ones(samples.size, dtype=bool)
         for side in (-around_ns, 0, around_ns):
             for late in (-_CLOCK_STEP_NS, _CLOCK_STEP_NS):
@@ -242,7 +242,7 @@ class _Run:
         return whole
 
     def _felt(self, late_ns: int) -> tuple[Float64, Float64, Float64]:
-        """Mean specific force (n, 3) by the trajectory, body axes; by lever arm (n, 3, 3); speed (n,)."""
+        """Mean specific force (n, 3) from the trajectory, body axes; derivative by lever arm (n, 3, 3); speed (n,)."""
         epochs = self.epochs[self.force_centres] + late_ns
         step = round(_FORCE_S * NS_PER_S)
         before, here, after = (self._run.trajectory.poses(epochs + side) for side in (-step, 0, step))
@@ -281,7 +281,7 @@ class _Run:
         self.body_turn_by_time = (later - earlier) / (2 * _CLOCK_STEP_NS / NS_PER_S)
 
     def _body_turn(self, start: Int64, end: Int64, late_ns: int) -> Float64:
-        """(n, 3) rotation vectors of the body against inertial space, body axes of the start."""
+        """Return (n, 3) rotation vectors of the body relative to inertial space, body axes of the start."""
         first, last = (self._run.trajectory.poses(self.epochs[i] + late_ns).world_from_body for i in (start, end))
         earth = np.zeros(3) if self._local else EARTH_RATE_ECEF_RAD_PER_S
         turned = exponential(earth * self.turn_seconds[:, None]) @ last
@@ -316,20 +316,20 @@ class _Run:
         self.prior = _inverse(covariance)
 
     def between(self, samples: Int64) -> tuple[Int64, Float64]:
-        """Knot before each sample (n,), and the way to the next (n,) in [0, 1]."""
+        """Return the knot before each sample (n,), and the fraction to the next (n,) in [0, 1]."""
         at = (self.epochs[samples] - self._origin) / NS_PER_S / self._knot_s
         knot = np.clip(np.floor(at), 0, self.knots - 2).astype(np.int64)
         return knot, np.clip(at - knot, 0.0, 1.0)
 
     def attitude_influence(self, by_own: Float64) -> AttitudeInfluence:
-        """Of errors (3, 9 knots + 7) by its own unknowns, those by the trajectory's attitude."""
+        """Select, from errors (3, 9 knots + 7) by the run's unknowns, those by the trajectory's attitude."""
         knots = by_own[:, : _SLOW * self.knots].reshape(3, self.knots, _SLOW)
         epochs = self._origin + np.rint(np.arange(self.knots) * self._knot_s * NS_PER_S).astype(np.int64)
         sigma = self._run.sigma_roll_pitch_heading_rad
         return AttitudeInfluence(epochs, knots[:, :, 6:], sigma, self._run.time_constant_s)
 
     def rows(self, rotation: Float64) -> tuple[_Rows, _Rows]:
-        """Residuals (n, 3), by shared unknowns (n, 3, 6) and own ones (3 n, 9 knots + 7): of forces, of rotations."""
+        """Return residuals (n, 3) and derivatives by shared (n, 3, 6) and the run's unknowns (3 n, 9 knots + 7)."""
         return self._force_rows(rotation), self._turn_rows(rotation)
 
     def _force_rows(self, rotation: Float64) -> _Rows:
@@ -356,7 +356,7 @@ class _Run:
         return residual, shared, self._own(self.turn_starts, slow, fixed)
 
     def _own(self, samples: Int64, slow: Float64, fixed: Float64) -> csr_matrix:
-        """(3 n, 9 knots + 7) of derivatives by slow errors (n, 3, 9), at the knots around, and fixed ones (n, 3, 7)."""
+        """Spread derivatives by slow errors (n, 3, 9) over the knots around, and append fixed ones (n, 3, 7)."""
         knot, way = self.between(samples)
         way = way[:, None, None]
         values = np.concatenate([slow * (1.0 - way), slow * way, fixed], axis=2)
@@ -374,20 +374,20 @@ _LEVI_CIVITA: Final[Float64] = cross_matrix(np.eye(3)).transpose(1, 0, 2)
 
 @dataclass(frozen=True)
 class _Unbroken:
-    """Which spans of samples have no gap and no unusable sample."""
+    """Finds spans of samples without a gap or an unusable sample."""
 
     piece: Int64
     usable: npt.NDArray[np.bool_]
 
     def between(self, first: Int64, last: Int64) -> npt.NDArray[np.bool_]:
-        """Of spans (n,), both ends included."""
+        """Return which spans (n,) are unbroken, both ends included."""
         bad = np.r_[0, np.cumsum(~self.usable)]
         whole: npt.NDArray[np.bool_] = (self.piece[first] == self.piece[last]) & (bad[last + 1] == bad[first])
         return whole
 
 
 def _composed(readings: ImuReadings) -> Float64:
-    """(n, 3, 3) attitude at each sample against that at the first, from rates alone: means of neighbours, composed."""
+    """Return the (n, 3, 3) attitude at each sample relative to the first, from rates alone: means of neighbours."""
     seconds = np.diff(readings.epochs_gps_ns) / NS_PER_S
     rate = np.nan_to_num(readings.angular_rate_rad_per_s)
     steps = exponential(0.5 * (rate[1:] + rate[:-1]) * seconds[:, None])
@@ -401,24 +401,24 @@ def _composed(readings: ImuReadings) -> Float64:
 
 @dataclass(frozen=True)
 class _Solution:
-    """One step of the adjustment."""
+    """Result of one iteration of the adjustment."""
 
     step_rad: Float64
     """(3,) small rotation that follows the orientation."""
     covariance: Float64
     """(3, 3)"""
     own: tuple[Float64, ...]
-    """By run: its own unknowns."""
+    """Unknowns of each run."""
     force: tuple[Float64, ...]
-    """By run: residuals (n, 3) after the adjustment."""
+    """Residuals (n, 3) after the adjustment, by run."""
     turn: tuple[Float64, ...]
     influence: tuple[Float64, ...]
-    """By run: (3, 9 knots + 7) error of the orientation by errors of its own unknowns from what they are held for."""
+    """By run: derivatives (3, 9 knots + 7) of the orientation by the prior values of the run's unknowns."""
 
 
 @dataclass(frozen=True)
 class _Noise:
-    """1 σ of windows, body axes, and what each window counts."""
+    """1 σ of windows, body axes, and the weight of each window."""
 
     force: Float64
     """(3,) m/s²"""
@@ -432,7 +432,7 @@ class _Noise:
 
     @classmethod
     def first(cls, errors: ImuErrors, step_s: float) -> _Noise:
-        """As the IMU states it, which the windows' residuals are not below."""
+        """Return the noise that the IMU states; the noise from residuals is not taken lower."""
         density = errors.accel_noise_ug_per_sqrt_hz * 1e-6 * _STANDARD_GRAVITY_M_PER_S2
         force = max(density * np.sqrt(2 / (3 * _FORCE_S)), 1e-5)
         walk = np.radians(errors.gyro_noise_deg_per_sqrt_h) / 60.0
@@ -440,7 +440,7 @@ class _Noise:
         return cls(np.full(3, max(force, 0.01)), np.full(3, max(turn, 1e-4)), force, turn)
 
     def renewed(self, solution: _Solution) -> _Noise:
-        """From residuals: robust against a tenth of the windows that saw something else."""
+        """Estimate the noise from residuals, robust against a tenth of outlying windows."""
         force, turn = _spread(solution.force, self.force_least), _spread(solution.turn, self.turn_least)
         return _Noise(
             force,
@@ -453,7 +453,7 @@ class _Noise:
 
 
 def _spread(residuals: Sequence[Float64], least: float) -> Float64:
-    """(3,) root mean square where residuals are normal, not led by the largest."""
+    """Return a robust scale (3,) that equals the root mean square of normal residuals."""
     whole = np.concatenate(residuals)
     if not whole.size:
         return np.full(3, least)
@@ -468,7 +468,7 @@ def _huber(normed: Float64) -> Float64:
 
 
 def _solved(runs: Sequence[_Run], rotation: Float64, lever_arm_sigma_m: Float64, noise: _Noise) -> _Solution:
-    """Linearised adjustment; each run's own unknowns are eliminated."""
+    """Solve the linearised adjustment; each run's unknowns are eliminated."""
     shared = np.diag(1.0 / np.r_[np.full(3, _UNKNOWN_RAD), np.maximum(lever_arm_sigma_m, 1e-6)] ** 2)
     right = np.zeros(_SHARED)
     parts = []

@@ -1,4 +1,4 @@
-"""Plane patches of a point cloud: what a reading is held against, with the uncertainty of the plane itself."""
+"""Plane patches of a point cloud, with the uncertainty of each plane, to which readings are compared."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _FLAT: Final = 0.2
-"""A cell may hold a plane where its thickness is below this share of its second extent."""
+"""A cell may contain a plane if its thickness is below this share of its second extent."""
 _WIDE: Final = 0.15
-"""The points of a patch spread (1 σ, along the shorter axis) over at least this share of the cell."""
+"""Least spread (1 σ, along the shorter axis) of a patch's points, as a share of the cell."""
 _THICK: Final = 2.0
-"""Patches thicker than this many times the cloud's usual thickness are no planes: leaves, edges, poles."""
-_TRIM: Final = 3.0
-_LEAST_THICKNESS_M: Final = 1e-4
-_KEY_BITS: Final = 21
+"""Patches thicker than this many times the cloud's usual thickness are no planes but leaves, edges, poles."""
+_TRIM: Final = 3.0  # Points farther from the plane than this many σ are left out of the second fit.
+_LEAST_THICKNESS_M: Final = 1e-4  # Least thickness of a plane that is assumed.
+_KEY_BITS: Final = 21  # Bits of a cell's key for each of its three indices.
 _AROUND: Final = 8.0
-"""Patches this many cells away may lie on one even surface."""
-_SAME: Final = 3.0
-_BENT_RAD: Final = 0.005
-_FEW: Final = 8
+"""Patches within this many cells may lie on one even surface."""
+_SAME: Final = 3.0  # Normals within this many σ of their difference may belong to one even surface …
+_BENT_RAD: Final = 0.005  # … with this much added for the curvature of the surface.
+_FEW: Final = 8  # With fewer such neighbours the mean of a normal is not used.
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Plane patches, one a cell of a cubic grid, in the axes of their cloud."""
+    """Plane patches, one for each cell of a cubic grid, in the axes of their cloud."""
 
     cell_m: float
     centre_m: Float64
@@ -42,9 +42,9 @@ class Surfels:
     normal: Float64
     """(m, 3) unit vectors of either sign."""
     points: Int64
-    """(m,) how many points made it."""
+    """(m,) number of its points."""
     thickness_m: Float64
-    """(m,) RMS of their distances from the plane."""
+    """(m,) RMS distance of its points from the plane."""
     slopes: Float64
     """(m, 3, 3) covariance of the plane's tilt: an offset d from the centre adds the variance dᵀ · slopes · d (1)."""
     wobble: Float64
@@ -75,7 +75,7 @@ class Surfels:
                 expected=f"at least {least_points} points in each cell of that size on walls and ground",
                 change="enlarge cell_m, or take a denser scan",
             )
-        # A least-squares plane through k points: its tilt along an axis of spread s is known to thickness / (s √k).
+        # A least-squares plane through k points: the σ of its tilt along an axis of spread s is thickness / (s √k).
         variance = values[flat, :1] / (np.maximum(count[flat, None] - 3, 1) * values[flat, 1:])
         axes = vectors[flat][:, :, 1:]
         slopes = np.einsum("mia,ma,mja->mij", axes, variance, axes)
@@ -90,7 +90,7 @@ class Surfels:
         return cKDTree(self.centre_m)
 
     def nearest(self, place_m: Float64, gate_m: Float64) -> tuple[Int64, Float64]:
-        """The patch (n,) at each place (n, 3), −1 where there is none, and the place's distance (n,) from its plane.
+        """Return the patch (n,) at each place (n, 3), −1 for none, and the place's distance (n,) from its plane.
 
         gate_m : (n,) how far a place may lie from its plane; beside the patch it may lie three quarters of a cell.
         """
@@ -105,17 +105,17 @@ class Surfels:
         return np.where(fits, patch, -1), distance
 
     def variance_m2(self, patch: Int64, place_m: Float64) -> Float64:
-        """Variance (n,) of the planes of patches (n,) themselves at places (n, 3)."""
+        """Return the variance (n,) of the planes of patches (n,) at places (n, 3)."""
         offset = place_m - self.centre_m[patch]
         tilt = np.einsum("ni,nij,nj->n", offset, self.slopes[patch], offset)
         return np.asarray(self.thickness_m[patch] ** 2 / self.points[patch] + tilt)
 
     def _steadied(self) -> Self:
-        """Normals as the mean of those of the patches around that could lie on one even surface.
+        """Return patches with normals averaged over neighbours that could lie on one even surface.
 
-        Ground whose patches are tilted a little, by noise or by its own roughness, would seem to hold a vehicle in
-        its place: each tilt resists a shift. That is deceptive, because with the next patch the tilt is another one.
-        What the normals scatter counts as the plane's uncertainty, and its mean's as that of the normal.
+        Ground whose patches are tilted a little, by noise or by roughness, would seem to determine horizontal shifts,
+        which each tilt resists. That is deceptive, because the tilt of the next patch differs. The scatter of the
+        normals counts as the plane's uncertainty, and that of their mean as the normal's.
         """
         variance = np.trace(self.slopes, axis1=1, axis2=2) / 2.0
         pairs, sign = self._alike(variance)
@@ -141,7 +141,7 @@ class Surfels:
         )
 
     def _alike(self, variance: Float64) -> tuple[Int64, Float64]:
-        """Pairs (p, 2) of patches near each other that could lie on one even surface; sign between their normals."""
+        """Pairs (p, 2) of nearby patches that could lie on one even surface, and the sign between their normals."""
         pairs = self._tree.query_pairs(_AROUND * self.cell_m, output_type="ndarray")
         i, j = pairs.T
         cosine = np.einsum("ij,ij->i", self.normal[i], self.normal[j])
@@ -154,7 +154,7 @@ class Surfels:
 
 
 def _cells(cloud_m: Float64, cell_m: float) -> Int64:
-    """Number (n,) of the cell of each point, counted from 0 without gaps."""
+    """Return the number (n,) of the cell of each point, counted from 0 without gaps."""
     whole = np.floor((cloud_m - cloud_m.min(axis=0)) / cell_m).astype(np.int64)
     if whole.max() >= 1 << _KEY_BITS:
         raise ConfigError(
@@ -167,7 +167,7 @@ def _cells(cloud_m: Float64, cell_m: float) -> Int64:
 
 
 def plane_moments(cloud_m: Float64, cell: Int64, cells: int | None = None) -> tuple[Int64, Float64, Float64, Float64]:
-    """Count (m,), mean (m, 3), ascending eigenvalues (m, 3) and eigenvectors (m, 3, 3; columns) of each cell."""
+    """Return count (m,), mean (m, 3), ascending eigenvalues (m, 3) and eigenvectors (m, 3, 3; columns) of each cell."""
     size = int(cell.max()) + 1 if cells is None else cells
     count = np.bincount(cell, minlength=size)
     least = np.maximum(count, 1)

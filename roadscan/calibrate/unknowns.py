@@ -1,7 +1,7 @@
-"""What a calibration estimates, with its prior: mountings, errors of poses, poses of calibration objects.
+"""The unknowns of a calibration with their priors: mountings, errors of poses, poses of calibration objects.
 
 All unknowns are one vector in units of prior σ: x = root · z with z ~ N(0, 1), so that a part without any uncertainty
-never moves and information of 1 is as much as the prior knows.
+never moves and information of 1 equals that of the prior.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ Float64 = npt.NDArray[np.float64]
 MOUNTING: Final = 7
 """Unknowns of a sensor: lever arm (3), small rotation about body axes (3), range offset."""
 BODY: Final = 6
-"""Unknowns of a traverse or object: shift (3), small rotation about its own axes (3)."""
+"""Unknowns of a traverse or object: shift (3), small rotation about its axes (3)."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a sensor's mounting before the calibration."""
+    """Prior of a sensor's mounting before the calibration."""
 
     mounting: Mounting
     lever_arm_sigma_m: tuple[float, float, float]
-    """Forward, right, down; 0 holds it fixed."""
+    """1 σ forward, right, down; 0 keeps it fixed."""
     boresight_sigma_rad: tuple[float, float, float]
-    """About body x, y, z; 0 holds it fixed."""
+    """1 σ about body x, y, z; 0 keeps it fixed."""
     range_offset_sigma_m: float = 0.0
-    """0: ranges have no constant error."""
+    """1 σ of a constant range error; 0 for none."""
     beam_axis_sensor: tuple[float, float, float] | None = None
     """Direction in which a range offset moves a point, for heads with parallel beams; None: away from the sensor."""
 
     @classmethod
     def of(cls, sensor: Sensor, settings: CalibrationSettings, range_offset_sigma_m: float = 0.0) -> Self:
-        """Mounting and σ as the rig file states them; σ of the settings where it states none."""
+        """Return mounting and σ of the rig file; σ of the settings where it states none."""
         boresight = np.radians(sensor.boresight_sigma_deg or settings.boresight_sigma_deg)
         return cls(
             sensor.mounting(),
@@ -56,7 +56,7 @@ class Prior:
 
 
 def priors_of(sensors: Mapping[str, Sensor], settings: CalibrationSettings) -> dict[str, Prior]:
-    """What is known of the mountings of sensors, by name, before a calibration.
+    """Return the priors of sensors' mountings, by name.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def priors_of(sensors: Mapping[str, Sensor], settings: CalibrationSettings) -> d
 
 @dataclass(frozen=True)
 class ObjectPose:
-    """About where a calibration object lies."""
+    """Approximate pose of a calibration object."""
 
     position_world_m: Float64
     """(3,) its origin."""
@@ -89,7 +89,7 @@ class ObjectPose:
 
 @dataclass(frozen=True)
 class Correction:
-    """Error of a traverse's poses, as the calibration found it; to be added to them."""
+    """Estimated error of a traverse's poses, to be added to them."""
 
     shift_north_east_down_m: Float64
     """(3,)"""
@@ -99,7 +99,7 @@ class Correction:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Values of all unknowns at one step; what a finder of ties starts from."""
+    """Values of all unknowns at one step, from which ties are searched for."""
 
     mountings: dict[str, Mounting]
     range_offsets_m: dict[str, float]
@@ -109,7 +109,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Geometry:
-    """The same values as arrays, as the observations use them. S sensors, B bodies: traverses, then objects."""
+    """The same values as arrays for the observations. S sensors, B bodies: traverses, then objects."""
 
     lever_arm_m: Float64
     """(S, 3)"""
@@ -120,9 +120,9 @@ class Geometry:
     shift_world_m: Float64
     """(B, 3)"""
     turn: Float64
-    """(B, 3, 3) of the body, in its own axes."""
+    """(B, 3, 3) rotation of the body, in its axes."""
     derivative: Float64
-    """(P, P) of lever arm, small rotation from here, offset, world shift, small body turn from here by z."""
+    """(P, P) derivative of lever arm, small rotation, offset, world shift and small body turn by z."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class Unknowns:
 
     @cached_property
     def sensor_index(self) -> dict[str, int]:
-        """Place of each sensor."""
+        """Index of each sensor."""
         return {name: index for index, name in enumerate(self.priors)}
 
     @cached_property
@@ -145,36 +145,36 @@ class Unknowns:
 
     @cached_property
     def object_index(self) -> dict[str, int]:
-        """Place of each object among the bodies."""
+        """Index of each object among the bodies."""
         return {name: self.traverse_keys.size + index for index, name in enumerate(self.objects)}
 
     @property
     def bodies(self) -> int:
-        """Traverses and objects."""
+        """Number of traverses and objects."""
         return len(self.traverses) + len(self.objects)
 
     @property
     def mounting_size(self) -> int:
-        """Unknowns of the sensors, which come first."""
+        """Number of unknowns of the sensors, which come first."""
         return MOUNTING * len(self.priors)
 
     @property
     def size(self) -> int:
-        """Unknowns in all."""
+        """Number of all unknowns."""
         return self.mounting_size + BODY * self.bodies
 
     def mounting_slice(self, sensor: str) -> slice:
-        """Place of a sensor's unknowns."""
+        """Return the place of a sensor's unknowns."""
         begin = MOUNTING * self.find_sensor(sensor)
         return slice(begin, begin + MOUNTING)
 
     def body_slice(self, body: int) -> slice:
-        """Place of a body's unknowns."""
+        """Return the place of a body's unknowns."""
         begin = self.mounting_size + BODY * body
         return slice(begin, begin + BODY)
 
     def find_sensor(self, sensor: str) -> int:
-        """Place of a sensor, or :class:`ConfigError`."""
+        """Return the index of a sensor; raises :class:`ConfigError` where it is unknown."""
         if sensor not in self.sensor_index:
             raise ConfigError(
                 f"evidence of the sensor '{sensor}', which is not calibrated{nearest(sensor, self.priors)}",
@@ -183,7 +183,7 @@ class Unknowns:
         return self.sensor_index[sensor]
 
     def find_traverses(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Places (n,) among the bodies of traverses (n,), or :class:`ConfigError`."""
+        """Return the indices (n,) among the bodies of traverses (n,); raises :class:`ConfigError` for unknown ones."""
         keys = self.traverse_keys
         place = np.searchsorted(keys, numbers)
         known = np.zeros(numbers.shape, dtype=bool)
@@ -197,7 +197,7 @@ class Unknowns:
         return place.astype(np.int64)
 
     def find_object(self, name: str) -> int:
-        """Place of an object among the bodies, or :class:`ConfigError`."""
+        """Return the index of an object among the bodies; raises :class:`ConfigError` where it is unknown."""
         if name not in self.object_index:
             raise ConfigError(
                 f"evidence of the unknown calibration object '{name}'{nearest(name, self.objects)}",
@@ -220,7 +220,7 @@ class Unknowns:
         return root
 
     def _traverse_root(self, root: Float64) -> None:
-        """Gauss–Markov within each run, independent between runs."""
+        """Fill in the root of traverses: Gauss–Markov within each run, independent between runs."""
         by_run: dict[str, list[int]] = {}
         for body, key in enumerate(self.traverse_keys.tolist()):
             by_run.setdefault(self.traverses[key].run, []).append(body)
@@ -238,7 +238,7 @@ class Unknowns:
                 root[np.ix_(places, places)] = sigma[:, axis, None] * factor
 
     def geometry(self, z: Float64) -> Geometry:
-        """Arrays at z (P,)."""
+        """Return the arrays at z (P,)."""
         x = self.root @ z
         mounting = x[: self.mounting_size].reshape(-1, MOUNTING)
         body = x[self.mounting_size :].reshape(-1, BODY)
@@ -264,7 +264,7 @@ class Unknowns:
         )
 
     def estimate(self, z: Float64) -> Estimate:
-        """Mountings, object poses and corrections at z (P,)."""
+        """Return mountings, object poses and corrections at z (P,)."""
         now = self.geometry(z)
         body = (self.root @ z)[self.mounting_size :].reshape(-1, BODY)
         objects = {}
@@ -285,6 +285,6 @@ class Unknowns:
 
 
 def mounting_of(body_from_sensor: Float64, lever_arm_m: Float64) -> Mounting:
-    """A mounting of a rotation (3, 3) and a lever arm (3,)."""
+    """Return a mounting with a rotation (3, 3) and a lever arm (3,)."""
     rows = tuple((float(r[0]), float(r[1]), float(r[2])) for r in body_from_sensor)
     return Mounting((float(lever_arm_m[0]), float(lever_arm_m[1]), float(lever_arm_m[2])), rows)

@@ -1,1 +1,1 @@
-"""What all features compute with, on arrays: robust scatter, runs of flags, ways along places."""
+"""Array computations that all features share: robust scatter, runs of flags, distances along places."""

@@ -1,26 +1,26 @@
-"""How a loop is compiled: with which options, for which types, where it is kept, and by which process.
+"""Compiles loops with Numba: options, argument types, the cache on disk, and locks between processes.
 
 Compiled code is cached on disk, in a folder named after the hash of the sources that it was made from: Numba itself
 looks only at the file a function stands in, and would keep one whose inlined parts have changed elsewhere.
 
 Among processes that share a cache, one compiles a function; the others wait for it and load it. Workers that begin on
-an empty cache want the same functions at the same moment. Without a lock each of them compiles all of them, and of two
-that store variants of one function at once, Numba's index keeps only one. A process waits for a function's lock with
-at most the locks of that function's callers in hand, and functions do not call one another in circles: nobody waits
-for ever. The system gives back the locks of a process that dies.
+an empty cache need the same functions at the same moment. Without a lock each of them compiles all of them, and of two
+that store variants of one function at once, Numba's index keeps only one. A process that waits for a function's lock
+has at most the locks of that function's callers, and calls have no cycles, so there is no deadlock. The operating
+system releases the locks of a process that dies.
 
-What is compiled is code that a process runs: a cache that other users can write to is refused.
+Compiled code is executed, so a cache that other users can write to is rejected.
 
-Functions that compiled functions alone call are kept as LLVM's bitcode. Numba would optimise each of them by itself and
-make machine code of it, which nothing runs: their callers take them in and are optimised with them.
+Functions that only compiled functions call are stored as LLVM's bitcode. Numba would optimise each of them by itself
+and generate machine code that nothing runs: their callers link the bitcode and are optimised with it.
 
-Each compilation has a number of its own in the names of its machine code, whichever process it ran in. Numba counts
-from 1 in every process, so that two functions of one name and signature (the variants that a factory makes) may get one
-name in two processes; a third that loads both from the cache would call one of them for the other, and tell nobody
+Each compilation has a unique number in the names of its machine code, whichever process it ran in. Numba counts from 1
+in every process, so that two functions of one name and signature (the variants that a factory makes) may get one name
+in two processes; a third that loads both from the cache would silently call one of them for the other
 (numba/numba, issue 10486).
 
-What a function of Numba answers for the types of its arguments is kept. Numba asks all of an operator's templates anew
-at each place where it stands, and words an error for each that does not fit: a sixth of the time of a compilation.
+The signature that a Numba function resolves for argument types is cached. Numba tries all of an operator's templates
+again wherever it occurs, and formats an error for each that does not fit: a sixth of the time of a compilation.
 """
 
 from __future__ import annotations
@@ -62,10 +62,10 @@ def compiled(function: Function, folder: str, *, counted: bool, entry: bool = Tr
     Parameters
     ----------
     folder : from :func:`cache_folder`.
-    counted : references to arrays are counted; a function that makes no array needs none. It may not hand one back
-        either: its callers would give back a reference that was never counted. Compiling such a function fails.
-    entry : Python can call it. An entry takes longer to make than a small function itself, so what only compiled
-        functions call has none.
+    counted : references to arrays are counted; a function that creates no array does not need that. It may not return
+        one either: its callers would release a reference that was never counted. Compiling such a function fails.
+    entry : Python can call it. An entry takes longer to compile than a small function itself, so functions that only
+        compiled functions call have none.
     inlined : only ever into the compiled functions that call it.
     """
     before = numba.config.CACHE_DIR
@@ -104,14 +104,14 @@ def cache_folder(kind: str, sources: Iterable[Path]) -> str:
 
 
 class _Part(CPUDispatcher):  # type: ignore[misc]
-    """A piece of compiled functions. Called from Python, where it has no entry, it would end the process."""
+    """A piece of compiled functions. A Python call would end the process, since it has no entry for one."""
 
     def __call__(self, *_: object, **__: object) -> None:
         raise TypeError(f"{self.py_func.__name__} is compiled for its callers only; Python calls a kernel")
 
 
 class _PartLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """Bitcode of a part for its callers to take in: no machine code, so no address and no environment at one."""
+    """Bitcode of a part, which its callers link: it has no machine code, so no address and no environment at one."""
 
     def _optimize_final_module(self) -> None:
         manager, builder = self._codegen._module_pass_manager(
@@ -143,7 +143,7 @@ class _PartCompiler(Compiler):  # type: ignore[misc]
 
 
 def _read_parts_as_bitcode() -> None:
-    """Let Numba's cache give back parts as what they were stored."""
+    """Make Numba's cache restore parts as the bitcode that was stored."""
     read_code = JITCPUCodegen.unserialize_library
 
     def read(codegen: Any, stored: tuple[str, str, Any]) -> Any:
@@ -159,10 +159,10 @@ def _read_parts_as_bitcode() -> None:
 
 
 def _compile_once(dispatcher: Any, folder: str, *, counted: bool) -> None:
-    """Let a function compile, or load what is compiled, with a lock of its own in the folder.
+    """Make a function compile, or load its compiled code, under a lock in the folder.
 
-    A literal number counts as its type: Numba would compile a function, and all that it calls, once for a `0` that is
-    written out and once more for the variable that it grows into.
+    A literal number counts as its type: Numba would otherwise compile a function, and all that it calls, once for a
+    literal `0` and once more for an integer variable.
     """
     function = dispatcher.py_func
     path = f"{folder}/{function.__module__}.{function.__qualname__}.lock"
@@ -191,7 +191,7 @@ def _compile_once(dispatcher: Any, folder: str, *, counted: bool) -> None:
 
 
 def _holds_array(kind: Any) -> bool:
-    """Whether a value of a type is an array, or a tuple with one."""
+    """Return whether a value of a type is an array, or a tuple with one."""
     if isinstance(kind, numba.types.BaseTuple):
         return any(_holds_array(part) for part in kind)
     return isinstance(kind, numba.types.Array)
@@ -207,9 +207,9 @@ def _locked(path: str) -> Iterator[None]:
 
 
 def _use_whole_registers() -> None:
-    """Let the compiler use all 512 bits of a register where there are that many; it prefers 256 for old machines.
+    """Let the compiler use 512-bit registers where the processor has them; for old machines it prefers 256 bits.
 
-    The processor is part of every compiled function's key, and settled when a process decorates its first one.
+    The processor is part of every compiled function's key, and is fixed when a process decorates its first one.
     """
     host = llvmlite.binding.get_host_cpu_features()
     if host.get("avx512f") and "NUMBA_CPU_FEATURES" not in os.environ:
@@ -224,7 +224,7 @@ def _number_apart() -> None:
 
 
 def _keep_answers_of_types() -> None:
-    """Let a function of Numba keep the signature that it found for types of arguments, under the options of now."""
+    """Cache the signature that a Numba function resolves for argument types, under the current options."""
     find_signature: Callable[..., Any] = BaseFunction.get_call_type
     kept_answers: WeakKeyDictionary[Any, dict[Any, Any]] = WeakKeyDictionary()
 

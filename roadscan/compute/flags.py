@@ -1,4 +1,4 @@
-"""Runs of flags."""
+"""Finds runs of true flags."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ import numpy.typing as npt
 
 
 def runs_of(flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
-    """First and one past the last index (r, 2) of each run of true flags (n,)."""
+    """Return first index and one past the last (r, 2) of each run of true flags (n,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return edges.reshape(-1, 2).astype(np.int64)

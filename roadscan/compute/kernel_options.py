@@ -1,4 +1,4 @@
-"""The kinds of kernels there are; parallelism comes from Dask over blocks, never from inside a kernel."""
+"""The kinds of kernels. Parallelism comes from Dask over blocks, never from inside a kernel."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ Kernel = Callable[..., Any]
 
 
 def kernel(function: Kernel) -> Kernel:
-    """Compile a loop over arrays."""
+    """Compile a loop over arrays into a kernel that Python calls."""
     return compiled(function, _folder_of(function), counted=True)
 
 
 def inner(function: Kernel) -> Kernel:
-    """Compile a loop that kernels alone call: an entry for Python takes as long to make as a small function."""
+    """Compile a loop that kernels alone call: an entry for Python would take as long to make as a small function."""
     return compiled(function, _folder_of(function), counted=True, entry=False)
 
 
 def bare(function: Kernel) -> Kernel:
-    """Compile a kernel that makes no array and hands none back: it counts no references to those that it is given.
+    """Compile a kernel that creates and returns no array: it does not count references to its arguments.
 
-    To count a reference to and fro takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
-    take as long for that as for the readings.
+    Counting a reference up and down takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
+    spend as long on that as on the readings.
     """
     return compiled(function, _folder_of(function), counted=False)
 
@@ -51,9 +51,9 @@ def bare_inlined(function: Kernel) -> Kernel:
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The same array, not to be written to.
+    """Return a read-only view of the array.
 
-    What Arrow decoded is so already, what NumPy computed is not; a kernel that can get either, array by array, would
+    Arrays that Arrow decoded are read-only already, those that NumPy computed are not; a kernel that gets either would
     be compiled for each mixture.
     """
     view = array.view()
@@ -91,7 +91,7 @@ def _reached(file: Path) -> set[Path]:
 
 @functools.cache
 def _imported_kernels(file: Path) -> list[Path]:
-    """Kernel files of roadscan (in folders named `kernels`) that a file imports, anywhere in it, in any form."""
+    """Return the kernel files of roadscan (in folders named `kernels`) that a file imports, anywhere in it."""
     library = Path(__file__).parents[1]
     within = ("roadscan", *file.parent.relative_to(library).parts) if file.is_relative_to(library) else ()
     found = []
@@ -104,7 +104,7 @@ def _imported_kernels(file: Path) -> list[Path]:
 
 
 def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """All statements below a node. Expressions, which hold no import, are most of a tree, and are passed over."""
+    """Yield all statements below a node. Expressions are skipped: they are most of a tree and hold no import."""
     for below in ast.iter_child_nodes(node):
         if isinstance(below, ast.stmt | ast.excepthandler | ast.match_case):
             yield below
@@ -112,7 +112,7 @@ def _statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _imported_names(node: ast.AST, within: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """What a statement may import, as parts of dotted names: modules, and what may be one inside them.
+    """Yield what a statement may import, as parts of dotted names: modules, and names that may be modules in them.
 
     within : package that relative imports start from.
     """

@@ -23,13 +23,13 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 KNOT_M: Final = 0.25
-"""A path is followed in pieces of at least this length, so that a standing vehicle's noise adds no way."""
-LEAST_KNOTS: Final = 5
+"""Spacing of the knots along a path is at least this, so that a standing vehicle's noise adds no distance."""
+LEAST_KNOTS: Final = 5  # With fewer knots a path is too short for a line.
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceLine:
-    """Vertices in equal steps; headings count anticlockwise from x."""
+    """A line of vertices in equal steps; headings count anticlockwise from x."""
 
     x_start_m: float
     y_start_m: float
@@ -39,7 +39,7 @@ class ReferenceLine:
 
     @classmethod
     def smoothed(cls, path_m: Float64, step_m: float, smoothing_m: float) -> tuple[Self, Int64]:
-        """A line along a driven path.
+        """Fit a line to a driven path.
 
         The path is cut into knots of equal distance, smoothed by local parabolas over `smoothing_m` (Savitzky and
         Golay 1964), joined by a cubic spline and followed in steps. Its headings are rounded to 32 bits, as a file
@@ -85,7 +85,7 @@ class ReferenceLine:
 
     @cached_property
     def vertices_m(self) -> Float64:
-        """(n, 2)."""
+        """(n, 2) positions of the vertices."""
         return vertices((self.x_start_m, self.y_start_m), self.phi_rad, self.step_m)
 
     @cached_property
@@ -95,14 +95,14 @@ class ReferenceLine:
 
 
 def vertices(start_m: tuple[float, float], phi_rad: Float64, step_m: float) -> Float64:
-    """(n, 2) vertices of a line of n − 1 steps along the headings `phi_rad`."""
+    """Return the (n, 2) vertices of a line of n − 1 steps along the headings `phi_rad`."""
     steps = step_m * np.column_stack([np.cos(phi_rad), np.sin(phi_rad)])
     out: Float64 = np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)]) + np.array(start_m)
     return out
 
 
 def mitred_normals(vertices_m: Float64) -> Float64:
-    """(n, 2) normals to the left at the vertices (n, 2), n ≥ 2, of length 1 when projected on their step's normal.
+    """Return (n, 2) normals to the left at the vertices (n, 2), n ≥ 2, of length 1 projected on their step's normal.
 
     At a vertex inside the line the direction is perpendicular to the chord between its neighbours (OpenCRG's
     crg_eval_uv2xy); the length is that of the step which begins there.
@@ -117,7 +117,7 @@ def mitred_normals(vertices_m: Float64) -> Float64:
 
 
 def _left(vectors: Float64) -> Float64:
-    """(n, 2) unit vectors, a quarter turn to the left of `vectors` (n, 2)."""
+    """Return (n, 2) unit vectors, a quarter turn to the left of `vectors` (n, 2)."""
     turned = np.column_stack([-vectors[:, 1], vectors[:, 0]])
     unit: Float64 = turned / np.hypot(turned[:, 0], turned[:, 1])[:, None]
     return unit

@@ -1,4 +1,4 @@
-"""Scatter that single wrong values do not change."""
+"""Robust measures of scatter, which single wrong values do not change."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy.typing as npt
 Float64 = npt.NDArray[np.float64]
 
 SIGMA_OF_MAD: Final = 1.4826
-"""Standard deviation of a normal distribution in median absolute deviations: 1 / Φ⁻¹(3/4) (Hampel 1974)."""
+"""Ratio of a normal distribution's standard deviation to its median absolute deviation: 1 / Φ⁻¹(3/4) (Hampel 1974)."""
 
 
 def scatter_about(values: Float64, middle: float | Float64) -> float:
-    """Robust standard deviation of values (n,) about a middle, or about one each (n,): 1.4826 MAD."""
+    """Return the robust standard deviation (1.4826 MAD) of values (n,) about a middle, or about one for each (n,)."""
     return SIGMA_OF_MAD * float(np.median(np.abs(values - middle)))

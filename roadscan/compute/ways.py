@@ -1,4 +1,4 @@
-"""Ways along places."""
+"""Distances along a sequence of places."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ Float64 = npt.NDArray[np.float64]
 
 
 def way_along(places_m: Float64) -> Float64:
-    """(n,) horizontal distance (m) from the first of places (n, ≥ 2) along the line through them; 0 for the first."""
+    """Return (n,) horizontal distances (m) from the first of places (n, ≥ 2) along the line through them."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places_m[:, :2], axis=0).T))])

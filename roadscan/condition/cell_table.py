@@ -1,4 +1,4 @@
-"""Cells of some tiles as one table that heights of the road are taken from."""
+"""Joins the cells of some tiles into one table, from which heights of the road are sampled."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from roadscan.tiles.cells import TileCells
 
 
 def cell_table(tiles: Sequence[TileCells], cell_m: float) -> CellTable:
-    """The cells of tiles of one grid, in any order; `cell_m` is a cell's edge (m)."""
+    """Return the cells of tiles of one grid, in any order, as a table; `cell_m` is a cell's edge (m)."""
     held = sorted(tiles, key=lambda t: (t.tile.row, t.tile.column))
     edge = held[0].cells_per_edge if held else 1
     columns, rows = [t.tile.column for t in held] or [0], [t.tile.row for t in held] or [0]

@@ -1,4 +1,4 @@
-"""Change of the condition between two surveys of a road: the same sections, and what changed beyond chance."""
+"""Compares the condition in two surveys of a road: matches sections, and tests changes for significance."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import numpy.typing as npt
 import shapely
 
 BESIDE_M: Final = 1.5
-"""Sections are of one lane where their middles lie no farther apart than this (m): half a narrow lane."""
+"""Largest distance between the middles of sections of one lane (m): half a narrow lane."""
 LEAST_SHARE: Final = 0.9
-"""Sections are compared where they have this share of their length in common."""
+"""Least common share of the lengths of sections that are compared."""
 MOST_TURN_DEG: Final = 45.0
-"""Sections are of one direction where they turn from one another by less than this."""
+"""Largest angle between sections of one direction."""
 
 Verdict: TypeAlias = Literal["larger", "smaller", "no change shown", "not judged"]
 VERDICTS: Final[tuple[Verdict, ...]] = get_args(Verdict)
 
 
 class Pair(NamedTuple):
-    """A section of the later survey, and the one of the earlier survey that it is compared with."""
+    """A section of the later survey, and the matching one of the earlier survey."""
 
     later: int
     earlier: int
@@ -37,14 +37,14 @@ class Change:
     change: float
     """Later minus earlier, in the quantity's unit."""
     sigma: float
-    """1 σ of it: both surveys' own, taken as independent; NaN where one has none."""
+    """1 σ of it, from both surveys taken as independent; NaN where one states none."""
     p_value: float
-    """Probability of so large a change, or a larger one, where nothing changed; NaN without σ."""
+    """Probability of so large a change, or a larger one, if nothing changed; NaN without σ."""
     verdict: Verdict
 
 
 def matched_sections(earlier: npt.NDArray[Any], later: npt.NDArray[Any]) -> tuple[list[Pair], npt.NDArray[np.int64]]:
-    """Sections that lie on the same piece of the same lane, and rows of the later survey that have none.
+    """Return sections on the same piece of the same lane, and the rows of the later survey without a match.
 
     Parameters
     ----------
@@ -66,12 +66,12 @@ def matched_sections(earlier: npt.NDArray[Any], later: npt.NDArray[Any]) -> tupl
 
 
 def change_of(earlier: float, later: float, sigma_earlier: float, sigma_later: float, level: float = 0.05) -> Change:
-    """The change of a quantity and whether it is more than the errors of both surveys explain, two-sided.
+    """Return the change of a quantity, and whether it exceeds the errors of both surveys, two-sided.
 
-    `level` : a change whose probability without any change is below this is told as one.
+    `level` : a change whose probability without any change is below this is significant.
     """
     change, sigma = later - earlier, math.hypot(sigma_earlier, sigma_later)
-    if not (math.isfinite(change) and sigma > 0.0):  # NaN compares as False
+    if not (math.isfinite(change) and sigma > 0.0):  # also for NaN
         return Change(change, math.nan, math.nan, "not judged")
     p_value = math.erfc(abs(change) / sigma / math.sqrt(2.0))
     if p_value >= level:
@@ -80,7 +80,7 @@ def change_of(earlier: float, later: float, sigma_earlier: float, sigma_later: f
 
 
 def _share(one: shapely.LineString, other: shapely.LineString) -> float:
-    """Length that two lines have side by side, divided by that of the longer; 0 where they run in other directions."""
+    """Return the common length of two lines, divided by that of the longer; 0 for different directions."""
     if _turn_deg(one, other) > MOST_TURN_DEG:
         return 0.0
     beside = shapely.buffer(one, BESIDE_M, cap_style="flat")

@@ -1,4 +1,4 @@
-"""Cracks as a lane sees them: stations and offsets of the pieces of their lines."""
+"""Cracks in lane coordinates: stations and offsets of the pieces of their lines."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from roadscan.condition.road_line import Lane, RoadLine
 Float64 = npt.NDArray[np.float64]
 
 PIECE_M: Final = 0.05
-"""Cracks are cut into pieces of at most this length (m)."""
-_ROUNDS: Final = 4
+"""Cracks are divided into pieces of at most this length (m)."""
+_ROUNDS: Final = 4  # Newton steps to a station.
 
 
 @dataclass(frozen=True, eq=False)
 class CrackOnLane:
-    """A crack near a lane, cut into short pieces."""
+    """A crack near a lane, divided into short pieces."""
 
     kind: str
     """Longitudinal, transverse, diagonal, alligator or unknown."""
@@ -30,11 +30,11 @@ class CrackOnLane:
     own_m: Float64
     """(k,) their offset from the lane's middle, positive to the right in the direction of travel."""
     length_m: Float64
-    """(k,) length of the pieces."""
+    """(k,) lengths of the pieces."""
 
 
 def located(line: RoadLine, lane: Lane, places_m: Float64, guess_m: float) -> tuple[Float64, Float64]:
-    """Stations, and offsets from the lane's middle (n,), of places (n, 2), from a station near all of them."""
+    """Return stations, and offsets from the lane's middle (n,), of places (n, 2), from a station near all of them."""
     station = np.full(len(places_m), guess_m)
     for _ in range(_ROUNDS):
         at = line.places(station, 0.0)

@@ -1,4 +1,4 @@
-"""The contract of an index of condition, and the registry that finds indices by themselves.
+"""Defines the interface of an index of condition, and the registry that finds indices.
 
 An index is one file of `roadscan/condition/indices/` (or an entry point of the group ``roadscan.condition_indices``)
 with one subclass of :class:`ConditionIndex`: its formula, its quantities, and how it is drawn.
@@ -29,10 +29,10 @@ ENTRY_POINT_GROUP: Final = "roadscan.condition_indices"
 
 @dataclass(frozen=True)
 class Quantity:
-    """A figure that an index gives."""
+    """A quantity that an index computes."""
 
     name: str
-    """With its unit, such as rut_depth_mm."""
+    """Name with its unit, such as rut_depth_mm."""
     unit: str
     meaning: str
 
@@ -45,13 +45,13 @@ class Value(NamedTuple):
     from_m: float
     to_m: float
     value: float
-    """NaN where it cannot be told."""
+    """Value; NaN where it is not known."""
     sigma: float
-    """NaN where it is not known."""
+    """1 σ; NaN where it is not known."""
     share: float
     reason: str = ""
     finding: Finding | None = None
-    """What is doubted of the heights that it comes from; its subject, the lane, is filled in where it is written."""
+    """Warning about the underlying heights; its subject, the lane, is filled in where it is written."""
 
 
 class ConditionIndex(ABC):
@@ -65,23 +65,23 @@ class ConditionIndex(ABC):
     needs_cracks: ClassVar[bool] = False
     """True for an index of the survey's cracks."""
     lead_m: ClassVar[float] = 0.0
-    """Way before and after a section that its values depend on."""
+    """Length before and after a section that its values depend on."""
 
     @abstractmethod
     def values(self, lane: LaneData) -> Iterable[Value]:
-        """Values of all sections, and of cross-sections in them."""
+        """Return the values of all sections, and of cross-sections in them."""
 
 
 @functools.cache
 def condition_indices() -> dict[str, ConditionIndex]:
-    """All indices by name."""
+    """Return all indices by name."""
     found = found_kinds("condition/indices/*.py", ConditionIndex, ENTRY_POINT_GROUP)
     return {name: kind() for name, kind in found.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class PerCrossSection:
-    """A quantity of each cross-section, before it is summed up by section."""
+    """A quantity of each cross-section, before it is aggregated by section."""
 
     quantity: str
     station_m: Float64
@@ -89,10 +89,10 @@ class PerCrossSection:
     sigma: Float64
     share: Float64
     noisy: npt.NDArray[np.bool_] | None = None
-    """(n,) which of them have no value for the noise of their heights; None: none."""
+    """(n,) True for those without a value because their heights are noisy; None: none."""
 
     def values(self) -> Iterable[Value]:
-        """Values of the cross-sections themselves."""
+        """Return the values of the cross-sections themselves."""
         columns = (self.station_m, self.value, self.sigma, self.share, self._left_out(slice(None)))
         for station, value, sigma, share, is_noisy in zip(*(column.tolist() for column in columns), strict=True):
             lacking = "its heights are noise" if is_noisy else "too little of the cross-section was measured"
@@ -100,7 +100,7 @@ class PerCrossSection:
             yield Value(self.quantity, "cross_section", station, station, value, sigma, share, reason)
 
     def remark(self, own: npt.NDArray[np.bool_]) -> str:
-        """What a section of the cross-sections `own` (n,) says of those that are left out."""
+        """Return a section's remark on those of its cross-sections `own` (n,) that are left out."""
         count = np.count_nonzero(self._left_out(own))
         words = f"{count} cross-sections are left out: their heights are over ten times as noisy as the lane's"
         return words if count else ""
@@ -113,13 +113,13 @@ class PerCrossSection:
 def by_section(
     held: PerCrossSection, lane: LaneData, wanted: Sequence[tuple[str, How]], spacing_m: float | None = None
 ) -> Iterable[Value]:
-    """Mean or greatest value of the cross-sections of each section, under names of their own.
+    """Return mean or greatest value of the cross-sections of each section, under separate names.
 
     `spacing_m` is their distance, that of the lane's cross-sections by default.
 
-    A section of which too few cross-sections have a value has none. The standard deviation of a mean takes the
-    cross-sections' errors as alike, since neighbours share the vehicle's motion: it is their root mean square. That of
-    the greatest value is its own.
+    A section in which too few cross-sections have a value has none. The standard deviation of a mean is the root mean
+    square of the cross-sections' σ, since neighbours share the vehicle's motion and so their errors. The greatest value
+    keeps its σ.
     """
     config = lane.config
     for from_m, to_m in lane.sections_m:

@@ -1,4 +1,4 @@
-"""What the indices of condition are computed from: profiles and cross-sections of a lane, and its sections."""
+"""Input of the indices of condition: profiles and cross-sections of a lane, and its sections."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Profile:
 
     @cached_property
     def distance_m(self) -> Float64:
-        """(n,) way along the path, from its first height."""
+        """(n,) distance along the path from its first height."""
         steps = np.hypot(*np.diff(self.place_m, axis=0).T)
         way: Float64 = np.concatenate([np.zeros(min(len(self.station_m), 1)), np.cumsum(steps)])
         return way
@@ -45,7 +45,7 @@ class Profile:
         return np.where(known, self.sigma_m, np.median(self.sigma_m[known]) if known.any() else np.nan)
 
     def between(self, from_m: float, to_m: float) -> Profile:
-        """Heights whose station lies in [from, to]; their way is counted anew."""
+        """Return heights whose station lies in [from, to]; their distance starts at 0."""
         own = (self.station_m >= from_m - 1e-6) & (self.station_m <= to_m + 1e-6)
         return Profile(self.station_m[own], self.place_m[own], self.height_m[own], self.sigma_m[own])
 
@@ -59,14 +59,14 @@ class CrossSections:
     offset_m: Float64
     """(m,) offset from the lane's middle, positive to the right in the direction of travel."""
     height_m: npt.NDArray[np.float64]
-    """(n, m) heights, each cross-section's from a height of its own; NaN where not known."""
+    """(n, m) heights, each cross-section's from its `base_m`; NaN where not known."""
     sigma_m: npt.NDArray[np.float64]
     """(n, m) standard deviations from the noise of the readings, NaN where not known."""
     base_m: Float64
-    """(n,) height that `height_m` counts from."""
+    """(n,) height from which `height_m` counts."""
 
     def between(self, from_m: float, to_m: float) -> CrossSections:
-        """Cross-sections whose station lies in [from, to)."""
+        """Return cross-sections whose station lies in [from, to)."""
         own = (self.station_m >= from_m - 1e-6) & (self.station_m < to_m - 1e-6)
         return replace(
             self, station_m=self.station_m[own], height_m=self.height_m[own], sigma_m=self.sigma_m[own],
@@ -75,22 +75,22 @@ class CrossSections:
 
     @property
     def share(self) -> Float64:
-        """(n,) share of the heights of each that are known."""
+        """(n,) known share of the heights of each."""
         shares: Float64 = np.mean(~np.isnan(self.height_m), axis=1)
         return shares
 
 
 @dataclass(frozen=True, eq=False)
 class LaneData:
-    """A lane along some sections, with what lies before and after them."""
+    """A lane along some sections, with the parts before and after them."""
 
     sign: int
     """1 where the lane is driven along the reference line, −1 against it."""
     width_m: float
     width_from: str
-    """What the width was taken from: stated, or default."""
+    """Origin of the width: stated, or default."""
     cell_m: float
-    """Edge of the cells that the heights come from."""
+    """Edge of the cells from which the heights come."""
     sections_m: tuple[tuple[float, float], ...]
     """Begin and end station of each section."""
     profiles: Mapping[str, Profile]
@@ -105,18 +105,18 @@ class LaneData:
     cracks: tuple[CrackOnLane, ...] | None = None
     """Cracks near the lane; None where the survey has no table of cracks."""
     sigma_roll_rad: float = 0.0
-    """Standard deviation of the vehicle's roll as the poses state it."""
+    """Standard deviation of the vehicle's roll as stated with the poses."""
     sigma_pose_height_m: float = 0.0
-    """The same of its height."""
+    """Standard deviation of its height as stated with the poses."""
     wander_m2_per_m: float = 0.0
-    """Variance a metre of travel by which the heights of the poses wander at random."""
+    """Variance of the random walk of the poses' heights per metre of travel."""
     edges: EdgesOnLane | None = None
-    """Edges of the road beside the lane; None where none are sought."""
+    """Edges of the road beside the lane; None where none are requested."""
     window_m2: float = 0.0
-    """Variance of the window along the road that a profile's height is a mean over; 0 for heights of points."""
+    """Variance of the window along the road over which a profile's height is a mean; 0 for heights of points."""
 
     def paths_share(self, from_m: float, to_m: float) -> float:
-        """Share of the wheel paths between two stations that was measured, of the one with less."""
+        """Return the measured share of the wheel paths between two stations, of the one with less."""
         due = max((to_m - from_m) / self.config.profile_spacing_m, 1.0)
         parts = [profile.between(from_m, to_m) for profile in self.profiles.values()]
         return min(1.0, *(np.count_nonzero(~np.isnan(part.height_m)) / due for part in parts))

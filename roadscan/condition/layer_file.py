@@ -1,4 +1,4 @@
-"""A table with lines as a GeoPackage: same rows, same bytes."""
+"""Writes a table with lines as a GeoPackage; the same rows give the same bytes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import in_crs_unit
 
 _WRITTEN: Final = "2000-01-01T00:00:00.000Z"
-"""A GeoPackage states when a layer changed; equal tables have to give equal bytes."""
+"""Date of change that a GeoPackage has to state: constant, so that equal tables give equal bytes."""
 
 
 def write_layer(path: Path, table: pa.Table, shapes_m: npt.NDArray[Any], context: ProductContext) -> None:
-    """Write rows with their lines (n,) on the map (m) as one layer, named as the file, in the CRS's own unit."""
+    """Write rows with their lines (n,) on the map (m) as one layer, named as the file, in the CRS's unit."""
     import pyogrio  # slow to import
 
     shapes = in_crs_unit(shapes_m, context)

@@ -18,9 +18,9 @@ from roadscan.condition.kernels.natural_neighbour import (
 Float64 = npt.NDArray[np.float64]
 
 WIDEST_M: Final = 100.0
-"""Greatest extent of the points: places are whole numbers whose products have to fit 128 bits."""
+"""Greatest extent of the points: positions are integers whose products have to fit 128 bits."""
 _IN_BIN: Final = 3.0
-"""Points that a row of the order of insertion is wide."""
+"""Width of a row of the insertion order, in mean distances of points."""
 
 
 def interpolate(
@@ -33,7 +33,7 @@ def interpolate(
     *,
     smooth: bool = False,
 ) -> Float64:
-    """(rows, columns) natural-neighbour values (Sibson 1981) at the centres of cells; NaN outside the points' hull.
+    """Return (rows, columns) natural-neighbour values (Sibson 1981) at cell centres; NaN outside the points' hull.
 
     The values are exact on linear fields, and equal those of the points at their places. In flat triangles at the hull,
     where the areas lose their digits, the linear value is taken.
@@ -72,7 +72,7 @@ def interpolate(
 
 
 def insertion_order(x: npt.NDArray[np.int64], y: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """(n,) order of points in which each lies near the one before: rows to and fro."""
+    """Return an order (n,) of points in which each lies near the one before: rows to and fro."""
     if x.size < 3:
         return np.arange(x.size)
     wide, high = float(np.ptp(x)) + 1.0, float(np.ptp(y)) + 1.0

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Float64 = npt.NDArray[np.float64]
 
 _COLOURS: Final = ("#1f5fa8", "#c8501e", "#3b8a3e", "#7a4fa3")
-_DOTS_PER_INCH: Final = 110
+_DOTS_PER_INCH: Final = 110  # Resolution of the pictures.
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +30,11 @@ class Strip:
     from_m: Float64
     to_m: Float64
     value: Float64
-    """NaN where a section has none."""
+    """Values; NaN where a section has none."""
 
 
 def draw_strips(path: Path, title: str, panels: Sequence[Sequence[Strip]], span_m: tuple[float, float]) -> None:
-    """Write a chart of a lane: a panel an index, its values as steps over the station."""
+    """Write a chart of a lane: one panel per index, its values as steps over the station."""
     figure = empty_figure(11.0, 0.9 + 1.5 * max(len(panels), 1), _DOTS_PER_INCH)
     axes = figure.subplots(max(len(panels), 1), 1, sharex=True, squeeze=False)[:, 0]
     for one, strips in zip(axes, panels, strict=False):
@@ -65,7 +65,7 @@ def _draw_panel(axes: Axes, strips: Sequence[Strip]) -> None:
 
 
 def _without_unit(quantity: str) -> str:
-    """Name of a quantity as the legend shows it: the axis tells the unit."""
+    """Return the name of a quantity in the legend, without the unit, which the axis shows."""
     for unit in ("_m_per_km", "_percent", "_mm", "_m"):
         quantity = quantity.removesuffix(unit)
     return quantity.replace("_", " ")
@@ -73,7 +73,7 @@ def _without_unit(quantity: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
-    """A cross-section to be drawn."""
+    """A cross-section to draw."""
 
     title: str
     """Which one it is, and where."""
@@ -82,7 +82,7 @@ class Crossing:
     height_m: Float64
     """(m,) finite."""
     wire: npt.NDArray[np.int64]
-    """Places on which the wire rests."""
+    """Indices of the points on which the wire rests."""
     told: Mapping[str, tuple[float, float, float]]
     """Depths (mm) that stand in the title, by name: of this cross-section with its σ, and the median of those around
     it."""
@@ -96,14 +96,14 @@ def draw_crossings(path: Path, title: str, crossings: Sequence[Crossing]) -> Non
     low, high = min(float(level.min()) for level in levels), max(float(level.max()) for level in levels)
     for axes, crossing, level in zip(places, crossings, levels, strict=True):
         _draw_crossing(axes, crossing, level)
-        axes.set_ylim(low - 2.0, high + 2.0)  # one scale, so that depths can be compared
+        axes.set_ylim(low - 2.0, high + 2.0)  # a common scale, so that depths can be compared
     figure.suptitle(title, fontsize=9, x=0.01, ha="left")
     places[-1].set_xlabel("offset from the lane's middle, right in the direction of travel (m)", fontsize=8)
     figure.savefig(path, metadata={"Software": None})
 
 
 def _level(crossing: Crossing) -> Float64:
-    """Heights (m,) above the straight line through them (mm)."""
+    """Return heights (m,) above the straight line through them (mm)."""
     x = crossing.offset_m
     tilt = np.polynomial.polynomial.polyval(x, np.polynomial.polynomial.polyfit(x, crossing.height_m, 1))
     return np.asarray(1e3 * (crossing.height_m - tilt), dtype=np.float64)

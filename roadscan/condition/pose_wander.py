@@ -1,8 +1,8 @@
-"""How the heights of a trajectory wander from one pose to the next, seen in the trajectory itself.
+"""Estimates the random walk of a trajectory's heights from the trajectory itself.
 
-A vehicle's body moves slowly: at 2 Hz, where it swings most, a fourth difference of poses 5 ms apart keeps 2 · 10⁻⁵ of
-the movement, at 10 Hz, where its wheels hop, 1 %. What is left is the random walk of the poses, whose fourth difference
-has 20 times the variance of its steps. A walk has the spectrum of a road of waviness 2, so it adds to roughness.
+A vehicle's body moves slowly: at 2 Hz, its main frequency, a fourth difference of poses 5 ms apart keeps 2 · 10⁻⁵ of
+the movement, at 10 Hz, the frequency of the wheels, 1 %. The rest is the random walk of the poses, whose fourth
+difference has 20 times the variance of its steps. Its spectrum is that of a road of waviness 2: it adds to roughness.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from roadscan.compute.robust import scatter_about
 Float64 = npt.NDArray[np.float64]
 
 _LONGEST_STEP_NS: Final = 11_000_000
-"""Poses that are farther apart show the vehicle's own movement in their fourth differences."""
+"""At a longer interval the fourth differences of poses contain the vehicle's movement."""
 _WALK: Final = 20.0
 """Variance of the fourth difference of a random walk over that of its steps: 1 + 9 + 9 + 1."""
-_SLOWEST_M_PER_S: Final = 1.0
+_SLOWEST_M_PER_S: Final = 1.0  # Slower poses are left out.
 
 
 def height_wander(epoch_ns: npt.NDArray[np.int64], place_m: Float64) -> float:
-    """Variance a metre of travel by which heights of poses wander (m²/m); 0 where poses do not show it.
+    """Return the random walk's variance of pose heights per metre of travel (m²/m); 0 where poses do not show it.
 
     Parameters
     ----------

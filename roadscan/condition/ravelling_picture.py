@@ -1,4 +1,4 @@
-"""Picture of ravelling: the texture of a lane's squares over that of its section, with the outlines of patches."""
+"""Draws ravelling: the ratio of the squares' texture to that of their section, with the outlines of patches."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from roadscan.core.canvas import empty_figure
 
-_DOTS_PER_INCH: Final = 110
-_WIDTH_IN: Final = 11.0
-_HEIGHT_IN: Final = 1.7
+_DOTS_PER_INCH: Final = 110  # Resolution.
+_WIDTH_IN: Final = 11.0  # Width of the picture.
+_HEIGHT_IN: Final = 1.7  # Height of a section.
 _OUTLINE: Final = "#111111"
 _MOST: Final = 2.5
-"""Texture over that of the section that has the darkest colour."""
+"""Ratio of the darkest colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,16 +26,16 @@ class DrawnLane:
 
     title: str
     ratio: npt.NDArray[np.float64]
-    """(along, across) texture over that of the section, from left to right; NaN where it is not known."""
+    """(along, across) texture over that of the section, from left to right; NaN where unknown."""
     corner_m: tuple[float, float]
     """Station, and offset from the lane's middle, of the first square's corner."""
     square_m: float
     outlines_m: tuple[npt.NDArray[Any], ...]
-    """(k, 2) stations and offsets from the lane's middle, each."""
+    """(k, 2) stations and offsets from the lane's middle, for each patch."""
 
 
 def draw_ravelling(path: Path, sections: Sequence[DrawnLane]) -> None:
-    """Write the sections one below the other; the way runs from left to right, left of the lane is up."""
+    """Write the sections one below the other; travel is from left to right, left of the lane is up."""
     figure = empty_figure(_WIDTH_IN, _HEIGHT_IN * len(sections), _DOTS_PER_INCH)
     axes = figure.subplots(len(sections), 1, squeeze=False)[:, 0]
     for one, section in zip(axes, sections, strict=True):

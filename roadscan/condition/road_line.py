@@ -1,7 +1,7 @@
-"""Reference lines of roads and the lanes along them: stations, offsets and places on the map.
+"""Reference lines of roads and the lanes along them: stations, offsets and map positions.
 
-Station counts metres along the reference line from its start; offset is positive to the right of it. A lane has its own
-frame as well: left and right are those of its direction of travel.
+Station counts metres along the reference line from its start; offset is positive to the right of it. A lane also has
+a frame: left and right are those of its direction of travel.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ Float64 = npt.NDArray[np.float64]
 NODE_M: Final = 1.0
 """Distance between the nodes of a line, and between those of a lane's middle (m)."""
 _ROUNDS: Final = 4
-"""Steps of Newton's method to the station beside a place."""
+"""Newton steps to the station beside a place."""
 _AROUND: Final = 4
-"""Nodes beyond a stretch that its places depend on."""
+"""Nodes beyond a stretch on which its places depend."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,17 +38,17 @@ class RoadLine:
     name: str | None = None
     """Name of the route, where the layer has one."""
     measure_from: float | None = None
-    """The layer's measure (milepost) at station 0, in its own unit."""
+    """The layer's measure (milepost) at station 0, in its unit."""
     measure_per_m: float | None = None
     """Its change per metre of station."""
 
     @property
     def length_m(self) -> float:
-        """From the first to the last node."""
+        """Length from the first to the last node."""
         return NODE_M * (len(self.nodes_m) - 1)
 
     def stretch(self, from_m: float, to_m: float) -> RoadLine:
-        """The same line, as far as places between two stations depend on it."""
+        """Return the part of the line on which places between two stations depend."""
         first = max(int(np.floor(from_m)) - _AROUND - self.first_m, 0)
         end = min(int(np.ceil(to_m)) + _AROUND + 1 - self.first_m, len(self.nodes_m))
         first = max(min(first, end - 2), 0)
@@ -64,7 +64,7 @@ class RoadLine:
         return out
 
     def along(self, places_m: Float64, guess_m: npt.ArrayLike) -> tuple[Float64, Float64]:
-        """Stations and offsets (n,) of places (n, 2), from a station near each of them."""
+        """Return stations and offsets (n,) of places (n, 2), from a station near each of them."""
         station = np.array(np.broadcast_to(np.asarray(guess_m, np.float64), len(places_m)))
         at = self.places(station, 0.0)
         for _ in range(_ROUNDS):
@@ -74,7 +74,7 @@ class RoadLine:
         return station, beside[:, 0] * at[:, 3] - beside[:, 1] * at[:, 2]
 
     def curvature_per_m(self, station_m: Float64, half_m: float = 10.0) -> Float64:
-        """(n,) curvature of the line (1/m), positive where it turns right: change of direction over 2 · `half_m`."""
+        """Return (n,) curvature of the line (1/m), positive to the right: change of direction over 2 · `half_m`."""
         before, after = self.places(station_m - half_m, 0.0), self.places(station_m + half_m, 0.0)
         cross = before[:, 3] * after[:, 2] - before[:, 2] * after[:, 3]
         dot = before[:, 2] * after[:, 2] + before[:, 3] * after[:, 3]
@@ -82,7 +82,7 @@ class RoadLine:
         return turned
 
     def measures(self, station_m: Float64) -> Float64:
-        """(n,) the layer's measure at stations; NaN where it has none."""
+        """Return (n,) the layer's measure at stations; NaN where it has none."""
         if self.measure_from is None or self.measure_per_m is None:
             return np.full(np.shape(station_m), np.nan)
         return self.measure_from + self.measure_per_m * np.asarray(station_m, np.float64)
@@ -102,15 +102,15 @@ class Lane:
     """(k,) offset of the lane's middle from the reference line at whole metres of station, positive to the right."""
     width_m: float
     width_from: str
-    """What the width was taken from: stated, or default."""
+    """Origin of the width: stated, or default."""
     passes: tuple[int, ...]
-    """Passes that drove it."""
+    """Passes along it."""
     sigma_roll_deg: float = 0.0
-    """Standard deviation of the roll of its drives' poses, as the logs state it; the greatest of all."""
+    """Standard deviation of the roll of its drives' poses, as stated in the log; the greatest of all."""
     sigma_height_m: float = 0.0
-    """The same of their heights."""
+    """Standard deviation of their heights, likewise."""
     wander_m2_per_m: float = 0.0
-    """Variance a metre of travel by which the heights of these poses wander at random, the greatest of all."""
+    """Variance of the random walk of these poses' heights per metre of travel, the greatest of all."""
 
     @property
     def last_m(self) -> int:
@@ -127,12 +127,12 @@ class Lane:
         return self.first_m + NODE_M * np.arange(len(self.offset_m), dtype=np.float64)
 
     def offsets(self, station_m: Float64, own_m: npt.ArrayLike = 0.0) -> Float64:
-        """Offset from the reference line at stations, of places `own_m` to the right of the lane's middle as driven."""
+        """Return offsets from the reference line of places `own_m` to the right of the lane's middle as driven."""
         found: Float64 = np.interp(station_m, self._nodes, self.offset_m) + self.sign * np.asarray(own_m, np.float64)
         return found
 
     def stretch(self, from_m: float, to_m: float) -> Lane:
-        """The same lane between two stations, a node more on each side."""
+        """Return the lane between two stations, with one more node on each side."""
         first = max(int(np.floor(from_m)) - 1 - self.first_m, 0)
         end = min(int(np.ceil(to_m)) + 2 - self.first_m, len(self.offset_m))
         return Lane(

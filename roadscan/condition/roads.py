@@ -1,4 +1,4 @@
-"""Roads and lanes of a survey: reference lines from a layer or from the drives, and which drive was on which lane."""
+"""Finds roads and lanes of a survey: reference lines from a layer or from the drives, and the drives of each lane."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 LEAST_M: Final = 20.0
-"""Shorter pieces of a drive make neither a road nor a lane."""
-_KNOT_M: Final = 0.25
+"""Shorter pieces of a drive are neither a road nor a lane."""
+_KNOT_M: Final = 0.25  # Spacing of the points of a smoothed drive.
 _PARALLEL: Final = 0.85
-"""Least cosine of the angle between a drive and the line that it is on."""
+"""Least cosine of the angle between a drive and its reference line."""
 _SAME_LANE_M: Final = 1.5
-"""Drives whose middle offsets differ by less are on one lane."""
+"""Largest difference of the mean offsets of drives on one lane."""
 _AGAIN_M: Final = 60.0
-"""A drive that comes back to a place this far behind it on its own way is there again."""
-_HALF_TURN_M: Final = 2
+"""A drive that returns to a place this far behind it along its way drives there again."""
+_HALF_TURN_M: Final = 2  # Nodes on each side over which a direction is taken.
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """The way of a pass."""
+    """Path of a pass."""
 
     pass_id: int
     path_m: Float64
     """(k, 2) easting and northing in the order of travel."""
     lane: str = ""
-    """Name of its lane, where the survey file states it."""
+    """Name of its lane, if the survey file states it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class _Piece:
 def find_roads(
     drives: Sequence[Drive], stated: Sequence[StatedLine], config: ConditionConfig
 ) -> tuple[list[RoadLine], list[Lane]]:
-    """Reference lines that were driven, and their lanes, each from left to right.
+    """Return the reference lines that were driven, and their lanes, each from left to right.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def find_roads(
 
 
 def nodes_along(path_m: Float64, smoothing_m: float) -> Float64:
-    """(k, 2) nodes :data:`NODE_M` apart along a path, smoothed by local parabolas (Savitzky and Golay 1964)."""
+    """Return (k, 2) nodes :data:`NODE_M` apart along a path, smoothed by local parabolas (Savitzky and Golay 1964)."""
     kept = np.zeros(len(path_m), bool)
     if len(path_m):
         thin_path(np.ascontiguousarray(path_m), _KNOT_M, kept)
@@ -120,7 +120,7 @@ def nodes_along(path_m: Float64, smoothing_m: float) -> Float64:
 
 
 def _line_of(stated: StatedLine) -> RoadLine | None:
-    """A layer's line; its corners are rounded within two metres."""
+    """Return a layer's line with corners rounded within two metres."""
     length = float(way_along(stated.path_m)[-1])
     nodes = nodes_along(_densified(stated.path_m), 2.0)
     if len(nodes) < 3:
@@ -138,7 +138,7 @@ def _densified(path_m: Float64) -> Float64:
 
 
 def _lines_of_drives(ways: Sequence[tuple[Drive, Float64]], config: ConditionConfig) -> list[RoadLine]:
-    """A line for each piece of road, from the first drive over it."""
+    """Return a line for each piece of road, from the first drive over it."""
     lines: list[RoadLine] = []
     for _, way in ways:
         known = _Net(lines, config.same_road_m).near(way) if lines else np.zeros(len(way), bool)
@@ -149,7 +149,7 @@ def _lines_of_drives(ways: Sequence[tuple[Drive, Float64]], config: ConditionCon
 
 
 def _again(way: Float64, near_m: float) -> Bool:
-    """Nodes of a way at which it is on a road that it drove before."""
+    """Return nodes of a drive at which it is on a road that it drove before."""
     direction = _directions(way)
     tree = cKDTree(way)
     again = np.zeros(len(way), bool)
@@ -161,7 +161,7 @@ def _again(way: Float64, near_m: float) -> Bool:
 
 
 class _Net:
-    """Lines, and what lies near to them."""
+    """Index of lines by place."""
 
     def __init__(self, lines: Sequence[RoadLine], near_m: float) -> None:
         self._lines, self._near_m = lines, near_m
@@ -172,11 +172,11 @@ class _Net:
         self._tree = cKDTree(self._nodes)
 
     def near(self, way: Float64) -> Bool:
-        """Nodes of a way that are on the road of one of the lines."""
+        """Return nodes of a drive that are on the road of one of the lines."""
         return self._nearest(way)[0] >= 0
 
     def _nearest(self, way: Float64) -> tuple[npt.NDArray[np.int64], Float64, Float64, Float64]:
-        """Line (−1 for none), station, offset, and cosine of the angle to it, of each node of a way (k, 2)."""
+        """Return line (−1 for none), station, offset, and cosine of the angle to it, of each node of a drive (k, 2)."""
         count = min(4, len(self._nodes))
         away, found = self._tree.query(way, k=np.arange(1, count + 1))
         direction = _directions(way)
@@ -193,7 +193,7 @@ class _Net:
         return line, self._index[own] + ahead, offset, cosine[np.arange(len(way)), first]
 
     def pieces(self, drive: Drive, way: Float64, config: ConditionConfig) -> Iterator[tuple[int, _Piece]]:
-        """Pieces of a drive along the lines, by the line's number."""
+        """Return pieces of a drive along the lines, by the line's number."""
         if not self._lines:
             return
         line, station, offset, cosine = self._nearest(way)
@@ -250,7 +250,7 @@ def _same_lane(one: _Piece, other: _Piece) -> bool:
 
 
 def _driven_lane(line: RoadLine, group: Sequence[_Piece], config: ConditionConfig) -> Lane:
-    """The mean way of the drives on a lane."""
+    """Return the lane along the mean path of its drives."""
     first = min(p.first_m for p in group)
     end = min(max(p.first_m + len(p.offset_m) for p in group), len(line.nodes_m))
     total, count = np.zeros(end - first), np.zeros(end - first)
@@ -265,7 +265,7 @@ def _driven_lane(line: RoadLine, group: Sequence[_Piece], config: ConditionConfi
 
 
 def _named(lanes: Sequence[Lane], groups: Sequence[Sequence[_Piece]]) -> list[Lane]:
-    """Lanes with the names of their passes; without such, numbered from the left."""
+    """Return lanes with the names of their passes; without names, numbered from the left."""
     stated = [next((p.drive.lane for p in g if p.drive.lane), "") for g in groups]
     names: list[str] = []
     for number, name in enumerate(stated, 1):
@@ -277,7 +277,7 @@ def _named(lanes: Sequence[Lane], groups: Sequence[Sequence[_Piece]]) -> list[La
 
 
 def _directions(way: Float64) -> Float64:
-    """(k, 2) unit vectors along a way of nodes (k, 2), k ≥ 2, over some nodes to both sides."""
+    """Return (k, 2) unit vectors along nodes (k, 2), k ≥ 2, over some nodes on both sides."""
     index = np.arange(len(way))
     ahead = way[np.minimum(index + _HALF_TURN_M, len(way) - 1)] - way[np.maximum(index - _HALF_TURN_M, 0)]
     length = np.hypot(ahead[:, 0], ahead[:, 1])
@@ -286,7 +286,7 @@ def _directions(way: Float64) -> Float64:
 
 
 def _runs(mask: Bool, least: int, bridge: int = 0) -> list[tuple[int, int]]:
-    """Start and end of runs of at least `least` set values; gaps of up to `bridge` values are bridged."""
+    """Return start and end of runs of at least `least` set values; gaps of up to `bridge` values are bridged."""
     held = np.flatnonzero(mask)
     if not held.size:
         return []

@@ -1,4 +1,4 @@
-"""Stage `condition`: cells along the lanes into profiles, cross-sections, values of indices and the section table."""
+"""Stage `condition`: computes profiles, cross-sections, index values and the section table from cells along lanes."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from roadscan.tiles.tasks.tiles import TaskResult
 from roadscan.tiles.tasks.wanted_products import product_context
 
 _PICTURES = 20
-"""Pictures that a task draws."""
+"""Pictures that one task draws."""
 _NAMED = 4
-"""Quantities that a finding names."""
+"""Most quantities that a finding names."""
 
 NOT_MEASURED: Final = Witness(
     "condition_not_measured",
@@ -107,7 +107,7 @@ class Condition(Stage):
         due: Sequence[P],
         title: str,
     ) -> None:
-        """Pieces of roads, one to a task; none without settings."""
+        """Compute pieces of roads, one to a task; none without settings."""
         if settings is None:
             return
         grid, context = plan_of(session).ground.grid, product_context(plan_of(session))
@@ -115,7 +115,7 @@ class Condition(Stage):
         session.failed(self.name, run_units(function, tasks, session.manifest, session.compute, session.bar(title)))
 
     def check(self, survey: Survey) -> list[RoadscanError]:
-        """Layers of lines and polygons can be opened as stated; there is a surface where its heights are asked for."""
+        """Check that layers open as stated, and that a surface is made where its heights are requested."""
         try:
             config = ConditionConfig.stated(survey)
             if config is not None and config.roughness_regions is not None:
@@ -152,7 +152,7 @@ class Condition(Stage):
         )
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """Steps of wheel paths that no road has; and figures that no section has, by the limit that they missed."""
+        """Return steps of wheel paths that no road has, and quantities that no section has, by the limit missed."""
         if not survey.has("condition") or not manifest.of(LINES):
             return ()
         told = known_sections(manifest)
@@ -162,7 +162,7 @@ class Condition(Stage):
         of_cracks = {q.name for one in condition_indices().values() if one.needs_cracks for q in one.quantities}
         found = [*value_findings(manifest)]
         for reason, quantities in told[1].items():
-            named = [name for name in quantities if name not in of_cracks]  # the product `cracks` is the user's choice
+            named = [name for name in quantities if name not in of_cracks]  # the product `cracks` is optional
             if named:
                 found.append(NOT_MEASURED.finds("condition", f"{_some(named)}: no section has a value; {reason}."))
         return found

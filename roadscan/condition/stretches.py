@@ -1,4 +1,4 @@
-"""Stretches of a road where a figure stays above a limit: localised roughness, bumps under a straightedge."""
+"""Stretches of a road where a quantity stays above a limit: localised roughness, bumps under a straightedge."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ Floats = npt.NDArray[np.float64]
 
 
 class Stretch(NamedTuple):
-    """A stretch where a figure stays above a limit."""
+    """A stretch where a quantity stays above a limit."""
 
     from_m: float
-    """Its first sample (m)."""
+    """Station of its first sample (m)."""
     to_m: float
-    """Its last sample (m)."""
+    """Station of its last sample (m)."""
     peak_m: float
     """Station of the greatest value (m)."""
     peak: float
-    """The greatest value, in the unit of the figure."""
+    """The greatest value, in the unit of the quantity."""
 
 
 def stretches_above(x_m: Floats, values: Floats, limit: float) -> list[Stretch]:
-    """Stretches where values (n,) at stations (n,) are above a limit, in their order; NaN is not above it."""
+    """Return stretches where values (n,) at stations (n,) are above a limit, in order; NaN is not above it."""
     found = []
     for first, behind in runs_of(values > limit).tolist():
         peak = first + int(np.argmax(values[first:behind]))

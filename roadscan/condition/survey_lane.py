@@ -1,4 +1,4 @@
-"""A stretch of lane from cells: heights along its wheel paths and across it, its texture, lines beside it."""
+"""Samples a stretch of lane from cells: wheel paths, cross-sections, texture, and lines beside it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from roadscan.condition.settings import SectionConfig
 Float64 = npt.NDArray[np.float64]
 
 SIDES: Final = {"left": -1.0, "right": 1.0}
-"""Wheel paths, and the side of the lane's middle on which they lie, in the direction of travel."""
+"""Wheel paths, with the side of the lane's middle on which they lie, in the direction of travel."""
 _LEAST_CELLS: Final = 1.5
-"""Half of a window of a profile holds at least so many cells each way."""
+"""Least number of cells in half of a profile's window, each way."""
 _LEAST_CELLS_ACROSS: Final = 2.0
-"""The same of a cross-section, whose surface may bend."""
+"""The same for a cross-section, whose surface may bend."""
 _CROSS_HALF_M: Final = 0.075
-"""Half of the way along the road over which a cross-section is smoothed (m)."""
+"""Half of the length along the road over which a cross-section is smoothed (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class PathHeights:
     places: Float64
     """(n, 4) easting, northing (m), direction."""
     values: Float64
-    """(n, 3) height (m), its standard deviation (m), and the share of the ground around that holds cells."""
+    """(n, 3) height (m), its standard deviation (m), and the share of the window that cells cover."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class CrossHeights:
     offset_m: Float64
     """(m,) offset from the lane's middle, positive to the right in the direction of travel."""
     base_m: Float64
-    """(n,) height that the others count from."""
+    """(n,) height from which the others count."""
     height_m: Float64
     """(n, m)"""
     sigma_m: Float64
@@ -64,7 +64,7 @@ class CrossHeights:
 
 @dataclass(frozen=True, eq=False)
 class LaneHeights:
-    """What was surveyed of a stretch."""
+    """Heights and features of a stretch."""
 
     paths: Mapping[str, PathHeights]
     cross: CrossHeights
@@ -73,7 +73,7 @@ class LaneHeights:
 
 
 def windows_m(config: SectionConfig, cell_m: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Half of the windows' extents along and across (m): of a profile's heights, and of a cross-section's."""
+    """Return half of the windows' extents along and across (m): of a profile's heights, and of a cross-section's."""
     least, across = _LEAST_CELLS * cell_m, _LEAST_CELLS_ACROSS * cell_m
     profile = max(config.profile_spacing_m, least), max(config.wheel_path_width_m / 2, least)
     cross = max(_CROSS_HALF_M, across), max(1.5 * config.cross_section_step_m, across)
@@ -81,13 +81,13 @@ def windows_m(config: SectionConfig, cell_m: float) -> tuple[tuple[float, float]
 
 
 def window_m2(config: SectionConfig, cell_m: float) -> float:
-    """Variance along the road of what a profile's height is a mean over (m²): its window's weights, and its cells."""
+    """Return the variance along the road of the window of a profile's height (m²): of its weights, and of its cells."""
     (along, _), _ = windows_m(config, cell_m)
     return along * along / 6.0 + cell_m * cell_m / 12.0
 
 
 def reach_m(config: SectionConfig, cell_m: float) -> float:
-    """How far beyond a lane's border, and before and behind a place, what is surveyed depends on cells (m)."""
+    """Return how far beyond a lane's border, and before and behind a place, results depend on cells (m)."""
     of_heights = max(math.hypot(*half) for half in windows_m(config, cell_m)) + cell_m
     return max(of_heights, LINE_REACH_M + cell_m)
 
@@ -95,7 +95,7 @@ def reach_m(config: SectionConfig, cell_m: float) -> float:
 def survey_lane(
     table: CellTable, line: RoadLine, lane: Lane, between_m: tuple[float, float], config: SectionConfig
 ) -> LaneHeights:
-    """Heights of a lane's wheel paths and cross-sections at stations in [from, to).
+    """Sample heights of a lane's wheel paths and cross-sections at stations in [from, to).
 
     Parameters
     ----------
@@ -138,9 +138,9 @@ def _cross_heights(
 def _heights(
     table: CellTable, places: Float64, half_m: tuple[float, float], config: SectionConfig, *, bend: bool = False
 ) -> Float64:
-    """Heights (n, 3) at places, as :func:`roadscan.condition.kernels.sampling.sample` has them.
+    """Return heights (n, 3) at places, see :func:`roadscan.condition.kernels.sampling.sample`.
 
-    Neighbours of a reconstructed surface err alike, so how they scatter says nothing of their errors.
+    Errors of neighbours on a reconstructed surface are correlated, so their scatter does not show the errors.
     """
     values = np.empty((len(places), 3))
     sample(table, places, *half_m, bend, values)
@@ -150,7 +150,7 @@ def _heights(
 
 
 def _multiples(spacing_m: float, between_m: tuple[float, float]) -> Float64:
-    """Multiples of a spacing in [from, to)."""
+    """Return multiples of a spacing in [from, to)."""
     first, end = (math.ceil(one / spacing_m - 1e-9) for one in between_m)
     stations: Float64 = spacing_m * np.arange(first, end, dtype=np.float64)
     return stations

@@ -1,1 +1,1 @@
-"""Footprints: which raw block touches which tile."""
+"""Footprints: which raw data touch which tile."""

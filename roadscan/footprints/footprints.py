@@ -1,7 +1,7 @@
-"""Footprints: which raw block touches which tile. One task some data files, about eight kilometres at line rate.
+"""Footprints record which row groups of raw data touch which tile; one task indexes about eight km of data.
 
-Profiles and returns are not placed for it: bounds (``georeference/reach.py``) name every tile that a row group
-may touch. Clouds, whose points are placed already, are read.
+Profiles and returns are not georeferenced for it: bounds (``georeference/reach.py``) name every tile that a row group
+may touch. Clouds, whose points are georeferenced already, are read.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from roadscan.store.writer import parquet_bytes
 PRODUCT = "footprints"
 
 _ROW_GROUPS = 65_536
-"""Row groups that one task bounds: eight kilometres of a pair of profilers at line rate."""
+"""Row groups per task: eight kilometres of a pair of profilers at line rate."""
 _CLOUD_GROUPS = 8
-"""How many of them cost as much as a row group of a cloud."""
+"""Row groups of profiles that cost as much as one row group of a cloud."""
 
 _LOADED: Final = [
     "tile_column", "tile_row", "first_group", "last_group", "readings", "first_epoch_gps_ns", "last_epoch_gps_ns",
@@ -48,7 +48,7 @@ _LOADED: Final = [
 
 @dataclass(frozen=True)
 class FootprintTask:
-    """One data file to index."""
+    """The indexing of one data file, as a worker gets it."""
 
     store: Store
     ground: MapSettings
@@ -57,18 +57,18 @@ class FootprintTask:
 
     @property
     def target(self) -> str:
-        """Where its footprints go, relative to the survey's root."""
+        """Path of its footprints, relative to the survey's root."""
         return "tables/footprints/" + self.slice.file.removeprefix("tables/")
 
     @property
     def work(self) -> int:
-        """In row groups that have a bound; the readings of clouds are looked at one by one."""
+        """Cost in row groups that have a bound; clouds are read reading by reading."""
         return len(self.slice.groups) * (_CLOUD_GROUPS if self.slice.source.table == "cloud" else 1)
 
 
 @dataclass(frozen=True)
 class FootprintRanges:
-    """Footprints of data files: one row a tile and run of row groups that touch it; arrays are (n,)."""
+    """Footprints of data files: one row for each tile and run of row groups that touch it; arrays are (n,)."""
 
     tile_column: npt.NDArray[np.int32]
     tile_row: npt.NDArray[np.int32]
@@ -77,17 +77,17 @@ class FootprintRanges:
     first_group: npt.NDArray[np.int32]
     last_group: npt.NDArray[np.int32]
     readings: npt.NDArray[np.int64]
-    """About how many readings of the groups lie in the tile."""
+    """Approximate number of the groups' readings in the tile."""
     first_epoch_gps_ns: npt.NDArray[np.int64]
     last_epoch_gps_ns: npt.NDArray[np.int64]
     slices: tuple[RawSlice, ...]
-    """Data files, whole, sorted by run, sensor and time."""
+    """Whole data files, sorted by run, sensor and time."""
 
 
 def index_footprints(
     plan: SurveyPlan, manifest: Manifest, compute: Compute, report: Callable[[int, int], None] = lambda _a, _b: None
 ) -> list[tuple[str, str]]:
-    """Index the data files whose footprints are missing or stale; returns what failed."""
+    """Index the data files whose footprints are missing or stale; return what failed."""
     tasks = _tasks(plan)
     due = {t.slice.file for t in tasks}
     manifest.remove(r for unit, r in manifest.of(PRODUCT).items() if unit not in due)
@@ -97,7 +97,7 @@ def index_footprints(
 
 
 def stale_footprints(plan: SurveyPlan, manifest: Manifest) -> list[FootprintTask]:
-    """A task for each data file whose footprints are missing or stale."""
+    """Return a task for each data file whose footprints are missing or stale."""
     return _stale(_tasks(plan), manifest)
 
 
@@ -112,7 +112,7 @@ def footprint_state(plan: SurveyPlan, manifest: Manifest, workers: int) -> Stage
 
 
 def _tasks(plan: SurveyPlan) -> list[FootprintTask]:
-    """A task for each data file."""
+    """Return a task for each data file."""
     code = code_digest("roadscan.footprints.footprints:footprint_task")
     return [
         FootprintTask(
@@ -127,7 +127,7 @@ def _stale(tasks: Sequence[FootprintTask], manifest: Manifest) -> list[Footprint
 
 
 def unplaced_logs(plan: SurveyPlan, manifest: Manifest) -> list[tuple[str, str]]:
-    """Logs of whose readings not one touches a tile, and what became of them."""
+    """Return the logs without a single reading in a tile, and what became of their readings."""
     paths = {f.path: r.path for r in plan.records for files in r.tables.values() for f in files}
     found: list[tuple[str, str]] = []
     for source, files in plan.sources:
@@ -147,7 +147,7 @@ def unplaced_logs(plan: SurveyPlan, manifest: Manifest) -> list[tuple[str, str]]
 
 
 def footprint_task(task: FootprintTask) -> OutputRecord:
-    """Index one data file (runs on a worker): by bounds; by placing all readings where there is no bound."""
+    """Index one data file (runs on a worker): by bounds, or by georeferencing all readings where there is no bound."""
     one = task.slice
     with opened(task.store, one) as file:
         spans = group_spans(one, file)
@@ -160,7 +160,7 @@ def footprint_task(task: FootprintTask) -> OutputRecord:
         if beyond:
             pairs = joined([bounded, _placed(task, beyond)[0]])
         apart = sorted(set(range(len(one.groups))) - set(pairs.group.tolist()))
-        if apart:  # no tile tells what became of their readings
+        if apart:  # no tile reports what became of their readings
             fates = _placed(task, apart)[1]
     rows, schema = _ranges(pairs, one, spans), table_schema(PRODUCT)
     content = parquet_bytes(rows.cast(schema.arrow()), schema)
@@ -171,7 +171,7 @@ def footprint_task(task: FootprintTask) -> OutputRecord:
 
 
 def _placed(task: FootprintTask, numbers: Sequence[int]) -> tuple[Touched, npt.NDArray[np.int64]]:
-    """Tiles of some groups of a slice, by placing their readings, and the fates of these."""
+    """Return the tiles of some groups of a slice, by georeferencing their readings, and the counts of these."""
     one = task.slice
     placer = Georeferencer(task.store, task.ground, [one], recorded=True)
     parts: list[Touched] = []
@@ -187,7 +187,7 @@ def _placed(task: FootprintTask, numbers: Sequence[int]) -> tuple[Touched, npt.N
 def _with_neighbours(
     tiles: tuple[npt.NDArray[np.int64], ...], within: int
 ) -> tuple[npt.NDArray[np.int64], ...]:  # fmt: skip
-    """Column, row and readings of tiles, and of those around them, up to so many columns and rows away."""
+    """Return column, row and readings of tiles, and of the tiles around them within so many columns and rows."""
     if not within:
         return tiles
     column, row, count = tiles
@@ -201,7 +201,7 @@ def _with_neighbours(
 
 
 def _ranges(pairs: Touched, one: RawSlice, group_spans_ns: npt.NDArray[np.int64]) -> pa.Table:
-    """Pairs of row group and tile as rows: runs of groups that touch one tile are one row."""
+    """Turn pairs of row group and tile into rows: consecutive groups that touch one tile become one row."""
     order = np.lexsort((pairs.group, pairs.row, pairs.column))
     number, column, row = pairs.group[order], pairs.column[order], pairs.row[order]
     breaks = (np.diff(column) != 0) | (np.diff(row) != 0) | (np.diff(number) != 1)
@@ -224,7 +224,7 @@ def _ranges(pairs: Touched, one: RawSlice, group_spans_ns: npt.NDArray[np.int64]
 
 
 def _detail(rows: pa.Table, fates: npt.NDArray[np.int64] | None) -> str:
-    """Figures of a data file: the box of its tiles, and the fates of readings that no tile tells: those of clouds,
+    """Return the box of a data file's tiles, and the counts of readings that no tile reports: those of clouds,
     and of row groups that touch no tile.
     """
     figures: dict[str, Any] = {}
@@ -237,14 +237,14 @@ def _detail(rows: pa.Table, fates: npt.NDArray[np.int64] | None) -> str:
 
 
 def count_tiles(tiles: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int64], ...]:
-    """Column, row and count of the tiles that occur in (n, 2) tile numbers, by row and column."""
+    """Return column, row and count of the distinct tiles in (n, 2) tile numbers, sorted by row and column."""
     if tiles.size == 0:
         empty = np.zeros(0, np.int64)
         return empty, empty, empty
     first = tiles.min(axis=0).astype(np.int64)
     width = int(tiles[:, 0].max()) - int(first[0]) + 1
     height = int(tiles[:, 1].max()) - int(first[1]) + 1
-    if width * height > 1 << 26:  # readings far apart: a dense count would not fit
+    if width * height > 1 << 26:  # tiles so far apart that a dense count would not fit into memory
         unique, counts = np.unique(tiles, axis=0, return_counts=True)
         return unique[:, 0].astype(np.int64), unique[:, 1].astype(np.int64), counts.astype(np.int64)
     flat = (tiles[:, 1] - first[1]) * width + (tiles[:, 0] - first[0])
@@ -256,9 +256,9 @@ def count_tiles(tiles: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int64], ..
 def load_ranges(
     plan: SurveyPlan, manifest: Manifest, files: Collection[str] | None = None, window: Window | None = None
 ) -> FootprintRanges:
-    """Current footprints of some data files, in some tiles; of all without a choice.
+    """Load the current footprints of some data files (default: all) in some tiles (default: all).
 
-    A data file without any is left out (its indexing failed); one that does not come near the window is not opened.
+    A data file without footprints is left out (its indexing failed); one outside the window is not opened.
     """
     slices = sorted(
         plan.slices(), key=lambda s: (s.source.run, s.source.sensor, s.source.key, s.spans[0] if s.spans else (0, 0))
@@ -291,7 +291,7 @@ def _in_window(window: Window) -> pc.Expression:
 
 
 def _is_apart(record: OutputRecord, window: Window | None) -> bool:
-    """True if a data file touches no tile of a window."""
+    """Return True if a data file touches no tile of a window."""
     own = record.figures().get("window") if window is not None else None
     if window is None or own is None:
         return window is not None
@@ -307,5 +307,5 @@ def _digests(plan: SurveyPlan) -> Sequence[str]:
 
 @found_once
 def footprints_of(session: Session) -> FootprintRanges:
-    """Which row group touches which tile."""
+    """Return the session's footprints: which row group touches which tile."""
     return load_ranges(plan_of(session), session.manifest)

@@ -1,4 +1,4 @@
-"""What bounds the readings of a data file: poses, spans of ranges, statistics of row groups."""
+"""Bounds on where the readings of a data file may lie, from poses, range spans and statistics of row groups."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from roadscan.store.readings.profiles import ProfileReader
 from roadscan.store.store import Store
 
 _SPAN_COLUMNS = ["range_low", "range_high"]
-_CHUNK_READINGS = 1 << 22
-_WINDOW_NS = 120 * NS_PER_S
+_CHUNK_READINGS = 1 << 22  # Range readings that are read at a time.
+_WINDOW_NS = 120 * NS_PER_S  # Poses are loaded in windows of this length.
 _KEPT = threading.local()
 
 
 def touched_tiles(store: Store, ground: MapSettings, one: RawSlice, file: pq.ParquetFile) -> Touched:
-    """Tiles that row groups of a slice of scans or returns, open as `file`, may touch; groups by place in the slice."""
+    """Return the tiles that row groups of a slice of scans or returns may touch; groups by place in the slice."""
     reach = _reach(store, ground, one)
     if reach is None:
         return joined([])
@@ -49,7 +49,7 @@ def touched_tiles(store: Store, ground: MapSettings, one: RawSlice, file: pq.Par
 
 
 def group_spans(one: RawSlice, file: pq.ParquetFile) -> npt.NDArray[np.int64]:
-    """First and last epoch (groups, 2), on time (GPS ns), of the row groups of a slice, from the file's own footer."""
+    """Return first and last epoch (groups, 2), corrected GPS ns, of a slice's row groups, from the file's footer."""
     metadata = file.metadata
     column = metadata.schema.names.index("epoch_gps_ns")
     spans = [_limits(metadata.row_group(g), column) or _span(file, g, "epoch_gps_ns") for g in one.groups]
@@ -57,9 +57,9 @@ def group_spans(one: RawSlice, file: pq.ParquetFile) -> npt.NDArray[np.int64]:
 
 
 def _reach(store: Store, ground: MapSettings, one: RawSlice) -> Reach | None:
-    """Poses around a slice and how far its readings count; None without any pose.
+    """Return the poses around a slice and the distance up to which its readings count; None without any pose.
 
-    They are those of the minutes that it lies in, and kept for the next slice: files may hold seconds.
+    Poses of whole minutes are loaded and kept for the next slice, since a file may contain only seconds.
     """
     spans = [(a // _WINDOW_NS * _WINDOW_NS, -(-b // _WINDOW_NS) * _WINDOW_NS) for a, b in one.spans]
     wanted = (store.root, one.source.key, one.source.allowance, ground, spans)
@@ -88,7 +88,7 @@ def _loaded(store: Store, ground: MapSettings, source: ReadingSource, spans: Seq
 
 @contextmanager
 def opened(store: Store, one: RawSlice) -> Iterator[pq.ParquetFile]:
-    """The file of a slice; a :class:`StoreError` where it cannot be read."""
+    """Open the file of a slice; raises :class:`StoreError` where it cannot be read."""
     try:
         with store.fs.open(store.path(one.file), "rb") as stream:
             yield pq.ParquetFile(stream)
@@ -105,7 +105,7 @@ def _on_time(one: RawSlice, epochs_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray
 
 
 def _stored_spans(rows: pa.Table, geometry: ScanGeometry) -> RangeSpans:
-    """Spans of ranges as ingest wrote them; any range where it did not."""
+    """Return the range spans that ingest wrote; the widest span where it wrote none."""
     if any(c not in rows.column_names for c in _SPAN_COLUMNS):
         return RangeSpans.unknown(rows.num_rows, geometry)
     low, high = (rows.column(c).fill_null(whole).to_numpy() for c, whole in zip(_SPAN_COLUMNS, (1, 65535), strict=True))
@@ -115,7 +115,7 @@ def _stored_spans(rows: pa.Table, geometry: ScanGeometry) -> RangeSpans:
 def _read_spans(
     store: Store, one: RawSlice, counts: Sequence[int], geometry: ScanGeometry
 ) -> tuple[npt.NDArray[np.int64], RangeSpans]:
-    """Epochs of the profiles as stored, and spans of ranges of the parts of each profile, from the readings."""
+    """Compute the profiles' epochs as stored, and the range spans of the parts of each profile, from the readings."""
     step = max(_CHUNK_READINGS // (max(counts) * geometry.readings), 1)
     reader = ProfileReader(store, one.file)
     epochs, parts = [], []
@@ -144,7 +144,7 @@ def _of_returns(reach: Reach, one: RawSlice, file: pq.ParquetFile) -> Touched:
 
 
 def _limits(part: pq.RowGroupMetaData, column: int) -> tuple[float, float] | None:
-    """Least and greatest value of a column by the statistics of a row group, None without any."""
+    """Return the least and greatest value of a column from the statistics of a row group; None without any."""
     statistics = part.column(column).statistics
     return (statistics.min, statistics.max) if statistics is not None and statistics.has_min_max else None
 

@@ -1,7 +1,7 @@
-"""Row groups by tile: which a block of tiles needs, and which tile tells what became of their readings.
+"""Index of row groups by tile: which groups a block of tiles needs, and which tile reports on their readings.
 
-Row groups of all data files are numbered through, with a gap after each file, so that runs of numbers are runs of row
-groups of one file. A survey of a day has millions of them: nothing here loops over row groups or tiles.
+Row groups of all data files are numbered consecutively, with a gap after each file, so that a run of numbers is a run
+of row groups of one file. A survey of a day has millions of them, so nothing here loops over row groups or tiles.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ class Runs:
     source: Int64
     """Index of the data file."""
     slice: Int64
-    """Place of that file among those of the runs."""
+    """Index of that file among the files of the runs."""
     position: Int64
-    """How many row groups of the same file lie in earlier runs."""
+    """Number of row groups of the same file in earlier runs."""
     first_epoch_gps_ns: Int64
     last_epoch_gps_ns: Int64
 
     def places(self, begin: Int64, end: Int64) -> Int32:
-        """(n, 3) slice, first position and end of ranges of row groups, each of which lies within a run."""
+        """Return (n, 3) slice, first position and end of ranges of row groups, each of which lies within a run."""
         run = np.searchsorted(self.begin, begin, side="right") - 1
         first = self.position[run] + begin - self.begin[run]
         return np.column_stack([self.slice[run], first, first + end - begin]).astype(np.int32)
@@ -59,7 +59,7 @@ class GroupsByTile:
         self._starts = starts
 
     def runs(self, tiles: Int64) -> Runs:
-        """What some tiles need together."""
+        """Return the runs that some tiles need together."""
         rows = expanded(self._starts[tiles], self._starts[tiles + 1])
         rows = rows[np.argsort(self._begin[rows], kind="stable")]
         begin, end = self._begin[rows], np.maximum.accumulate(self._end[rows])
@@ -80,7 +80,7 @@ class GroupsByTile:
         )
 
     def groups(self, runs: Runs, first: int, last: int) -> Sequence[int]:
-        """Row groups of one data file, from run `first` to `last` − 1, counted within their file."""
+        """Return the row groups of one data file, from run `first` to `last` − 1, numbered within their file."""
         base = self._base[runs.source[first]]
         begin, end = runs.begin[first:last] - base, runs.end[first:last] - base
         if begin.size == 1:
@@ -88,13 +88,13 @@ class GroupsByTile:
         return tuple(expanded(begin, end).tolist())
 
     def touched(self, runs: Runs, tiles: Int64) -> Int32:
-        """(n, 4) place among `tiles`, slice, first position and end of what each of the tiles needs."""
+        """Return (n, 4) index in `tiles`, slice, first position and end of the row groups that each tile needs."""
         rows = expanded(self._starts[tiles], self._starts[tiles + 1])
         place = np.repeat(np.arange(tiles.size), self._starts[tiles + 1] - self._starts[tiles])
         return np.column_stack([place, runs.places(self._begin[rows], self._end[rows])]).astype(np.int32)
 
     def owned(self, runs: Runs, tiles: Int64) -> Int32:
-        """(n, 4) slice, first position, end and place among `tiles`, of the groups whose fates each tile tells.
+        """Return (n, 4) slice, first position, end and index in `tiles` of the groups that each tile reports on.
 
         That is the first by row and column of the tiles that a group touches.
         """
@@ -107,17 +107,17 @@ class GroupsByTile:
 
     @cached_property
     def _owned(self) -> tuple[Int64, Int64, Int64]:
-        """First and end of the ranges of groups that a tile owns, by tile; where each tile's begin (tiles + 1,)."""
+        """First and end of the groups that each tile reports on, and where a tile's ranges begin (tiles + 1,)."""
         tiles = self._starts.size - 1
         edges = np.sort(np.concatenate([self._begin, self._end]))
         edges = edges[np.diff(edges, prepend=-1) != 0]
         first, last = np.searchsorted(edges, self._begin), np.searchsorted(edges, self._end)
         owner = np.full(edges.size, tiles)
         tile = np.repeat(np.arange(tiles), np.diff(self._starts))
-        painted = expanded(first[::-1], last[::-1])  # later tiles first: what is painted last stays
+        painted = expanded(first[::-1], last[::-1])  # in reverse order, so that the first tile of a group stays
         owner[painted] = np.repeat(tile[::-1], (last - first)[::-1])
         begins = np.flatnonzero(np.diff(owner, prepend=-1))
-        ends = np.append(edges[begins[1:]], 0)[: begins.size]  # the last range is no tile's
+        ends = np.append(edges[begins[1:]], 0)[: begins.size]  # the last range belongs to no tile
         order = np.argsort(owner[begins], kind="stable")
         order = order[owner[begins][order] < tiles]
         starts = np.searchsorted(owner[begins][order], np.arange(tiles + 1))
@@ -125,7 +125,7 @@ class GroupsByTile:
 
 
 def expanded(begin: Int64, end: Int64) -> Int64:
-    """All numbers of the ranges from `begin` (n,) to `end` (n,) − 1, range after range."""
+    """Return all numbers of the ranges from `begin` (n,) to `end` (n,) − 1, one range after another."""
     counts = end - begin
     numbers: Int64 = np.arange(int(counts.sum())) + np.repeat(begin - (np.cumsum(counts) - counts), counts)
     return numbers

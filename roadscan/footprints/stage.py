@@ -1,4 +1,4 @@
-"""Stage `footprints`: which raw block touches which tile."""
+"""Stage `footprints`: which raw data touch which tile."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from roadscan.store.manifest import Manifest
 
 
 def faults_of_plan(session: Session) -> list[tuple[str, str]]:
-    """Logs that give nothing, and passes without a reading."""
+    """Return logs that contribute nothing, and passes without a reading."""
     plan = plan_of(session)
     return [*(fault.told for fault in plan.apart), *empty_passes(plan), *unplaced_logs(plan, session.manifest)]
 
 
 class Footprints(Stage):
-    """One record a data file, from bounds; readings are placed only where there are none."""
+    """Records the tiles of each data file, from bounds; without bounds its readings are georeferenced."""
 
     name = "footprints"
     title = "which raw block touches which tile"

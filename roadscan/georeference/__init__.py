@@ -1,1 +1,1 @@
-"""Readings + trajectory → points, and the filters of points."""
+"""Georeferencing: readings and a trajectory become points on the map, and filters select points."""

@@ -1,4 +1,4 @@
-"""Centre-line buffer: only points near a road's centre line are kept.
+"""Filters points by their distance from a road's centre line.
 
 The extent kept beside a centre line is half the road's width and a margin "in order to accommodate the roadside
 landscape, pavement and other features of interest" (Sairam, Nagarajan, Ornitz 2016, 3.3.1).
@@ -20,7 +20,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class CentreLineBuffer:
-    """Ground within a distance of centre lines."""
+    """The area within a distance of centre lines."""
 
     lines: npt.NDArray[np.object_]
     """(n,) Shapely lines, easting and northing (m)."""
@@ -28,7 +28,7 @@ class CentreLineBuffer:
     """(n,) distance from each line that is kept."""
 
     def keeps(self, easting_m: Float64, northing_m: Float64, box_m: Box) -> Bool:
-        """Points (n,) of one tile that lie in the buffer; `box_m` is the tile's west, south, east, north edge.
+        """Return which points (n,) of one tile lie in the area; `box_m` is the tile's west, south, east, north edge.
 
         The rounding of ends and corners departs from a circle by less than 0.13 % of the half width (16 chords a
         quarter). Only lines near the tile are widened, so the cost does not grow with the layer.
@@ -47,6 +47,6 @@ class CentreLineBuffer:
 
     @cached_property
     def _tree(self) -> shapely.STRtree:
-        """Boxes of the widened lines."""
+        """Spatial index of the boxes of the widened lines."""
         bounds = shapely.bounds(self.lines) + self.half_widths_m[:, None] * np.array([-1.0, -1.0, 1.0, 1.0])
         return shapely.STRtree(shapely.box(*bounds.T))

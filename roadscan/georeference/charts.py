@@ -1,4 +1,4 @@
-"""Charts: the map projection near the vehicle as polynomials.
+"""Charts approximate the map projection near the vehicle by polynomials.
 
 PROJ places a million points a second; a chart places a hundred times as many. World space is cut into
 boxes of 200 m; about the centre of each box the map coordinates are expanded to second order from 19
@@ -20,21 +20,21 @@ from roadscan.core.errors import NavigationError
 
 Float64 = npt.NDArray[np.float64]
 
-BOX_M = 200.0
+BOX_M = 200.0  # Edge of a box: within 300 m of its centre an expansion errs by less than 2 µm.
 STEP_M = 100.0
-"""Step of the finite differences; truncation is far below PROJ's own 1 nm."""
+"""Step of the finite differences; truncation is far below the 1 nm of PROJ."""
 
 _MOST_BOXES = 1 << 27
-"""Boxes of the table at most (0.5 GB): the box of a drive over 100 km across all axes."""
+"""Most boxes of the table (0.5 GB): the box of a drive over 100 km across all axes."""
 _FOLDED = (127, 251, 509)
-"""Edges (boxes) of tables that are tried where poses lie farther apart: places that no road joins."""
+"""Edges (boxes) of smaller tables, which are tried where poses lie so far apart that no road joins them."""
 
-_PAIRS = ((0, 1), (0, 2), (1, 2))
+_PAIRS = ((0, 1), (0, 2), (1, 2))  # Pairs of axes of the mixed second derivatives.
 
 
 @dataclass(frozen=True)
 class Charts:
-    """Charts over the boxes that a trajectory passes; arrays as the kernels take them."""
+    """Charts of the boxes that a trajectory passes, as arrays for the kernels."""
 
     lattice: Float64
     """(4,) box edge (m), and the indices of the first box along x, y, z."""
@@ -47,14 +47,14 @@ class Charts:
 
 
 def charts_along(frame: MapFrame, world: str, positions_world_m: Float64) -> Charts:
-    """Charts for all boxes that hold a position of a trajectory, (n, 3) world, m, and their neighbours.
+    """Return charts for all boxes that contain a position (n, 3; world, m) of a trajectory, and for their neighbours.
 
     The neighbours serve poses between two knots that lie in a box which neither knot lies in.
     """
     if world == LOCAL_WORLD and frame.is_local:
         return _identity()
     boxes = np.floor(positions_world_m / BOX_M).astype(np.int64)
-    enters = np.append(True, (np.diff(boxes, axis=0) != 0).any(axis=1))  # sorting all poses would take most of the time
+    enters = np.append(True, (np.diff(boxes, axis=0) != 0).any(axis=1))  # sorting all poses would dominate the time
     visited = np.unique(boxes[enters], axis=0)
     steps = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     unique = np.unique((visited[:, None, :] + steps).reshape(-1, 3), axis=0)
@@ -70,10 +70,10 @@ def charts_along(frame: MapFrame, world: str, positions_world_m: Float64) -> Cha
 
 
 def _table(boxes: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
-    """(nx, ny, nz) number of each box (b, 3), from 0, at its indices modulo the shape; −1 elsewhere.
+    """Return the (nx, ny, nz) table with the number of each box (b, 3) at its indices modulo the shape; −1 elsewhere.
 
     The shape is that of all boxes. Where poses step by hundreds of kilometres it is smaller, such that no two boxes
-    share a place: what is between them is never looked at.
+    share a place: positions between them are never looked up.
     """
     whole = (boxes.max(axis=0) + 1).tolist()
     shapes = [whole] if math.prod(whole) <= _MOST_BOXES else [[edge] * 3 for edge in _FOLDED]
@@ -101,7 +101,7 @@ def _identity() -> Charts:
 
 @functools.lru_cache(maxsize=20_000)
 def _chart(frame: MapFrame, world: str, box: tuple[int, int, int]) -> Float64:
-    """(3, 10) second-order expansion of the map about the centre of a box, by central differences."""
+    """Return the (3, 10) second-order expansion of the map about the centre of a box, by central differences."""
     centre = (np.array(box) + 0.5) * BOX_M
     axes = np.eye(3) * STEP_M
     corners = [s * axes[a] + t * axes[b] for a, b in _PAIRS for s in (1, -1) for t in (1, -1)]

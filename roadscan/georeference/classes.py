@@ -1,7 +1,7 @@
-"""What became of each reading: kept, or which filter left it out.
+"""Classes of readings: kept, or the filter that left a reading out.
 
 The classes are those of the filters of 3.3.1 in Sairam, Nagarajan, Ornitz 2016: readings outside the scanner's
-range, unrealistic heights, and what lies off the road; beside readings that have no place at all.
+range, unrealistic heights, and what lies off the road; in addition, readings without a return or a pose.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from roadscan.georeference.kernels.segmentation import CLASS_ABOVE, CLASS_GRAZIN
 KEPT: Final = CLASS_KEPT
 TOO_LOW: Final = CLASS_TOO_LOW
 TOO_HIGH: Final = CLASS_TOO_HIGH
-OUTSIDE_PASS: Final = 7
-OFF_CENTRE_LINE: Final = 8
+OUTSIDE_PASS: Final = 7  # The reading was taken outside the passes.
+OFF_CENTRE_LINE: Final = 8  # The point lies beyond the distance kept beside the centre lines.
 OVERLAPPING: Final = 13
-"""Beyond the crossing of successive profiles in a turn."""
+"""The reading lies beyond the crossing of successive profiles in a turn."""
 NOT_ROAD: Final = (CLASS_ABOVE, CLASS_SCATTERED, CLASS_GRAZING, CLASS_OFF_ROAD, OVERLAPPING)
 """Classes of the profile segmentation and of the range filter for turns."""
 
@@ -60,4 +60,4 @@ LAS_CLASSES[[CLASS_TOO_LOW, CLASS_TOO_HIGH, CLASS_TOO_NEAR, CLASS_TOO_FAR, OFF_C
 LAS_CLASSES[[CLASS_ABOVE, CLASS_SCATTERED, CLASS_GRAZING, CLASS_OFF_ROAD, OVERLAPPING]] = [67, 68, 69, 70, 71]
 
 WITHHELD_FLAG: Final = 16
-"""Bit of the column ``flags`` that programs take as: not to be used."""
+"""Bit of the column ``flags`` that tells other programs not to use a point."""

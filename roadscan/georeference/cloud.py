@@ -1,4 +1,4 @@
-"""Points of one tile: the view of the raw readings that products and cells are made of."""
+"""The points of one tile, from which cells and products are made."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class TilePoints:
         return int(self.x_quanta.size)
 
     def and_then(self, other: TilePoints) -> TilePoints:
-        """These points, then `other` of the same tile; values that one side lacks are those of a single return."""
+        """Return these points followed by `other` of the same tile; missing values become those of a single return."""
         size, more = len(self), len(other)
         extra: dict[str, npt.NDArray[Any]] = {}
         for name in (*self.extra, *(n for n in other.extra if n not in self.extra)):
@@ -58,5 +58,5 @@ class TilePoints:
 
 
 def fill_of(column: str, size: int, kind: np.dtype[Any]) -> npt.NDArray[Any]:
-    """Values (n,) of an extra column for points without recorded ones."""
+    """Return values (n,) of an extra column for points without recorded ones."""
     return np.full(size, 1 if column in {"return_number", "number_of_returns"} else 0, kind)

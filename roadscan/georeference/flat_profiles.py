@@ -1,4 +1,4 @@
-"""Profiles that are measured at once and lie near the sensor: what kernels need of their geometry."""
+"""Prepares the geometry of flat profiles, whose readings are taken at one instant near the sensor, for kernels."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ REACH_M: Final = 8.0
 s²/2R = 5 µm (R the Earth's radius), and a 32-bit float resolves 0.6 µm."""
 
 EVERY_RAW_RANGE: Final = (np.uint16(1), np.uint16(65_535))
-"""All raw ranges that are returns."""
+"""Lowest and highest raw range of a return."""
 
 
 @functools.lru_cache(maxsize=64)
 def flat_profiles(geometry: ScanGeometry, range_min_m: float, range_max_m: float) -> FlatProfiles | None:
-    """Flat profiles of a geometry between range limits; None where they have to be placed reading by reading."""
+    """Flat profiles of a geometry between range limits; None where each reading has to be georeferenced singly."""
     if geometry.reading_period_ns > 0.0:
         return None
     low, high = geometry.raw_limits(range_min_m, range_max_m)

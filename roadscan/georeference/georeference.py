@@ -1,4 +1,4 @@
-"""What the kernels need to place the readings of a sensor: its mounting, the trajectory, the map, limits."""
+"""Collects what kernels need to georeference a sensor's readings: its mounting, the trajectory, the map, limits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from roadscan.poses.trajectory import Trajectory
 
 
 def georeference_of(mounting: Mounting, trajectory: Trajectory, charts: Charts, limits: Limits) -> Georeference:
-    """The structure that kernels take, over the arrays of a trajectory and of charts."""
+    """Return the structure that kernels take, from a mounting, a trajectory, charts and limits."""
     rotation, lever = mounting.arrays()
     lattice = tuple(charts.lattice.tolist())
     return Georeference(

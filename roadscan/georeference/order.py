@@ -1,4 +1,4 @@
-"""Canonical order of a tile's points, so that equal readings give equal files."""
+"""Canonical order of a tile's points: equal readings give equal files."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ def canonical_order(
     whole_profiles: npt.NDArray[np.bool_],
     content: Callable[[], list[npt.NDArray[Any]]],
 ) -> npt.NDArray[np.int64] | None:
-    """Order by source, epoch and, where epochs repeat, by content; None where the points are in order.
+    """Return the order by source, epoch and, where epochs repeat, content; None where the points are in order.
 
     Parameters
     ----------
     source : (n,) number of the sensor and run, ascending as loaded.
     epoch_gps_ns : (n,).
     whole_profiles : (n,) True where equal epochs mean readings of one profile, already in their order.
-    content : gives arrays (n, …) that tell points of equal epoch apart, asked only where there are any;
+    content : gives arrays (n, …) that distinguish points of equal epoch, called only where there are any;
         points equal in all of them are interchangeable.
     """
     same = source[1:] == source[:-1]

@@ -1,4 +1,4 @@
-"""How a camera's axes lie on the map: what a page needs to put a point of the map into a picture."""
+"""Camera axes on the map, with which a page projects a map point into a picture."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Float64 = npt.NDArray[np.float64]
 def camera_from_map(
     frame: MapFrame, world: str, eye_world_m: Float64, opencv_from_world: Float64
 ) -> tuple[Float64, Float64]:
-    """Places (n, 3) of cameras on the map (m), and matrices (n, 3, 3) that take a difference on the map to their axes.
+    """Return map positions (n, 3; m) of cameras, and matrices (n, 3, 3) from map differences to camera axes.
 
-    The matrix is the turn from the world to the camera times the inverse of the map's derivative at the camera, taken
-    over a metre; so convergence and scale of the map are in it. What the map's curvature adds stays below 1 mm within
-    100 m.
+    The matrix is the rotation from world to camera times the inverse of the map's derivative at the camera, taken
+    over a metre; so it includes convergence and scale of the map. The effect of the map's curvature stays below 1 mm
+    within 100 m.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Readings of a batch become points: pose, mounting, map, filters."""
+"""Georeferences batches of readings: pose, mounting, map projection, filters."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ Int64 = npt.NDArray[np.int64]
 UInt8 = npt.NDArray[np.uint8]
 
 EIGHT_TO_SIXTEEN_BITS: Final = 257
-"""An 8-bit intensity of 255 becomes 65,535."""
+"""Factor from 8-bit to 16-bit intensities: 255 becomes 65,535."""
 
 FARTHEST_HEIGHT_M: Final = 21_000.0
-"""Heights beyond this are no heights (a vendor's −99,999, say)."""
+"""Heights beyond this are invalid (some vendors write −99,999)."""
 
 EXTRA_COLUMNS: Final = (
     "return_number", "number_of_returns", "scan_angle_deg", "flags", "user_data", "point_source_id",
@@ -57,14 +57,14 @@ FATE_NAMES: Final = (
     "kept", "no_pose", "range", "height", "outside", "no_return", *(READING_CLASSES[k] for k in NOT_ROAD),
     "outside_pass", "centre_line",
 )  # fmt: skip
-"""What can become of a reading; the first six in the kernels' order, then what segmentation says it is."""
+"""Outcomes of readings; the first six in the kernels' order, then the classes of the segmentation."""
 COUNTED_FATES: Final = FATES + len(NOT_ROAD)
-"""So many of them are counted, beginning with the first."""
+"""Number of outcomes that are counted, from the first on."""
 
 
 @dataclass(frozen=True)
 class HeightLimits:
-    """Unrealistic heights are left out; infinite where not limited."""
+    """Limits of realistic heights; infinite where there is none."""
 
     height_min_m: float = -np.inf
     height_max_m: float = np.inf
@@ -72,11 +72,11 @@ class HeightLimits:
     above_body_max_m: float = np.inf
 
     def absolute(self) -> tuple[float, float]:
-        """Lowest and highest height kept (m), never beyond what 32 bits of 10 µm hold."""
+        """Return the lowest and highest height kept (m), never beyond what 32 bits of 10 µm hold."""
         return max(float(self.height_min_m), -FARTHEST_HEIGHT_M), min(float(self.height_max_m), FARTHEST_HEIGHT_M)
 
     def classes(self, height_m: Float64) -> UInt8:
-        """Class (n,) of points by their absolute heights (n,)."""
+        """Return the class (n,) of points by their absolute heights (n,)."""
         lowest, highest = self.absolute()
         below = np.where(height_m < lowest, TOO_LOW, TOO_HIGH)
         return np.where((height_m >= lowest) & (height_m <= highest), KEPT, below).astype(np.uint8)
@@ -84,7 +84,7 @@ class HeightLimits:
 
 @dataclass(frozen=True)
 class Window:
-    """Tiles whose points are wanted: columns and rows, end exclusive."""
+    """The tiles whose points are requested: columns and rows, ends exclusive."""
 
     first_column: int
     first_row: int
@@ -92,9 +92,9 @@ class Window:
     end_row: int
 
 
-_NO_LIMITS: Final = Limits(0.0, np.inf, -FARTHEST_HEIGHT_M, FARTHEST_HEIGHT_M, -np.inf, np.inf)
-_NO_CLASSES: Final = np.empty(0, np.uint8)
-EVERYWHERE: Final = Window(-(2**30), -(2**30), 2**30, 2**30)
+_NO_LIMITS: Final = Limits(0.0, np.inf, -FARTHEST_HEIGHT_M, FARTHEST_HEIGHT_M, -np.inf, np.inf)  # Valid heights only.
+_NO_CLASSES: Final = np.empty(0, np.uint8)  # No classes are requested.
+EVERYWHERE: Final = Window(-(2**30), -(2**30), 2**30, 2**30)  # Contains every tile.
 
 
 @dataclass(frozen=True)
@@ -109,15 +109,15 @@ class Placed:
     intensity: npt.NDArray[np.uint16]
     classification: npt.NDArray[np.uint8]
     fates: Int64
-    """(11,) counts of readings by fate (``FATE_NAMES``); of clouds the first six."""
+    """(11,) counts of readings by outcome (``FATE_NAMES``); of clouds the first six."""
     classes: UInt8 | None = None
-    """(n,) class of each point's reading, where readings that a filter leaves out were asked for too."""
+    """(n,) class of each point's reading, where filtered readings were requested too."""
     extra: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class ProfilePoints:
-    """Readings of n profiles on the map; arrays (n, m)."""
+    """Map positions of the readings of n profiles; arrays (n, m)."""
 
     epoch_gps_ns: Int64
     """(n,) of the profiles."""
@@ -125,12 +125,12 @@ class ProfilePoints:
     northing_m: Float64
     height_m: Float64
     kept: npt.NDArray[np.bool_]
-    """False for readings that a filter leaves out; their places are 0."""
+    """False for readings that a filter leaves out; their positions are 0."""
 
 
 @dataclass(frozen=True)
 class Located:
-    """Readings of a batch that no filter leaves out, by their rows in it; arrays (n, …)."""
+    """Readings of a batch that pass all filters, by their rows in it; arrays (n, …)."""
 
     row: Int32
     reading: Int32
@@ -143,7 +143,7 @@ class Located:
 
 @dataclass(frozen=True)
 class Placement:
-    """How the readings of one sensor in one run become points."""
+    """Georeferencing of the readings of one sensor in one run."""
 
     trajectory: Trajectory
     charts: Charts
@@ -153,15 +153,15 @@ class Placement:
     heights: HeightLimits
     tile_quanta: int
     road: RoadFinder | None = None
-    """Readings of profiles that did not hit the road are left out; None where all count."""
+    """Finder of the road in profiles, whose other readings are left out; None where all count."""
 
     def georeference(self, mounting: Mounting, *, limited: bool = True) -> Georeference:
-        """What the kernels need to place readings of a mounting; not `limited`: whatever their ranges and heights."""
+        """What kernels need to georeference with a mounting; unless `limited`, without limits of range and height."""
         return georeference_of(mounting, self.trajectory, self.charts, self.limits if limited else _NO_LIMITS)
 
     @property
     def limits(self) -> Limits:
-        """Limits of ranges and heights."""
+        """Return the limits of ranges and heights."""
         h = self.heights
         return Limits(
             float(self.range_min_m), float(self.range_max_m), *h.absolute(),
@@ -174,7 +174,7 @@ class Placement:
         return self.trajectory.interval_sigmas_m()
 
     def returns(self, batch: pa.RecordBatch, window: Window, *, marked: bool = False) -> Placed:
-        """Place rows of the table ``returns``; `marked`: those too that a filter leaves out, with their classes."""
+        """Georeference rows of the table ``returns``; `marked`: include filtered ones, with their classes."""
         work = self._work(batch, None, window, marked)
         kept = work.rows
         return Placed(
@@ -190,7 +190,7 @@ class Placement:
     def profiles(
         self, batch: pa.RecordBatch, geometry: ScanGeometry, window: Window, *, marked: bool = False
     ) -> Placed:
-        """Place rows of the table ``scans``; `marked` as for :meth:`returns`."""
+        """Georeference rows of the table ``scans``; `marked` as for :meth:`returns`."""
         work = self._work(batch, geometry, window, marked)
         row, reading = work.rows, work.readings
         epoch = geometry.reading_epochs(_numpy(batch, "epoch_gps_ns")[row], reading)
@@ -199,18 +199,18 @@ class Placement:
             digital = _lists(batch, "intensity", geometry.readings)[row, reading]
             intensity = digital.astype(np.uint16) * EIGHT_TO_SIXTEEN_BITS
         classes = None if work.classes is None else work.classes[row.astype(np.int64) * geometry.readings + reading]
-        # Copies: the working arrays are far larger where a window keeps little.
+        # Copied, because the working arrays are far larger where a window keeps little.
         return Placed(
             work.tiles.copy(), work.quanta.copy(), epoch, intensity, np.ones(row.size, np.uint8), work.fates, classes
         )
 
     def located(self, batch: pa.RecordBatch, geometry: ScanGeometry | None, window: Window) -> Located:
-        """Places of the readings of a batch within a window, with their rows; `geometry` for scans."""
+        """Return positions of the readings of a batch within a window, with their rows; `geometry` for scans."""
         work = self._work(batch, geometry, window, marked=False)
         return Located(work.rows, work.readings, work.tiles, work.quanta)
 
     def by_profile(self, batch: pa.RecordBatch, geometry: ScanGeometry) -> ProfilePoints:
-        """Where the readings of rows of the table ``scans`` lie, profile by profile."""
+        """Return the map positions of the readings of rows of the table ``scans``, by profile."""
         work = self._work(batch, geometry, EVERYWHERE, marked=False)
         shape = batch.num_rows, geometry.readings
         east, north, height = np.zeros(shape), np.zeros(shape), np.zeros(shape)
@@ -226,20 +226,20 @@ class Placement:
     def touched(
         self, batch: pa.RecordBatch, geometry: ScanGeometry | None, *, marked: bool = False
     ) -> tuple[Int32, Int64]:
-        """Tiles (n, 2) of all points of a batch, and the fates of its readings; `geometry` for scans.
+        """Return the tiles (n, 2) of all points of a batch, and the counts of its readings; `geometry` for scans.
 
-        `marked`: tiles of those too that a filter leaves out. The road is not told from what is beside it.
+        `marked`: include tiles of filtered readings. Profiles are not segmented.
         """
         work = replace(self, road=None)._work(batch, geometry, EVERYWHERE, marked)
         return work.tiles, work.fates
 
     def classes(self, batch: pa.RecordBatch, geometry: ScanGeometry | None) -> UInt8:
-        """Class of every reading of a batch, in its order; `geometry` for scans.
+        """Return the class of every reading of a batch, in its order; `geometry` for scans.
 
         Returns
         -------
         (n,) for returns, (n · readings,) profile by profile for scans, of ``READING_CLASSES``; passes and centre
-        lines are not looked at.
+        lines are ignored.
         """
         classes = np.zeros(_readings(batch, geometry), np.uint8)
         self._filtered(batch, geometry, EVERYWHERE, classes)
@@ -256,7 +256,7 @@ class Placement:
     def _filtered(
         self, batch: pa.RecordBatch, geometry: ScanGeometry | None, window: Window, classes: UInt8 | None = None
     ) -> _Work:
-        """Place the readings that no filter leaves out, and write the classes of all where they are asked for."""
+        """Georeference the readings that pass all filters, and write the classes of all where requested."""
         if self.road is None or geometry is None:
             return self._place(batch, geometry, window, classes)
         road = self.road.profiles(_numpy(batch, "epoch_gps_ns"), _lists(batch, "range", geometry.readings), geometry)
@@ -303,14 +303,14 @@ class Placement:
 
 
 def mirror_profiles(geometry: ScanGeometry, epochs_gps_ns: Int64, ranges: npt.NDArray[np.uint16]) -> MirrorProfiles:
-    """Profiles (n,) of a turning mirror as the kernels take them; ranges : (n, m) raw."""
+    """Return profiles (n,) of a rotating mirror in the form that kernels take; ranges: (n, m) raw."""
     scale = geometry.range_offset_m, geometry.range_step_m
     return MirrorProfiles(epochs_gps_ns, ranges, *geometry.rays(), scale, geometry.reading_period_ns)
 
 
 @dataclass(frozen=True)
 class _Work:
-    """The kernels' output arrays."""
+    """Output arrays of the kernels."""
 
     rows: Int32
     readings: Int32
@@ -318,7 +318,7 @@ class _Work:
     quanta: Int32
     fates: Int64
     classes: UInt8 | None = None
-    """Of all readings, kept or not, where they were asked for."""
+    """Classes of all readings, kept or not, where requested."""
 
     @classmethod
     def of(cls, n: int) -> _Work:
@@ -328,7 +328,7 @@ class _Work:
         )  # fmt: skip
 
     def points(self, made: int, classes: UInt8 | None, readings: slice) -> Points:
-        """Where the kernels write points behind the `made` ones, and the classes of some readings where asked for."""
+        """Return the output for points after the first `made`, and for the classes of some readings where requested."""
         own = _NO_CLASSES if classes is None else classes[readings]
         return Points(
             self.rows[made:], self.readings[made:], self.tiles[made:], self.quanta[made:], self.fates, own
@@ -352,7 +352,7 @@ def place_cloud(
     *,
     marked: bool = False,
 ) -> Placed:
-    """Place rows of the table ``cloud``: points that are already georeferenced.
+    """Convert rows of the table ``cloud``, whose points are already georeferenced.
 
     Of the filters only the absolute heights hold for them. `marked`: those too that these leave out, with their
     classes.
@@ -382,28 +382,28 @@ def place_cloud(
 
 
 def cloud_classes(batch: pa.RecordBatch, cloud: CloudFrame, frame: MapFrame, heights: HeightLimits) -> UInt8:
-    """Class (n,) of rows of the table ``cloud``, by their heights."""
+    """Return the class (n,) of rows of the table ``cloud``, by their heights."""
     return heights.classes(cloud.to_map(np.stack([_numpy(batch, f"{a}_m") for a in "xyz"], axis=-1), frame)[:, 2])
 
 
 @dataclass(frozen=True)
 class CloudFrame:
-    """What the coordinates of a vendor's cloud are."""
+    """The coordinate system of a vendor's cloud."""
 
     crs: str
     height: str
     geoid: Geoid | None = None
-    """Grid that orthometric heights count from; None for the map's own, where that has the same kind of heights."""
+    """Grid that orthometric heights refer to; None for the map's grid, where that has the same kind of heights."""
     vertical: str | None = None
     """Vertical CRS that the file names, where PROJ knows it."""
 
     def check(self, frame: MapFrame) -> None:
-        """Raise :class:`CrsError` where the cloud's heights cannot be brought into those of the map."""
+        """Raise :class:`CrsError` where the cloud's heights cannot be converted into those of the map."""
         if self.crs != "local" and not frame.is_local:
             self.to_map(np.zeros((0, 3)), frame)
 
     def to_map(self, xyz_m: Float64, frame: MapFrame) -> Float64:
-        """Easting, northing, height (n, 3) in the survey's map, metres."""
+        """Return easting, northing, height (n, 3) in the survey's map, metres."""
         if self.is_in(frame):
             return xyz_m
         if self.is_by_proj(frame):
@@ -423,23 +423,23 @@ class CloudFrame:
         return frame.map_from_world(world, own.world_from_map(world, xyz_m))
 
     def is_in(self, frame: MapFrame) -> bool:
-        """Whether the coordinates are those of the map, heights included."""
+        """Return whether the coordinates are those of the map, heights included."""
         same_height = self.height == frame.height and not self._other_geoid(frame) and not self._other_datum(frame)
         return (self.crs == frame.crs or (self.crs == "local" and frame.is_local)) and same_height
 
     def is_by_proj(self, frame: MapFrame) -> bool:
-        """Whether PROJ's operation between two vertical CRS brings the coordinates into the map, and no geoid does."""
+        """Return whether PROJ's operation between two vertical CRS converts the coordinates, and no geoid does."""
         return self._other_datum(frame) and (self.geoid is None or frame.geoid is None)
 
     def _other_datum(self, frame: MapFrame) -> bool:
-        """Whether both name a vertical CRS, of two datums."""
+        """Return whether both name a vertical CRS, with different datums."""
         if self.vertical is None or frame.vertical_crs is None or self.height != frame.height:
             return False
         theirs = vertical_of(crs_from_text(frame.vertical_crs))
         return theirs is not None and not one_vertical_datum(self.vertical, theirs)
 
     def _by_proj(self, xyz_m: Float64, frame: MapFrame) -> Float64:
-        """Coordinates (n, 3) in the map by the operation that PROJ knows between the two vertical CRS."""
+        """Convert coordinates (n, 3) to the map by PROJ's operation between the two vertical CRS."""
         vertical = crs_from_text(str(self.vertical))
         own_m = float(crs_from_text(self.crs).axis_info[0].unit_conversion_factor)
         units = np.array([own_m, own_m, float(vertical.axis_info[-1].unit_conversion_factor)])
@@ -455,14 +455,14 @@ class CloudFrame:
         return out
 
     def _other_geoid(self, frame: MapFrame) -> bool:
-        """Whether the heights count from a grid whose content is not that of the map's."""
+        """Return whether the heights refer to a grid with other content than the map's."""
         if self.height != "orthometric" or self.geoid is None or frame.geoid is None:
             return False
         return self.geoid.content != frame.geoid.content
 
 
 def passes_of(epochs_gps_ns: Int64, passes: Sequence[LanePass]) -> npt.NDArray[np.uint16]:
-    """Pass of each epoch, (n,), 0 where none: `passes` are those of one run."""
+    """Return the pass of each epoch, (n,), 0 where none: `passes` are those of one run."""
     ids = np.array(sorted(one.pass_id for one in passes), dtype=np.uint16)
     return np.append(ids, np.uint16(0))[pass_numbers(epochs_gps_ns, passes, ids)]
 
@@ -470,7 +470,7 @@ def passes_of(epochs_gps_ns: Int64, passes: Sequence[LanePass]) -> npt.NDArray[n
 def pass_numbers(
     epochs_gps_ns: Int64, passes: Sequence[LanePass], ids: npt.NDArray[np.uint16]
 ) -> npt.NDArray[np.int32]:
-    """Index of each epoch's pass among `ids` (p,), which are ascending, (n,), −1 where none; as :func:`passes_of`."""
+    """Return the index (n,) of each epoch's pass in the ascending `ids` (p,), −1 where none; as :func:`passes_of`."""
     if epochs_gps_ns.size and len(passes) == 1:
         low, high, only = epochs_gps_ns.min(), epochs_gps_ns.max(), passes[0]
         if only.start_gps_ns <= low and high < only.end_gps_ns:
@@ -493,6 +493,6 @@ def _numpy(batch: pa.RecordBatch, column: str) -> npt.NDArray[Any]:
 
 
 def _lists(batch: pa.RecordBatch, column: str, size: int) -> npt.NDArray[Any]:
-    """(n, size) view of a fixed-size list column."""
+    """Return a (n, size) view of a fixed-size list column."""
     flat: npt.NDArray[Any] = batch.column(column).flatten().to_numpy(zero_copy_only=False)
     return flat.reshape(batch.num_rows, size)

@@ -33,18 +33,18 @@ Bool = npt.NDArray[np.bool_]
 
 
 def crossing_limits(path_m: Float64, heading_rad: Float64, settings: RangeFilter) -> Float64:
-    """How far (n, 2) to the left and right of the path readings are kept (m); infinite outside turns.
+    """Return how far (n, 2) to the left and right of the path readings are kept (m); infinite outside turns.
 
     Parameters
     ----------
-    path_m : (n,) position of each profile along the sensor's own path (m), not decreasing.
+    path_m : (n,) position of each profile along the sensor's path (m), not decreasing.
     heading_rad : (n,) heading of each profile, clockwise positive; whole turns do not matter.
     """
     return limits_of_turns(*_arc_and_turn(path_m, heading_rad, settings.base_m), settings)
 
 
 def limits_of_turns(arc_m: Float64, turn_rad: Float64, settings: RangeFilter) -> Float64:
-    """Limits (n, 2) to the left and right (m), from arcs (n,), negative backwards, and changes of heading (n,)."""
+    """Return limits (n, 2) to the left and right (m), from arcs (n,), negative backwards, and heading changes (n,)."""
     limits = np.full((arc_m.size, 2), np.inf)
     turning = (np.abs(turn_rad) > 1e-9) & (arc_m != 0.0)
     critical = np.abs(arc_m) / np.sin(np.clip(np.abs(turn_rad), 1e-9, math.pi / 2))
@@ -56,7 +56,7 @@ def limits_of_turns(arc_m: Float64, turn_rad: Float64, settings: RangeFilter) ->
 
 
 def resolution_limits(path_m: Float64, heading_rad: Float64, resolution_rad: float, settings: RangeFilter) -> Float64:
-    """Limits (n, 2) with the scanner's resolution in place of the turn, as the paper words it; only in turns."""
+    """Return limits (n, 2) with the scanner's resolution in place of the turn, as the paper words it; only in turns."""
     arc = np.diff(path_m, append=path_m[-1:] + (path_m[-1] - path_m[-2] if path_m.size > 1 else 0.0))
     turning = np.isfinite(crossing_limits(path_m, heading_rad, settings)).any(axis=1)
     critical = np.where(turning & (arc > 0.0), arc / math.sin(resolution_rad), np.inf)
@@ -64,13 +64,13 @@ def resolution_limits(path_m: Float64, heading_rad: Float64, resolution_rad: flo
 
 
 def kept_in_turns(across_m: Float64, limits_m: Float64) -> Bool:
-    """Readings (n, m) that are kept, by their horizontal distance across the path (n, m), right positive (m)."""
+    """Which readings (n, m) are kept, by their horizontal distance across the path (n, m), right positive (m)."""
     kept: Bool = (across_m >= -limits_m[:, :1]) & (across_m <= limits_m[:, 1:])
     return kept
 
 
 def _arc_and_turn(path_m: Float64, heading_rad: Float64, base_m: float) -> tuple[Float64, Float64]:
-    """Path (n,) and change of heading (n,) over at least `base_m` around each profile; less at the ends of a drive."""
+    """Return path (n,) and change of heading (n,) over at least `base_m` around each profile; less at the ends."""
     turned = np.unwrap(heading_rad)
     first = np.maximum(np.searchsorted(path_m, path_m - base_m / 2, side="right") - 1, 0)
     last = np.minimum(np.searchsorted(path_m, path_m + base_m / 2, side="left"), path_m.size - 1)

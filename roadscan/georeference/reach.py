@@ -1,4 +1,4 @@
-"""Which tiles the readings of a row group may touch, told from poses and reach: no reading is placed for it."""
+"""Bounds the tiles that the readings of a row group may touch, from poses and reach, without georeferencing."""
 
 from __future__ import annotations
 
@@ -26,30 +26,30 @@ Int64 = npt.NDArray[np.int64]
 UInt16 = npt.NDArray[np.uint16]
 
 PIECE_M: Final = 1.0
-"""A profile is cut into pieces about so wide at its farthest reading."""
+"""Profiles are cut into pieces of about this width at their farthest reading."""
 LOOSE_SPAN_M: Final = 5.0
-"""A turning beam whose ranges within one profile differ by more sees too much for one span of ranges."""
+"""If ranges within a profile of a rotating beam differ by more, one range span would cover too many tiles."""
 BLOCK_READINGS: Final = 6
-"""Readings of such a profile that share a span of ranges."""
+"""Number of readings of such a profile that share a range span."""
 
 
 @dataclass(frozen=True)
 class Touched:
-    """Tiles that row groups may touch: one row a (group, tile) pair, arrays are (n,)."""
+    """Tiles that row groups may touch: one row for each (group, tile) pair; arrays are (n,)."""
 
     group: Int64
-    """Number of the group among those asked for."""
+    """Index of the group among the requested ones."""
     column: Int64
     row: Int64
     readings: Int64
-    """About how many readings of the group lie in the tile."""
+    """Approximate number of the group's readings in the tile."""
     unbounded: npt.NDArray[np.bool_]
     """(g,) True for groups that may touch too many tiles to list; they have no rows."""
 
 
 @dataclass(frozen=True)
 class RangeSpans:
-    """Least and greatest raw range of each profile, block of readings by block; 0 without any."""
+    """Least and greatest raw range of each profile, by block of readings; 0 without any."""
 
     low: UInt16
     """(n, blocks)."""
@@ -59,23 +59,23 @@ class RangeSpans:
 
     @classmethod
     def of_profiles(cls, low: UInt16, high: UInt16, geometry: ScanGeometry) -> RangeSpans:
-        """From spans of whole profiles (n,)."""
+        """Build from range spans of whole profiles (n,)."""
         return cls(low[:, None], high[:, None], geometry.readings)
 
     @classmethod
     def unknown(cls, profiles: int, geometry: ScanGeometry) -> RangeSpans:
-        """Of profiles that may hold any range."""
+        """Build spans for profiles that may contain any range."""
         low = np.ones((profiles, 1), np.uint16)
         return cls(low, np.full_like(low, 65535), geometry.readings)
 
     @classmethod
     def of_ranges(cls, ranges: UInt16) -> RangeSpans:
-        """From raw ranges (n, m): as close as :data:`BLOCK_READINGS` allows."""
+        """Build from raw ranges (n, m), as closely as :data:`BLOCK_READINGS` allows."""
         low, high = block_ranges(np.ascontiguousarray(ranges), BLOCK_READINGS)
         return cls(low, high, BLOCK_READINGS)
 
     def whole(self, geometry: ScanGeometry) -> RangeSpans:
-        """Spans of whole profiles."""
+        """Return the spans of whole profiles."""
         known = np.where(self.high > 0, self.low, 65_535).min(axis=1)
         high = self.high.max(axis=1)
         return RangeSpans.of_profiles(np.where(high > 0, known, 0).astype(np.uint16), high, geometry)
@@ -83,7 +83,7 @@ class RangeSpans:
 
 @dataclass(frozen=True)
 class Reach:
-    """How far the readings of one sensor in one run can lie."""
+    """Bounds on the readings of one sensor in one run."""
 
     trajectory: Trajectory
     charts: Charts
@@ -92,10 +92,10 @@ class Reach:
     range_max_m: float
     tile_quanta: int
     allowance: Allowance = NO_CORRECTION
-    """Corrections that the poses may get afterwards: the tiles hold for all of them."""
+    """Later corrections of the poses for all of which the tiles are valid."""
 
     def is_loose(self, spans: RangeSpans, geometry: ScanGeometry) -> bool:
-        """True where spans of whole profiles would name far more tiles than their readings touch."""
+        """Return True where spans of whole profiles would cover far more tiles than the readings touch."""
         if geometry.kind != "polar" or spans.block_readings < geometry.readings or not spans.high.any():
             return False
         known = spans.high > 0
@@ -104,7 +104,7 @@ class Reach:
         return bool((far - near).max() > LOOSE_SPAN_M)
 
     def profiles(self, epochs: Int64, spans: RangeSpans, starts: Int64, geometry: ScanGeometry) -> Touched:
-        """Tiles of row groups of the table ``scans``.
+        """Return the tiles of row groups of the table ``scans``.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ class Reach:
         return _under_each(parts, starts.size - 1)
 
     def returns(self, spans_gps_ns: Int64, boxes_m: Float64, readings: Int64) -> Touched:
-        """Tiles of row groups of the table ``returns``.
+        """Return the tiles of row groups of the table ``returns``.
 
         Parameters
         ----------
@@ -157,7 +157,7 @@ class Reach:
 
     @property
     def _moved(self) -> tuple[float, float]:
-        """How far readings move: by the shift of a pose (m), and for each metre from the body's origin by its turn."""
+        """Return how far readings move: the shift of a pose (m), and its turn per metre from the body's origin."""
         shift = self.allowance.moved_m(0.0)
         return shift, self.allowance.moved_m(1.0) - shift
 
@@ -173,9 +173,9 @@ class Reach:
 
 
 def profile_pieces(geometry: ScanGeometry, size: int, block: int) -> Float64:
-    """Pieces (p, 9) of a profile, of `size` readings at most, each in one block of `block` readings.
+    """Return the pieces (p, 9) of a profile, of `size` readings at most, each in one block of `block` readings.
 
-    Columns as ``kernels.georeferencing.reach.SpannedProfiles`` states them.
+    Columns as ``georeference.kernels.reach.SpannedProfiles`` states them.
     """
     edges = range(0, geometry.readings, block)
     first = np.concatenate([np.arange(a, min(a + block, geometry.readings), size) for a in edges])
@@ -191,7 +191,7 @@ def profile_pieces(geometry: ScanGeometry, size: int, block: int) -> Float64:
 
 
 def joined(parts: Sequence[Touched]) -> Touched:
-    """Tiles of different groups as one list; what has no bound in one is listed by another."""
+    """Join the tiles of different groups; a group that is unbounded in one part is listed by another."""
     if not parts:
         none = np.zeros(0, np.int64)
         return Touched(none, none, none, none, np.zeros(0, dtype=bool))
@@ -202,7 +202,7 @@ def joined(parts: Sequence[Touched]) -> Touched:
 
 
 def _under_each(parts: list[tuple[Any, ...]], groups: int) -> Touched:
-    """Tiles under several mountings as one list, each pair once."""
+    """Merge the tiles under several mountings, each pair once."""
     unbounded = np.zeros(groups, dtype=bool)
     for part in parts:
         unbounded |= part[2]

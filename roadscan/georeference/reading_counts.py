@@ -1,4 +1,4 @@
-"""What became of readings, told with the tiles: each row group's readings with one of the tiles that it touches."""
+"""Counts of readings by outcome: each row group is reported by one of the tiles that it touches."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from roadscan.store.logs import LogRecord, log_of
 from roadscan.store.manifest import OutputRecord
 
 _MOST_NOTED: Final = 10
-"""Logs that are named."""
+"""Most logs that a finding names."""
 
 
 class ReadingCounts:
-    """Readings by fate of the row groups of a task, by the tile that tells them and by log."""
+    """Counts of readings by outcome for the row groups of a task, by reporting tile and by log."""
 
     def __init__(self) -> None:
         self._counts: dict[TileId, dict[str, npt.NDArray[np.int64]]] = defaultdict(
@@ -29,11 +29,11 @@ class ReadingCounts:
         )
 
     def add(self, tile: TileId, file: str, fates: npt.NDArray[np.int64]) -> None:
-        """Count (11,) readings of a log's file by fate; those placed outside the task's tiles are kept ones, too."""
+        """Count (11,) readings of a log's file by outcome; readings outside the task's tiles count as kept."""
         self._counts[tile][log_of(file)] += fates
 
     def of(self, tile: TileId) -> dict[str, dict[str, int]]:
-        """Figures for the tile's record: by the key of the log."""
+        """Return figures for the tile's record, by the key of the log."""
         return {log: _counts(fates) for log, fates in sorted(self._counts.get(tile, {}).items())}
 
 
@@ -45,10 +45,10 @@ def _counts(fates: npt.NDArray[np.int64]) -> dict[str, int]:
 
 
 def counts_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
-    """Readings by fate over the records of tiles and footprints, by the key of their log.
+    """Sum readings by outcome over the records of tiles and footprints, by the key of their log.
 
-    Footprints tell of clouds, which are placed for these, and of row groups that touch no tile. Tiles of older versions
-    do not say which log it was; theirs stand under "".
+    Footprints report clouds, which are read for them, and row groups that touch no tile. Tiles of older versions do not
+    name the log; their readings have the key "".
     """
     logs: dict[str, dict[str, int]] = defaultdict(lambda: dict.fromkeys(FATE_NAMES, 0))
     for record in records:
@@ -61,12 +61,12 @@ def counts_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
 
 
 def reading_counts(records: Iterable[OutputRecord]) -> dict[str, int]:
-    """The same of all logs together."""
+    """Sum readings by outcome over all records."""
     return of_all(counts_by_log(records))
 
 
 def of_all(logs: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
-    """Readings by fate, of all logs together."""
+    """Sum readings by outcome over all logs."""
     totals = dict.fromkeys(FATE_NAMES, 0)
     for fates in logs.values():
         for name, count in fates.items():
@@ -82,11 +82,11 @@ FATE_WORDS: Final = {
     "outside_pass": "lie outside all passes",
     "centre_line": "lie off the centre lines of filters.centre_line",
 }
-"""What became of readings that were not kept, in words."""
+"""Descriptions of the outcomes other than kept."""
 
 
 def fate_words(fates: Mapping[str, int]) -> str:
-    """What became of readings that were not kept, the largest number first."""
+    """Return descriptions and counts of readings that were not kept, the largest count first."""
     lost = sorted(((n, c) for n, c in fates.items() if c and n not in {"kept", "outside"}), key=lambda one: -one[1])
     return "; ".join(f"{count:,} {FATE_WORDS.get(name, f'are {name}')}" for name, count in lost)
 
@@ -104,7 +104,7 @@ NO_POSE: Final = Witness(
 def lost_findings(
     logs: Mapping[str, Mapping[str, int]], records: Iterable[LogRecord], share: float
 ) -> list[Finding]:  # fmt: skip
-    """Logs of which more than a share of the readings has no pose.
+    """Return the logs of which more than a share of the readings has no pose.
 
     Parameters
     ----------

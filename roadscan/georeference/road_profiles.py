@@ -1,4 +1,4 @@
-"""Profiles in which only the road is left to be counted, and what the other readings are."""
+"""Profiles in which only road readings have ranges, and the classes of the other readings."""
 
 from __future__ import annotations
 
@@ -28,48 +28,48 @@ _FIRST: Final = min(NOT_ROAD)
 
 @dataclass(frozen=True)
 class RoadProfiles:
-    """Profiles whose readings beside the road are silenced."""
+    """Profiles whose readings off the road are set to 0."""
 
     ranges: UInt16
     """(n, m) raw; 0, no return, for readings that did not hit the road."""
     classes: UInt8
-    """(n, m); those of ``NOT_ROAD`` are silenced, of the others a filter or the map says what they are."""
+    """(n, m) classes; readings of ``NOT_ROAD`` are set to 0, those of the others depend on filters and map."""
     counts: Int64
-    """(5,) silenced readings by class, in the order of ``NOT_ROAD``."""
+    """(5,) readings set to 0 by class, in the order of ``NOT_ROAD``."""
 
     @classmethod
     def of(cls, ranges: UInt16, classes: UInt8) -> RoadProfiles:
-        """Silence the readings (n, m) that `classes` names."""
+        """Set the readings (n, m) to 0 that `classes` names."""
         road, counts = np.array(ranges, order="C"), np.zeros(len(NOT_ROAD), np.int64)
         keep_road(classes.reshape(-1), _FIRST, road.reshape(-1), counts)
         return cls(road, classes, counts)
 
     def tell(self, fates: Int64) -> None:
-        """Mend counts (11,) by fate (``FATE_NAMES``): a kernel takes what is silenced for readings without return."""
+        """Correct counts (11,) by outcome (``FATE_NAMES``): a kernel counts readings set to 0 as without return."""
         fates[NO_RETURN] -= self.counts.sum()
         fates[-len(NOT_ROAD) :] += self.counts
 
     def mark(self, classes: UInt8) -> None:
-        """Name the silenced readings in the classes (n · m,) that a kernel wrote, profile by profile."""
+        """Write the classes of readings set to 0 into the classes (n · m,) that a kernel wrote, by profile."""
         own = self.classes.reshape(-1)
         np.copyto(classes, own, where=own >= _FIRST)
 
 
 @dataclass(frozen=True)
 class RoadFinder:
-    """Tells the road in the profiles of one sensor in one run. Each profile is judged by its own ranges and the poses
-    around its epoch, so nothing depends on which others are judged with it.
+    """Finder of the road in the profiles of one sensor in one run. A profile is judged by its ranges and the poses
+    around its epoch, so the result does not depend on other profiles.
     """
 
     settings: RoadSegmentation
     trajectory: Trajectory
-    """As far around the profiles as ``turns.WINDOW_NS`` says, where the range filter is on."""
+    """Trajectory, extending ``turns.WINDOW_NS`` around the profiles where the range filter is on."""
     mountings: Mountings
     range_min_m: float
     range_max_m: float
 
     def profiles(self, epochs_gps_ns: Int64, ranges: UInt16, geometry: ScanGeometry) -> RoadProfiles:
-        """Segment profiles: epochs (n,) of their first readings, raw ranges (n, m).
+        """Segment profiles with epochs (n,) of their first readings and raw ranges (n, m).
 
         Where there is no pose at that epoch, a profile is left alone.
         """
@@ -110,7 +110,7 @@ class RoadFinder:
 
 
 def _across_m(ranges: UInt16, geometry: ScanGeometry, mounting: Mounting) -> npt.NDArray[np.float64]:
-    """How far (n, m) readings lie from the sensor across the body, right positive (m)."""
+    """Return the distances (n, m) of readings from the sensor across the body, right positive (m)."""
     origins, directions = geometry.rays()
     right = np.array(mounting.body_from_sensor[1])
     distance = geometry.range_offset_m + geometry.range_step_m * ranges

@@ -8,7 +8,7 @@ read as follows.
 
 **The datum.** The paper's scanner hung level over a level road, and its histogram is one of z. Here a road has
 crossfall and a crown, the vehicle rolls, and the same road is spread over half a metre of z. Heights are counted from
-the road's own level in the profile: lines through nine pieces of the profile are tried, the one that most readings
+the road's level in the profile: lines through nine pieces of the profile are tried, the one that most readings
 agree with (within `gate_m`) is the road's, and a parabola is fitted to the readings near it.
 
 **1. Threshold from the histogram** of these heights, bins of `bin_m`. *(i)* N is the bin with most readings. *(ii)*
@@ -22,7 +22,7 @@ potholes go.
 
 **3. Scattered and grazing readings.** *Second derivative*: how far a reading stands above the line through its two
 neighbours, which is the second difference free of the spacing. "Larger compared with neighboring points": more than
-`scatter_factor` times the mean of the `scatter_readings` on each side, more than that many times the profile's own
+`scatter_factor` times the mean of the `scatter_readings` on each side, more than that many times the profile's
 noise, and no less than that of the two beside it: `scattered`. Only upwards: what stands on the road scatters, and a
 reading below its neighbours is a crack. *Angle*: the surface is the chord to the next reading at least `chord_m`
 away; where the beam meets the chords on both sides at less than `grazing_deg`, the reading is `grazing`: beams that
@@ -38,7 +38,7 @@ through a hole, readings as high above the datum as before it count as on the li
 within `bridge_m`, the carriageway ends: `off_carriageway`. It is the connected surface with most readings.
 
 The noise of the ranges is estimated in each profile, from the median of the second differences: the same settings serve
-a mirror scanner of 6 mm and a triangulation profiler of 0.3 mm. What no single profile shows is not told: a
+a mirror scanner of 6 mm and a triangulation profiler of 0.3 mm. What no single profile shows is not detected: a
 pavement or verge flush with the road is road, and a dropped kerb of 2 cm stays below the tolerance of a scanner with
 6 mm noise that looks at it steeply.
 """
@@ -65,7 +65,7 @@ def segmented(
     range_min_m: float = 0.0,
     range_max_m: float = np.inf,
 ) -> UInt8:
-    """Class of every reading of profiles.
+    """Return the class of every reading of profiles.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def segmented(
 
 
 def _numbers(s: SegmentationConfig) -> tuple[float, ...]:
-    """Settings in the order of ``kernels.road.carriageway.SETTINGS``."""
+    """Return the settings in the order of ``georeference.kernels.carriageway.SETTINGS``."""
     return (
         s.bin_m, s.share, s.gate_m, s.scatter_factor, float(s.scatter_readings), math.radians(s.grazing_deg),
         s.chord_m, s.step_m, s.noise_factor, s.slope, s.window_m, float(s.window_readings), s.bridge_m,

@@ -1,4 +1,4 @@
-"""Where a sensor stood on the map when it measured: of many readings, by way of a few poses."""
+"""Map positions of a sensor at many epochs, interpolated between a few poses."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _TICK_NS: Final = 20_000_000
-"""Places are computed at multiples of this and are linear between: at 10 m/s² that errs by 0.5 mm."""
+"""Positions are computed at multiples of this and are linear between: at 10 m/s² the error is 0.5 mm."""
 _MOST_TICKS: Final = 20_000_000
-"""Epochs over a longer time (4 days) have a pose each."""
+"""Over a longer time (4 days), a pose is computed for each epoch."""
 
 
 def sensor_places(trajectory: Trajectory, frame: MapFrame, mountings: Mountings, epochs_gps_ns: Int64) -> Float64:
-    """(n, 3) easting, northing and height (m) of a sensor's origin at epochs (n,); NaN where there is no pose.
+    """Return (n, 3) easting, northing and height (m) of a sensor's origin at epochs (n,); NaN without a pose.
 
-    A place depends on its own epoch alone, not on the others that are asked for.
+    A position depends on its epoch alone, not on the other epochs.
     """
     if not epochs_gps_ns.size:
         return np.zeros((0, 3))
@@ -45,7 +45,7 @@ def sensor_places(trajectory: Trajectory, frame: MapFrame, mountings: Mountings,
 
 
 def _used(tick: Int64) -> tuple[Int64, Int64]:
-    """Ticks (k,) at which places are needed, from 0 on, and the row among them of each tick (t,)."""
+    """Return the ticks (k,) at which positions are needed, from 0 on, and the row among them of each tick (t,)."""
     is_used = np.zeros(int(tick.max()) + 2, bool)
     is_used[tick] = True
     is_used[1:] |= is_used[:-1].copy()
@@ -53,7 +53,7 @@ def _used(tick: Int64) -> tuple[Int64, Int64]:
 
 
 def _exact(trajectory: Trajectory, frame: MapFrame, mountings: Mountings, epochs_gps_ns: Int64) -> Float64:
-    """The same by a pose for each epoch."""
+    """Return the same positions from a pose for each epoch."""
     poses = trajectory.poses(epochs_gps_ns)
     lever = np.empty((epochs_gps_ns.size, 3))
     for rows, mounting in mountings.pieces(epochs_gps_ns):

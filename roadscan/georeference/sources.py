@@ -1,4 +1,4 @@
-"""Raw readings and what places them: loaded for a span of time, never more."""
+"""Loads raw readings and what georeferences them, for one span of time at once."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ from roadscan.store.schema import table_schema
 from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store
 
-_CHUNK_READINGS = 1 << 20
+_CHUNK_READINGS = 1 << 20  # Readings per chunk, for which the working arrays are sized.
 _MAP_SCALE = 2.0
-"""No map in use shows a metre of the ground longer than that (Web Mercator up to 60°)."""
+"""Upper bound on the scale of a map: Web Mercator reaches it at 60° latitude."""
 _EPOCH_COLUMNS = ("epoch_gps_ns", "pose_epoch_gps_ns")
 MOUNTING_COLUMNS: Final = (
     "lever_forward_m", "lever_right_m", "lever_down_m", "roll_rad", "pitch_rad", "heading_rad", "range_scale",
@@ -56,35 +56,35 @@ MOUNTING_COLUMNS: Final = (
 
 @dataclass(frozen=True)
 class ReadingSource:
-    """One sensor's readings in one run, and how they are placed. Sent to workers: it holds no data."""
+    """One sensor's readings in one run, and what georeferences them. Sent to workers: it holds no data."""
 
     run: str
     sensor: str
     table: str
     attributes: tuple[tuple[str, Any], ...]
-    """What the readings need to be understood: scan geometry, or the cloud's CRS."""
+    """Attributes of the readings: scan geometry, or the cloud's CRS."""
     trajectory: TrajectorySource | None
-    """None for clouds, which are placed already."""
+    """None for clouds, which are georeferenced already."""
     mountings: Mountings
     range_min_m: float
     range_max_m: float
     key: str
-    """Hash of all that places the readings: recorded poses, mounting, clock, range limits, map, grid. Corrections of
-    the poses belong to the keys of what lies in their span of time, the code to the keys of what it makes."""
+    """Hash of all that georeferences the readings: recorded poses, mounting, clock, range limits, map, grid. Pose
+    corrections are part of the keys of outputs in their span of time, the code of the keys of its outputs."""
     clock: ClockCorrection | None = None
     """Estimated correction of the ingested epochs; None where the sensor's clock is right as ingested."""
     road: RoadSegmentation | None = None
-    """How the road is told in profiles, so that nothing else counts; None where all readings do. Not in `key`: it
+    """Segmentation of profiles, after which only road readings count; None where all count. Not in `key`: it
     belongs to the keys of tiles."""
     geoid: Geoid | None = None
-    """Grid that a cloud's orthometric heights count from."""
+    """Grid that a cloud's orthometric heights refer to."""
     mounting_change: MountingChange | None = None
-    """What an adjustment adds to the mountings. Not in `key`, as corrections of the poses are not."""
+    """Change of the mountings by an adjustment. Not in `key`, as corrections of the poses are not."""
     allowance: Allowance = NO_CORRECTION
-    """Corrections of the poses that footprints leave room for. Not in `key`: it belongs to the keys of footprints."""
+    """Corrections of the poses that footprints allow for. Not in `key`: it belongs to the keys of footprints."""
 
     def spans(self, ingested: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-        """First and last epochs (GPS ns) on time, of spans of ingested epochs."""
+        """Return first and last epochs (GPS ns), with the clock corrected, of spans of ingested epochs."""
         if self.clock is None:
             return tuple(ingested)
         ends = self.clock.applied(np.array(ingested, dtype=np.int64).ravel()).reshape(-1, 2)
@@ -92,7 +92,7 @@ class ReadingSource:
 
     @property
     def adjusted_mountings(self) -> Mountings:
-        """The mountings as an adjustment changed them: they go with corrected poses."""
+        """Return the mountings with the adjustment's change, for use with corrected poses."""
         if self.mounting_change is None:
             return self.mountings
         return self.mounting_change.applied(self.mountings, parallel=self.has_parallel_beams)
@@ -105,20 +105,20 @@ class ReadingSource:
 
     @property
     def attribute(self) -> dict[str, Any]:
-        """Attributes by name."""
+        """Return the attributes by name."""
         return dict(self.attributes)
 
 
 @dataclass(frozen=True)
 class MapSettings:
-    """Where points go: the map, its grid, and which heights count."""
+    """Settings of the map: its projection, its grid, and limits of heights."""
 
     map: MapFrame
     grid: TileGrid
     heights: HeightLimits
     max_gap_s: float
     marks: bool = False
-    """Readings that a filter leaves out are placed too, with their classes."""
+    """Whether filtered readings are georeferenced too, with their classes."""
 
 
 @dataclass(frozen=True)
@@ -130,13 +130,13 @@ class RawSlice:
     groups: Sequence[int]
     """Ascending, and so in the order of time; a range where they are consecutive."""
     spans: tuple[tuple[int, int], ...]
-    """First and last epoch (GPS ns), on time, of each run of consecutive groups."""
+    """First and last epoch (GPS ns, clock corrected) of each run of consecutive groups."""
     bytes: int
-    """Compressed bytes of the groups, about."""
+    """Approximate compressed bytes of the groups."""
 
     @classmethod
     def whole(cls, source: ReadingSource, file: DataFile) -> RawSlice:
-        """All row groups of a data file."""
+        """Return all row groups of a data file."""
         spans = () if file.span is None else source.spans([file.span])
         return cls(source, file.path, range(len(file.group_rows)), spans, file.bytes)
 
@@ -144,7 +144,7 @@ class RawSlice:
 def read_rows(
     store: Store, source: ReadingSource, file: str, groups: Sequence[int], columns: list[str] | None = None
 ) -> pa.Table:
-    """Row groups of a source's data file, their epochs on time."""
+    """Read row groups of a source's data file, with the clock of their epochs corrected."""
     rows = read_groups(store, file, groups, columns)
     if source.clock is None:
         return rows
@@ -157,12 +157,12 @@ def read_rows(
 
 
 class Georeferencer:
-    """Places the readings of slices: loads the poses they need, once for each source."""
+    """Georeferences the readings of slices; it loads the poses once for each source."""
 
     def __init__(
         self, store: Store, ground: MapSettings, slices: Sequence[RawSlice], *, recorded: bool = False
     ) -> None:
-        """`recorded`: with poses as they were recorded and mountings as stated, whatever corrections there are."""
+        """Load the poses. `recorded`: use recorded poses and stated mountings, without corrections."""
         self._store = store
         self._ground = ground
         self._load, self._recorded = load_recorded if recorded else load_trajectory, recorded
@@ -177,14 +177,14 @@ class Georeferencer:
                 self._placements[key] = self._placement(source, spans[key])
 
     def place(self, one: RawSlice, window: Window) -> Iterator[tuple[int, Placed]]:
-        """Points of a slice, chunk by chunk, with the row group each chunk starts with."""
+        """Yield points of a slice, chunk by chunk, with the row group each chunk starts with."""
         for groups in _chunks(one):
             rows = read_rows(self._store, one.source, one.file, groups).combine_chunks()
             for batch in rows.to_batches():
                 yield groups[0], self._place_batch(one.source, batch, window, self._ground.marks)
 
     def located(self, one: RawSlice, window: Window, columns: list[str]) -> Iterator[tuple[pa.RecordBatch, Located]]:
-        """Some columns of a slice of scans or returns, chunk by chunk, and where its readings lie within a window."""
+        """Yield columns of a slice of scans or returns, chunk by chunk, and its readings' positions within a window."""
         placement, geometry = self._placements[one.source.key], geometry_of(one.source)
         for groups in _chunks(one):
             rows = read_rows(self._store, one.source, one.file, groups, columns).combine_chunks()
@@ -192,16 +192,16 @@ class Georeferencer:
                 yield batch, placement.located(batch, geometry, window)
 
     def placement(self, source: ReadingSource) -> Placement:
-        """How the readings of a source, which is no cloud, become points."""
+        """Return the georeferencing of a source's readings; the source is no cloud."""
         return self._placements[source.key]
 
     def trajectory(self, source: ReadingSource) -> Trajectory | None:
-        """Poses around the slices of a source; None for clouds."""
+        """Return poses around the slices of a source; None for clouds."""
         placement = self._placements.get(source.key)
         return None if placement is None else placement.trajectory
 
     def touched(self, one: RawSlice, group: int) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
-        """Tiles (n, 2) of the points of one row group, and the fates of its readings."""
+        """Return the tiles (n, 2) of the points of one row group, and the counts of its readings."""
         batch = read_rows(self._store, one.source, one.file, [group]).combine_chunks().to_batches()[0]
         if one.source.table == "cloud":
             placed = self._place_batch(one.source, batch, EVERYWHERE, self._ground.marks)
@@ -209,7 +209,7 @@ class Georeferencer:
         return self._placements[one.source.key].touched(batch, geometry_of(one.source), marked=self._ground.marks)
 
     def moved_tiles(self, one: RawSlice, group: int) -> int:
-        """How many tiles further the points of one row group may lie once the poses are corrected, at most."""
+        """Return by how many tiles, at most, corrections may move the points of one row group."""
         source = one.source
         if source.trajectory is None or source.allowance.is_none:
             return 0
@@ -218,9 +218,9 @@ class Georeferencer:
         return math.ceil(_MAP_SCALE * source.allowance.moved_m(arm) / self._ground.grid.size_m)
 
     def classified(self, one: RawSlice) -> Iterator[tuple[pa.RecordBatch, npt.NDArray[np.uint8], Placed]]:
-        """Rows of a slice, chunk by chunk, with the class of every reading in their order, and the points kept.
+        """Yield rows of a slice, chunk by chunk, with the class of every reading in order, and the points kept.
 
-        Passes and centre lines are not looked at.
+        Passes and centre lines are ignored.
         """
         for groups in _chunks(one):
             for batch in read_rows(self._store, one.source, one.file, groups).combine_chunks().to_batches():
@@ -263,32 +263,32 @@ class Georeferencer:
 
 
 MountingChanges: TypeAlias = Mapping[tuple[str, str], MountingChange]
-"""By run, "*" for all that have none of their own, and sensor."""
+"""Changes by run and sensor; "*" stands for all runs without an entry."""
 
 
 def load_mounting_changes(store: Store) -> MountingChanges:
-    """What an adjustment adds to the mountings of sensors."""
+    """Read an adjustment's changes to the mountings of sensors."""
     table = read_small(store, "mounting_corrections")
     return {key_of_row(row): mounting_change_of(row) for row in ([] if table is None else table.to_pylist())}
 
 
 def key_of_row(row: Mapping[str, Any]) -> tuple[str, str]:
-    """Run, "*" for all, and sensor of a row of `mounting_corrections`."""
+    """Return run, "*" for all, and sensor of a row of `mounting_corrections`."""
     return row.get("run") or "*", row["sensor"]
 
 
 def change_of(changes: MountingChanges, run: str, sensor: str) -> MountingChange | None:
-    """What is added to the mounting of a sensor in a run; None: it holds as it is stated."""
+    """Return the change of a sensor's mounting in a run; None where the stated mounting applies."""
     return changes.get((run, sensor), changes.get(("*", sensor)))
 
 
 def mounting_change_of(row: Mapping[str, Any]) -> MountingChange:
-    """The change that a row of `mounting_corrections` states; rows without a scale have none."""
+    """Return the change that a row of `mounting_corrections` states; a missing value counts as 0."""
     return MountingChange.of(np.array([row.get(name) or 0.0 for name in MOUNTING_COLUMNS]))
 
 
 def load_mountings(store: Store) -> dict[tuple[str, str], list[tuple[int, Mounting]]]:
-    """Calibrated mountings by run ('*' for all) and sensor, with the epochs from which they hold, ascending."""
+    """Read calibrated mountings by run ('*' for all) and sensor, with the epochs from which they apply, ascending."""
     table = read_small(store, "mountings")
     found: dict[tuple[str, str], list[tuple[int, Mounting]]] = {}
     for row in () if table is None else table.sort_by("valid_from_gps_ns").to_pylist():
@@ -311,7 +311,7 @@ def _geometry_of(items: tuple[tuple[str, Any], ...]) -> ScanGeometry:
 
 
 def geometry_of(source: ReadingSource) -> ScanGeometry | None:
-    """Scan geometry of a source of scans, None for other readings."""
+    """Return the scan geometry of a source of scans, None for other readings."""
     if source.table != "scans":
         return None
     stated = source.attribute.get("scan_geometry")
@@ -326,7 +326,7 @@ def _cloud_frame(source: ReadingSource) -> CloudFrame:
 
 
 def _chunks(one: RawSlice) -> Iterator[list[int]]:
-    """Row groups in pieces of about a million readings, which the working arrays are made for."""
+    """Return the row groups in chunks of about `_CHUNK_READINGS` readings."""
     geometry = geometry_of(one.source)
     readings = table_schema(one.source.table).row_group_rows * (1 if geometry is None else geometry.readings)
     step = max(_CHUNK_READINGS // readings, 1)
@@ -335,7 +335,7 @@ def _chunks(one: RawSlice) -> Iterator[list[int]]:
 
 
 def farthest_m(batch: pa.RecordBatch, geometry: ScanGeometry | None) -> float:
-    """Farthest that a reading of rows of ``scans``, or without `geometry` of ``returns``, lies from its sensor (m)."""
+    """Greatest distance (m) of readings from the sensor, in rows of ``scans`` or (without `geometry`) ``returns``."""
     if geometry is None:
         xyz = [batch.column(f"{axis}_sensor_m").to_numpy(zero_copy_only=False).astype(np.float64) for axis in "xyz"]
         return float(np.sqrt(sum(x * x for x in xyz)).max(initial=0.0))

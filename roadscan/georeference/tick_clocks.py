@@ -1,4 +1,4 @@
-"""Clocks of sensors that count a wheel's ticks, against those of the poses: a record a sensor and run."""
+"""Compares the clocks of sensors that count wheel ticks with that of the poses: a record for each sensor and run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 
 PRODUCT: Final = "tick_clocks"
-"""Name in the manifest of what the ticks of a sensor say in a run; it has no file of its own."""
+"""Name in the manifest of the result for a sensor in a run; it has no file."""
 
 TICK_CLOCK: Final = Witness(
     "tick_clock",
@@ -58,19 +58,19 @@ TICKS_STILL: Final = Witness(
 
 _COLUMNS: Final = ["epoch_gps_ns", "encoder_ticks"]
 _PAD_NS: Final = 25 * NS_PER_S
-"""Poses are read so far beyond the readings: a clock may be off by up to 20 s."""
+"""Poses are read this far beyond the readings: a clock may be off by up to 20 s."""
 _STRETCH_NS: Final = 600 * NS_PER_S
-"""Profiles of so long a time are compared at once; memory is bounded by it."""
+"""Profiles of this length of time are compared at once, which bounds memory."""
 _BUNDLE_ROWS: Final = 50_000_000
-"""Rows of which a task reads two columns, at least."""
+"""Least number of rows of which a task reads two columns."""
 _SAME_NS: Final = NS_PER_S // 10
-"""Steps of two sensors that lie closer are one step of the poses."""
+"""Steps of two sensors that lie closer in time count as one step of the poses."""
 _SAME_SHARE: Final = 0.2
-"""Two sizes that differ by less are the same."""
+"""Two sizes that differ by a smaller share count as equal."""
 _COARSE_M: Final = 1.0
-"""Where positions or stamps of the poses are coarse, smaller steps of their way are those."""
+"""Smaller steps along the way are attributed to the poses where their positions or stamps are coarse."""
 _NAMED: Final = 3
-"""So many steps are named, the largest."""
+"""Most steps that a finding names, the largest first."""
 
 
 @dataclass(frozen=True)
@@ -89,14 +89,14 @@ class TickTask:
 
     @property
     def rows(self) -> int:
-        """Profiles."""
+        """Number of profiles."""
         return sum(file.rows for file in self.files)
 
 
 def check_tick_clocks(
     plan: SurveyPlan, manifest: Manifest, compute: Compute, report: Callable[[int, int], None]
 ) -> list[tuple[str, str]]:
-    """Compare ticks with poses where that was not done; returns what failed."""
+    """Compare ticks with poses where that was not done; return what failed."""
     tasks = _tasks(plan)
     manifest.remove(manifest.beside([PRODUCT], {task.unit for task in tasks}))
     stale = [task for task in tasks if not manifest.is_current(PRODUCT, task.unit, task.key)]
@@ -133,7 +133,7 @@ def _tasks(plan: SurveyPlan) -> list[TickTask]:
 
 
 def tick_clock(task: TickTask) -> OutputRecord:
-    """What the ticks of a sensor say of its clock in a run (runs on a worker)."""
+    """Compare the ticks of a sensor with the poses of a run (runs on a worker)."""
     verdicts = [
         judge_ticks(wheel, _poses(task, wheel))
         for files in _stretches(task.files)
@@ -144,7 +144,7 @@ def tick_clock(task: TickTask) -> OutputRecord:
 
 
 def _stretches(files: Sequence[DataFile]) -> Iterator[list[DataFile]]:
-    """Data files one after another; each stretch begins with the last file of the one before."""
+    """Yield groups of consecutive data files; each group begins with the last file of the group before."""
     own: list[DataFile] = []
     for file in files:
         span = file.span
@@ -159,7 +159,7 @@ def _stretches(files: Sequence[DataFile]) -> Iterator[list[DataFile]]:
 
 
 def _wheel(task: TickTask, files: Sequence[DataFile]) -> WheelTicks:
-    """Ticks of the first profile of each period; none where a row group has no counts."""
+    """Return the ticks of the first profile of each period; none where a row group has no counts."""
     epochs, ticks = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     period = NS_PER_S // SAMPLES_PER_S
     for file, group in ((one, group) for one in files for group in range(len(one.group_rows))):
@@ -180,7 +180,7 @@ def _poses(task: TickTask, wheel: WheelTicks) -> PoseWay:
 
 
 def _figures(verdicts: Sequence[TickVerdict]) -> dict[str, object]:
-    """Steps of all stretches, each once, and the offset that is known best, with its σ (s)."""
+    """Return the steps of all groups, each once, and the best-known offset with its σ (s)."""
     jumps = {jump.epoch_gps_ns: jump for one in verdicts for jump in one.jumps}
     offsets = [one.offset for one in verdicts if one.offset is not None and one.is_off]
     offset = min(offsets, key=lambda one: one.sigma_s, default=None)
@@ -195,18 +195,18 @@ def _figures(verdicts: Sequence[TickVerdict]) -> dict[str, object]:
 
 
 class _Said(NamedTuple):
-    """What the ticks of one log say."""
+    """Result of the comparison for one log."""
 
     log: str
     jumps: tuple[ClockJump, ...]
     offset: tuple[float, float] | None
-    """How far the clock is off, and its σ (s)."""
+    """Offset of the clock, and its σ (s)."""
     still_m: float
-    """Way on which the ticks stand still; 0 where they count."""
+    """Distance over which the ticks stand still; 0 where they count."""
 
 
 def tick_findings(records: Sequence[LogRecord], manifest: Manifest) -> list[Finding]:
-    """Clocks that ticks and poses contradict, by log; by run where all logs of several sensors say the same."""
+    """Return clocks that ticks and poses contradict: by log, or by run where all logs of several sensors agree."""
     log_of = {file.path: record.path for record in records for files in record.tables.values() for file in files}
     coarse = {
         record.run

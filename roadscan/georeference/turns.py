@@ -1,7 +1,7 @@
-"""Where successive profiles cross in turns of a trajectory (Yu and others 2007, eq. 3; see ``points.range_filter``).
+"""Crossings of successive profiles in turns of a trajectory (Yu et al. 2007, eq. 3; see ``georeference.range_filter``).
 
-The trajectory is looked at every :data:`TICK_NS`, at whole multiples of it. From tick to tick, Δs is how far the
-sensor goes along the body's x axis, and Δθ how far the body turns about its own z axis: the planes of two profiles
+The trajectory is sampled at whole multiples of :data:`TICK_NS`. From tick to tick, Δs is the distance of the
+sensor along the body's x axis, and Δθ the rotation of the body about its z axis: the planes of two profiles
 that lie across the body cross at Δs / sin Δθ beside the sensor, on the right where the vehicle turns right (and on the
 left where it turns right backwards). A profile has the limits of the tick nearest to it, from the ticks around it over
 `base_m` of path, at most :data:`WINDOW_NS` before and after. A vehicle that does not go half as far in that time
@@ -20,12 +20,12 @@ from roadscan.core.settings.segmentation import RangeFilter
 from roadscan.georeference.range_filter import limits_of_turns
 from roadscan.poses.trajectory import Poses, Trajectory
 
-TICK_NS: Final = 10_000_000
+TICK_NS: Final = 10_000_000  # Interval at which the trajectory is sampled.
 WINDOW_NS: Final = 200 * TICK_NS
-"""Poses that limits depend on lie no farther than this from a profile's epoch, and half a tick."""
+"""Limits depend on poses within this time of a profile's epoch, and half a tick."""
 
 _WINDOW: Final = WINDOW_NS // TICK_NS
-_NANO: Final = 1e-9
+_NANO: Final = 1e-9  # Steps are summed as whole nanometres and nanoradians.
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -34,7 +34,7 @@ Int64 = npt.NDArray[np.int64]
 def turn_limits(
     trajectory: Trajectory, lever_arm_body_m: tuple[float, float, float], epochs_gps_ns: Int64, settings: RangeFilter
 ) -> Float64:
-    """How far (n, 2) to the left and right of the sensor readings of profiles are kept (m); infinite outside turns.
+    """Return how far (n, 2) left and right of the sensor readings of profiles are kept (m); infinite outside turns.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def turn_limits(
 def _limits(
     trajectory: Trajectory, lever_arm_body_m: tuple[float, float, float], ticks: Int64, settings: RangeFilter
 ) -> Float64:
-    """Limits (k, 2) at ticks (k,), ascending."""
+    """Return limits (k, 2) at ticks (k,), ascending."""
     begin = int(ticks[0]) - _WINDOW
     poses = trajectory.poses(np.arange(begin, int(ticks[-1]) + _WINDOW + 1) * TICK_NS)
     step_nm, turn_nrad = _steps(poses, lever_arm_body_m)
@@ -71,7 +71,7 @@ def _limits(
 
 
 def _steps(poses: Poses, lever_arm_body_m: tuple[float, float, float]) -> tuple[Int64, Int64]:
-    """Steps (k − 1,) of a sensor along the body (nm) and turns of the body to the right (nrad), 0 beside no pose.
+    """Return steps (k − 1,) of a sensor along the body (nm) and turns to the right (nrad), 0 beside no pose.
 
     Written out by element: sums of a library may depend on how many there are.
     """
@@ -97,7 +97,7 @@ def _summed(steps: Int64) -> Int64:
 
 
 def _pieces(found: npt.NDArray[np.bool_]) -> tuple[Int64, Int64]:
-    """First and last tick (k,) of the unbroken piece of poses that each tick lies in."""
+    """Return first and last tick (k,) of the unbroken piece of poses that contains each tick."""
     number = np.arange(found.size)
     breaks = ~(found[:-1] & found[1:])
     first = np.maximum.accumulate(np.where(np.concatenate([[True], breaks]), number, 0))

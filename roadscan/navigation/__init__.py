@@ -1,1 +1,1 @@
-"""Poses at any epoch: corrections and mountings are applied here and nowhere else."""
+"""Navigation: trajectories from GNSS, IMU and odometer, and the clocks of sensors."""

@@ -1,4 +1,4 @@
-"""The picture of a run's navigation: path, σ, residuals, innovations, and what was estimated beside the path."""
+"""Draws a run's navigation: path, σ, residuals, innovations, and the other estimated states."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ Int64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 OUTAGE_S: Final = 2.0
-"""Without a position for longer (and for two and a half times the usual) GNSS is out."""
+"""GNSS is out where there is no position for longer than this, and than two and a half times the usual interval."""
 _MOST_POINTS: Final = 6000
-"""A line of more points shows no more."""
+"""Most points of a line."""
 _INK, _GREY, _SHADE = "#222222", "#9a9a9a", "#f3d9c9"
 _AXIS_COLOURS: Final = ("#1f5fa8", "#d1495b", "#3d8b40")
 _QUALITY_COLOURS: Final = {
@@ -40,13 +40,13 @@ _DOWN, _REFUSED = "#e07a00", "#c1121f"
 
 @dataclass(frozen=True)
 class NavigationPicture:
-    """What is drawn."""
+    """Content of the picture."""
 
     title: str
-    """Run, and what else names it."""
+    """Run, and other names."""
     solution: Solution
     gnss: GnssSolutions
-    """Of the run, on GPS time."""
+    """Solutions of the run, on GPS time."""
     antenna_lever_arm_body_m: Float64
     """(3,) from the IMU reference point, forward, right, down."""
 
@@ -66,7 +66,7 @@ class _Axis:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Antenna by the solution less antenna by GNSS, at the epochs of GNSS."""
+    """Antenna position of the solution less that of GNSS, at the epochs of GNSS."""
 
     seconds: Float64
     ned_m: Float64
@@ -129,7 +129,7 @@ def _residuals(picture: NavigationPicture, axis: _Axis) -> _Residuals:
 
 
 def _antenna_arm(picture: NavigationPicture) -> Float64:
-    """The lever arm as the smoother has it in the end, where it estimates it."""
+    """Return the lever arm that the smoother estimated, or the stated one."""
     found = picture.solution.states.get("antenna_lever_arm_body_m")
     if found is None or len(found[0]) == 0:
         return picture.antenna_lever_arm_body_m
@@ -137,7 +137,7 @@ def _antenna_arm(picture: NavigationPicture) -> Float64:
 
 
 def _covered(solution: Solution, epochs: Int64) -> Flags:
-    """Epochs (m,) that lie in an unbroken piece of the solution."""
+    """Return epochs (m,) that lie in an unbroken piece of the solution."""
     if not solution.pieces:
         return np.ones(epochs.size, dtype=bool)
     inside: Flags = np.any([(epochs >= a) & (epochs <= b) for a, b in solution.pieces], axis=0)
@@ -249,7 +249,7 @@ def _draw_residuals(axes: Axes, r: _Residuals, axis: _Axis) -> None:
 
 
 def _draw_spread(axes: Axes, r: _Residuals) -> None:
-    """How large the residuals are, by quality: cumulative."""
+    """Draw the cumulative distribution of the residuals' sizes, by quality."""
     for name in _qualities(r.quality):
         rows = r.quality == name
         for values, style, label in (
@@ -289,7 +289,7 @@ def _draw_innovations(axes: Axes, found: Innovations | None, axis: _Axis) -> Non
 
 
 def _draw_states(axes: Axes, s: Solution, axis: _Axis, name: str) -> None:
-    """A bias of the IMU's three axes with its 1 σ as a band, in the units of data sheets."""
+    """Draw a bias of the IMU's three axes with its 1 σ as a band, in the units of data sheets."""
     key = next((k for k in s.states if k.startswith(name)), None)
     scale, unit, title = {
         "gyro_bias": (np.degrees(1.0) * 3600.0, "°/h", "Bias of the gyroscopes"),
@@ -308,7 +308,7 @@ def _draw_states(axes: Axes, s: Solution, axis: _Axis, name: str) -> None:
 
 
 def _draw_odometer(axes: Axes, s: Solution, axis: _Axis) -> None:
-    """Scale of the odometer with its σ; without one, the speed that was driven."""
+    """Draw the scale of the odometer with its σ; without one, the speed."""
     key = next((k for k in s.states if k.startswith("odometer_scale")), None)
     if key is None:
         thin = _thinned(s.epochs_gps_ns.size)
@@ -331,7 +331,7 @@ def _lines(axes: Axes, seconds: Float64, values: Float64, names: Sequence[str]) 
 
 
 def _logarithmic(axes: Axes, values: Float64) -> None:
-    """A logarithmic axis with room for the legend above."""
+    """Set a logarithmic axis with room for the legend above."""
     axes.set_yscale("log")
     known = values[np.isfinite(values) & (values > 0)]
     if known.size:
@@ -367,7 +367,7 @@ def _finish(axes: Axes, title: str, columns: int = 1) -> None:
 
 
 def _qualities(quality: npt.NDArray[np.str_]) -> list[str]:
-    """Kinds of solution, the best first."""
+    """Return the kinds of solution, the best first."""
     kinds = set(quality.tolist())
     known = [name for name in _QUALITY_COLOURS if name in kinds]
     return known + sorted(kinds - set(known))
@@ -378,7 +378,7 @@ def _colour(quality: str) -> str:
 
 
 def _thinned(count: int) -> Int64:
-    """Rows that are drawn of so many."""
+    """Return the rows that are drawn of this many."""
     return (
         np.unique(np.linspace(0, count - 1, min(count, _MOST_POINTS)).astype(np.int64))
         if count

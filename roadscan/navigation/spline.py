@@ -1,8 +1,8 @@
-"""Trajectories smoothed where GNSS dropped out, by piecewise cubic polynomials in time.
+"""Smooths trajectories in GNSS outages by piecewise cubic polynomials in time.
 
 "The trajectory appears rugged mostly at places where there is a GPS signal outage. We smooth the trajectory by creating
 a piecewise polynomial function": a cubic B-spline with time as its parameter (the mobile-mapping paper, 3.2, 3.2.1).
-Three things make a trajectory rugged, and each is mended by its own cubic:
+A trajectory is rugged for three reasons, and each is corrected by a different cubic:
 
 - **Steps**: through an outage the solution drifts, and leaps back when GNSS returns. Value and slope of the leap fix a
   cubic c(t) with c = c' = 0 where the outage begins, which is added to the poses before the leap. Errors that grow with
@@ -40,32 +40,32 @@ Int64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 SIDE_S: Final = 0.5
-"""Poses over this long beside a step or a gap state the motion there."""
+"""Poses over this long beside a step or a gap determine the motion there."""
 RECOVERY_S: Final = 1.0
-"""Steps so long after an outage's end still belong to it: a filter comes back with more than one."""
-_SIDE_POSES: Final = 4
-_TRIALS: Final = 200
+"""Steps up to this long after an outage's end belong to it: a filter returns with more than one."""
+_SIDE_POSES: Final = 4  # Least number of poses beside a step.
+_TRIALS: Final = 200  # Most places at which the error of filled gaps is tried.
 _TRUSTED: Final = 3.0
-"""A change of velocity at a step counts only where it exceeds its σ this many times."""
+"""A change of velocity at a step counts only beyond this many σ."""
 
 Kind = Literal["step", "jitter", "gap"]
 
 
 @dataclass(frozen=True)
 class Mended:
-    """What was done to a span of a trajectory."""
+    """The correction of a span of a trajectory."""
 
     kind: Kind
     begin_gps_ns: int
     end_gps_ns: int
-    """The first and the last epoch whose pose changed or is new."""
+    """First and last epoch whose pose changed or is new."""
     poses: int
     greatest_shift_m: float
-    """Of a gap NaN: there was nothing before."""
+    """Largest shift; NaN for a gap, which had no poses."""
     rms_shift_m: float
     greatest_turn_rad: float
     sigma_m: float
-    """Step: 1 σ of its size; jitter: scatter that was taken away; gap: greatest 1 σ of a filled position."""
+    """Step: 1 σ of its size; jitter: scatter that was removed; gap: largest 1 σ of a filled position."""
 
     def __str__(self) -> str:
         span = f"{iso_from_gps_ns(self.begin_gps_ns)}, {(self.end_gps_ns - self.begin_gps_ns) / NS_PER_S:.2f} s"
@@ -79,7 +79,7 @@ class Mended:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """A smoothed trajectory and what changed."""
+    """A smoothed trajectory and its changes."""
 
     trajectory: Trajectory
     changes: list[Mended]
@@ -99,7 +99,7 @@ class _Side:
 
 @dataclass(frozen=True)
 class _Leap:
-    """A step between two poses: what comes after less what came before."""
+    """A step between two poses: after less before."""
 
     shift_m: Float64
     """(3,) world."""
@@ -115,7 +115,7 @@ class _Leap:
 def smoothed(
     trajectory: Trajectory, config: SplineConfig, outages_gps_ns: Sequence[tuple[int, int]] | None = None
 ) -> Smoothed:
-    """Smooth a trajectory where GNSS dropped out.
+    """Smooth a trajectory in GNSS outages.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def smoothed(
 
 
 def outages_by_sigma(trajectory: Trajectory, config: SplineConfig) -> list[tuple[int, int]]:
-    """Spans in which the stated horizontal σ is far above its median; none where the trajectory states none."""
+    """Return spans in which the stated horizontal σ is far above its median; none where the trajectory states none."""
     if trajectory.sigma_ned_m is None:
         return []
     sigma = np.hypot(trajectory.sigma_ned_m[:, 0], trajectory.sigma_ned_m[:, 1])
@@ -157,7 +157,7 @@ def outages_by_sigma(trajectory: Trajectory, config: SplineConfig) -> list[tuple
     high = sigma > max(config.outage_sigma_factor * usual, config.outage_sigma_m)
     spans = []
     for a, b in runs_of(high):
-        # The drift begins where σ begins to grow, before it is far above.
+        # The drift begins where σ begins to grow, before it is far above the median.
         first = int(a)
         while first > 0 and sigma[first - 1] < sigma[first] and sigma[first - 1] > 1.05 * usual:
             first -= 1
@@ -166,7 +166,7 @@ def outages_by_sigma(trajectory: Trajectory, config: SplineConfig) -> list[tuple
 
 
 def rugged_spans(trajectory: Trajectory, config: SplineConfig) -> list[tuple[int, int]]:
-    """First and last pose of spans in which increments scatter far more than they usually do."""
+    """Return the first and last pose of spans in which increments scatter far more than usual."""
     surprise = np.linalg.norm(_surprises(trajectory), axis=1)
     usual = float(np.median(surprise[np.isfinite(surprise)])) if np.isfinite(surprise).any() else 0.0
     width = max(_SIDE_POSES, round(2 * SIDE_S / _step_s(trajectory)))
@@ -181,7 +181,7 @@ def rugged_spans(trajectory: Trajectory, config: SplineConfig) -> list[tuple[int
 
 
 def _surprises(trajectory: Trajectory) -> Float64:
-    """Increments (n − 1, 3) less what those before and after make of them; NaN beside a gap and at the ends."""
+    """Return increments (n − 1, 3) less those predicted from the neighbours; NaN beside a gap and at the ends."""
     seconds = np.diff(trajectory.epochs_gps_ns) / NS_PER_S
     steps = np.diff(trajectory.position_world_m, axis=0)
     speed = steps / seconds[:, None]
@@ -198,15 +198,15 @@ def _surprises(trajectory: Trajectory) -> Float64:
 def _leaps(
     trajectory: Trajectory, config: SplineConfig, outages: Sequence[tuple[int, int]]
 ) -> list[tuple[int, int, slice]]:
-    """Steps in time: the pose before each, the pose at which its drift began, and the poses beside it without others.
+    """Return steps in time: the pose before each, the pose at which its drift began, and undisturbed poses beside it.
 
-    Within an outage every step (a standstill, a constraint) corrects the drift since its begin; elsewhere what came
-    before the step before is not its concern.
+    Within an outage every step (a standstill, a constraint) corrects the drift since the outage began; elsewhere it
+    corrects only the drift since the step before.
     """
     surprise = np.linalg.norm(np.nan_to_num(_surprises(trajectory)), axis=1)
     usual = float(np.median(surprise))
     large = surprise > max(config.step_m, 8 * usual)
-    # A step surprises the increments beside it by half its size: only the greatest of neighbours is one.
+    # A step also changes the neighbouring residuals by half its size: only the largest counts.
     peak = large & (surprise >= np.maximum(np.append(surprise[1:], 0.0), np.append(0.0, surprise[:-1])))
     steps = np.flatnonzero(peak)
     bounds = [0, *(steps + 1).tolist(), trajectory.epochs_gps_ns.size]
@@ -222,7 +222,7 @@ def _leaps(
 def _begin_of(
     trajectory: Trajectory, at: int, config: SplineConfig, outages: Sequence[tuple[int, int]]
 ) -> tuple[int, bool]:
-    """The pose at which the drift before a step began, after the last gap; and whether an outage says so."""
+    """Pose at which the drift before a step began, after the last gap; and whether an outage determines it."""
     epochs = trajectory.epochs_gps_ns
     after_ns = round(RECOVERY_S * NS_PER_S)
     around = [b for b, e in outages if b < epochs[at] and epochs[at] <= e + after_ns]
@@ -235,7 +235,7 @@ def _begin_of(
 def _without_step(
     trajectory: Trajectory, step: tuple[int, int, slice], config: SplineConfig, changes: list[Mended], touched: Flags
 ) -> Trajectory:
-    """Poses from the one after the begin to that before the step, moved by a cubic to where those after it go on."""
+    """Move the poses from the begin of the drift to the step by a cubic, so that they join those after it."""
     begin, at, beside = step
     epochs = trajectory.epochs_gps_ns
     middle = int(epochs[at]) + (int(epochs[at + 1]) - int(epochs[at])) // 2
@@ -254,7 +254,7 @@ def _without_step(
 
 
 def _leap_at(trajectory: Trajectory, at: int, middle: int, beside: slice) -> _Leap:
-    """Size and slope of a step, by one polynomial of degree 5 on both sides with a step and a bend between them.
+    """Return size and slope of a step, from one polynomial of degree 5 on both sides with a step and a bend.
 
     Motion that both sides share, such as that of the springs, does not count as a step.
     """
@@ -284,7 +284,7 @@ def _leap_at(trajectory: Trajectory, at: int, middle: int, beside: slice) -> _Le
 
 
 def _fitted(columns: Float64, values: Float64) -> tuple[Float64, Float64]:
-    """Coefficients (c, 3) of least squares and their variances (c,), of the axis that fits worst."""
+    """Return coefficients (c, 3) of least squares and their variances (c,), of the axis that fits worst."""
     found: Float64 = np.asarray(np.linalg.lstsq(columns, values, rcond=None)[0], dtype=np.float64)
     rest = ((values - columns @ found) ** 2).sum(axis=0).max() / max(len(columns) - columns.shape[1], 1)
     variance: Float64 = rest * np.diag(np.linalg.pinv(columns.T @ columns))
@@ -292,7 +292,7 @@ def _fitted(columns: Float64, values: Float64) -> tuple[Float64, Float64]:
 
 
 def _likely_slope(leap: _Leap, length: float) -> Float64:
-    """Slope (3,) with which the drift ends: as measured, and as drift is known to grow.
+    """Return the likely slope (3,) at the end of the drift, from the measurement and from the known growth of drift.
 
     An error of velocity grows with t, of acceleration with t², of rotation with t³: its slope at the end is one to
     three times its size over the length of the outage. The mean of both, weighted by their variances.
@@ -305,7 +305,7 @@ def _likely_slope(leap: _Leap, length: float) -> Float64:
 
 
 def _cubic(seconds: Float64, length: float, value: Float64, slope: Float64) -> Float64:
-    """(n, 3) at seconds since the begin: 0 with slope 0 there, a value and a slope (per second) at the end."""
+    """Return (n, 3) at seconds since the begin: 0 with slope 0 there, a value and a slope (per second) at the end."""
     ends = scipy.interpolate.CubicHermiteSpline(
         [0.0, length], np.stack([np.zeros(3), value]), np.stack([np.zeros(3), slope])
     )
@@ -314,13 +314,13 @@ def _cubic(seconds: Float64, length: float, value: Float64, slope: Float64) -> F
 
 
 def _trusted(change: Float64, sigma: float) -> Float64:
-    """A change as far as it is more than its noise (positive-part James–Stein)."""
+    """Shrink a change by its noise (positive-part James–Stein)."""
     size2 = float(change @ change)
     return change * max(0.0, 1.0 - (_TRUSTED * sigma) ** 2 / size2) if size2 > 0 else change
 
 
 def _side(trajectory: Trajectory, at: int, epoch: int, reference: Rotation, sign: int) -> _Side:
-    """The motion at an epoch by the poses up to `at` (sign −1) or from the next one on (1): cubics in time."""
+    """Return the motion at an epoch from the poses up to `at` (sign −1) or after it (1), by cubics in time."""
     epochs = trajectory.epochs_gps_ns
     count = max(_SIDE_POSES, round(SIDE_S / _step_s(trajectory)))
     rows = (
@@ -340,7 +340,7 @@ def _side(trajectory: Trajectory, at: int, epoch: int, reference: Rotation, sign
 def _without_jitter(
     trajectory: Trajectory, span: tuple[int, int], config: SplineConfig, changes: list[Mended], touched: Flags
 ) -> Trajectory:
-    """The poses of a span replaced by a weighted cubic B-spline, into which they pass at both ends."""
+    """Replace the poses of a span by a weighted cubic B-spline, with smooth transitions at both ends."""
     first, last = span
     rows = np.arange(first, last + 1)
     seconds = (trajectory.epochs_gps_ns[rows] - trajectory.epochs_gps_ns[first]) / NS_PER_S
@@ -365,7 +365,7 @@ def _without_jitter(
 
 
 def _turns_are_rugged(trajectory: Trajectory, rows: Int64, config: SplineConfig) -> bool:
-    """Attitudes of a span scatter far more than the trajectory's usually do."""
+    """Return whether attitudes of a span scatter far more than the trajectory's usually do."""
     turns = Rotation.from_quat(trajectory.quaternion_world_from_body, scalar_first=True)
     steps = (turns[:-1].inv() * turns[1:]).as_rotvec()
     bends = np.linalg.norm(np.diff(steps, n=2, axis=0), axis=1)
@@ -374,9 +374,9 @@ def _turns_are_rugged(trajectory: Trajectory, rows: Int64, config: SplineConfig)
 
 
 def _spline(seconds: Float64, values: Float64, weights: Float64, knot_s: float) -> Float64:
-    """Values (n, k) of the cubic B-spline of least squares, its knots about `knot_s` apart."""
+    """Return values (n, k) of the cubic B-spline of least squares, its knots about `knot_s` apart."""
     pieces = max(1, min(round(seconds[-1] / knot_s), seconds.size // _SIDE_POSES))
-    # Knots where the poses are: each piece has as many of them.
+    # Knots follow the poses, so each piece has equally many.
     inner = np.quantile(seconds, np.arange(1, pieces) / pieces)
     knots = np.concatenate([np.repeat(seconds[0], 4), inner, np.repeat(seconds[-1], 4)])
     spline: Float64 = scipy.interpolate.make_lsq_spline(seconds, values, knots, k=3, w=weights)(seconds)
@@ -384,7 +384,7 @@ def _spline(seconds: Float64, values: Float64, weights: Float64, knot_s: float) 
 
 
 def _smoothed_turns(seconds: Float64, turns: Rotation, weights: Float64, knot_s: float) -> Float64:
-    """Rotation vectors (n, 3), body axes, from attitudes to smoothed ones.
+    """Return rotation vectors (n, 3), body axes, from attitudes to smoothed ones.
 
     In the tangent of a rotation spline through every tenth of a knot's poses or so, which carries the tangent through
     bends of any angle.
@@ -398,7 +398,7 @@ def _smoothed_turns(seconds: Float64, turns: Rotation, weights: Float64, knot_s:
 
 
 def _filled(trajectory: Trajectory, config: SplineConfig, changes: list[Mended], touched: Flags) -> Smoothed:
-    """Gaps up to `fill_gap_s` filled by Hermite's cubic, at the trajectory's usual rate."""
+    """Fill gaps up to `fill_gap_s` by Hermite's cubic, at the trajectory's usual rate."""
     epochs = trajectory.epochs_gps_ns
     steps = np.diff(epochs)
     usual = round(_step_s(trajectory) * NS_PER_S)
@@ -421,7 +421,7 @@ def _filled(trajectory: Trajectory, config: SplineConfig, changes: list[Mended],
 
 
 def _bridge(trajectory: Trajectory, at: int, new: Int64) -> Trajectory:
-    """Poses at new epochs between pose `at` and the next one, with their σ."""
+    """Return poses at new epochs between pose `at` and the next one, with their σ."""
     epochs = trajectory.epochs_gps_ns
     first, last = int(epochs[at]), int(epochs[at + 1])
     length, seconds = (last - first) / NS_PER_S, (new - first) / NS_PER_S
@@ -441,7 +441,7 @@ def _bridge(trajectory: Trajectory, at: int, new: Int64) -> Trajectory:
 
 
 def _hermite(before: _Side, after: _Side, ends_m: Float64, length: float, seconds: Float64) -> Float64:
-    """Positions (n, 3) between two poses (2, 3) with the velocities beside them."""
+    """Return positions (n, 3) between two poses (2, 3) with the velocities beside them."""
     origin = ends_m[0]
     curve = scipy.interpolate.CubicHermiteSpline(
         [0.0, length], ends_m - origin, np.stack([before.velocity_m_per_s, after.velocity_m_per_s])
@@ -462,7 +462,7 @@ def _tangent_rate(turn: Float64, rate: Float64) -> Float64:
 
 
 def _bridge_sigma(trajectory: Trajectory, at: int, seconds: Float64, length: float) -> Float64:
-    """1 σ (n, 3), north, east, down, of positions in a gap: of its ends, and of a body pushed by white noise."""
+    """Return 1 σ (n, 3), north, east, down, of positions in a gap: of its ends, and of white acceleration noise."""
     ned = ned_from_world(trajectory.world, trajectory.position_world_m[at])
     push = 192.0 * _missed_m2(trajectory, length, ned) / length**3
     variance = push * (seconds * (length - seconds))[:, None] ** 3 / (3 * length**3)
@@ -474,7 +474,7 @@ def _bridge_sigma(trajectory: Trajectory, at: int, seconds: Float64, length: flo
 
 
 def _missed_m2(trajectory: Trajectory, length: float, ned: Float64) -> Float64:
-    """Mean square (3,), north, east, down, of what Hermite's cubic misses in the middle of as long a gap elsewhere.
+    """Mean square error (3,), north, east, down, of Hermite's cubic in the middle of as long a gap elsewhere.
 
     NaN where the trajectory has no unbroken piece of that length.
     """
@@ -520,7 +520,7 @@ def _joined(whole: Trajectory, part: Trajectory, place: int) -> Trajectory:
 
 
 def _moved(trajectory: Trajectory, rows: Int64, shift: Float64, turn: Float64) -> Trajectory:
-    """The trajectory with some poses shifted (world axes) and turned (body axes)."""
+    """Return the trajectory with some poses shifted (world axes) and turned (body axes)."""
     position = trajectory.position_world_m.copy()
     quaternion = trajectory.quaternion_world_from_body.copy()
     position[rows] += shift
@@ -545,7 +545,7 @@ def _change(kind: Kind, trajectory: Trajectory, rows: Int64, shift: Float64, tur
 
 
 def _ease(seconds: Float64, over_s: float, begin: bool, end: bool) -> Float64:
-    """Weights (n,) that rise from 0 to 1 at the begin and fall to 0 at the end, with slopes of 0."""
+    """Return weights (n,) that rise from 0 to 1 at the begin and fall to 0 at the end, with slopes of 0."""
     u = np.ones(seconds.size)
     if begin:
         u = np.minimum(u, seconds / over_s)
@@ -556,7 +556,7 @@ def _ease(seconds: Float64, over_s: float, begin: bool, end: bool) -> Float64:
 
 
 def _step_s(trajectory: Trajectory) -> float:
-    """Usual time from pose to pose."""
+    """Return the usual time between poses."""
     return float(np.median(np.diff(trajectory.epochs_gps_ns))) / NS_PER_S
 
 
@@ -566,11 +566,11 @@ def _seconds(trajectory: Trajectory, first: int, last: int) -> float:
 
 
 def _moving_median(values: Float64, width: int) -> Float64:
-    """Median (n,) of `width` values about each."""
+    """Return the median (n,) of `width` values around each."""
     medians: Float64 = median_filter(values, size=width, mode="nearest")
     return medians
 
 
 def _closed(flags: Flags, width: int) -> Flags:
-    """Flags with holes of up to `width` filled."""
+    """Return flags with holes of up to `width` filled."""
     return np.asarray(binary_closing(np.pad(flags, width), structure=np.ones(width))[width:-width], dtype=bool)

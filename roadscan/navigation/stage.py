@@ -20,7 +20,7 @@ from roadscan.store.manifest import MISSING, Manifest
 
 
 class Navigate(Stage):
-    """Computed trajectories are logs of their own; clocks are a small table."""
+    """Computes trajectories, which are stored like logs, and clocks, which are a small table."""
 
     name = "navigate"
     title = "trajectories from GNSS, IMU and odometer, clocks from shared motion"
@@ -45,7 +45,7 @@ class Navigate(Stage):
             renew_reports(store, say)
         finally:
             session.forget(records_of)
-            session.forget(manifest_of)  # pictures were recorded beside it
+            session.forget(manifest_of)  # pictures were recorded meanwhile
 
     def state(self, session: Session) -> StageState:
         """Computed trajectories, estimated clocks, calibrated mountings."""
@@ -58,5 +58,5 @@ class Navigate(Stage):
         return StageState(len(found.trajectories) - due, due, why=why, tasks=due, lines=list(found.lines()))
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """What computed trajectories, held against their own measurements, are doubted for."""
+        """Return computed trajectories that their measurements contradict."""
         return trajectory_findings(records)

@@ -1,6 +1,6 @@
-"""Stamps of a sensor that counts a wheel's ticks, against the distance that the poses travel in the same time.
+"""Compares stamps of a sensor that counts wheel ticks with the distance that the poses travel in the same time.
 
-Both measure one motion, each by a clock of its own. Where one clock steps, ticks and distance disagree across a single
+Both measure one motion, but by different clocks. Where one clock steps, ticks and distance disagree across a single
 link, by speed times step. Where one is off as a whole, they disagree wherever the speed changes.
 """
 
@@ -21,46 +21,46 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 SAMPLES_PER_S: Final = 200
-"""Samples that are compared a second, at most: a link then lasts 5 ms, as one of a usual trajectory."""
+"""Most samples per second that are compared: a link then lasts 5 ms, as in a usual trajectory."""
 LEAST_SAMPLES: Final = 200
-"""Of fewer samples nothing is said."""
+"""With fewer samples nothing is reported."""
 _LEAST_WAY_M: Final = 10.0
-"""On a shorter way nothing is said."""
+"""Over a shorter way nothing is reported."""
 _LEAST_SPEED_M_PER_S: Final = 1.0
-"""Below it, a length of way says little of time."""
+"""Below this speed, a distance has little information about time."""
 _WIDE: Final = 1.5
-"""Poses so many times farther apart in time than usual show nothing of the motion between them."""
+"""Poses farther apart than this many usual intervals do not show the motion between them."""
 _LEAST_JUMP_M: Final = 0.02
-"""Poses and ticks disagree by less across a link: filters of navigation shift by centimetres where a fix comes in."""
+"""Least disagreement that is a jump: navigation filters shift by centimetres where a fix comes in."""
 _NOISE_TIMES: Final = 12.0
-"""So many times the usual disagreement there (1.4826 MAD) is a jump."""
+"""Least jump, as a multiple of the usual disagreement there (1.4826 MAD)."""
 _WAY_SHARE: Final = 0.03
-"""Ticks and poses disagree by up to this share of the way across a gap: slip, and bends that the poses cut."""
+"""Least jump as a share of the way across a gap: slip, and bends that the poses cut, explain less."""
 _QUANTA: Final = 3.0
-"""So many ticks are lost in rounding."""
+"""Least jump in ticks: rounding explains less."""
 _NEIGHBOURS: Final = 64
-"""Links on either side that say what is usual."""
+"""Links on either side from which the usual disagreement is computed."""
 _BESIDE: Final = 4
 """A wheel that slips disagrees over many links, a clock that steps over no more than two; links that lie closer to one
 another than this are of one event."""
 _LONG_LINK_S: Final = 0.1
-"""Within a shorter time no vehicle changes its speed by a tenth."""
+"""In a shorter time no vehicle changes its speed by a tenth."""
 _WINDOW_S: Final = 0.5
-"""Way and ticks are compared over windows of this length: slip wanders slowly, and drops out."""
-_LEAST_WINDOWS: Final = 12
+"""Length of the windows over which way and ticks are compared: slip changes slowly and cancels."""
+_LEAST_WINDOWS: Final = 12  # Least number of windows.
 _LEAST_TURN_RAD: Final = 1e-4
 """Smaller turns a window move a wheel by less than 0.3 mm; on a straight road the level itself turns with the way."""
 _FARTHEST_S: Final = 20.0
-"""Clocks that are farther off leave readings without poses, or on quite another road."""
-_LAG_STEP_S: Final = 0.05
+"""Largest offset that is searched: a larger one leaves readings without poses, or on another road."""
+_LAG_STEP_S: Final = 0.05  # Step of the coarse search.
 _LEAST_OVERLAP: Final = 0.4
-"""Share of the windows that a shifted clock has to leave in common."""
-_SIGMAS: Final = 5.0
+"""Least share of the windows that a shifted clock has in common with the poses."""
+_SIGMAS: Final = 5.0  # An offset is proved beyond this many σ.
 _LEAST_OFFSET_S: Final = 0.004
-"""Counters are latched, and wheels are filtered, by a few milliseconds late."""
-_ROUNDS: Final = 8
+"""Least offset that is reported: latched counters and filtered wheels are late by a few milliseconds."""
+_ROUNDS: Final = 8  # Most rounds of the refinement.
 _EXPLAINS: Final = 4.0
-"""A clock that is far off has to leave at most a quarter of the variance that the best small offset leaves."""
+"""Least ratio of the variances that the best small offset and a large offset leave."""
 
 
 class WheelTicks(NamedTuple):
@@ -88,32 +88,32 @@ class ClockJump:
     """One link across which ticks and poses disagree."""
 
     epoch_gps_ns: int
-    """Stamp after it."""
+    """Stamp after the link."""
     way_m: float
     """Way of the poses minus that of the ticks."""
     step_s: float
-    """By how much the sensor's stamps step against those of the poses."""
+    """Step of the sensor's stamps relative to those of the poses."""
     sigma_s: float
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """A clock that is off by the same throughout."""
+    """A constant offset of a clock."""
 
     offset_s: float
-    """The sensor's stamps minus the stamps that the poses give the same motion."""
+    """The sensor's stamps minus those of the poses for the same motion."""
     sigma_s: float
 
 
 @dataclass(frozen=True)
 class TickVerdict:
-    """What ticks say of the clocks of a sensor and of the poses."""
+    """Result of comparing ticks and poses."""
 
     jumps: tuple[ClockJump, ...]
     offset: ClockOffset | None
-    """None where the speed does not change enough to know one, and where clocks step."""
+    """Offset; None where the speed does not change enough to determine it, and where clocks step."""
     still_m: float = 0.0
-    """Way of the poses on which the ticks do not count at all; 0 where they do."""
+    """Distance of the poses over which the ticks do not count at all; 0 where they do."""
 
     @property
     def is_off(self) -> bool:
@@ -127,7 +127,7 @@ NOTHING: Final = TickVerdict((), None)
 
 
 def judge_ticks(wheel: WheelTicks, poses: PoseWay) -> TickVerdict:
-    """What ticks and poses say of each other's clock; nothing where there is too little of either."""
+    """Compare ticks with poses; the result is empty where there is too little of either."""
     if poses.epochs_gps_ns.size < LEAST_SAMPLES:
         return NOTHING
     way = _Way.of(poses)
@@ -151,14 +151,14 @@ def judge_ticks(wheel: WheelTicks, poses: PoseWay) -> TickVerdict:
 
 @dataclass(frozen=True)
 class _Way:
-    """How far poses have travelled and turned."""
+    """Distance and turns of the poses since the first."""
 
     epochs_gps_ns: Int64
     distance_m: Float64
     turned_rad: Float64
     """(m, 2) about the body's axes right and down: a wheel beside or below the poses' point travels another way."""
     is_wide: Bool
-    """(m − 1,) intervals that are longer than usual."""
+    """(m − 1,) True for intervals that are longer than usual."""
 
     @classmethod
     def of(cls, poses: PoseWay) -> _Way:
@@ -173,7 +173,7 @@ class _Way:
         )  # fmt: skip
 
     def is_known(self, epochs: Int64) -> Bool:
-        """Whether poses lie close on both sides of epochs (n,)."""
+        """Return whether poses lie close on both sides of epochs (n,)."""
         after = np.searchsorted(self.epochs_gps_ns, epochs, side="left")
         inside = (after > 0) & (after < self.epochs_gps_ns.size)
         exact = np.isin(epochs, self.epochs_gps_ns)
@@ -181,11 +181,11 @@ class _Way:
         return np.asarray(exact | (inside & ~self.is_wide[interval]))
 
     def at(self, epochs: Int64) -> Float64:
-        """Distance (n,) at epochs (n,)."""
+        """Return the distance (n,) at epochs (n,)."""
         return self._at(epochs, self.distance_m)
 
     def turn_at(self, epochs: Int64) -> Float64:
-        """Turns (n, 2) since the first pose about the body's axes right and down."""
+        """Return turns (n, 2) since the first pose about the body's axes right and down."""
         return np.stack([self._at(epochs, one) for one in self.turned_rad.T], axis=-1)
 
     def _at(self, epochs: Int64, values: Float64) -> Float64:
@@ -194,14 +194,14 @@ class _Way:
 
 
 def _thinned(wheel: WheelTicks) -> WheelTicks:
-    """The first sample of each period of `SAMPLES_PER_S`."""
+    """Return the first sample of each period of `SAMPLES_PER_S`."""
     period = wheel.epochs_gps_ns // (NS_PER_S // SAMPLES_PER_S)
     kept = np.concatenate([[True], np.diff(period) > 0]) if period.size else np.zeros(0, bool)
     return WheelTicks(wheel.epochs_gps_ns[kept], wheel.ticks[kept])
 
 
 def _metres_per_tick(steps_m: Float64, steps_ticks: Float64) -> float | None:
-    """Way of a tick, negative where the count goes down; None where the count does not follow the way."""
+    """Return the length of a tick, negative where the count falls; None where the count does not follow the way."""
     moving = (steps_ticks != 0) & (steps_m > 0)
     if moving.sum() < LEAST_SAMPLES // 2:
         return None
@@ -212,10 +212,10 @@ def _metres_per_tick(steps_m: Float64, steps_ticks: Float64) -> float | None:
 
 
 def _jumps(epochs: Int64, steps_m: Float64, by_ticks_m: Float64, tick_m: float) -> tuple[ClockJump, ...]:
-    """Single links across which the poses travel farther or less far than the ticks."""
+    """Return single links across which the poses travel farther or less far than the ticks."""
     away = steps_m - by_ticks_m
     elapsed = np.diff(epochs) / NS_PER_S
-    known = by_ticks_m >= 0  # a counter that starts anew says nothing of the link
+    known = by_ticks_m >= 0  # a counter that restarts has no information on the link
     usual, noise = _usual(np.where(known, away, np.nan), elapsed)
     bound = np.maximum(_LEAST_JUMP_M, _NOISE_TIMES * noise) + _WAY_SHARE * np.maximum(by_ticks_m, 0) + _QUANTA * tick_m
     beyond = known & (np.abs(away - usual) > bound)
@@ -223,7 +223,7 @@ def _jumps(epochs: Int64, steps_m: Float64, by_ticks_m: Float64, tick_m: float) 
     at = np.flatnonzero(beyond)
     for links in np.split(at, np.flatnonzero(np.diff(at) > _BESIDE) + 1):
         if not links.size or links[-1] - links[0] > 1:
-            continue  # a wheel that slips
+            continue  # wheel slip
         first, last = int(links[0]), int(links[-1])
         own = slice(first, last + 1)
         speed = _speed(slice(max(first - _NEIGHBOURS, 0), last + _NEIGHBOURS + 1), own, (steps_m, by_ticks_m), elapsed)
@@ -236,14 +236,14 @@ def _jumps(epochs: Int64, steps_m: Float64, by_ticks_m: Float64, tick_m: float) 
 
 
 def _speed(near: slice, own: slice, ways_m: tuple[Float64, Float64], elapsed_s: Float64) -> float:
-    """Speed (m/s) while a clock steps: over a long link that of the farther way, whose clock went on."""
+    """Return the speed (m/s) while a clock steps: over a long link that of the longer way, whose clock continued."""
     if (duration := float(elapsed_s[own].sum())) > _LONG_LINK_S:
         return max(float(way[own].sum()) for way in ways_m) / duration
     return float(np.median(ways_m[1][near] / elapsed_s[near]))
 
 
 def _usual(away: Float64, elapsed_s: Float64) -> tuple[Float64, Float64]:
-    """Median (n,) of what ticks and poses disagree over a link, and its scatter (1.4826 MAD), by blocks of links."""
+    """Return the median (n,) disagreement of ticks and poses over a link, and its scatter (1.4826 MAD), by blocks."""
     middle, noise = np.zeros(away.size), np.zeros(away.size)
     for start in range(0, away.size, _NEIGHBOURS):
         own = slice(start, start + _NEIGHBOURS)
@@ -259,7 +259,7 @@ def _usual(away: Float64, elapsed_s: Float64) -> tuple[Float64, Float64]:
 
 
 def _offset(wheel: WheelTicks, way: _Way) -> ClockOffset | None:
-    """How far the sensor's stamps are off; None where the speed does not tell."""
+    """Return the offset of the sensor's stamps; None where the speed does not determine it."""
     window_ns = round(_WINDOW_S * NS_PER_S)
     edges = np.arange(wheel.epochs_gps_ns[0], wheel.epochs_gps_ns[-1], window_ns)
     if edges.size <= _LEAST_WINDOWS:
@@ -273,23 +273,23 @@ def _offset(wheel: WheelTicks, way: _Way) -> ClockOffset | None:
     )  # fmt: skip
     if best is None:
         return None
-    # A drive whose speed repeats fits as well a period later.
+    # A drive with periodic speed fits equally well one period later.
     found = near if near is not None and near.left_m2 < _EXPLAINS * best.left_m2 else best
     return ClockOffset(-found.lag_s, found.sigma_s)
 
 
 class _Fit(NamedTuple):
-    """How well ticks explain the way at a lag."""
+    """Fit of the ticks to the way at a lag."""
 
     lag_s: float
-    """Added to the sensor's stamps."""
+    """Lag to be added to the sensor's stamps."""
     sigma_s: float
     left_m2: float
     """Variance of the way that is not explained."""
 
 
 def _settled(edges: Int64, ticks: Float64, way: _Way, start_s: float) -> _Fit | None:
-    """The lag that explains the way best, from a first guess on; None where too little is in common."""
+    """Return the lag that explains the way best, from a first guess on; None where too little is in common."""
     lag, fit = start_s, None
     for _ in range(_ROUNDS):
         fit = _refined(edges, ticks, way, lag)
@@ -300,7 +300,7 @@ def _settled(edges: Int64, ticks: Float64, way: _Way, start_s: float) -> _Fit | 
 
 
 def _design(edges: Int64, ticks: Float64, way: _Way, lag_s: float) -> tuple[Float64, Float64] | None:
-    """Way (k,) of each window at a lag, and what explains it (k, 4): ticks, turns, change of speed."""
+    """Return the way (k,) of each window at a lag, and its regressors (k, 4): ticks, turns, change of speed."""
     moved = edges + round(lag_s * NS_PER_S)
     inside = (moved[:-1] > way.epochs_gps_ns[0]) & (moved[1:] < way.epochs_gps_ns[-1]) & (ticks != 0)
     if inside.sum() < max(_LEAST_WINDOWS, _LEAST_OVERLAP * ticks.size):
@@ -313,7 +313,7 @@ def _design(edges: Int64, ticks: Float64, way: _Way, lag_s: float) -> tuple[Floa
 
 
 def _left(edges: Int64, ticks: Float64, way: _Way, lag_s: float) -> float | None:
-    """Variance of the way that ticks and turns leave at a lag."""
+    """Return the variance of the way that ticks and turns leave at a lag."""
     found = _design(edges, ticks, way, lag_s)
     if found is None:
         return None
@@ -324,7 +324,7 @@ def _left(edges: Int64, ticks: Float64, way: _Way, lag_s: float) -> float | None
 
 
 def _coarse_lag(edges: Int64, ticks: Float64, way: _Way) -> float | None:
-    """The lag (s), to be added to the sensor's stamps, at which ticks explain the way best."""
+    """Return the lag (s), to be added to the sensor's stamps, at which ticks explain the way best."""
     lags = np.arange(-_FARTHEST_S, _FARTHEST_S + _LAG_STEP_S, _LAG_STEP_S)
     left = [np.inf if (one := _left(edges, ticks, way, float(lag))) is None else one for lag in lags]
     best = int(np.argmin(left))
@@ -332,7 +332,7 @@ def _coarse_lag(edges: Int64, ticks: Float64, way: _Way) -> float | None:
 
 
 def _refined(edges: Int64, ticks: Float64, way: _Way, lag_s: float) -> _Fit | None:
-    """The fit at a lag, with the lag that it says is better."""
+    """Return the fit at a lag, with an improved lag."""
     found = _design(edges, ticks, way, lag_s)
     if found is None:
         return None
@@ -340,11 +340,11 @@ def _refined(edges: Int64, ticks: Float64, way: _Way, lag_s: float) -> _Fit | No
     size = np.linalg.norm(parts, axis=0)
     if not size[-1] > 0:
         return None
-    parts = parts[:, size > 0] / size[size > 0]  # on a straight road nothing turns
+    parts = parts[:, size > 0] / size[size > 0]  # on a straight road there are no turns
     inverse = np.linalg.pinv(parts.T @ parts)
     rest = y - parts @ (inverse @ (parts.T @ y))
     free_m2 = float(np.sum(rest**2)) / max(len(y) - parts.shape[1] - 1, 1)
-    # Neighbouring windows err alike (Newey and West): σ of independent ones would be too small.
+    # Errors of neighbouring windows are correlated (Newey and West), so σ of independent ones would be too small.
     scores = parts * rest[:, None]
     spread = scores.T @ scores
     reach = min(8, len(y) // 4)
@@ -352,6 +352,6 @@ def _refined(edges: Int64, ticks: Float64, way: _Way, lag_s: float) -> _Fit | No
         both = scores[k:].T @ scores[:-k]
         spread += (1.0 - k / (reach + 1)) * (both + both.T)
     covariance = inverse @ spread @ inverse * len(y) / max(len(y) - parts.shape[1], 1)
-    # The way at a lag that is too small by d is too short by the change of speed times d.
+    # If the lag is too small by d, the way is too short by the change of speed times d.
     change, sigma = float((inverse @ (parts.T @ y))[-1]), float(np.sqrt(max(covariance[-1, -1], 0.0)))
     return _Fit(lag_s - change / float(size[-1]), sigma / float(size[-1]), free_m2)

@@ -1,1 +1,1 @@
-"""Poses at any epoch: trajectories, corrections of them, and what poses say of themselves."""
+"""Poses at any epoch: trajectories, corrections to them, and checks of the poses of a log against themselves."""

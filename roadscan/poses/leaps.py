@@ -1,10 +1,10 @@
-"""Poses of a log that no vehicle can have taken: those that leap away and back, and steps after which it goes on.
+"""Detects poses that no vehicle can have taken: short leaps away and back, and steps after which the drive continues.
 
-Three things must exclude a pose together: its neighbours, the motion of a vehicle, and the σ that the log states. Each
+A pose is excluded only if its neighbours, the motion of a vehicle, and the σ that the log states all contradict it. A
 link between two poses is compared with the velocities just before and just after it, with a polynomial of degree four
 through three poses on each side, and with the integral of the velocities that the log states. A link that contradicts
 them by more than a vehicle's acceleration explains is cut, and what lies between two cuts is a segment. The explanation
-of least cost says which segments are the drive: to leave out a pose costs 1, to believe that positions step costs
+of least cost determines which segments are the drive: a pose left out costs 1, a step that is accepted costs
 `STEP_COST`. So a short burst between two pieces that fit each other is left out, and where two long pieces do not fit,
 both stay: nothing shows which of them is right.
 """
@@ -29,18 +29,18 @@ Bool = npt.NDArray[np.bool_]
 FASTEST_M_PER_S: Final = 70.0
 """No survey vehicle is faster (252 km/h)."""
 FAR_M: Final = 10.0
-"""What goes beyond the way of the fastest vehicle by more is no error of a good fix but a wrong place."""
+"""A position farther beyond the reach of the fastest vehicle than this is a wrong place, not an error of a good fix."""
 _FASTEST_TURN_RAD_PER_S: Final = 3.5
 """No survey vehicle turns faster (200°/s)."""
 _FAR_RAD: Final = float(np.radians(30.0))
-"""What goes beyond the turn of the fastest vehicle by more is no error of a good attitude but a wrong one."""
+"""An attitude turned farther beyond the reach of the fastest vehicle than this is wrong, not an error of a good one."""
 STEP_COST: Final = 20.5
-"""Poses that may be left out to avoid one step: bursts at an end are no longer than 20, between two pieces 40."""
+"""Cost of believing one step, in poses left out: a burst at an end has at most 20 poses, one between two pieces 40."""
 END_POSES: Final = 5
-"""At an end of a piece only so many are left out for a near leap, which could be a step that is real."""
+"""At an end of a piece at most this many poses are left out for a near leap, which could be a real step."""
 
 _ACCELERATION_M_PER_S2: Final = 12.0
-"""More than the tyres of a car hold (1.2 g)."""
+"""Greatest acceleration of a vehicle: more than the tyres of a car transmit (1.2 g)."""
 _STATED: Final = 0.175
 """Times that acceleration and the squared time of a link: what it moves beyond the mean of the velocities at both ends.
 A change in the middle gives 1/8; 1,200 drawn drives that brake with 9.8 m/s², stop, and swerve with 8 m/s² reach
@@ -48,53 +48,53 @@ A change in the middle gives 1/8; 1,200 drawn drives that brake with 9.8 m/s², 
 _UNEVEN: Final = 0.42
 """The same beyond a polynomial through three poses on each side, where acceleration comes and goes within the window:
 those drives reach 0.398. The time is that of the longest link; links differ by up to `_EVEN_LINKS` times."""
-_EVEN_LINKS: Final = 2.0
+_EVEN_LINKS: Final = 2.0  # Links of a window are compared where the longest is at most this many times the shortest.
 _WINDOW: Final = 6
-"""Poses of such a polynomial and its step."""
+"""Poses in the window of such a polynomial and its step."""
 _AGREEING: Final = 0.5
 """What stated velocities contradict is a leap where positions alone show at least this share of it; where they do not,
 it is the velocity that is wrong."""
 _TURN_RAD_PER_S2: Final = np.array([30.0, 30.0, 10.0])
-"""Roll and pitch over a pothole; heading of a vehicle that swerves."""
+"""Greatest angular acceleration: roll and pitch over a pothole, heading of a vehicle that swerves."""
 _MOST_TURN_RAD: Final = np.radians([10.0, 10.0, 60.0])
-"""However far apart in time two poses are, a road turns a vehicle by no more beyond its even turning."""
+"""Greatest turn between two poses beyond a uniform rotation, however far apart they are: roll, pitch, heading."""
 _STEEPEST: Final = 0.3
-"""Metres that a vehicle rises or falls in a metre of its way, beyond its even slope."""
+"""Greatest rise or fall of a vehicle per metre of its way, beyond a uniform slope."""
 _UNCLEAR_COST: Final = 3.0
-"""Poses that may be left out to avoid a bridge that does not fit far better than what it leaves out."""
+"""Cost of a bridge that does not fit far better than what it leaves out, in poses left out."""
 _LEAST_LEAP_M: Final = 0.10
-"""Filters of navigation shift their positions by centimetres where a fix comes in."""
+"""Least leap of a position: navigation filters shift positions by centimetres when a fix comes in."""
 _LEAST_LEAP_RAD: Final = float(np.radians(0.3))
-"""The same of angles."""
+"""Least leap of an attitude."""
 _NOISE_TIMES: Final = 8.0
-"""So many times the median of what links usually contradict is no leap."""
+"""A contradiction below this multiple of the median contradiction of neighbouring links is no leap."""
 _JITTER_TIMES: Final = 4.0
-"""Stamps are wrong by at most so many times the median of what steps of time differ from the usual one."""
+"""Stamps are wrong by at most this multiple of the median deviation of the time steps from the usual step."""
 _IRREGULAR: Final = 0.1
-"""Where the steps of time usually differ by more than this share, a short one may be a late stamp."""
+"""Where time steps usually deviate by more than this share, a short one may be a late stamp."""
 _SIGMA_TIMES: Final = 3.0
-"""So many times the stated σ is no leap."""
+"""A contradiction below this multiple of the stated σ is no leap."""
 _NOISE_LINKS: Final = 128
-"""Links of which one median is taken."""
+"""Number of links over which one median is taken."""
 _GAP_STEPS: Final = 5.0
-"""A link longer than so many usual ones, and than a second, is a gap: velocities say little of it."""
-_LEAST_GAP_S: Final = 1.0
+"""A link longer than this many usual ones, and than `_LEAST_GAP_S`, is a gap: velocities say little about it."""
+_LEAST_GAP_S: Final = 1.0  # Shorter links (s) are no gap, however many usual ones they span.
 _VELOCITY_LINKS: Final = 3
-"""Links over which the velocity at the end of a segment is taken."""
+"""Number of links over which the velocity at the end of a segment is taken."""
 _LEAST_STALL_M: Final = 0.5
-"""The way across a gap has to be shorter by so much than a vehicle needs."""
+"""The way across a gap is reported if it is shorter than the least way of a vehicle by at least this."""
 _STALL_M_PER_S: Final = 2.0
-"""Slower, a vehicle may have stood still in the gap."""
+"""A slower vehicle may have stood still in the gap."""
 _MOST_SHARE: Final = 0.25
-"""Where more poses than that would be left out, it is no leap but how this log is."""
+"""Where more than this share of the poses would be left out, the whole log is like that and none is left out."""
 _MOST_SEGMENTS: Final = 1_000
-"""So many segments, where they are shorter than 50 poses in the mean, are noise."""
+"""More segments than this, with fewer than 50 poses on average, are noise."""
 _LOOK_BACK: Final = 44
-"""Segments that are left out together at most."""
+"""At most this many segments are left out together."""
 
 
 class PoseTrack(NamedTuple):
-    """Poses of a log in order of time."""
+    """The poses of a log in order of time."""
 
     epochs_gps_ns: Int64
     """(n,) strictly ascending."""
@@ -123,14 +123,14 @@ class PoseTrack(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A link after which poses go on at another level."""
+    """A link after which positions or attitudes continue at another level."""
 
     before: int
     """Row of the pose before it."""
     after: int
     """Row of the pose after it."""
     shift_m: float
-    """By how much the position contradicts the velocities about it."""
+    """Difference between the step of the position and what the velocities around it give."""
     turn_rad: float
     """The same of the attitude."""
     sigma_m: float
@@ -138,7 +138,7 @@ class Step(NamedTuple):
 
 
 class Stall(NamedTuple):
-    """A gap in time after which the poses go on where no vehicle can be: the stamps jump, and not the vehicle."""
+    """A gap in time after which the poses continue where no vehicle can be: the stamps jump, the vehicle does not."""
 
     after: int
     """Row of the pose after it."""
@@ -153,7 +153,7 @@ class Stall(NamedTuple):
 
 @dataclass(frozen=True)
 class Leaps:
-    """What is wrong with the poses of a track."""
+    """The poses of a track that leap, and the steps and stalls that no vehicle explains."""
 
     position: Bool
     """(n,) poses to leave out for their position."""
@@ -172,7 +172,7 @@ class Leaps:
 
 
 def find_leaps(track: PoseTrack) -> Leaps:
-    """Poses that leap and steps of a track; nothing of one of fewer than three poses."""
+    """Return the leaping poses and the steps of a track; nothing for fewer than three poses."""
     n = track.epochs_gps_ns.size
     if n < 3:
         none = np.zeros(n, dtype=bool)
@@ -184,7 +184,7 @@ def find_leaps(track: PoseTrack) -> Leaps:
 
 
 def _stalls(links: _Links, segments: Sequence[_Segment]) -> Iterator[Stall]:
-    """Gaps across which the way is shorter than a vehicle needs to brake from the speed before it, and to drive off."""
+    """Return the gaps whose way is too short for a vehicle to brake from the speed before and to drive off again."""
     for a, b in itertools.pairwise(segments):
         link = a.last
         before, after = (_velocity(links.track, a, at_end=True), _velocity(links.track, b, at_end=False))
@@ -201,7 +201,7 @@ def _stalls(links: _Links, segments: Sequence[_Segment]) -> Iterator[Stall]:
 
 
 def rotation_vectors(before: Float64, after: Float64) -> Float64:
-    """Turns (k, 3) in rad, about body axes, from attitudes (k, 4) to others: the shorter way round."""
+    """Return rotation vectors (k, 3) in rad, body axes, from attitudes (k, 4) to others: the shorter way round."""
     w1, v1 = before[:, :1], before[:, 1:]
     w2, v2 = after[:, :1], after[:, 1:]
     scalar = w1 * w2 + np.sum(v1 * v2, axis=1, keepdims=True)
@@ -214,7 +214,7 @@ def rotation_vectors(before: Float64, after: Float64) -> Float64:
 
 
 class _Misfit(NamedTuple):
-    """How a link contradicts the motion about it."""
+    """Sizes of the contradictions between links and the motion around them."""
 
     shift_m: Float64
     """(k,) position."""
@@ -224,7 +224,7 @@ class _Misfit(NamedTuple):
 
 @dataclass(frozen=True)
 class _Links:
-    """Links between neighbouring poses, and which of them no vehicle explains."""
+    """Links between neighbouring poses, with the contradictions that no vehicle explains."""
 
     track: PoseTrack
     elapsed_s: Float64
@@ -293,7 +293,7 @@ class _Links:
 
     @property
     def cut(self) -> Bool:
-        """(n − 1,) links that no vehicle explains, and gaps."""
+        """(n − 1,) True for links that no vehicle explains, and for gaps."""
         return (self.leap.shift_m > 0) | (self.leap.turn_rad > 0) | self.gap
 
     def step(self, before: int, after: int) -> Step:
@@ -304,7 +304,7 @@ class _Links:
 
 @dataclass(frozen=True)
 class _StatedMotion:
-    """What stated velocities say of the way along each link."""
+    """The motion along each link according to the stated velocities."""
 
     way_m: Float64
     """(n − 1, 3) integral of the velocities, NaN where there is none."""
@@ -313,7 +313,7 @@ class _StatedMotion:
 
     @classmethod
     def of(cls, track: PoseTrack, elapsed_s: Float64, gap: Bool, late_m: Float64) -> _StatedMotion:
-        """Of all links but gaps."""
+        """Integrate the stated velocities along all links except gaps."""
         velocity = track.velocity_world_m_per_s
         if velocity is None:
             return cls(np.full((elapsed_s.size, 3), np.nan), np.full(elapsed_s.size, np.inf))
@@ -339,7 +339,7 @@ class _StatedMotion:
         return np.where((size > self.bound_m) & agreeing, size, 0.0), self.bound_m
 
     def misses(self, inside: slice, shift: Float64) -> tuple[float, float]:
-        """By how much a shift (3,) over links contradicts their velocities, and what explains that; inf without."""
+        """Return how far a shift (3,) over links contradicts their velocities, and its bound; inf if there are none."""
         away = float(np.linalg.norm(shift - self.way_m[inside].sum(axis=0)))
         return (away, float(self.bound_m[inside].sum())) if np.isfinite(away) else (np.inf, 0.0)
 
@@ -400,7 +400,7 @@ def _greatest(values: Float64, beside: int) -> Float64:
 
 
 def _against_neighbours(steps: Float64, elapsed_s: Float64, gap: Bool) -> tuple[Float64, Float64]:
-    """What links (k, 3) have beyond an even motion with the velocity before, and after; NaN without one."""
+    """Return what links (k, 3) differ by from uniform motion at the velocity before, and after; NaN without one."""
     velocity = np.where(gap[:, None], np.nan, steps / elapsed_s[:, None])
     none = np.full((1, 3), np.nan)
     before = steps - elapsed_s[:, None] * np.concatenate([none, velocity[:-1]])
@@ -409,7 +409,7 @@ def _against_neighbours(steps: Float64, elapsed_s: Float64, gap: Bool) -> tuple[
 
 
 def _mean(before: Float64, after: Float64) -> Float64:
-    """Mean of both, or the one that there is; 0 without any."""
+    """Return the mean of both, or the one that exists; 0 where both are missing."""
     total = np.nan_to_num(before) + np.nan_to_num(after)
     count = np.isfinite(before).astype(float) + np.isfinite(after)
     mean: Float64 = total / np.maximum(count, 1.0)
@@ -417,7 +417,7 @@ def _mean(before: Float64, after: Float64) -> Float64:
 
 
 def _slower(steps: Float64, elapsed_s: Float64) -> Float64:
-    """Speed (k,) of the slower one of the links before and after: what leaps is not the measure of itself."""
+    """Return the lower speed (k,) of the links before and after, so that a leap is not measured by itself."""
     speed = np.linalg.norm(steps, axis=1) / elapsed_s
     padded = np.concatenate([[np.inf], speed, [np.inf]])
     slower = np.minimum(padded[:-2], padded[2:])
@@ -425,12 +425,12 @@ def _slower(steps: Float64, elapsed_s: Float64) -> Float64:
 
 
 def _block_medians(values: Float64) -> Float64:
-    """Medians (b, c) of values (k, c) by block of links."""
+    """Return the medians (b, c) of values (k, c) for each block of links."""
     count = len(values)
     starts = np.arange(0, count, _NOISE_LINKS)
     medians = np.array([np.median(values[s : s + _NOISE_LINKS], axis=0) for s in starts])
     if len(medians) > 1 and count - starts[-1] < _NOISE_LINKS // 2:
-        medians[-1] = medians[-2]  # of so few links a burst is the half
+        medians[-1] = medians[-2]  # a burst would be half of so few links
     return medians
 
 
@@ -440,26 +440,26 @@ def _medians(values: Float64) -> Float64:
 
 
 def _noise(contradiction: Float64) -> Float64:
-    """Usual contradiction (k, c) about each link: the greatest of three neighbouring medians."""
+    """Return the usual contradiction (k, c) around each link: the greatest of three neighbouring medians."""
     medians = _block_medians(contradiction)
     wide = np.stack([_greatest(column, 1) for column in medians.T], axis=-1)
     return np.asarray(wide[np.arange(len(contradiction)) // _NOISE_LINKS])
 
 
 def _bound_m(elapsed_s: Float64, both: Bool) -> Float64:
-    """What a vehicle's acceleration explains (m), with velocities on both sides or on one."""
+    """Return the deviation (m) that a vehicle's acceleration explains, with velocities on both sides or on one."""
     return _LEAST_LEAP_M + np.where(both, 0.5, 1.0) * _ACCELERATION_M_PER_S2 * elapsed_s**2
 
 
 def _bound_rad(elapsed_s: Float64, both: Bool) -> Float64:
-    """What a vehicle's turning explains (k, 3) in rad about body axes."""
+    """Return the deviation (k, 3; rad, about body axes) that a vehicle's turning explains."""
     physical = np.where(both, 0.5, 1.0)[:, None] * _TURN_RAD_PER_S2 * elapsed_s[:, None] ** 2
     bound: Float64 = _LEAST_LEAP_RAD + np.minimum(physical, _MOST_TURN_RAD)
     return bound
 
 
 def _up(track: PoseTrack) -> Float64:
-    """Unit vector (3,) that points up where the track lies; up of a sphere is close enough."""
+    """Return the unit vector (3,) that points up where the track lies, on a spherical Earth."""
     if track.is_local:
         return np.array([0.0, 0.0, 1.0])
     middle = np.median(track.position_world_m, axis=0)
@@ -472,7 +472,7 @@ def _rises(before: Float64, after: Float64, up: Float64) -> tuple[Float64, Float
 
 
 def _slope_bound_m(shift: Float64, up: Float64) -> Float64:
-    """What the slopes of roads explain of a rise (k, 1), in m: of the way of each link and of its neighbours."""
+    """Return the rise (k, 1) in m that road slopes explain, from the way of each link and of its neighbours."""
     level = np.linalg.norm(shift - (shift @ up)[:, None] * up, axis=1)
     padded = np.concatenate([level[:1], level, level[-1:]])
     bound: Float64 = _LEAST_LEAP_M + _STEEPEST * (level + 0.5 * (padded[:-2] + padded[2:]))
@@ -502,7 +502,7 @@ def _leap_sizes(before: Float64, after: Float64, bound: Float64, *, whole: bool 
 
 
 class _Segment(NamedTuple):
-    """Poses that fit one another."""
+    """A run of poses that agree with one another."""
 
     first: int
     last: int
@@ -519,7 +519,7 @@ def _segments(links: _Links, n: int) -> list[_Segment]:
 
 
 def _kept(links: _Links, segments: Sequence[_Segment]) -> list[int]:
-    """Numbers of the segments that are the drive: the explanation of least cost."""
+    """Return the numbers of the segments that form the drive: the explanation of least cost."""
     count, poses = len(segments), sum(s.poses for s in segments)
     everything = list(range(count))
     if count == 1 or (count > _MOST_SEGMENTS and count * 50 > poses):
@@ -543,7 +543,7 @@ def _kept(links: _Links, segments: Sequence[_Segment]) -> list[int]:
 
 
 def _cost(links: _Links, segments: Sequence[_Segment], i: int, j: int, skipped: int) -> float:
-    """Cost of going from segment i to j without what lies between, of `skipped` poses."""
+    """Return the cost of going from segment i to j without the `skipped` poses between them."""
     a, b = segments[i], segments[j]
     if j == i + 1:
         link = a.last
@@ -563,7 +563,7 @@ def _cost(links: _Links, segments: Sequence[_Segment], i: int, j: int, skipped: 
 
 
 def _end_cost(links: _Links, segments: Sequence[_Segment], first: int, last: int, beside: int) -> float:
-    """Cost of leaving out segments `first` to `last` at an end of the track, next to the segment `beside`."""
+    """Return the cost of leaving out segments `first` to `last` at an end of the track, beside the segment `beside`."""
     if first > last:
         return 0.0
     skipped = sum(segments[k].poses for k in range(first, last + 1)) if last - first < _LOOK_BACK else STEP_COST
@@ -577,7 +577,7 @@ def _end_cost(links: _Links, segments: Sequence[_Segment], first: int, last: int
 
 
 def _bridge(links: _Links, a: _Segment, b: _Segment) -> tuple[bool, bool]:
-    """Whether a vehicle can go from segment a to b, and whether they fit far better than what lies between."""
+    """Return whether a vehicle can go from segment a to b, and whether they fit far better than what lies between."""
     track = links.track
     elapsed = np.array([(track.epochs_gps_ns[b.first] - track.epochs_gps_ns[a.last]) / NS_PER_S])
     shift = track.position_world_m[b.first] - track.position_world_m[a.last]
@@ -586,7 +586,7 @@ def _bridge(links: _Links, a: _Segment, b: _Segment) -> tuple[bool, bool]:
         return False, False
     before, after = _velocity(track, a, at_end=True), _velocity(track, b, at_end=False)
     known = [one for one in (before, after) if one is not None]
-    if not known or links.gap[a.last : b.first].any():  # over a gap, velocities say nothing
+    if not known or links.gap[a.last : b.first].any():  # velocities say nothing about a gap
         return True, False
     both = np.array([len(known) == 2])
     inside = slice(a.last, b.first)
@@ -611,7 +611,7 @@ def _far_better(links: _Links, inside: slice, miss_m: float, miss_rad: float) ->
 
 
 def _velocity(track: PoseTrack, segment: _Segment, *, at_end: bool) -> tuple[Float64, Float64] | None:
-    """Velocity (3,) and turn rate (3,) at an end of a segment; None of a single pose."""
+    """Return velocity (3,) and turn rate (3,) at an end of a segment; None for a single pose."""
     over = min(_VELOCITY_LINKS, segment.poses - 1)
     if not over:
         return None
@@ -622,7 +622,7 @@ def _velocity(track: PoseTrack, segment: _Segment, *, at_end: bool) -> tuple[Flo
 
 
 def _leaps(links: _Links, segments: Sequence[_Segment], kept: Sequence[int], n: int) -> Leaps:
-    """What was left out and which steps remain."""
+    """Return the poses that were left out and the steps that remain."""
     out = np.ones(n, dtype=bool)
     for k in kept:
         out[segments[k].first : segments[k].last + 1] = False
@@ -643,7 +643,7 @@ def _leaps(links: _Links, segments: Sequence[_Segment], kept: Sequence[int], n: 
 
 
 def _beside_links(sizes: Float64, out: Bool) -> Float64:
-    """The smaller leap (n,) at the two ends of each run of poses that are left out; 0 elsewhere."""
+    """Return the smaller leap (n,) at the two ends of each run of poses that are left out; 0 elsewhere."""
     found = np.zeros(out.size)
     for first, end in runs_of(out).tolist():
         ends = np.array([sizes[k] for k in (first - 1, end - 1) if 0 <= k < sizes.size])

@@ -1,4 +1,4 @@
-"""Poses as an adjustment needs them: places on the map, attitudes against the local level, grid against true north."""
+"""Poses for an adjustment: map positions, attitudes relative to the local level, and meridian convergence."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from roadscan.poses.trajectory import Poses, Trajectory, world_from_ned
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_STEP_M = 10.0
+_STEP_M = 10.0  # Length (m) of the line to true north whose map direction gives the convergence.
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class LevelPoses:
 
 
 def level_poses(trajectory: Trajectory, frame: MapFrame, epochs_gps_ns: Int64) -> LevelPoses:
-    """Those of the epochs (n,) that have a pose, in their order."""
+    """Return the poses of those of the epochs (n,) that have one, in their order."""
     found = trajectory.poses(epochs_gps_ns)
     keep = found.found
     poses = Poses(epochs_gps_ns[keep], found.position_world_m[keep], found.world_from_body[keep], keep[keep])

@@ -1,9 +1,9 @@
-"""What the poses of a log say of themselves: whether they look and rise where they go, and whether they change.
+"""Checks the poses of a log against each other: heading and course, pitch and slope, constant values, speed scale.
 
 A vehicle drives along its body's forward axis. So its heading is the course over ground where it drives straight, its
 pitch follows the slope of its path, and the velocities that a log states are the change of its positions. A real
-instrument never gives one value for long. Poses that are far apart say less of the path between them than their σ: how
-much less, poses that are left out show.
+instrument never gives one value for long. The path between poses that are far apart is less certain than their σ: the
+additional error is estimated by leaving poses out.
 """
 
 from __future__ import annotations
@@ -28,61 +28,61 @@ Bool = npt.NDArray[np.bool_]
 
 ANGLES: Final = ("roll", "pitch", "heading")
 VALUES: Final = ("height", *ANGLES)
-"""What must change while a vehicle drives."""
+"""Values that must change while a vehicle drives."""
 
 _WINDOW_M: Final = 5.0
-"""Way over which course and slope are taken: two wheelbases."""
+"""Distance over which course and slope are taken: two wheelbases."""
 _LEAST_SPEED_M_PER_S: Final = 2.0
-"""Slower, noise of the positions is much of the way."""
+"""Below this speed, noise of the positions is a large part of the distance."""
 _STRAIGHT_RAD: Final = float(np.radians(2.0))
 """A window that turns by less is straight: a point 4 m before the rear axle then moves aside by less than 1.6°."""
 _LEAST_WINDOWS: Final = 8
-"""Of fewer windows nothing is said."""
+"""With fewer windows nothing is reported."""
 _LEAST_TOLD: Final = 0.25
-"""Sine of half the angle (29°) between two axes that can be told apart by how they rise."""
+"""Sine of half the angle (29°) between two axes that can be distinguished by how they rise."""
 _LEAST_SLOPES: Final = 15
-"""Of fewer windows nothing is said of pitch: over 70 m, heights of a drifting fix rise and fall once."""
-_SIGMAS: Final = 3.0
+"""With fewer windows nothing is reported about pitch: over 70 m, heights of a drifting fix rise and fall once."""
+_SIGMAS: Final = 3.0  # Multiples of σ by which a difference has to exceed a limit before it is reported.
 _LEAST_OFF_RAD: Final = float(np.radians(2.0))
 """A unit is mounted along a vehicle to a degree, and a vehicle on a crossfall drifts by half of one."""
 _LEAST_SLOPE_RAD: Final = 0.003
 """Slopes have to vary by so much (1 σ) before pitch can follow them."""
 _SLOPE_NOISE_TIMES: Final = 2.0
-"""And by so many times the noise of the slopes: it takes no more than a fifth of what pitch follows."""
+"""And by this multiple of the slopes' noise, which then lowers the apparent response of pitch by at most a fifth."""
 _LEAST_FOLLOWED: Final = 0.5
-"""Pitch that follows less than that of a slope is none; a soft suspension loses a tenth."""
+"""Pitch that follows a smaller share of the slope is wrong; a soft suspension loses a tenth."""
 _SAME_M: Final = 1e-7
-"""Heights that differ by less are one value: what a way over geocentric coordinates leaves."""
-_SAME_RAD: Final = 1e-9
+"""Heights that differ by less count as equal: a conversion by way of geocentric coordinates leaves this much."""
+_SAME_RAD: Final = 1e-9  # Angles that differ by less (rad) count as equal.
 _LEAST_SAME: Final = 20
-"""Poses of one value in a row, while others of the log are not rounded."""
-_SAME_WAY_M: Final = 5.0
+"""Least number of equal poses in a row that is reported, where other values of the log are not rounded."""
+_SAME_WAY_M: Final = 5.0  # A run of equal values is reported if the vehicle drives farther (m) in it.
 _ROUNDED: Final = 0.05
-"""Where more of the other neighbours are alike, the values are rounded."""
+"""Where a larger share of the other neighbours is equal, the values are rounded."""
 _ALL_SAME_WAY_M: Final = 50.0
-"""A log of one value throughout has to drive so far."""
+"""A log with one value throughout is reported if it drives farther."""
 _HARD_M_PER_S2: Final = 12.0
-"""More than the tyres of a car hold (1.2 g)."""
+"""Greatest acceleration of a vehicle: more than the tyres of a car transmit (1.2 g)."""
 _FROZEN_M: Final = 0.5
-"""A leap from the last of frozen poses is longer: coarse positions repeat as well."""
+"""The leap after frozen poses is longer than this: coarse positions repeat as well."""
 _EVEN_SHARE: Final = 0.05
-"""The way since the first of them is that of the mean speed to this share, beside braking."""
+"""The way since the first frozen pose is that of the mean speed to this share, apart from braking."""
 _LEAST_SCALE: Final = 0.003
-"""Speeds of a good log and the change of its positions agree to a thousandth over a drive."""
+"""Least reported error of scale: in a good log, speeds and changes of position agree to a thousandth over a drive."""
 _LEAST_STEP_M: Final = 0.25
-"""Poses that are closer are interpolated to less than a millimetre."""
+"""Where poses are closer than this, interpolation errs by less than a millimetre."""
 _LEAST_LEFT_OUT: Final = 3
-"""Of fewer places nothing is said."""
+"""With fewer left-out places no error is estimated."""
 _DOUBTED: Final = 0.02
-"""Velocities that are off by more say nothing of the path between poses."""
+"""Velocities whose scale is off by more are not used for the path between poses."""
 _BEYOND: Final = 0.02
-"""Share of the largest errors that is left aside: a step is none of interpolation."""
+"""Share of the largest errors that is left out: a step is no error of interpolation."""
 _ORDERS: Final = (4.0, 256.0)
-"""How the square of the error grows where poses are twice as far apart: linear at least, and fourth order at most."""
+"""Growth of the squared error where the spacing of poses doubles: at least linear, at most fourth order."""
 
 
 class _Windows(NamedTuple):
-    """Windows of way; each array (k,)."""
+    """Windows along the way; each array has shape (k,)."""
 
     way_m: Float64
     speed_m_per_s: Float64
@@ -93,18 +93,18 @@ class _Windows(NamedTuple):
     """How far the heading turns."""
     slope_rad: Float64
     down_forward: Float64
-    """How far down the body's forward axis points."""
+    """Downward component of the body's forward axis."""
     down_right: Float64
-    """The same of its right axis."""
+    """Downward component of the body's right axis."""
 
 
 class HeadingOff(NamedTuple):
-    """A heading that is not the course over ground."""
+    """A heading that differs from the course over ground."""
 
     off_rad: float
     """Median of heading minus course, clockwise."""
     scatter_rad: float
-    """1 σ of one window about it."""
+    """1 σ of a single window about the median."""
     way_m: float
     """Straight way on which it is compared."""
     is_mounted: bool | None
@@ -113,15 +113,15 @@ class HeadingOff(NamedTuple):
 
 
 class PitchOff(NamedTuple):
-    """A pitch that is not the slope of the path."""
+    """A pitch that does not follow the slope of the path."""
 
     followed: float
-    """Change of pitch by change of slope: 1 of a sound log."""
+    """Change of pitch per change of slope: 1 for a sound log."""
     sigma: float
     roll_followed: float
-    """The same of roll; 0 where roll does not follow it."""
+    """Change of roll per change of slope; 0 where roll does not follow it."""
     slope_rad: float
-    """1 σ by which slopes vary."""
+    """1 σ of the slopes."""
     way_m: float
 
 
@@ -134,41 +134,41 @@ class Same(NamedTuple):
     way_m: float
     first_gps_ns: int
     last_gps_ns: int
-    """Of the longest run."""
+    """Last epoch of the longest run."""
     everywhere: bool
 
 
 class Scale(NamedTuple):
-    """Stated speeds that are not the change of the positions."""
+    """Stated speeds that contradict the change of the positions."""
 
     ratio: float
-    """Way of the positions along the stated velocities by that of the velocities; infinite where these are 0."""
+    """Way of the positions along the stated velocities over the way of the velocities; infinite where these are 0."""
     way_m: float
 
 
 class Between(NamedTuple):
-    """Error of the path between poses."""
+    """Error of the interpolated path between poses."""
 
     error_m: Float64
     """(2,) 1 σ in the middle between two poses: horizontal, vertical."""
     sigma_m: float
-    """Median of the stated ones, of all three axes together; 0 where none is stated."""
+    """Median of the stated σ of all three axes together; 0 where none is stated."""
     step_s: float
     """Usual time between poses."""
 
 
 @dataclass
 class PoseMotion:
-    """Gathers what blocks of a log's poses, one after another in time, say."""
+    """Collects evidence from blocks of a log's poses, which are given in order of time."""
 
     world: str
     _windows: list[_Windows] = field(default_factory=list)
     _ways: list[tuple[float, float, float]] = field(default_factory=list)
-    """Ways of positions along the stated velocities, of the velocities, and of the positions."""
+    """Way of positions along the stated velocities, way of the velocities, and way of the positions."""
     _runs: dict[str, list[tuple[int, float, int, int]]] = field(default_factory=lambda: {name: [] for name in VALUES})
-    """Poses, way, first and last epoch of each run of one value."""
+    """Poses, way, first and last epoch of each run of equal values."""
     _alike: dict[str, list[int]] = field(default_factory=lambda: {name: [0, 0] for name in VALUES})
-    """Neighbours that are alike outside of such runs, and neighbours in all."""
+    """Number of equal neighbours outside such runs, and of all neighbours."""
     _ends: dict[str, list[float]] = field(default_factory=lambda: {name: [np.inf, -np.inf] for name in VALUES})
     """Least and largest value."""
     _way_m: float = 0.0
@@ -177,7 +177,7 @@ class PoseMotion:
     _between: list[Between] = field(default_factory=list)
 
     def take(self, track: PoseTrack) -> None:
-        """Look at a block of poses."""
+        """Add a block of poses."""
         if track.epochs_gps_ns.size < 3:
             return
         axes = world_from_ned(self.world, track.position_world_m)
@@ -185,7 +185,7 @@ class PoseMotion:
         elapsed = np.diff(track.epochs_gps_ns) / NS_PER_S
         steps = np.diff(track.position_world_m, axis=0)
         links = np.linalg.norm(steps, axis=1)
-        links = np.where(links > _LEAST_SPEED_M_PER_S * elapsed, links, 0.0)  # standing still is no way
+        links = np.where(links > _LEAST_SPEED_M_PER_S * elapsed, links, 0.0)  # standing still adds no way
         way = np.concatenate([[0.0], np.cumsum(links)])
         self._way_m += float(way[-1])
         self._poses += track.epochs_gps_ns.size
@@ -199,7 +199,7 @@ class PoseMotion:
             self._between.append(between)
 
     def heading(self) -> HeadingOff | None:
-        """Heading that is not the course; None where it is, and where the log does not say it."""
+        """Return how the heading differs from the course; None where it agrees, or where the log cannot show it."""
         rows = self._rows()
         rows = _Windows(*(each[np.abs(rows.turn_rad) < _STRAIGHT_RAD] for each in rows))
         if rows.off_rad.size < _LEAST_WINDOWS:
@@ -211,7 +211,7 @@ class PoseMotion:
         return HeadingOff(middle, scatter, float(rows.way_m.sum()), self._is_mounted(middle))
 
     def pitch(self) -> PitchOff | None:
-        """Pitch that is not the slope; None where it is, and where the log does not say it."""
+        """Return how the pitch differs from the slope; None where it agrees, or where the log cannot show it."""
         rows = self._rows()
         if rows.slope_rad.size < _LEAST_SLOPES:
             return None
@@ -236,7 +236,7 @@ class PoseMotion:
         return None if follows[0] == follows[1] else follows[1]
 
     def same(self) -> list[Same]:
-        """Values that do not change while the vehicle drives."""
+        """Return the values that do not change while the vehicle drives."""
         found = list[Same]()
         for name in VALUES:
             tolerance = _SAME_M if name == "height" else _SAME_RAD
@@ -252,14 +252,14 @@ class PoseMotion:
         return found
 
     def scale(self) -> Scale | None:
-        """Stated speeds that are not the change of the positions."""
+        """Return the stated speeds' scale where it contradicts the change of the positions."""
         along, stated, way = (sum(one[k] for one in self._ways) for k in range(3))
         if way < _ALL_SAME_WAY_M or abs(stated - along) < _LEAST_SCALE * way:
             return None
         return Scale(along / stated if stated > 0 else np.inf, way)
 
     def between(self) -> Between | None:
-        """Error between poses, of the block where it is largest."""
+        """Return the error between poses, from the block where it is largest."""
         return max(self._between, key=lambda one: float(np.max(one.error_m)), default=None)
 
     def _rows(self) -> _Windows:
@@ -268,7 +268,7 @@ class PoseMotion:
         return _Windows(*(np.concatenate(each) for each in zip(*self._windows, strict=True)))
 
     def _same(self, track: PoseTrack, level_from_body: Float64, way: Float64) -> None:
-        """Runs of one value in a block."""
+        """Return the runs of equal values in a block."""
         height = track.position_world_m[:, 2]
         if self.world != LOCAL_WORLD:
             height = geodetic_from_world(self.world, track.position_world_m)[:, 2]
@@ -313,7 +313,7 @@ def frozen(track: PoseTrack) -> Bool:
 
 
 def _ways(velocity: Float64, steps: Float64, links: Float64, elapsed_s: Float64) -> tuple[float, float, float]:
-    """Way of the positions along the stated velocities, where there are some, of the velocities, and of the positions.
+    """Return ways: of the positions along the stated velocities where stated, of the velocities, of the positions.
 
     Noise lengthens the way of the positions, and not what lies along the velocities.
     """
@@ -325,7 +325,7 @@ def _ways(velocity: Float64, steps: Float64, links: Float64, elapsed_s: Float64)
 
 
 def _middle(angles: Float64) -> tuple[float, float]:
-    """Median of angles about a circle, and the scatter about it (1.4826 MAD), rad."""
+    """Return the circular median of angles, and the scatter about it (1.4826 MAD), rad."""
     centre = float(np.angle(np.mean(np.exp(1j * angles))))
     away = np.angle(np.exp(1j * (angles - centre)))
     middle = float(np.median(away))
@@ -333,7 +333,7 @@ def _middle(angles: Float64) -> tuple[float, float]:
 
 
 def _windows(track: PoseTrack, axes: Float64, level_from_body: Float64, way: Float64) -> _Windows | None:
-    """Course, slope and attitude over windows of `_WINDOW_M`, or of a link where poses are farther apart."""
+    """Return course, slope and attitude over windows of `_WINDOW_M`, or over one link where poses are farther apart."""
     at = np.flatnonzero(np.diff(np.floor(way / _WINDOW_M), prepend=-1.0) > 0)
     if at.size < 4:
         return None
@@ -359,27 +359,27 @@ def _windows(track: PoseTrack, axes: Float64, level_from_body: Float64, way: Flo
 
 
 def _varies(rows: _Windows) -> float | None:
-    """1 σ of the slopes; None where they vary too little, or are noise."""
+    """Return 1 σ of the slopes; None where they vary too little, or are noise."""
     spread = float(np.std(rows.slope_rad))
     noise = scatter_about(np.diff(rows.slope_rad), 0.0) / np.sqrt(6.0)
     return spread if spread > max(_LEAST_SLOPE_RAD, _SLOPE_NOISE_TIMES * noise) else None
 
 
 def _risen(rows: _Windows, turn_rad: float) -> tuple[float, float]:
-    """How much an axis of the body, turned to the right of the forward one, rises with the slope; and its σ."""
+    """Return how much a body axis, turned to the right of the forward one, rises with the slope; and its σ."""
     down = np.cos(turn_rad) * rows.down_forward + np.sin(turn_rad) * rows.down_right
     return _followed(-np.arcsin(np.clip(down, -1.0, 1.0)), rows)
 
 
 def _followed(angle: Float64, rows: _Windows) -> tuple[float, float]:
-    """Change of an angle by change of slope, and its σ, beside what braking changes."""
+    """Return the change of an angle per change of slope, and its σ, with the effect of braking removed."""
     parts = np.column_stack([np.ones(angle.size), rows.slope_rad, rows.acceleration_m_per_s2])
     inverse = np.linalg.pinv(parts.T @ parts)
     solved = inverse @ (parts.T @ angle)
     rest = angle - parts @ solved
     scores = parts * rest[:, None]
     spread = scores.T @ scores
-    for k in range(1, 5):  # neighbouring windows err alike (Newey and West)
+    for k in range(1, 5):  # errors of neighbouring windows are correlated (Newey and West)
         both = scores[k:].T @ scores[:-k]
         spread += (1.0 - k / 5.0) * (both + both.T)
     covariance = inverse @ spread @ inverse
@@ -387,7 +387,7 @@ def _followed(angle: Float64, rows: _Windows) -> tuple[float, float]:
 
 
 def _between(track: PoseTrack, world: str, axes: Float64, links: Float64) -> Between | None:
-    """Error of the path between poses; None where they are close, or too few."""
+    """Return the error of the path between poses; None where they are close, or too few."""
     epochs = track.epochs_gps_ns
     elapsed = np.diff(epochs)
     step_ns = float(np.median(elapsed))
@@ -400,7 +400,7 @@ def _between(track: PoseTrack, world: str, axes: Float64, links: Float64) -> Bet
 
 
 def _against_velocities(track: PoseTrack, world: str, axes: Float64, links: Float64, step_ns: float) -> Float64 | None:
-    """Squared errors (2,) of the middle of links by those of a cubic through the stated velocities at both ends."""
+    """Return squared errors (2,) at the middle of links, against a cubic through the stated velocities at both ends."""
     velocity = track.velocity_world_m_per_s
     elapsed = np.diff(track.epochs_gps_ns)
     if velocity is None:
@@ -421,7 +421,7 @@ def _against_velocities(track: PoseTrack, world: str, axes: Float64, links: Floa
 
 
 def _against_left_out(track: PoseTrack, world: str, axes: Float64, links: Float64, step_ns: float) -> Float64 | None:
-    """Squared errors (2,) between poses by those of poses that are left out, two, four and eight times as far apart.
+    """Return squared errors (2,) between poses, from poses left out at two, four and eight times the spacing.
 
     Noise of the poses is the same at all three; what grows is interpolation.
     """
@@ -436,7 +436,7 @@ def _against_left_out(track: PoseTrack, world: str, axes: Float64, links: Float6
     if len(found) < 2:
         return None
     near = np.maximum(found[1] - found[0], 0.0)
-    grows = found[1] / np.maximum(found[0], _SAME_M**2)  # without noise
+    grows = found[1] / np.maximum(found[0], _SAME_M**2)  # noise is subtracted
     if len(found) > 2:
         grows = np.maximum(grows, (found[2] - found[1]) / np.maximum(near, _SAME_M**2))
     grows = np.clip(grows, *_ORDERS)
@@ -444,13 +444,13 @@ def _against_left_out(track: PoseTrack, world: str, axes: Float64, links: Float6
 
 
 def _placed(track: PoseTrack, world: str, rows: slice, step_ns: float, epochs: Int64) -> Float64:
-    """Positions (k, 3) at epochs, by the poses of some rows."""
+    """Interpolate positions (k, 3) at epochs from the poses of some rows."""
     each = (track.epochs_gps_ns[rows], track.position_world_m[rows], track.quaternion[rows])
     return Trajectory.of(world, *each, max_gap_s=1.5 * step_ns / NS_PER_S).poses(epochs).position_world_m
 
 
 def _squares(away: Float64, axes: Float64) -> Float64 | None:
-    """Mean squares (2,), horizontal and vertical, of errors (k, 3) but for the largest; None where there are few."""
+    """Return mean squares (2,), horizontal and vertical, of errors (k, 3) less the largest; None for too few."""
     level = np.einsum("kij,ki->kj", axes, away)
     level = level[np.isfinite(level).all(axis=1)]
     if len(level) < _LEAST_LEFT_OUT:

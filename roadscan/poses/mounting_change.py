@@ -1,4 +1,4 @@
-"""What an adjustment adds to the mounting of a sensor."""
+"""Changes that an adjustment makes to the mounting of a sensor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Seat:
-    """Where a sensor sits as it is stated, and which way it looks: what a change of its mounting acts on."""
+    """The stated lever arm and beam direction of a sensor, on which a change of its mounting acts."""
 
     lever_body_m: Float64
     """(3,) or (n, 3) lever arm."""
@@ -24,7 +24,7 @@ class Seat:
     """(3,) or (n, 3) direction of its beams where all are parallel; NaN where they fan out from its origin."""
 
     def by_scale(self, arm_body_m: Float64) -> Float64:
-        """Movement (n, 3), body axes, of points at arms (n, 3) from the body's origin for a range scale of 1."""
+        """Return the movement (n, 3), body axes, of points at arms (n, 3) from the body's origin for scale 1."""
         beam = np.broadcast_to(self.beam_body, arm_body_m.shape)
         away = arm_body_m - self.lever_body_m
         along = np.einsum("ni,ni->n", away, beam)[:, None] * beam
@@ -32,13 +32,13 @@ class Seat:
 
 
 NO_SEAT: Final = Seat(np.zeros(3), np.full(3, np.nan))
-"""Of a sensor that is not asked for."""
+"""Placeholder where no sensor is concerned."""
 
 
 @dataclass(frozen=True)
 class MountingChange:
-    """Added to the mounting that rig file or calibration state: a longer lever arm, a turn after the boresight, and a
-    scale of the ranges.
+    """A change of the mounting that rig file or calibration state: a longer lever arm, a turn after the boresight,
+    and a scale of the ranges.
     """
 
     lever_arm_body_m: tuple[float, float, float]
@@ -50,24 +50,24 @@ class MountingChange:
 
     @classmethod
     def of(cls, values: Float64) -> Self:
-        """From seven numbers: lever arm, turn, scale."""
+        """Build the change from seven numbers: lever arm, turn, scale."""
         a, b, c, d, e, f, scale = (float(v) for v in values)
         return cls((a, b, c), (d, e, f), scale)
 
     @property
     def values(self) -> Float64:
-        """(7,) lever arm (m), turn (rad), scale."""
+        """Return (7,) numbers: lever arm (m), turn (rad), scale."""
         return np.array([*self.lever_arm_body_m, *self.turn_rad, self.range_scale])
 
     @property
     def largest(self) -> tuple[float, float]:
-        """Length of the shift (m), and angle (rad) of a turn that moves points as far as turn and scale do."""
+        """Return the length of the shift (m), and the turn (rad) that moves points as far as turn and scale do."""
         return float(np.linalg.norm(self.lever_arm_body_m)), float(
             np.linalg.norm(self.turn_rad) + abs(self.range_scale)
         )
 
     def applied(self, mountings: Mountings, *, parallel: bool) -> Mountings:
-        """All mountings of the sensor with the change; `parallel` : its beams are, along its z, and only z is a range.
+        """Apply the change to all mountings of a sensor; `parallel`: its beams run along its z, and only z is a range.
 
         A mounting then stretches: what it turns, it makes longer by the scale.
         """
@@ -83,7 +83,7 @@ class MountingChange:
         return Mounting((forward, right, down), tuple((float(r[0]), float(r[1]), float(r[2])) for r in turned))
 
     def moves_level(self, level_from_body: Float64, arm_body_m: Float64, seat: Seat) -> Float64:
-        """By how much (n, 3; north, east, down) it moves points that lie at arms (n, 3) from the body's origin.
+        """Return the movement (n, 3; north, east, down) of points at arms (n, 3) from the body's origin.
 
         seat : of the sensor that saw them.
         """

@@ -1,4 +1,4 @@
-"""How far corrections move poses, and how far they are allowed to before what rests on recorded poses is made anew."""
+"""Bounds on how far corrections move poses, within which results made from recorded poses stay valid."""
 
 from __future__ import annotations
 
@@ -9,44 +9,44 @@ import numpy.typing as npt
 
 from roadscan.poses.trajectory import Corrections
 
-_LEAST_SHIFT_M: Final = 0.05
-_LEAST_TURN_RAD: Final = 0.0005
-_STEP: Final = 4.0
-_MOST_STEPS: Final = 8
+_LEAST_SHIFT_M: Final = 0.05  # Smallest allowance of a shift.
+_LEAST_TURN_RAD: Final = 0.0005  # Smallest allowance of a turn.
+_STEP: Final = 4.0  # Each allowance is this many times the one before it.
+_MOST_STEPS: Final = 8  # Number of allowances; a larger correction is an error.
 
 
 class Allowance(NamedTuple):
-    """Corrections that bounds on recorded poses leave room for: none larger than this."""
+    """The largest corrections for which bounds on recorded poses still hold."""
 
     shift_m: float
-    """Horizontally. A movement straight up or down changes no place on the map."""
+    """Horizontal shift. A vertical movement changes no place on the map."""
     turn_rad: float
     """Angle of the small rotation."""
 
     @property
     def is_none(self) -> bool:
-        """True where the poses hold as they were recorded."""
+        """True where no correction is allowed for."""
         return self.shift_m == 0.0 and self.turn_rad == 0.0
 
     def moved_m(self, arm_m: float) -> float:
-        """How far a point may move on the ground that lies `arm_m` from the body's origin (m).
+        """Return how far (m) a point on the ground moves at most that lies `arm_m` from the body's origin.
 
         Between its knots the corrected trajectory is not the recorded one with a correction that is linear in time: it
         is interpolated through corrected knots. With even knots that swings over by at most 3/8 of the largest
         correction (cubic Hermite with slopes through five knots: |slope| ≤ 1.5 per knot, times u (1 − u) ≤ 1/4), with
-        uneven ones by more, where corrections change from one knot to the next by as much as they are. So twice the
-        correction is left room for.
+        uneven ones by more, where corrections change from one knot to the next by their own size. So the bound is twice
+        the correction.
         """
         return 2.0 * (self.shift_m + self.turn_rad * arm_m)
 
 
-NO_CORRECTION: Final = Allowance(0.0, 0.0)
+NO_CORRECTION: Final = Allowance(0.0, 0.0)  # Bounds hold for the recorded poses only.
 
 
 def allowance_for(corrections: Corrections | None, mounting: tuple[float, float] = (0.0, 0.0)) -> Allowance:
-    """The least allowance that covers corrections, in steps of four from 0.05 m and 0.5 mrad on.
+    """Return the smallest allowance that covers the corrections, in steps of four from 0.05 m and 0.5 mrad on.
 
-    The first step is left room for where there are none yet: most corrections to come stay within it.
+    Without corrections it is the first step, within which most later corrections stay.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def allowance_for(corrections: Corrections | None, mounting: tuple[float, float]
 
 
 def largest(corrections: Corrections | None) -> tuple[float, float]:
-    """Largest horizontal shift (m) and turn (rad) of corrections."""
+    """Return the largest horizontal shift (m) and turn (rad) of corrections."""
     if corrections is None or corrections.epochs_gps_ns.size == 0:
         return 0.0, 0.0
     shift: npt.NDArray[np.float64] = np.hypot(*corrections.north_east_down_m[:, :2].T)

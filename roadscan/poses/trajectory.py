@@ -18,7 +18,7 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 STENCIL_KNOTS = 3
-"""Knots beyond each end of a span that its poses depend on."""
+"""Number of knots beyond each end of a span that poses within it depend on."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Corrections:
     """(k, 6) 1 σ of the corrected poses: north, east, down (m), turns about body axes (rad); NaN where unknown."""
 
     def at(self, epochs_gps_ns: Int64) -> tuple[Float64, Float64]:
-        """Position (n, 3) and rotation (n, 3) corrections; the end values beyond the ends."""
+        """Return position (n, 3) and rotation (n, 3) corrections; beyond the ends, those of the ends."""
         since = (epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64)
         knots = (self.epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64)
         columns = [
@@ -46,7 +46,7 @@ class Corrections:
         return np.stack(columns[:3], axis=-1), np.stack(columns[3:], axis=-1)
 
     def sigma_ned_m(self, epochs_gps_ns: Int64) -> Float64 | None:
-        """1 σ (n, 3) of corrected positions; None where it is not known."""
+        """Return 1 σ (n, 3) of corrected positions; None where it is not known."""
         if self.sigma is None or not np.isfinite(self.sigma[:, :3]).all():
             return None
         since = (epochs_gps_ns - self.epochs_gps_ns[0]).astype(np.float64)
@@ -85,7 +85,7 @@ class Trajectory:
     max_gap_s: float = 1.0
     """Between knots farther apart there is no pose."""
     sigma_ned_m: Float64 | None = None
-    """(n, 3) 1 σ of the positions, local level (local frame: y, x, −z), as the log states it; NaN where it does not."""
+    """(n, 3) stated 1 σ of the positions, local level (local frame: y, x, −z); NaN where none is stated."""
 
     @classmethod
     def of(
@@ -97,7 +97,7 @@ class Trajectory:
         max_gap_s: float = 1.0,
         sigma_ned_m: Float64 | None = None,
     ) -> Trajectory:
-        """Sort, drop repeated epochs (the first stays) and normalise the quaternions."""
+        """Build a trajectory: sort, keep the first pose of a repeated epoch, and normalise the quaternions."""
         order = np.argsort(epochs_gps_ns, kind="stable")
         epochs = np.ascontiguousarray(epochs_gps_ns[order])
         keep = np.concatenate([[True], np.diff(epochs) > 0]) if epochs.size else np.zeros(0, dtype=bool)
@@ -108,7 +108,7 @@ class Trajectory:
 
     @property
     def span_gps_ns(self) -> tuple[int, int]:
-        """First and last epoch."""
+        """First and last epoch of the trajectory."""
         if self.epochs_gps_ns.size == 0:
             raise NavigationError("the trajectory is empty", expected="at least two poses")
         return int(self.epochs_gps_ns[0]), int(self.epochs_gps_ns[-1])
@@ -119,7 +119,7 @@ class Trajectory:
         return [(int(self.epochs_gps_ns[k]), int(self.epochs_gps_ns[k + 1])) for k in where]
 
     def corrected(self, corrections: Corrections | None) -> Trajectory:
-        """The trajectory with an adjustment's corrections applied."""
+        """Return the trajectory with an adjustment's corrections applied."""
         if corrections is None or corrections.epochs_gps_ns.size == 0 or self.epochs_gps_ns.size == 0:
             return self
         shift, turn = corrections.at(self.epochs_gps_ns)
@@ -147,7 +147,7 @@ class Trajectory:
         return np.maximum(known[:-1], known[1:])
 
     def poses(self, epochs_gps_ns: Int64, *, strict: bool = False) -> Poses:
-        """Interpolate.
+        """Interpolate poses at epochs.
 
         Parameters
         ----------
@@ -169,7 +169,7 @@ class Trajectory:
 
     @cached_property
     def intervals(self) -> PoseIntervals:
-        """Intervals between the knots, as the kernels take them."""
+        """Return the intervals between the knots in the form that kernels take."""
         size = max(self.epochs_gps_ns.size - 1, 0)
         coefficients = np.zeros((size, COEFFICIENTS))
         valid = np.zeros(size, dtype=bool)
@@ -208,7 +208,7 @@ class Trajectory:
 
 
 def world_from_ned(world: str, position_world_m: Float64) -> Float64:
-    """(n, 3, 3) axes of the local level, north, east, down, at positions (n, 3) of a world frame."""
+    """Return the local level axes (n, 3, 3; north, east, down) at positions (n, 3) of a world frame."""
     if world == LOCAL_WORLD:
         return np.broadcast_to(ENU_FROM_NED, (len(position_world_m), 3, 3))
     geodetic = geodetic_from_world(world, position_world_m)
@@ -216,7 +216,7 @@ def world_from_ned(world: str, position_world_m: Float64) -> Float64:
 
 
 def _turned(quaternion: Float64, turn: Float64) -> Float64:
-    """Attitudes (n, 4), q ⊗ exp(turn), turned by small rotation vectors (n, 3) about body axes."""
+    """Return the attitudes (n, 4) q ⊗ exp(turn), turned by small rotation vectors (n, 3) about body axes."""
     angle = np.linalg.norm(turn, axis=1)
     half = 0.5 * turn * np.sinc(angle / (2 * np.pi))[:, None]
     w2, (x2, y2, z2) = np.cos(0.5 * angle), half.T

@@ -1,4 +1,4 @@
-"""Distance travelled along a trajectory, and where and which way the vehicle is, as a log's header states them."""
+"""Distance travelled along a trajectory, and position and heading as the header of a log states them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Int64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Fix:
-    """Where the vehicle is at one epoch."""
+    """Position and heading of the vehicle at one epoch."""
 
     longitude_deg: float
     """NaN where the trajectory lives in a local frame."""
@@ -30,7 +30,7 @@ class Fix:
 
 @dataclass(frozen=True)
 class Travel:
-    """Distances between a trajectory's knots, summed."""
+    """Cumulative distances at a trajectory's knots."""
 
     trajectory: Trajectory
 
@@ -40,7 +40,7 @@ class Travel:
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def distance_m(self, epochs_gps_ns: Int64) -> Float64:
-        """(n,) metres travelled since the trajectory's first knot; the end values beyond its ends."""
+        """Return (n,) metres travelled since the trajectory's first knot; beyond its ends, those of the ends."""
         knots = self.trajectory.epochs_gps_ns
         since = (epochs_gps_ns - knots[0]).astype(np.float64)
         travelled: Float64 = np.interp(since, (knots - knots[0]).astype(np.float64), self._knots_m)

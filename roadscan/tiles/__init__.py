@@ -1,1 +1,1 @@
-"""The 10 m grid, footprints, blocks and halos, cells."""
+"""Tiles of 10 m: their cells, the blocks and tasks that compute them, and their products."""

@@ -1,4 +1,4 @@
-"""Cells of the tiles that are being worked on: readings go in, finished tiles come out, memory is used again."""
+"""Accumulates readings into the cells of active tiles, yields finished tiles, and reuses the memory."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ ROBUST_FLOOR_QUANTA: Final = 100.0
 """Heights within 1 mm of the median always count."""
 
 MOST_BYTES: Final = 800 << 20
-"""Memory that the cells of begun tiles may take."""
+"""Memory that the cells of active tiles may take."""
 
 _BUCKETS: Final = 1 / 3
-"""Share of that which readings may take that are not counted yet."""
+"""Share of that memory that readings in buckets may take, which are not counted yet."""
 
-_FIRST_ELEMENTS: Final = 4096
+_FIRST_ELEMENTS: Final = 4096  # Elements of a new pool.
 _COLUMNS: Final = (
     np.uint16, np.uint16, np.uint32, np.float64, np.float64, np.float64, np.float64, np.float32, np.float32,
 )  # fmt: skip
-"""Of the columns of ``CellColumns`` but the last two."""
-_NEVER: Final = np.array([2**62, -(2**62)])
+"""Types of the columns of ``CellColumns`` except the last two."""
+_NEVER: Final = np.array([2**62, -(2**62)])  # First and last epoch (GPS ns) of a tile without readings.
 
 
 @dataclass(frozen=True)
 class TileEvidence:
-    """When and how well the readings of a tile were placed."""
+    """Epochs of a tile's readings, and σ of the poses that georeferenced them."""
 
     first_epoch_gps_ns: int
     last_epoch_gps_ns: int
@@ -54,7 +54,7 @@ class TileEvidence:
 
 
 class Pool:
-    """Elements that hold the heights of cells (``kernels.cells.accumulate``); it grows, and is never given back."""
+    """Memory for the heights of cells (``tiles.kernels.accumulate``); it grows and never shrinks."""
 
     def __init__(self) -> None:
         self.held = np.zeros(2, np.int64)
@@ -64,26 +64,26 @@ class Pool:
 
     @property
     def size(self) -> int:
-        """Elements there are."""
+        """Number of elements."""
         return int(self.free.size)
 
     @property
     def bytes(self) -> int:
-        """Memory of the elements."""
-        return sum(a.nbytes for a in self.arrays) - self.slots.nbytes  # the headers are in the slots
+        """Memory of the elements (bytes)."""
+        return sum(a.nbytes for a in self.arrays) - self.slots.nbytes  # the headers are views of the slots
 
     @property
     def arrays(self) -> kernels.Pool:
-        """The elements, as the kernels take them."""
+        """The elements in the form that kernels take."""
         headers = self.slots.view(np.uint64)
         return kernels.Pool(self.slots, headers, self.bases, self.chain, self.free, self.spare, self.held)
 
     def make_room(self, elements: int, most_bytes: int) -> bool:
-        """Grow until so many elements are free; False where that would take more than `most_bytes`."""
+        """Grow until so many elements are free; return False where that would take more than `most_bytes`."""
         needed = int(self.held[0]) + elements
         if needed <= self.size:
             return True
-        size = max(needed, self.size * 4)  # memory that is never written takes none, and what is copied costs
+        size = max(needed, self.size * 4)  # unwritten memory takes no space, but growing copies what is written
         each = self.bytes // self.size
         if size * each > most_bytes:
             size = most_bytes // each
@@ -96,7 +96,7 @@ class Pool:
         return True
 
     def columns(self, cells: int, passes: int) -> CellColumns:
-        """Arrays for the statistics of so many cells: the same ones every time."""
+        """Return arrays for the statistics of so many cells, the same ones at every call."""
         sizes = [cells] * len(_COLUMNS) + [cells + 1, cells * passes]
         kinds = (*_COLUMNS, np.int32, np.uint16)
         for k, (size, kind) in enumerate(zip(sizes, kinds, strict=True)):
@@ -107,7 +107,7 @@ class Pool:
         return CellColumns(*(array[:size] for array, size in zip(self._columns, sizes, strict=True)))
 
     def clear(self) -> None:
-        """Take all elements back."""
+        """Return every element to the free list."""
         self.held[:] = 0
         self.free[:] = np.arange(self.size, dtype=np.int32)
         self.buckets.clear()
@@ -119,7 +119,7 @@ class Pool:
 
 
 def _aligned(size: int, kind: type[np.generic]) -> npt.NDArray[Any]:
-    """An array that starts with a line of the cache; memory that is never written takes none."""
+    """Return an array that starts at a cache line; unwritten memory takes no space."""
     size *= np.dtype(kind).itemsize
     raw = np.empty(size + 64, np.uint8)
     start = -raw.ctypes.data % 64
@@ -127,10 +127,10 @@ def _aligned(size: int, kind: type[np.generic]) -> npt.NDArray[Any]:
 
 
 class Accumulator:
-    """Counts readings into the cells of the tiles that are active.
+    """Counts readings into the cells of the active tiles.
 
-    Tiles are activated before readings of theirs come, and finished once all have; what falls outside the active
-    tiles is not counted. A finished tile does not depend on the order of the readings, nor on what else was active.
+    Tiles are activated before their first reading, and finished after their last one; readings outside the active
+    tiles are not counted. A finished tile does not depend on the order of the readings, nor on what else was active.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class Accumulator:
         pool: Pool | None = None,
         most_bytes: int = MOST_BYTES,
     ) -> None:
-        """Make ready.
+        """Create an accumulator without active tiles.
 
         Parameters
         ----------
@@ -176,7 +176,7 @@ class Accumulator:
         return edge * -(-edge // LANES)
 
     def activate(self, tiles: Sequence[TileId]) -> None:
-        """Count readings of these tiles from now on."""
+        """Activate tiles: count their readings from now on."""
         for tile in tiles:
             if self._row(tile) >= 0:
                 continue
@@ -188,7 +188,7 @@ class Accumulator:
 
     @property
     def active(self) -> ActiveTiles:
-        """The active tiles, as the kernels take them."""
+        """The active tiles in the form that kernels take."""
         return ActiveTiles(
             self.tile_rows, self.corner_quanta, self.grid.cell_quanta, self.grid.cells_per_edge, self._groups,
             self._ends, self.spans, self.sigmas,
@@ -197,7 +197,7 @@ class Accumulator:
     def run(
         self, kernel: Callable[[ActiveTiles, kernels.Pool, CountingWork, int], int], items: int, elements: int
     ) -> None:
-        """Call `kernel` with the active tiles, the pool, work and the item to begin with until it has done all items.
+        """Call `kernel` with the active tiles, the pool, work and the first item until all items are done.
 
         The kernel stops before an item for which the pool is short of `elements`; the pool is then made larger.
         """
@@ -210,10 +210,10 @@ class Accumulator:
                 raise PoolExhaustedError(f"the cells of the tiles in work take more than {self._most_bytes >> 20} MB")
 
     def fill(self, kernel: Callable[[ActiveTiles, Buckets, int], int], items: int, blocks: int) -> None:
-        """Call `kernel` with the active tiles, the buckets and the item to begin with until it has done all items.
+        """Call `kernel` with the active tiles, the buckets and the first item until all items are done.
 
-        The kernel stops before an item for which there may be too few free `blocks`. Then the buckets get more memory;
-        where they have their share, what lies in them is counted.
+        The kernel stops before an item for which there may be too few free `blocks`. Then the buckets get more memory,
+        up to their share; beyond it, their readings are counted to free them.
         """
         buckets, done = self._pool.buckets, 0
         while True:
@@ -226,9 +226,9 @@ class Accumulator:
                 buckets.make_room(blocks, int(_BUCKETS * self._most_bytes))
 
     def finish(self, tile: TileId) -> tuple[TileCells, TileEvidence] | None:
-        """Cells of a tile, which becomes inactive; None where no reading fell into it.
+        """Deactivate a tile and return its cells; None where no reading fell into it.
 
-        The next tile that is finished overwrites them: fresh memory would cost as much as the statistics.
+        The next finished tile overwrites them, since allocating memory would take as long as the statistics.
         """
         row, along, across = self._row(tile), tile.row - self._south, tile.column - self._west
         taken, most_slots = find_groups(self._groups[row], self._pool.chain, self._found)
@@ -248,7 +248,7 @@ class Accumulator:
         return cells, TileEvidence(first, last, horizontal, down)
 
     def drop(self) -> None:
-        """Forget all active tiles."""
+        """Deactivate all tiles without computing their cells."""
         self._groups[:] = -1
         self._ends[:] = 0
         self.tile_rows[:] = -1
@@ -256,20 +256,20 @@ class Accumulator:
         self._pool.clear()
 
     def _sizes(self, row: int) -> tuple[int, int]:
-        """Readings in the buckets of a tile, and in its fullest one."""
+        """Return the number of readings in the buckets of a tile, and in its fullest one."""
         buckets = self._pool.buckets
         total, most = sizes_of_rows(self._ends[row], buckets.before, buckets.sizes)
         return int(total), int(most)
 
     def _count_buckets(self, along: int, across: int) -> None:
-        """Count what lies in the buckets of a tile, by its place in the box, into its cells."""
+        """Count the readings in a tile's buckets into its cells; `along` and `across` are its place in the box."""
         row, edge = int(self.tile_rows[along, across]), self.grid.cells_per_edge
         n, _ = self._sizes(row)
         column, rows, passes = (np.empty(n, np.int32) for _ in range(3))
         readings, intensity = Heights(column, rows, np.zeros(n + VECTOR, np.int32)), np.empty(n, np.uint16)
         buckets = self._pool.buckets.arrays
         take_readings(self._ends[row], buckets, across * edge, along * edge, readings, passes, intensity)
-        told = np.zeros(FATES, np.int64)  # they were told when they were put into buckets
+        told = np.zeros(FATES, np.int64)  # counted by outcome when they were put into buckets
 
         def count(active: ActiveTiles, pool: kernels.Pool, work: CountingWork, first: int) -> int:
             done: int = accumulate_cells(readings, passes, intensity, active, pool, work, told, first)
@@ -317,4 +317,4 @@ class Accumulator:
 
 
 class PoolExhaustedError(RoadscanError):
-    """The tiles in work hold more readings than memory allows: work on fewer of them at a time."""
+    """The active tiles have more readings than memory allows: compute fewer of them at a time."""

@@ -1,6 +1,6 @@
-"""Blocks: neighbouring tiles that one task computes, with the halo it needs.
+"""Blocks: neighbouring tiles that one task computes, with the halo around them.
 
-What a tile contains never depends on the block it was computed in.
+The content of a tile never depends on the block it was computed in.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from roadscan.core.ids import TileId
 
 @dataclass(frozen=True)
 class Block:
-    """Tiles computed together."""
+    """Tiles that are computed together."""
 
     tiles: tuple[TileId, ...]
     """Core tiles, by row and column."""
@@ -25,7 +25,7 @@ class Block:
     """Rings of neighbouring tiles whose points are loaded as well."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """As one array: a tile each takes longer to send than the rest of a task."""
+        """Pickle the tiles as one array: one by one they take longer than the rest of a task."""
         packed = np.array(self.tiles, np.int32).reshape(-1, 2)
         return _unpacked, (packed, self.halo_tiles)
 
@@ -37,7 +37,7 @@ class Block:
         return min(columns) - h, min(rows) - h, max(columns) + 1 + h, max(rows) + 1 + h
 
     def with_halo(self) -> frozenset[TileId]:
-        """Core tiles and the halo around each of them."""
+        """Return core tiles and the halo around each of them."""
         reach = range(-self.halo_tiles, self.halo_tiles + 1)
         return frozenset(TileId(t.column + c, t.row + r) for t in self.tiles for c in reach for r in reach)
 
@@ -53,7 +53,7 @@ def cut_blocks(readings: Mapping[TileId, int], edge_tiles: int, max_readings: in
     ----------
     readings : readings expected in each tile to be computed.
     edge_tiles : edge of the largest block; blocks lie on the lattice of that edge.
-    max_readings : a block with more is quartered, down to single tiles.
+    max_readings : a block with more is divided into four, down to single tiles.
     """
     groups: dict[tuple[int, int], list[TileId]] = {}
     for tile in sorted(readings, key=lambda t: (t.row, t.column)):

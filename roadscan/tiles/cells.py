@@ -12,7 +12,7 @@ from roadscan.core.ids import TileId
 
 @dataclass(frozen=True)
 class TileCells:
-    """Cells of one tile that hold a point, in order of row and column; columns as in ``schemas/cells.toml``.
+    """Cells of one tile with at least one point, in order of row and column; columns as in ``schemas/cells.toml``.
 
     All arrays are (n,); heights are metres in the map frame.
     """
@@ -20,9 +20,9 @@ class TileCells:
     tile: TileId
     cells_per_edge: int
     column: npt.NDArray[np.uint16]
-    """From the west edge."""
+    """Column counted from the west edge."""
     row: npt.NDArray[np.uint16]
-    """From the south edge."""
+    """Row counted from the south edge."""
     count: npt.NDArray[np.uint32]
     height_mean_m: npt.NDArray[np.float64]
     height_robust_m: npt.NDArray[np.float64]
@@ -39,7 +39,7 @@ class TileCells:
         return int(self.column.size)
 
     def raster(self, name: str) -> npt.NDArray[np.float32]:
-        """(rows, columns) float32 image of one quantity, north up, NaN where no point lies.
+        """Return a (rows, columns) float32 image of one quantity, north up, NaN where no point lies.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Raw readings → cells of active tiles, without points."""
+"""Counts raw readings into the cells of active tiles, without writing points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from roadscan.tiles.kernels.profile_counting import accumulate_profiles
 from roadscan.tiles.kernels.row_buckets import Buckets
 
 _EIGHT_BITS: Final = np.uint32(EIGHT_TO_SIXTEEN_BITS)
-_SIXTEEN_BITS: Final = np.uint32(1)
+_SIXTEEN_BITS: Final = np.uint32(1)  # Factor on intensities that have 16 bits already.
 
 Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
@@ -31,14 +31,14 @@ Int64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Counting:
-    """Readings of one source on their way into an accumulator."""
+    """Counts the readings of one source into an accumulator."""
 
     placement: Placement
     accumulator: Accumulator
     geometry: ScanGeometry | None
     """None for returns."""
     fates: Int64 = field(default_factory=lambda: np.zeros(COUNTED_FATES, np.int64))
-    """Readings by fate (``FATE_NAMES``); those of tiles that are not active count as outside."""
+    """Readings by outcome (``FATE_NAMES``); readings in inactive tiles count as outside."""
 
     def profiles(
         self,

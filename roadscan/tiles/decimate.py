@@ -1,4 +1,4 @@
-"""A tile's cells → one point a square: the pavement's height, without stones that lie on it and cracks in it."""
+"""Reduces a tile's cells to one point per square: the pavement's height without loose stones and cracks."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from roadscan.tiles.kernels import decimate as kernels
 from roadscan.tiles.kernels.decimate_2x2 import decimate_2x2
 
 PATCH_M: Final = 0.1
-"""A slope is told from at least this much of the road: fewer cells, and a few stones would make one."""
+"""A slope is computed from at least this length of road; from fewer cells, a few stones would make one."""
 
 FLOOR_UM: Final = 1000
 """Residuals within 1 mm of the median always count."""
 
-_SAMPLE: Final = 1001
+_SAMPLE: Final = 1001  # About this many cells give the base from which heights are counted.
 
 
 @dataclass(frozen=True)
 class Squares:
-    """Squares of a tile that hold a cell, in order of row and column; all arrays are (s,)."""
+    """Squares of a tile with at least one cell, in order of row and column; all arrays are (s,)."""
 
     column: npt.NDArray[np.uint16]
-    """Of the square in its tile, from the west edge."""
+    """Column of the square in its tile, from the west edge."""
     row: npt.NDArray[np.uint16]
-    """Of the square in its tile, from the south edge."""
+    """Row of the square in its tile, from the south edge."""
     height_m: npt.NDArray[np.float64]
-    """At the square's centre, in the map frame."""
+    """Height at the square's centre, in the map frame."""
     intensity: npt.NDArray[np.float32]
-    """Mean of the cells that count."""
+    """Mean intensity of the cells that count."""
     cells: npt.NDArray[np.uint32]
-    """Cells that count."""
+    """Number of cells that count."""
     points: npt.NDArray[np.uint32]
-    """Points in those cells."""
+    """Number of points in those cells."""
     sloped: npt.NDArray[np.bool_]
-    """False where too few cells lie around the square to tell its slope: the height is that of its cells' middle."""
+    """False where too few cells around the square determine a slope: the height is that of its cells' middle."""
 
     def __len__(self) -> int:
         return int(self.column.size)
 
 
 def cells_per_square(spacing_m: float, grid: TileGrid, setting: str) -> int:
-    """Cells along a square's edge, or :class:`ConfigError` where squares are no whole cells or do not fill the tile."""
+    """Number of cells along a square's edge; raises :class:`ConfigError` where squares do not fit cells and tile."""
     side = round(spacing_m / grid.cell_m)
     if side < 1 or abs(side * grid.cell_m - spacing_m) > 1e-9 or grid.cells_per_edge % side:
         raise ConfigError(
@@ -61,7 +61,7 @@ def cells_per_square(spacing_m: float, grid: TileGrid, setting: str) -> int:
 
 
 def decimate(cells: TileCells, side: int, cell_m: float) -> Squares:
-    """Robust height of every square of `side`² cells.
+    """Return the robust height of every square of `side`² cells.
 
     Let z be the robust heights of a square's cells and (x, y) their centres, counted from the square's centre.
 
@@ -103,7 +103,7 @@ def decimate(cells: TileCells, side: int, cell_m: float) -> Squares:
 
 
 def patch_cells(side: int, edge: int, cell_m: float) -> int:
-    """Edge of a patch in cells: the fewest squares that make 0.1 m and divide the tile."""
+    """Return the edge of a patch in cells: the fewest squares that make 0.1 m and divide the tile."""
     squares = edge // side
     enough = max(1, math.ceil(PATCH_M / (side * cell_m) - 1e-9))
     return side * next(n for n in range(min(enough, squares), squares + 1) if squares % n == 0)

@@ -1,4 +1,4 @@
-"""Where the vehicles drove, for products that ask which way a lane runs."""
+"""Where the vehicles drove, for products that need the direction of a lane."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ class Drives:
 
     @classmethod
     def of(cls, plan: SurveyPlan) -> Drives:
-        """Of all runs with readings."""
+        """Collect the trajectories of all runs with readings."""
         sources = dict.fromkeys(s.trajectory for s, _ in plan.sources if s.trajectory is not None)
         return cls(plan.ground.map, tuple(sources))
 
     def key(self) -> list[list[str]]:
-        """What of them shapes a product."""
+        """Key of what changes a product."""
         return [[f.digest for f in t.files] for t in self.trajectories]
 
     def lanes(self, store: Store) -> LaneDirections:
-        """Directions of travel, from positions as they were logged or computed; adjustments turn no lane."""
+        """Read directions of travel from recorded or computed positions; adjustments do not change them."""
         steps = [LaneDirections(np.zeros((0, 2)), np.zeros(0))]
         steps += [LaneDirections.of_path(self.path_m(store, one)) for one in self.trajectories]
         return LaneDirections(
@@ -44,7 +44,7 @@ class Drives:
         )
 
     def path_m(self, store: Store, one: TrajectorySource) -> npt.NDArray[np.float64]:
-        """(n, 2) easting and northing of every pose that lies in another cube of :data:`STEP_M` than the one before."""
+        """Return (n, 2) easting and northing of every pose in another cube of :data:`STEP_M` than the one before."""
         parts = [np.zeros((0, 3)), *_positions(store, one)]
         world = np.concatenate(parts)
         return self.map.map_from_world(one.world, world)[:, :2] if len(world) else np.zeros((0, 2))

@@ -1,4 +1,4 @@
-"""Which way the lane runs: the direction in which a vehicle drove nearby."""
+"""Directions of lanes: the direction in which a vehicle drove nearby."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from scipy.spatial import cKDTree
 Float64 = npt.NDArray[np.float64]
 
 STEP_M: Final = 1.0
-"""Directions are those of steps about this long."""
+"""Directions are those of steps of about this length."""
 _LEAST_STEP_M: Final = 0.5
-"""Shorter ones are those of a vehicle that stands."""
+"""Shorter steps are ignored: the vehicle stands."""
 _LONGEST_STEP_M: Final = 50.0
-"""Longer ones are gaps between poses."""
+"""Longer steps are ignored: they are gaps between poses."""
 _FARTHEST_M: Final = 20.0
-"""A lane this far from every drive has no direction."""
+"""A lane farther than this from every drive has no direction."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class LaneDirections:
     place_m: Float64
     """(k, 2) easting and northing of the middle of each step (m)."""
     azimuth_rad: Float64
-    """(k,) its direction, clockwise from map north."""
+    """(k,) direction of the step, clockwise from map north."""
 
     @classmethod
     def of_path(cls, path_m: npt.ArrayLike) -> Self:
-        """Steps from each to the next of places (n, 2) about :data:`STEP_M` apart, in the order driven."""
+        """Build from the steps between successive places (n, 2) about :data:`STEP_M` apart, in driving order."""
         path = np.asarray(path_m, np.float64).reshape(-1, 2)
         step = np.diff(path, axis=0)
         length = np.hypot(*step.T)
@@ -41,7 +41,7 @@ class LaneDirections:
         return cls((path[:-1] + 0.5 * step)[own], np.arctan2(step[own, 0], step[own, 1]))
 
     def at(self, places_m: npt.ArrayLike) -> Float64:
-        """Directions (n,) at places (n, 2), those of the nearest steps; NaN where none is near."""
+        """Return directions (n,) at places (n, 2), from the nearest steps; NaN where none is near."""
         places = np.asarray(places_m, np.float64).reshape(-1, 2)
         if not len(self.place_m) or not len(places):
             return np.full(len(places), np.nan)

@@ -1,4 +1,4 @@
-"""The contract of a product, and the registry that finds products by themselves.
+"""Defines the interface of products, and the registry that finds them.
 
 A product is one file of a folder `products` of its feature (or one entry point of the group ``roadscan.products``) with
 one subclass of :class:`TileProduct`, :class:`SurfaceProduct` or :class:`SurveyProduct`. It writes whole files to the
@@ -34,7 +34,7 @@ ENTRY_POINT_GROUP: Final = "roadscan.products"
 
 
 FINE_CELL_M: Final = 0.02
-"""Cells below this are those of profilers at line rate: a network of them is looked at tile by tile, or from far."""
+"""Below this edge, cells are those of profilers at line rate, and a network is viewed by tile or in overview."""
 
 Cells = Literal["any", "fine", "coarse"]
 
@@ -45,7 +45,7 @@ class NoOptions(Strict):
 
 @dataclass(frozen=True)
 class ProductContext:
-    """What every product may need beside its data; nothing in it depends on how the work was batched."""
+    """Information that products need beside their data; none of it depends on how the work was batched."""
 
     survey_id: str
     title: str
@@ -60,21 +60,21 @@ class ProductContext:
 
 @dataclass(frozen=True)
 class Tile:
-    """A computed tile, as tile products receive it. Its arrays may be reused when the product has been written."""
+    """A computed tile, as tile products receive it. Its arrays may be reused after the product is written."""
 
     points: TilePoints | None
-    """None unless one of the products wanted needs points."""
+    """None unless a wanted product needs points."""
     cells: TileCells
     marked: TilePoints | None = None
-    """Points that filters leave out, withheld and marked by class, where the survey keeps them (`keep_marked`)."""
+    """Filtered points, withheld and marked by class, where the survey keeps them (`keep_marked`)."""
     sigma_horizontal_m: float | None = None
-    """Largest horizontal 1 σ of the poses that placed the readings, √(σ_north² + σ_east²); None where not stated."""
+    """Largest horizontal 1 σ of the poses of the readings, √(σ_north² + σ_east²); None where not stated."""
     sigma_height_m: float | None = None
-    """The same of the height."""
+    """Largest vertical 1 σ of the poses; None where not stated."""
 
     @functools.cached_property
     def overviews(self) -> list[Level]:
-        """The cells in larger pixels, ascending; made once for all who want them."""
+        """The cells in larger pixels, ascending; computed once for all products."""
         return pyramid_of(self.cells, overview_factors(self.cells.cells_per_edge))
 
 
@@ -98,7 +98,7 @@ class TileSummary:
 
     @classmethod
     def without_readings(cls, tile: TileId) -> Self:
-        """A tile that has a surface and no reading of its own."""
+        """Return the summary of a tile that has a surface and no reading."""
         nan = math.nan
         return cls(tile, 0, 0, nan, nan, nan, nan, nan, (), 0, 0)
 
@@ -110,30 +110,30 @@ class Output:
     name: str
     """File name below ``products/<product>/``."""
     tiles: tuple[TileId, ...]
-    """Tiles its content depends on; it is rewritten when one of them changes."""
+    """Tiles that its content depends on; it is rewritten when one of them changes."""
 
 
 class LoadCells(Protocol):
-    """Gives what the store holds of a tile, for products over many tiles."""
+    """Loads what the store has of a tile, for products over many tiles."""
 
     def __call__(self, tile: TileId) -> TileCells | None:
-        """Cells of a tile, or None where the survey has no such tile."""
+        """Return the cells of a tile, or None where the survey has no such tile."""
 
     def overview(self, tile: TileId, factor: int) -> Level | None:
-        """Overview of a tile in pixels of `factor` squared cells, or None where the survey has no such tile.
+        """Return the overview of a tile in pixels of `factor` squared cells, or None where the survey has no such tile.
 
         `factor` is one of :func:`roadscan.tiles.pyramid.overview_factors`.
         """
 
     def file(self, product: str, tile: TileId) -> bytes | None:
-        """Content of a tile's file of a surface product that this product `reads`, or None where there is none."""
+        """Return the content of a tile's file of a surface product that this product `reads`, or None."""
 
     def lanes(self) -> LaneDirections:
-        """Which way the lanes run, for a product that `needs_lanes`."""
+        """Return the directions of the lanes, for a product that `needs_lanes`."""
 
 
 class TileFiles(ABC):
-    """What the two kinds of product with one file a tile share."""
+    """Common part of the two kinds of product with one file per tile."""
 
     name: ClassVar[str]
     """Name in survey files, and of its folder below ``tiles/``."""
@@ -146,24 +146,24 @@ class TileFiles(ABC):
     options: ClassVar[type[Strict]] = NoOptions
     """Model of its settings."""
     default: ClassVar[bool] = True
-    """Made where the survey file does not list products."""
+    """Whether it is made where the survey file does not list products."""
     default_cells: ClassVar[Cells] = "any"
     """Made by default only with fine cells (below 2 cm) or only with coarse ones, if it is made by default."""
 
     def suffix_for(self, options: Strict) -> str:
-        """File suffix under these settings."""
+        """Return the file suffix under these settings."""
         return self.suffix
 
     def companions(self, options: Strict) -> dict[str, str]:
-        """Small files that belong beside each file, such as a world file: suffix by name.
+        """Return small files that belong beside each file, such as a world file: suffix by name.
 
-        They are written with the file, under its path with their suffix instead of its own; the names do not
+        They are written with the file, under its path with another suffix; the names do not
         depend on the settings.
         """
         return {}
 
     def check_options(self, options: Strict, context: ProductContext) -> None:
-        """Raise :class:`ConfigError` where the settings do not fit the survey; asked once, before any work."""
+        """Raise :class:`ConfigError` where the settings do not fit the survey; called once, before any work."""
         return
 
     @abstractmethod
@@ -172,10 +172,10 @@ class TileFiles(ABC):
 
 
 class TileProduct(TileFiles):
-    """A product of one file a tile, written while the tile's points are in memory."""
+    """A product of one file per tile, written while the tile's points are in memory."""
 
     needs_points: ClassVar[bool] = False
-    """True for a product of single points: they are placed and kept for it, which cells alone do not need."""
+    """True for a product of single points, for which readings are georeferenced one by one."""
 
     @abstractmethod
     def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
@@ -183,32 +183,32 @@ class TileProduct(TileFiles):
 
 
 class SurfaceProduct(TileFiles):
-    """A product of one file a tile, written while the tile's reconstructed surface is in memory.
+    """A product of one file per tile, written while the tile's reconstructed surface is in memory.
 
     It is made in the stage `surfaces`, which the section `[surface]` of the survey file turns on; without that
     section none is made by default.
     """
 
     def around_m(self, options: Strict, cell_m: tuple[float, float]) -> float:
-        """How far beyond a tile the product looks at heights before smoothing (m); 0 where those after it are enough.
+        """Return how far beyond a tile the product needs heights before smoothing (m); 0 where smoothed ones suffice.
 
         `cell_m` are a cell's edges, east and north.
         """
         return 0.0
 
     def check_cells(self, options: Strict, cell_m: tuple[float, float], seen: int) -> None:
-        """Raise :class:`ConfigError` where the settings do not fit the surface's cells; asked once, before any work.
+        """Raise :class:`ConfigError` where the settings do not fit the surface's cells; called once, before any work.
 
         `cell_m` are a cell's edges, east and north; `seen` is how many of the neighbours' a tile shows on each side.
         """
         return
 
     def picture_rule(self, options: Strict) -> PictureRule | None:
-        """Which of the survey's pictures give colours, for a product that wants such; asked before any work."""
+        """Return which of the survey's pictures give colours, for a product that needs them; called before any work."""
         return None
 
     def coloured_nodes(self, surface: SurfaceTile, options: Strict) -> tuple[range, range]:
-        """Rows and columns of the surface's arrays whose colours such a product gets, as `surface.colours`."""
+        """Return rows and columns of the surface's arrays whose colours such a product gets, as `surface.colours`."""
         return range(0), range(0)
 
     @abstractmethod
@@ -226,19 +226,19 @@ class SurveyProduct(ABC):
     default: ClassVar[bool] = True
     default_cells: ClassVar[Cells] = "any"
     reads: ClassVar[tuple[str, ...]] = ()
-    """Surface products whose files of the tiles it is made from; they are made wherever this product is."""
+    """Surface products from whose files it is made; they are made wherever this product is."""
     table: ClassVar[str] = ""
-    """Table of ``schemas/`` that its file holds, where it holds one."""
+    """Table of ``schemas/`` that its file contains, if any."""
     needs_lanes: ClassVar[bool] = False
-    """True for a product that asks which way the lanes run."""
+    """True for a product that needs the directions of the lanes."""
 
     def check_reads(self, options: Strict, read: Mapping[str, Strict]) -> None:
-        """Raise :class:`ConfigError` where settings of the products that it `reads`, by name, do not fit its own."""
+        """Raise :class:`ConfigError` where settings of the products that it `reads`, by name, do not fit this one's."""
         return
 
     @abstractmethod
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
-        """Files to write; none may read another."""
+        """Return the files to write; none may read another."""
 
     @abstractmethod
     def write(
@@ -265,20 +265,20 @@ Product: TypeAlias = TileProduct | SurfaceProduct | SurveyProduct
 
 
 def is_default(product: Product, cell_m: float) -> bool:
-    """True for a product that is made where the survey file does not list products."""
+    """Return True for a product that is made where the survey file does not list products."""
     fits = product.default_cells in ("any", "fine" if cell_m < FINE_CELL_M else "coarse")
     return product.default and fits
 
 
 @functools.cache
 def products() -> dict[str, Product]:
-    """All products by name: those of this folder, and installed entry points."""
+    """Return all products by name: those of this folder, and installed entry points."""
     kinds = (TileProduct, SurfaceProduct, SurveyProduct)
     return {name: kind() for name, kind in found_kinds("**/products/*.py", kinds, ENTRY_POINT_GROUP).items()}
 
 
 def product_named(name: str) -> Product:
-    """Product by name, or an error that names the nearest known one."""
+    """Return a product by name; raises an error that names the nearest known one."""
     known = products()
     if name not in known:
         raise ConfigError(f"unknown product '{name}'{nearest(name, known)}", expected="one of: " + ", ".join(known))

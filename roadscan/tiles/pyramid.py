@@ -1,4 +1,4 @@
-"""Overviews of a tile: its cells in ever larger pixels, for looking at a road from far away."""
+"""Overviews of a tile: its cells in ever larger pixels, for small map scales."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ WANTED_FACTORS: Final = (2, 8, 32)
 """Cells along an edge of a pixel: cells of 5 mm become pixels of 10, 40 and 160 mm."""
 
 LARGEST_FACTOR: Final = 256
-"""Sums stay exact while a pixel's cells, times their height above the tile's first cell, are below 2²¹ m."""
+"""Largest factor: sums stay exact while a pixel's cells, times their height above the first cell, are below 2²¹ m."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """Pixels of one overview that hold a point, in order of row and column; all arrays are (n,)."""
+    """Pixels of one overview with at least one point, in order of row and column; all arrays are (n,)."""
 
     factor: int
     """Cells of the tile along an edge of a pixel."""
     column: npt.NDArray[np.uint16]
-    """Of the pixel in its tile, from the west edge."""
+    """Column of the pixel in its tile, from the west edge."""
     row: npt.NDArray[np.uint16]
-    """Of the pixel in its tile, from the south edge."""
+    """Row of the pixel in its tile, from the south edge."""
     count: npt.NDArray[np.uint32]
-    """Points in the pixel."""
+    """Number of points in the pixel."""
     cells: npt.NDArray[np.uint32]
-    """Cells of the pixel that hold a point."""
+    """Number of cells of the pixel with a point."""
     height_m: npt.NDArray[np.float64]
-    """Mean of the robust heights of those cells, each counted once, rounded to 2⁻³² m before they are added."""
+    """Mean of the robust heights of those cells, each counted once, rounded to 2⁻³² m before summation."""
     intensity: npt.NDArray[np.float32]
     """Mean intensity of the pixel's points."""
 
@@ -50,7 +50,7 @@ class Level:
 
 @functools.cache
 def overview_factors(cells_per_edge: int, wanted: tuple[int, ...] = WANTED_FACTORS) -> tuple[int, ...]:
-    """Factors of a tile's overviews: for each wanted one the nearest that fits, ascending.
+    """Return the factors of a tile's overviews: for each wanted one the nearest that fits, ascending.
 
     A factor fits if it divides the tile's edge, so that no pixel straddles two tiles, and is a multiple of the
     factor before it. Nearest is by ratio, the smaller of two equally near. 10 m tiles with cells of 5 mm get
@@ -71,7 +71,7 @@ def overview_factors(cells_per_edge: int, wanted: tuple[int, ...] = WANTED_FACTO
 
 
 def pyramid_of(cells: TileCells, factors: Sequence[int]) -> list[Level]:
-    """Overviews of a tile by `factors`, in that order; equal to the bit whichever others are made with them.
+    """Compute overviews of a tile by `factors`, in that order; the result does not depend on the other factors.
 
     Sums are of whole units: heights of 2⁻³² m, intensities of digital numbers (a cell's mean times its count,
     rounded: exact up to 128 readings of 65,535 a cell). Raises :class:`ConfigError` for factors that do not

@@ -1,4 +1,4 @@
-"""Memory for buckets of readings by row of cells (``kernels.cells.row_buckets``)."""
+"""Memory for buckets of readings by row of cells (``tiles.kernels.row_buckets``)."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy.typing as npt
 
 from roadscan.tiles.kernels.row_buckets import BLOCK, PASS, Buckets
 
-_FIRST_BLOCKS: Final = 4096
-_RECORD, _BLOCK_NUMBERS = 8, 4 * 4
+_FIRST_BLOCKS: Final = 4096  # Blocks of new buckets, at least.
+_RECORD, _BLOCK_NUMBERS = 8, 4 * 4  # Bytes of a reading, and of a block's four numbers.
 BLOCK_BYTES: Final = BLOCK * _RECORD + _BLOCK_NUMBERS
-"""Memory of a block."""
+"""Bytes of a block."""
 
 
 class RowBuckets:
-    """Blocks that hold readings; they grow, and are never given back."""
+    """Blocks of readings; the memory grows and never shrinks."""
 
     def __init__(self) -> None:
         self.held = np.zeros(2, np.int64)
@@ -25,12 +25,12 @@ class RowBuckets:
 
     @property
     def size(self) -> int:
-        """Blocks there are."""
+        """Number of blocks."""
         return int(self.free.size)
 
     @property
     def arrays(self) -> Buckets:
-        """The blocks, as the kernels take them."""
+        """The blocks in the form that kernels take."""
         return Buckets(self.records, self.before, self.sizes, self.owners, self.free, self.held)
 
     def make_room(self, blocks: int, most_bytes: int) -> bool:
@@ -49,7 +49,7 @@ class RowBuckets:
         return True
 
     def clear(self) -> None:
-        """Take all blocks back."""
+        """Return every block to the free list."""
         self.held[:] = 0
         self.held[PASS] = -1
         self.free[:] = np.arange(self.size, dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Stage `tiles`: readings into cells and tile files, by way of points where these are asked for."""
+"""Stage `tiles`: counts readings into cells and writes tile files, with points where these are requested."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Tiles(Stage):
         """Compute the tiles that are missing or stale, or those that are chosen."""
         manifest, work = session.manifest, plan_tile_work(session)
         if work.chosen:
-            check_colours(plan_of(session), folders=True)  # before the tiles are computed for them
+            check_colours(plan_of(session), folders=True)  # before tiles are computed for them
         manifest.remove(work.gone)
 
         def counted(task: TileTask) -> TileTask:
@@ -67,8 +67,8 @@ class Tiles(Stage):
         self._tell_of_readings(session, work.chosen)
 
     def _tell_of_readings(self, session: Session, chosen: Sequence[TileId]) -> None:
-        """Fail logs that give nothing, and the survey where no tile holds anything; say how much of what was computed
-        has no pose.
+        """Fail logs without a usable reading, and the survey where no tile has any; report the share of readings
+        without a pose.
         """
         manifest = session.manifest
         session.failed(self.name, faults_of_plan(session))
@@ -101,11 +101,11 @@ class Tiles(Stage):
         )
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """Logs of which many readings have no pose, and passes that lie at different heights."""
+        """Return logs of which many readings have no pose, and passes that lie at different heights."""
         tiles = list(manifest.of(TILE).values())
         logs = counts_by_log([*manifest.of(FOOTPRINTS).values(), *tiles])
         return [*lost_findings(logs, records, survey.config.checks.lost_share), *apart_findings(tiles)]
 
     def folders(self) -> Sequence[str]:
-        """Files a tile, those of surfaces too."""
+        """Return the folders of tile files, those of surfaces included."""
         return ("tiles",)

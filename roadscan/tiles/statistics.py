@@ -1,4 +1,4 @@
-"""Points of a tile → its cells."""
+"""Computes a tile's cells from its points."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from roadscan.tiles.kernels.pool import Pool
 from roadscan.tiles.kernels.row_buckets import Buckets
 
 _SAMPLE: Final = 1 << 16
-"""Points that are looked at for the order they come in."""
+"""Number of points from which the order is determined."""
 _MOST_CHANGES: Final = 256
-"""Changes of the pass among a tile's points with which they are put into buckets: each closes those of all rows."""
+"""With more changes of the pass than this, points are not put into buckets: each change closes a block of every row."""
 
 
 def cells_of(points: TilePoints, grid: TileGrid) -> TileCells:
-    """Statistics of every cell with a point; equal to the bit whatever the order of the points.
+    """Return statistics of every cell with a point, independent of the order of the points to the bit.
 
     Sums are made of whole 10 µm, so they are exact. The squared deviations of one cell stay below 2⁶³ for
     up to 250,000 points spread over 60 m of height, and for more where the spread is less.
@@ -66,6 +66,6 @@ def cells_of(points: TilePoints, grid: TileGrid) -> TileCells:
 
 
 def _cell_by_cell(x: npt.NDArray[np.int32], y: npt.NDArray[np.int32], cell_quanta: int) -> bool:
-    """Whether half of the points lie in the cell of the point before."""
+    """Return whether half of the points lie in the cell of the point before."""
     column, row = x[:_SAMPLE] // cell_quanta, y[:_SAMPLE] // cell_quanta
     return bool(2 * np.count_nonzero((np.diff(column) == 0) & (np.diff(row) == 0)) >= len(column))

@@ -1,1 +1,1 @@
-"""Residuals of a calibration, and the surfaces that it compares."""
+"""Kernels for the residuals of a calibration and for matching surfaces."""

@@ -1,4 +1,4 @@
-"""Surfaces seen from several drives: places of readings, height images, and the shifts between patches of them."""
+"""Kernels for surfaces seen in several drives: positions of readings, height images, shifts between patches."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import numpy.typing as npt
 from roadscan.compute.kernel_options import inlined, kernel
 
 UNKNOWNS = 5
-"""Of a patch: shift along x, y, z, and two tilts that are no part of the answer."""
+"""Unknowns of a patch: shift along x, y, z, and two tilts that are eliminated afterwards."""
 LONGEST_CELLS = 2.0
-"""A patch moves no farther in one step."""
+"""Longest movement of a patch in one step."""
 DONE_CELLS = 0.002
 """A step this short ends a patch's search."""
 MOMENTS = 4
-"""Sums of a patch that say where its shift was felt: of w, w x, w y, w h, with w the product of the slopes."""
+"""Weighted sums of a patch that give the centre of its shift: of w, w x, w y, w h; w: product of both slopes."""
 
 
 class Matches(NamedTuple):
-    """What is found of p patches, written by kernels."""
+    """Matches of p patches, written by kernels."""
 
     shift_m: npt.NDArray[np.float64]
     """(p, 3) in/out: dx, dy, dz."""
@@ -39,7 +39,7 @@ class Matches(NamedTuple):
 
 @kernel
 def place(point_sensor, pose, position, rotation, body_from_sensor, lever, out):
-    """Places of readings.
+    """Compute the positions of readings.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def place(point_sensor, pose, position, rotation, body_from_sensor, lever, out):
 
 @kernel
 def splat(place_m, pose, corner_x, corner_y, cell, mass, height, carrier):
-    """Add readings to the four cells around each, by their nearness.
+    """Distribute readings over the four cells around each, by proximity.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def splat(place_m, pose, corner_x, corner_y, cell, mass, height, carrier):
 
 @inlined
 def catmull_rom(s):
-    """Weights of four neighbours at part `s` between the middle two, Catmull and Rom, then their derivatives."""
+    """Return Catmull–Rom weights of four neighbours at fraction `s` between the middle two, then their derivatives."""
     return (
         s * (-0.5 + s * (1.0 - 0.5 * s)), 1.0 + s * s * (-2.5 + 1.5 * s),
         s * (0.5 + s * (2.0 - 1.5 * s)), s * s * (-0.5 + 0.5 * s),
@@ -101,7 +101,7 @@ def catmull_rom(s):
 
 @inlined
 def sampled(image, r, c, s, t):
-    """Value and derivatives by column and row (per cell) of an image beyond (r, c), with weights `s` and `t`."""
+    """Return value and derivatives by column and row (per cell) of an image beyond (r, c), with weights `s` and `t`."""
     value, along, across = 0.0, 0.0, 0.0
     for j in range(4):
         a, b, d, e = image[r - 1 + j, c - 1], image[r - 1 + j, c], image[r - 1 + j, c + 1], image[r - 1 + j, c + 2]
@@ -114,7 +114,7 @@ def sampled(image, r, c, s, t):
 
 @kernel
 def _equations(first, second, cell, row, column, size, step, move, crossed, mean, right, felt):
-    """Normal equations of one patch at a move of (dx, dy, dz, tilts); returns squares of residuals and cells used."""
+    """Fill the normal equations of one patch at (dx, dy, dz, tilts); return sum of squared residuals and cells used."""
     rows, columns = first.shape
     half = 0.5 * (size - 1)
     du, dv = move[0] / cell, move[1] / cell
@@ -166,7 +166,7 @@ def _equations(first, second, cell, row, column, size, step, move, crossed, mean
 
 @kernel
 def match_patches(first, second, cell, corner, size, step, iterations, least, found):
-    """How far patches of two height images lie apart: Gauss–Newton on the heights of each (Lucas and Kanade 1981).
+    """Find the shifts between patches of two height images, by Gauss–Newton on the heights (Lucas and Kanade 1981).
 
     A place (x, y, h) of the first image lies at (x + dx, y + dy, h + dz) in the second; tilts of the patch against
     the second image are unknowns too. A second normal matrix is made of products of one image's slopes with the

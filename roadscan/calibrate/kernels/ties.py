@@ -1,4 +1,4 @@
-"""Ties of a calibration: their residuals, and the derivatives by mountings and poses.
+"""Kernels for the residuals of ties and their derivatives by mountings and poses.
 
 One end of n ties is a tuple of arrays `side`:
 
@@ -25,7 +25,7 @@ SIDE = 13
 
 @inlined
 def times(m, v):
-    """Matrix (nine numbers, row by row) times vector."""
+    """Return a matrix (nine numbers, row by row) times a vector."""
     return (
         m[0] * v[0] + m[1] * v[1] + m[2] * v[2],
         m[3] * v[0] + m[4] * v[1] + m[5] * v[2],
@@ -35,7 +35,7 @@ def times(m, v):
 
 @inlined
 def back(m, v):
-    """Transposed matrix (nine numbers, row by row) times vector."""
+    """Return a transposed matrix (nine numbers, row by row) times a vector."""
     return (
         m[0] * v[0] + m[3] * v[1] + m[6] * v[2],
         m[1] * v[0] + m[4] * v[1] + m[7] * v[2],
@@ -45,7 +45,7 @@ def back(m, v):
 
 @inlined
 def product(a, b):
-    """Product of two matrices of nine numbers."""
+    """Return the product of two matrices of nine numbers."""
     return (
         a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
         a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
@@ -61,7 +61,7 @@ def product(a, b):
 
 @inlined
 def placed(seen, mounting, position, rotation, shift, turn):
-    """One end: place in the world; in body axes; from the sensor's origin in body axes; beam; world from body."""
+    """Return place in the world, in body axes, and from the sensor's origin in body axes; beam; world from body."""
     matrix, lever, offset, axis = mounting
     if axis[0] == 0.0 and axis[1] == 0.0 and axis[2] == 0.0:
         length = max(math.sqrt(seen[0] * seen[0] + seen[1] * seen[1] + seen[2] * seen[2]), 1e-9)
@@ -79,13 +79,13 @@ def placed(seen, mounting, position, rotation, shift, turn):
 
 @inlined
 def vector(rows, i):
-    """Row i of an array (n, 3) as three numbers."""
+    """Return row i of an array (n, 3) as three numbers."""
     return rows[i, 0], rows[i, 1], rows[i, 2]
 
 
 @inlined
 def matrix(stack, i):
-    """Matrix i of an array (n, 3, 3) as nine numbers, row by row."""
+    """Return matrix i of an array (n, 3, 3) as nine numbers, row by row."""
     return (
         stack[i, 0, 0], stack[i, 0, 1], stack[i, 0, 2],
         stack[i, 1, 0], stack[i, 1, 1], stack[i, 1, 2],
@@ -95,7 +95,7 @@ def matrix(stack, i):
 
 @inlined
 def end(side, mounting, shift, turn, i):
-    """End i of a side, as :func:`placed` returns it."""
+    """Return end i of a side as :func:`placed` does."""
     body, point, position, rotation = side
     j = i if position.shape[0] > 1 else 0
     b = body[i]
@@ -106,7 +106,7 @@ def end(side, mounting, shift, turn, i):
 
 @kernel
 def tie_residuals(first, first_mounting, second, second_mounting, shift, turn, weight, on_object, residual):
-    """Whitened differences of n ties.
+    """Compute the whitened differences of n ties.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def tie_residuals(first, first_mounting, second, second_mounting, shift, turn, w
 
 @kernel
 def tie_rows(first, first_mounting, second, second_mounting, shift, turn, weight, on_object, counts, residual, rows):
-    """Whitened differences and their derivatives, each multiplied by the root of what the tie counts.
+    """Compute whitened differences and their derivatives, each multiplied by the root of the tie's weight.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def tie_rows(first, first_mounting, second, second_mounting, shift, turn, weight
         d = (p[0][0] - q[0][0], p[0][1] - q[0][1], p[0][2] - q[0][2])
         arm = q[1]
         if on_object:
-            # Rows turn with the object, and so does what it sees of the first place.
+            # Rows rotate with the object, and so does the position of the first place relative to it.
             d = back(q[4], d)
             arm = (arm[0] + d[0], arm[1] + d[1], arm[2] + d[2])
         for k in range(weight.shape[1]):
@@ -161,7 +161,7 @@ def tie_rows(first, first_mounting, second, second_mounting, shift, turn, weight
 
 @inlined
 def derivatives(w, c, in_body, from_sensor, beam):
-    """Of w · place, with w in the body's axes c."""
+    """Return the derivatives of w · place, with w in body axes c."""
     return (
         c[0], c[1], c[2],
         from_sensor[1] * c[2] - from_sensor[2] * c[1],

@@ -1,1 +1,1 @@
-"""Surfaces that were seen more than once: loops, back-through and right-angle loops, sensor to sensor."""
+"""Evidence from surfaces seen more than once: in several drives, or by several sensors."""

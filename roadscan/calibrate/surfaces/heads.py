@@ -1,7 +1,7 @@
-"""Two heads that see the same place in the same drive: ties between them there, and how well they agree.
+"""Ties between two heads that see the same strip in one drive, and the agreement of their heights.
 
-The strip where the profiles of two heads overlap is narrow, and both see it with one trajectory: what they differ by
-there is their mounting's, and nothing else's.
+The strip where the profiles of two heads overlap is narrow, and both see it with one trajectory: any difference there
+comes from their mountings alone.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from roadscan.core.errors import NavigationError
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_CELL_M: Final = 0.01
-_LEAST: Final = 4
+_CELL_M: Final = 0.01  # Edge of a cell in which heights are compared.
+_LEAST: Final = 4  # Least number of readings of a cell, and least number of common cells.
 _EVEN: Final = 4.0
-"""Cells whose readings scatter with more than this many times the usual variance lie on an edge."""
-_FLOOR_M: Final = 2e-5
+"""Cells with a variance above this multiple of the usual one lie on an edge."""
+_FLOOR_M: Final = 2e-5  # Added to the limit for outlying differences: rounding.
 _COMMON_M: Final = 1e-4
-"""1 σ that the whole strip of a drive is off (m)."""
-_OUTLYING: Final = 4.0
+"""1 σ of an error that the whole strip of a drive shares (m)."""
+_OUTLYING: Final = 4.0  # A difference farther from the median than this many σ is left out.
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Heights of two heads in the cells that both see."""
+    """Agreement of two heads in the cells that both see."""
 
     cells: int
     mean_m: float
-    """First − second."""
+    """Mean of first − second."""
     rms_m: float
     beyond_noise_m: float
-    """RMS without what the scatter of the readings within their cells explains: noise and texture."""
+    """RMS less the scatter of the readings within their cells, which is noise and texture."""
 
 
 def agreement(first: Placed, second: Placed, cell_m: float = 0.01, least: int = 4) -> Agreement:
@@ -82,14 +82,14 @@ class _Cells:
     middle_m: Float64
     """(m, 2) mean x and y of the cell's readings."""
     reading: Int64
-    """(m,) one of them."""
+    """(m,) index of one of them."""
 
 
 def _cells(place_m: Float64, cell_m: float, least: int) -> _Cells:
     whole = np.floor(place_m[:, :2] / cell_m).astype(np.int64)
     key, inverse = np.unique((whole[:, 0] << 32) + whole[:, 1], return_inverse=True)
     count = np.bincount(inverse)
-    # About the mean of all heights: squares of heights above the sea would leave no digits.
+    # Relative to the mean height, since squares of heights above sea level would lose all digits.
     height = place_m[:, 2] - place_m[:, 2].mean()
     mean = np.bincount(inverse, height) / count
     square = np.bincount(inverse, (height - mean[inverse]) ** 2)
@@ -104,7 +104,7 @@ def _cells(place_m: Float64, cell_m: float, least: int) -> _Cells:
 
 @dataclass
 class HeadTies:
-    """Finds ties between heads in the strip that both see; hand it to the estimator as its evidence.
+    """Finds ties between heads in the strip that both see; the estimator takes it as its evidence.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class HeadTies:
 
 
 def _strip(first: Placed, second: Placed, level_from_world: Float64) -> Ties | None:
-    """Ties of two heads in one drive."""
+    """Return the ties of two heads in one drive."""
     if first.readings.sensor == second.readings.sensor:
         return None
     own, other = (_cells(one.place_m, _CELL_M, _LEAST) for one in (first, second))
@@ -142,13 +142,13 @@ def _strip(first: Placed, second: Placed, level_from_world: Float64) -> Ties | N
     if kept.sum() < _LEAST:
         return None
     a, b, variance = a[kept], b[kept], variance[kept]
-    # What all cells have in common (unlike places within a cell, texture, rounding) no number of them averages out.
+    # An error that all cells share does not average out.
     sigma = np.sqrt(variance + _COMMON_M**2 * variance.size)
     weight = level_from_world[None, 2:3, :] / sigma[:, None, None]
     return Ties("overlap, heads", _seen(first, own, a), _seen(second, other, b), weight)
 
 
 def _seen(one: Placed, cells: _Cells, which: Int64) -> Seen:
-    """Mean places of cells as the head would have seen them from the pose of one of their readings."""
+    """Return mean places of cells as the head would have seen them from the pose of one of their readings."""
     place = np.concatenate([cells.middle_m[which], cells.height_m[which, None]], axis=1)
     return one.seen(place, one.readings.pose[cells.reading[which]].astype(np.int64))

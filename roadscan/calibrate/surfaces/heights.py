@@ -1,9 +1,9 @@
-"""Ties from heights: patches of a surface that profilers saw in several drives, laid upon one another.
+"""Ties from heights: patches of a surface that profilers saw in several drives are matched with one another.
 
 Readings become height images, one a sensor and drive. Where two images overlap, small patches are shifted against each
-other until their heights agree (Lucas and Kanade 1981). A patch with relief or texture gives all three directions, an
-even one the height alone: which it is, the patch's own normal equations say. Cells are coarse at first and fine once
-the mountings have come near.
+other until their heights agree (Lucas and Kanade 1981). A patch with relief or texture determines all three directions,
+an even one the height alone, as its normal equations show. Cells are coarse at first and fine once the mountings are
+close.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ _BLUR_CELLS: Final = 1.5
 """Images are smoothed with a Gaussian of this σ. With less, interpolation between cells would damp their noise and
 draw shifts to half cells, where it does so most."""
 _EDGE_CELLS: Final = 4
-"""Cells this near to the edge of what was seen are one-sided means, and left out."""
+"""Cells this near to the edge of the seen area are left out: they are one-sided means."""
 _INDEPENDENT: Final = 4.0 * math.pi * (_BLUR_CELLS**2 + 1.0 / 6.0)
 """Cells that count as one independent height: area under the correlation of the smoothed noise (bilinear splat too)."""
 _FILLED: Final = 0.3
-"""A cell is seen where it holds this share of the usual weight."""
+"""A cell counts as seen if it has this share of the usual weight."""
 _WIDTH_M: Final = 2.0
-"""About as wide as a head's profiles."""
-_MOST_CELLS: Final = 60_000_000
+"""Approximate width of a head's profiles."""
+_MOST_CELLS: Final = 60_000_000  # Most cells of an image.
 _ALIKE: Final = 0.9
-"""Cosine of the angle below which two drives have one direction."""
-_DIRECTION: Final = (0, 1, -1, 2, -2)
+"""Two drives have the same direction if the cosine of the angle between them exceeds this."""
+_DIRECTION: Final = (0, 1, -1, 2, -2)  # Offsets (cells) at which a pose is searched for, the nearest first.
 
 
 class HeightLevel(Strict):
@@ -96,13 +96,13 @@ class Image:
     height_m: Float64
     """(rows, columns); NaN where nothing was seen."""
     carrier: npt.NDArray[np.int32]
-    """(rows, columns) pose of a reading in the cell; −1: none."""
+    """(rows, columns) pose of a reading in the cell; −1 for none."""
     corner_m: Float64
     """(2,) x and y of the centre of cell (0, 0), level axes."""
     cell_m: float
 
     def pose_at(self, place_m: Float64) -> Int64:
-        """Pose (n,) of a reading within two cells of places (n, 2+); −1: none."""
+        """Return the pose (n,) of a reading within two cells of places (n, 2+); −1 for none."""
         cell = np.rint((place_m[:, :2] - self.corner_m) / self.cell_m).astype(np.int64)
         rows, columns = self.carrier.shape
         found = np.full(len(cell), -1, dtype=np.int64)
@@ -113,7 +113,7 @@ class Image:
         return found
 
     def height_at(self, place_m: Float64) -> Float64:
-        """Height (n,) of the cell at places (n, 2+); NaN: none."""
+        """Return the height (n,) of the cell at places (n, 2+); NaN for none."""
         cell = np.rint((place_m[:, :2] - self.corner_m) / self.cell_m).astype(np.int64)
         rows, columns = self.height_m.shape
         inside = ((cell >= 0) & (cell < [columns, rows])).all(axis=1)
@@ -124,7 +124,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Matched:
-    """Patches of one image found in another."""
+    """Patches of one image matched with another."""
 
     first: Image
     second: Image
@@ -133,18 +133,18 @@ class Matched:
     centre_m: Float64
     """(n, 2) x and y of its middle."""
     felt_m: Float64
-    """(n, 3) where its horizontal shift was felt, in the first image."""
+    """(n, 3) centre of the slopes that determine its horizontal shift, in the first image."""
     shift_m: Float64
     """(n, 3) from the first image to the second."""
     upright: Float64
     """(n, 1, 3) row of the height: at the patch's middle, unit variance."""
     level: Float64
-    """(n, 2, 3) rows of the horizontal directions: where it was felt; zero where the patch does not know one."""
+    """(n, 2, 3) rows of the horizontal directions at `felt_m`; zero for undetermined directions."""
 
 
 @dataclass
 class HeightTies:
-    """Finds the ties of an estimate; hand it to the estimator as its evidence.
+    """Finds the ties of an estimate; the estimator takes it as its evidence.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def height_ties(
     settings: HeightSettings,
     level: int = -1,
 ) -> list[Ties]:
-    """Ties between drives, and between sensors, at one level.
+    """Return the ties between drives, and between sensors, at one level.
 
     Returns one :class:`Ties` for heights and one for horizontal shifts of each pair of sensors; none where nothing
     overlaps.
@@ -223,7 +223,7 @@ def _images(all_placed: Sequence[Placed], at: HeightLevel) -> list[Image]:
 
 
 def _overlap(places: Sequence[Float64]) -> tuple[Float64, Float64]:
-    """Corners (2,), (2,) of the box around all that two of the clouds cover."""
+    """Return the corners (2,), (2,) of the box around the area that two or more clouds cover."""
     boxes = [
         (np.array([p[:, a].min() for a in (0, 1)]), np.array([p[:, a].max() for a in (0, 1)])) for p in places if len(p)
     ]
@@ -263,7 +263,7 @@ def _image(one: Placed, corner_m: Float64, rows: int, columns: int, at: HeightLe
 
 
 def _smoothed(mass: Float64, height: Float64, at: HeightLevel) -> Float64:
-    """Heights of cells; NaN near the edge of what was seen and near slopes that are too steep."""
+    """Return the heights of cells; NaN near the edge of the seen area and near slopes that are too steep."""
     mass, height = (gaussian_filter(a, _BLUR_CELLS, mode="constant", truncate=3.0) for a in (mass, height))
     near = 2 * _EDGE_CELLS + 1
     seen = minimum_filter(mass > _FILLED * float(np.median(mass[mass > 0])), near, mode="constant")
@@ -276,7 +276,7 @@ def _smoothed(mass: Float64, height: Float64, at: HeightLevel) -> Float64:
 
 
 def _pairs(images: Sequence[Image], partners: int) -> list[tuple[int, int]]:
-    """Pairs of images that overlap, each drive with about so many partner drives.
+    """Return pairs of overlapping images, each drive with about so many partner drives.
 
     Drives in other directions come first: two in the same direction see a wrong mounting alike, and their profiles lie
     side by side, so that texture finer than the profiles' spacing makes patterns that match where nothing does.
@@ -302,7 +302,7 @@ def _pairs(images: Sequence[Image], partners: int) -> list[tuple[int, int]]:
 
 
 def match(first: Image, second: Image, at: HeightLevel, settings: HeightSettings, drift_m: float) -> Matched:
-    """Find the patches of one image in another.
+    """Match the patches of one image with another.
 
     drift_m : 1 σ of a pose's error against the mean of its piece; it is no error of the match, and adds to it.
     """
@@ -321,7 +321,7 @@ def match(first: Image, second: Image, at: HeightLevel, settings: HeightSettings
         Matches(shift, crossed, mean, spread, used, felt),
     )  # fmt: skip
     centre = first.corner_m + at.cell_m * (corner[:, ::-1] + 0.5 * (size - 1))
-    # A pose that is off is so for all patches across the drive: together they know no more than one.
+    # The error of a pose is common to all patches across the drive: it does not average out among them.
     across = max(_WIDTH_M / at.stride_m, 1.0)
     floor_m2 = settings.sigma_floor_m**2 + 2.0 * drift_m**2 * across
     independent = np.maximum(_INDEPENDENT / step**2, 1.0)
@@ -342,13 +342,13 @@ def match(first: Image, second: Image, at: HeightLevel, settings: HeightSettings
 
 
 def _corners(shape: tuple[int, ...], size: int, stride: int) -> npt.NDArray[np.int32]:
-    """Corners (n, 2), row and column, of all patches of an image."""
+    """Return the corners (n, 2), row and column, of all patches of an image."""
     r, c = (np.arange(0, max(edge - size, 0) + 1, stride, dtype=np.int32) for edge in shape)
     return np.stack(np.meshgrid(r, c, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _middle_difference(first: Image, second: Image) -> float:
-    """Median of the heights' difference."""
+    """Return the median of the heights' difference."""
     away = second.height_m[::4, ::4] - first.height_m[::4, ::4]
     away = away[np.isfinite(away)]
     return float(np.median(away)) if away.size else 0.0
@@ -357,7 +357,7 @@ def _middle_difference(first: Image, second: Image) -> float:
 def rows_of(
     crossed: Float64, mean: Float64, variance_m2: Float64, coherence: float, floor_m2: float
 ) -> tuple[Float64, Float64]:
-    """Rows of unit variance of what patches know.
+    """Return rows of unit variance with the information of patches.
 
     The tilts are eliminated. What remains is one row for the height, and along the principal directions of the
     slopes one row each for the horizontal. With signal S common to both images and noise, `mean` holds S and noise,
@@ -370,7 +370,7 @@ def rows_of(
 
     Returns
     -------
-    (n, 1, 3) and (n, 2, 3), 1/m; NaN where a patch knows nothing, zero rows for directions that are noise.
+    (n, 1, 3) and (n, 2, 3), 1/m; NaN where a patch has no information, zero rows for directions that are noise.
     """
     n = len(mean)
     upright, level = np.full((n, 1, 3), np.nan), np.full((n, 2, 3), np.nan)
@@ -397,13 +397,13 @@ def rows_of(
 
 
 def _without_tilts(normal: Float64) -> Float64:
-    """(n, 3, 3) normal matrices with the last two unknowns eliminated."""
+    """Eliminate the last two unknowns from normal matrices: (n, 3, 3)."""
     beside = normal[:, :3, 3:]
     return np.asarray(normal[:, :3, :3] - beside @ np.linalg.solve(normal[:, 3:, 3:], np.swapaxes(beside, 1, 2)))
 
 
 def _shared(matched: list[Matched]) -> list[Matched]:
-    """Rows weakened where more pairs than images hold a patch: q pairs of m images say only m − 1 things."""
+    """Reduce weights where more pairs than images contain a patch: q pairs of m images give m − 1 independent ties."""
     pairs: dict[int, int] = {}
     images: dict[int, set[int]] = {}
     for one in matched:
@@ -424,7 +424,7 @@ def _shared(matched: list[Matched]) -> list[Matched]:
 
 
 def _ties(group: Sequence[Matched], level_from_world: Float64) -> list[Ties]:
-    """Ties of one pair of sensors: heights, shifts in both directions, shifts in one."""
+    """Return the ties of one pair of sensors: heights, shifts in both directions, shifts in one."""
     found: dict[str, list[tuple[Seen, Seen, Float64]]] = {"heights": [], "shifts": [], "shifts one way": []}
     for one in group:
         heights = np.column_stack([one.centre_m, one.first.height_at(one.centre_m)])
@@ -445,7 +445,7 @@ def _ties(group: Sequence[Matched], level_from_world: Float64) -> list[Ties]:
 def _tied(
     one: Matched, place_m: Float64, rows: Float64, good: Bool, level_from_world: Float64
 ) -> tuple[Seen, Seen, Float64]:
-    """Both ends and their rows in world axes, of those patches that are good and have a reading near."""
+    """Return both ends and their rows in world axes, for accepted patches that have a reading near."""
     there = place_m + one.shift_m
     first, second = one.first.pose_at(place_m), one.second.pose_at(there)
     keep = good & (first >= 0) & (second >= 0)

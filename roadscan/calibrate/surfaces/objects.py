@@ -27,20 +27,20 @@ Steps = Sequence[tuple[float, float, float]]
 
 KIND: Final = "object"
 EDGE_MARGINS_M: Final = (0.08, 0.05, 0.03)
-"""Readings nearer than this to an edge are not used: at first, then once the mountings have come near."""
+"""Readings nearer to an edge are not used: the first limit at first, the later ones as the mountings improve."""
 
-_CELL_M: Final = 0.02
-_LEAST: Final = 4
-_NOISE_M: Final = 2e-5
-_SEARCH_M: Final = 0.3
-_TRUNCATED_M: Final = 0.008
-_MOST: Final = 40_000
-_SURROUNDING_M: Final = 0.8
-_GATE_M: Final = 0.02
+_CELL_M: Final = 0.02  # Edge of a cell whose readings are averaged.
+_LEAST: Final = 4  # Least number of readings of a cell.
+_NOISE_M: Final = 2e-5  # Least σ of a reading's height that is assumed.
+_SEARCH_M: Final = 0.3  # The object is searched for within this distance of its stated place.
+_TRUNCATED_M: Final = 0.008  # Height residuals count up to this in the search.
+_MOST: Final = 40_000  # Approximate number of readings in the search.
+_SURROUNDING_M: Final = 0.8  # Width of the ground around the object that is used.
+_GATE_M: Final = 0.02  # Readings farther than this from the median offset are not of the top.
 
 
 def heights_of(steps: Steps, x_m: Float64, y_m: Float64) -> tuple[Float64, Float64]:
-    """Height of the object (n,) at places in its axes, 0 beside it, and how far away (n,) the nearest edge is (m).
+    """Object's height (n,) at positions in its axes, 0 beside it, and the distance (n,) to the nearest edge (m).
 
     steps : length (x), width (y) and height above the ground of each step, all about the same middle.
     """
@@ -56,7 +56,7 @@ def heights_of(steps: Steps, x_m: Float64, y_m: Float64) -> tuple[Float64, Float
 
 
 def find_object(readings: Sequence[Readings], estimate: Estimate, steps: Steps, about: ObjectPose) -> ObjectPose:
-    """Where the object lies, from about where it does: position and heading that fit the heights best.
+    """Find the position and heading of an object near a stated place that fit the heights best.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def find_object(readings: Sequence[Readings], estimate: Estimate, steps: Steps, 
 
 
 def _above_ground(place_m: Float64, radius_m: float) -> Float64:
-    """Places (n, 3) with their heights above the plane of the ground farther than a radius from the middle.
+    """Return places (n, 3) with heights above the plane of the ground farther than a radius from the middle.
 
     A head that is not yet calibrated sees the ground tilted and too high or low; so seen, the object stands on it.
     """
@@ -126,7 +126,7 @@ def _simplex(best: Float64) -> Float64:
 
 @dataclass
 class ObjectTies:
-    """Finds the ties of an estimate; hand it to the estimator as its evidence.
+    """Finds the ties of an estimate; the estimator takes it as its evidence.
 
     Parameters
     ----------
@@ -160,14 +160,14 @@ class ObjectTies:
     def _of(
         self, at: Placed, pose: ObjectPose, level: Float64, margin_m: float
     ) -> tuple[Seen, Float64, Float64] | None:
-        """Means of the readings of one sensor and drive in small cells on the tops, and their σ."""
+        """Return means of the readings of one sensor and drive in small cells on the tops, and their σ."""
         world = at.place_m @ level - pose.position_world_m
         local = world @ pose.world_from_object
         height, away = heights_of(self.steps, local[:, 0], local[:, 1])
-        # Far enough above the ground's own unevenness only the tops are known.
+        # Only tops that rise clearly above the ground's unevenness are recognised.
         on_top = np.flatnonzero((height > 0.0) & (away > margin_m))
         off = local[on_top, 2] - height[on_top]
-        # One head in one drive is off by the same everywhere, but for its tilt.
+        # The error of one head in one drive is the same everywhere, but for its tilt.
         on_top = on_top[np.abs(off - np.median(off)) < _GATE_M] if on_top.size else on_top
         if on_top.size < _LEAST:
             return None
@@ -185,7 +185,7 @@ class ObjectTies:
             return None
         usual = max(float(np.median(variance[kept])), _NOISE_M**2)
         rows = first[kept]
-        # The error of a top is common to all that lies on it: many readings know it no better than one.
+        # The error of a top is common to all readings on it, so it does not average out.
         _, top, sharing = np.unique(height[rows], return_inverse=True, return_counts=True)
         sigma = np.sqrt(usual / count[kept] + self.sigma_m**2 * sharing[top.ravel()])
         target = (mean[kept] @ level - pose.position_world_m) @ pose.world_from_object

@@ -25,11 +25,11 @@ from roadscan.core.strict import Strict
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_KEY_BITS: Final = 16
+_KEY_BITS: Final = 16  # Bits of a cell's key for each of its three indices.
 _FLAT: Final = 0.25
-"""A patch's thickness is below this share of its shorter extent."""
+"""Largest thickness of a patch, as a share of its shorter extent."""
 _WIDE: Final = 0.1
-"""Points of a patch spread (1 σ) over this share of the cell along both of its axes."""
+"""Least spread (1 σ) of a patch's points along both of its axes, as a share of the cell."""
 
 
 class PlaneLevel(Strict):
@@ -81,14 +81,14 @@ class _Patches:
     tilt: Float64
     """(m,) variance of the plane's tilt (rad²), the worse axis."""
     pose: Int64
-    """(m,) pose in the middle of the readings."""
+    """(m,) pose of the middle reading."""
     position_m: Float64
     """(m, 3) mean position of the readings' poses, level axes."""
 
 
 @dataclass
 class PlaneTies:
-    """Finds the ties of an estimate; hand it to the estimator as its evidence.
+    """Finds the ties of an estimate; the estimator takes it as its evidence.
 
     Parameters
     ----------
@@ -118,14 +118,14 @@ def plane_ties(
     settings: PlaneSettings,
     level: int = -1,
 ) -> list[Ties]:
-    """Ties between drives, pieces and sensors at one level, one :class:`Ties` a pair of sensors."""
+    """Return the ties between drives, pieces and sensors at one level, one :class:`Ties` a pair of sensors."""
     turned = level_from_world(readings)
     at = settings.levels[level]
     all_placed = [placed(one, estimate, pieces, traverses, turned) for one in readings]
     low = np.min([[one.place_m[:, a].min() for a in range(3)] for one in all_placed], axis=0)
     found = _joined([_patches(one, i, low, at, settings) for i, one in enumerate(all_placed)])
     first, second = _partners(found, at, settings, pieces, all_placed)
-    # The normal of the patch that knows its own better.
+    # Use the normal of the patch that determines it better.
     better = (found.tilt[first] <= found.tilt[second])[:, None]
     normal = np.where(better, found.normal[first], found.normal[second])
     away = found.centre_m[second] - found.centre_m[first]
@@ -143,7 +143,7 @@ def plane_ties(
 
 
 def _patches(one: Placed, drive: int, low: Float64, at: PlaneLevel, settings: PlaneSettings) -> _Patches:
-    """Plane patches of the readings of one sensor and drive."""
+    """Return the plane patches of the readings of one sensor and drive."""
     whole = np.floor((one.place_m - low) / at.cell_m).astype(np.int64)
     if whole.size and whole.max() >= 1 << _KEY_BITS:
         raise NavigationError(
@@ -194,7 +194,7 @@ def _joined(parts: Sequence[_Patches]) -> _Patches:
 def _partners(
     found: _Patches, at: PlaneLevel, settings: PlaneSettings, pieces: Pieces, all_placed: Sequence[Placed]
 ) -> tuple[Int64, Int64]:
-    """Pairs of patches in one cell with like normals: rings through each cell's patches in random orders."""
+    """Return pairs of patches in one cell with similar normals, as rings through its patches in random order."""
     rng = np.random.default_rng(settings.seed)
     firsts, seconds = [], []
     for _ in range(settings.partners):
@@ -221,8 +221,8 @@ def _ties(
     level_from_world: Float64,
     partners: int,
 ) -> list[Ties]:
-    """Ties by pair of drives, joined by pair of sensors."""
-    # k random orders through n patches give k (n − 1) ties that say n − 1 things.
+    """Return ties by pair of drives, joined by pair of sensors."""
+    # k random orders through n patches give k (n − 1) ties, of which n − 1 are independent.
     rows = rows[:, None, :] / math.sqrt(partners) @ level_from_world
     sensors = [one.readings.sensor for one in all_placed]
     parts: dict[tuple[str, str], list[tuple[Seen, Seen, Float64]]] = {}

@@ -1,4 +1,4 @@
-"""What the search for common surfaces starts from: readings with their poses, cut into pieces of equal pose error."""
+"""Readings with their poses, cut into pieces of equal pose error: the input of the search for common surfaces."""
 
 from __future__ import annotations
 
@@ -73,19 +73,19 @@ class Pieces:
 
     @classmethod
     def of_seconds(cls, piece_s: float) -> Pieces:
-        """Pieces of so many seconds."""
+        """Return pieces of so many seconds."""
         return cls(round(piece_s * NS_PER_S))
 
     def numbers(self, epoch_gps_ns: Int64) -> Int64:
-        """Number (n,) of the piece of each epoch (n,)."""
+        """Return the number (n,) of the piece of each epoch (n,)."""
         return epoch_gps_ns // self.piece_ns
 
     def middle_gps_ns(self, number: int) -> int:
-        """Epoch in the middle of a piece."""
+        """Return the epoch in the middle of a piece."""
         return number * self.piece_ns + self.piece_ns // 2
 
     def drift_m(self, traverses: Mapping[int, Traverse]) -> float:
-        """1 σ of how far a pose's position is off the mean of its piece: largest axis of the worst traverse.
+        """Return 1 σ of the difference of a pose's position from the mean of its piece: largest axis, worst traverse.
 
         A Gauss–Markov process departs from its mean over a short time T by σ · √(T / 3τ), root mean square
         (integrated random walk of density 2 σ² / τ, variance within a window T / 6).
@@ -107,7 +107,7 @@ class Pieces:
         sigma_roll_pitch_heading_rad: tuple[float, float, float],
         time_constant_s: float,
     ) -> dict[int, Traverse]:
-        """The estimator's traverses: one a piece that has readings, with the stated errors of the poses.
+        """Return the estimator's traverses, one for each piece with readings, with the stated errors of the poses.
 
         Raises
         ------
@@ -136,14 +136,14 @@ class Pieces:
 
 @dataclass(frozen=True)
 class Placed:
-    """Readings placed with an estimate's mountings and corrections, in a level frame of the place.
+    """Positions of readings with an estimate's mountings and corrections, in a level frame of the place.
 
     The level frame is the world turned so that z is up at the place.
     """
 
     readings: Readings
     number: Int64
-    """(p,) piece of each pose."""
+    """(p,) number of the piece of each pose."""
     position_m: Float64
     """(p, 3) corrected, level axes."""
     rotation: Float64
@@ -154,7 +154,7 @@ class Placed:
 
     @cached_property
     def place_m(self) -> Float64:
-        """(n, 3) places of all readings, level axes."""
+        """(n, 3) positions of all readings, level axes."""
         out = np.empty_like(self.readings.point_sensor_m)
         place(
             self.readings.point_sensor_m,
@@ -168,7 +168,7 @@ class Placed:
         return out
 
     def seen(self, place_m: Float64, pose: Int64, position_m: Float64 | None = None) -> Seen:
-        """Places (n, 3), level axes, as the sensor would have seen them from poses (n,).
+        """Return places (n, 3), level axes, as the sensor would have seen them from poses (n,).
 
         position_m : (n, 3) corrected positions in place of those of `pose`, level axes.
         """
@@ -184,7 +184,7 @@ class Placed:
 
 
 def level_from_world(readings: Sequence[Readings]) -> Float64:
-    """(3, 3) axes with z against the mean down axis of the body over all poses, and x along the first pose.
+    """Return (3, 3) axes with z against the mean down axis of the body over all poses, and x along the first pose.
 
     Patches then lie across the drive: all of a row were seen with the same poses.
     """
@@ -199,7 +199,7 @@ def level_from_world(readings: Sequence[Readings]) -> Float64:
 def placed(
     one: Readings, estimate: Estimate, pieces: Pieces, traverses: Mapping[int, Traverse], level: Float64
 ) -> Placed:
-    """Place readings with the mountings and the mean correction of an estimate.
+    """Compute the positions of readings with the mountings and the mean correction of an estimate.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def placed(
 
 
 def _mean_correction(number: Int64, estimate: Estimate, traverses: Mapping[int, Traverse]) -> tuple[Float64, Float64]:
-    """Shift (3,), world axes, and turn (3,), body axes, that the pieces of a drive have in common.
+    """Return the shift (3,), world axes, and turn (3,), body axes, that the pieces of a drive have in common.
 
     What is left between pieces stays in the ties: corrections that jump from piece to piece would tear images.
     """

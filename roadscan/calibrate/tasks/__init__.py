@@ -1,1 +1,1 @@
-"""Mountings of sensors and interior orientation of cameras from evidence."""
+"""Tasks that calibrate mountings of sensors and interior orientations of cameras."""

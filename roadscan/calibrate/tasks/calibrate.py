@@ -1,4 +1,4 @@
-"""Calibrate: evidence of the survey file → mountings with covariance, in the table ``mountings``."""
+"""Estimates mountings with covariance from the survey file's evidence, and stores them in the table ``mountings``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from roadscan.store.store import Store
 Report = Callable[[str], None]
 
 _HELD: Final = 0.9
-"""A σ above this share of the prior's is the prior's."""
+"""A σ above this share of the prior's counts as that of the prior."""
 PICTURE: Final = "products/calibration/calibration.png"
 TEXT: Final = "products/calibration/calibration.txt"
 _PICTURE, _TEXT = "picture", "report"
@@ -43,11 +43,11 @@ _PICTURE, _TEXT = "picture", "report"
 
 @dataclass(frozen=True)
 class Calibrated:
-    """What a calibration wrote."""
+    """Results of a calibration."""
 
     calibration: Calibration
     rows: list[dict[str, Any]]
-    """Of the table ``mountings``."""
+    """Rows of the table ``mountings``."""
     text: str
     """The report."""
 
@@ -112,7 +112,7 @@ def calibrate_survey(survey: Survey, store: Store, say: Report = lambda _: None)
 
 
 def _keep_report(store: Store, calibration: str, text: str, picture: CalibrationPicture) -> None:
-    """Write report and picture; their records hold all that it takes to write them again."""
+    """Write report and picture; their records contain all that is needed to write them again."""
     manifest = Manifest(store)
     _write_report(store, manifest, _TEXT, {"calibration": calibration, "text": text})
     _write_report(store, manifest, _PICTURE, {"calibration": calibration, "picture": picture.as_values()})
@@ -134,7 +134,7 @@ def _write_report(store: Store, manifest: Manifest, unit: str, values: dict[str,
 
 
 def renew_reports(store: Store, say: Report = lambda _: None) -> None:
-    """Write again what is missing or damaged of the last calibration's report and picture."""
+    """Write the last calibration's report and picture again where they are missing or damaged."""
     if not store.exists(small_path("mountings")):
         return
     manifest = Manifest(store)
@@ -147,7 +147,7 @@ def renew_reports(store: Store, say: Report = lambda _: None) -> None:
 
 
 class _Finder:
-    """All evidence as one; it says how much each round finds, and remembers what found nothing."""
+    """Combines all evidence; it reports how much each round finds, and remembers what found nothing."""
 
     def __init__(self, collected: Sequence[Collected], say: Report) -> None:
         self._collected = collected
@@ -175,7 +175,7 @@ def _size(evidence: Evidence) -> int:
 
 
 def _refuse_empty(finder: _Finder, kinds: Sequence[str]) -> None:
-    """Evidence that was asked for and holds nothing is an error, and not a smaller calibration."""
+    """Raise an error for requested evidence that yields nothing, which would otherwise make the calibration smaller."""
     counted = enumerate(zip(kinds, finder.counts, strict=True), 1)
     empty = [f"number {number} ({kind})" for number, (kind, count) in counted if not count]
     if empty:
@@ -187,7 +187,7 @@ def _refuse_empty(finder: _Finder, kinds: Sequence[str]) -> None:
 
 
 def _determined(calibration: Calibration) -> list[str]:
-    """Sensors of which the evidence determines any part."""
+    """Return the sensors of which the evidence determines any part."""
     return [n for n, one in calibration.sensors.items() if (one.sigma < _HELD * one.prior_sigma).any()]
 
 
@@ -198,7 +198,7 @@ def _objects(
     settings: CalibrationSettings,
     say: Report,
 ) -> dict[str, ObjectPose]:
-    """Where the calibration objects lie, as seen with the mountings that all other evidence gives by itself."""
+    """Locate the calibration objects with the mountings that all other evidence gives."""
     locating = [one.locate for one in collected if one.locate is not None]
     if not locating:
         return {}
@@ -212,7 +212,7 @@ def _objects(
 
 
 def _prior(survey: Survey, name: str) -> Prior:
-    """What the rig file knows of a sensor."""
+    """Return the rig file's prior of a sensor."""
     if name not in survey.rig.sensors:
         known = survey.rig.sensors
         raise ConfigError(
@@ -223,7 +223,7 @@ def _prior(survey: Survey, name: str) -> Prior:
 
 
 def outdated_calibrations(plan: SurveyPlan) -> list[str]:
-    """In words, the calibrations of the table that were made from other logs, rig, settings or code than there are."""
+    """Return, in words, calibrations in the table that were made from other logs, rig, settings or code."""
     by_key: dict[str, dict[str, str]] = {}
     table = read_small(plan.store, "mountings")
     for row in () if table is None else table.to_pylist():
@@ -238,7 +238,7 @@ def outdated_calibrations(plan: SurveyPlan) -> list[str]:
 
 
 def _asked(plan: SurveyPlan) -> list[str]:
-    """Sensors that the survey file's evidence names and the rig has."""
+    """Return the sensors that the survey file's evidence names and the rig has."""
     named: list[str] = []
     for entry in plan.survey.config.calibration:
         named += entry.sensors if isinstance(entry, OverlapEvidence | ObjectEvidence) else [entry.sensor]
@@ -246,7 +246,7 @@ def _asked(plan: SurveyPlan) -> list[str]:
 
 
 def _key(plan: SurveyPlan, sensors: Iterable[str]) -> str:
-    """What the calibration was made from: logs, rig, settings, code."""
+    """Return the key of the calibration's inputs: logs, rig, settings, code."""
     config = plan.survey.config
     return key_of(
         code_digest("roadscan.calibrate.tasks.calibration_evidence", "roadscan.calibrate.estimator"),
@@ -258,7 +258,7 @@ def _key(plan: SurveyPlan, sensors: Iterable[str]) -> str:
 
 
 def _sound_mountings(store: Store, say: Report) -> DatedMountings:
-    """What the table holds; where it is damaged, readings are found by the rig file's mountings meanwhile."""
+    """Read the table; where it is damaged, the rig file's mountings serve to find readings."""
     try:
         return load_mountings(store)
     except DamagedError as error:

@@ -1,4 +1,4 @@
-"""Evidence of a calibration, as the survey file names it: load what it needs, and hand over who finds the ties."""
+"""Loads the evidence of a calibration that the survey file names, and provides the searches for ties."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ Float64 = npt.NDArray[np.float64]
 Find = Callable[[Estimate], Sequence[Evidence]]
 
 _ANY_TIME: Final = Clock(TimeSystem.FREE, offset_s=1e9)
-"""Brings stamps of any system, even zeros, to where time stamps may be: the epochs of a reference scan mean nothing."""
+"""Clock that accepts stamps of any system, even zeros: the epochs of a reference scan are not used."""
 
 REFERENCE_READINGS: Final = 400_000
-"""Of a sensor that are held against a reference scan; more are thinned evenly."""
-_WIDEST_M2: Final = 700.0
-_REFERENCE_MARGIN_M: Final = 5.0
+"""Most readings of a sensor that are compared with a reference scan; more are thinned evenly."""
+_WIDEST_M2: Final = 700.0  # Largest area over which profilers are compared.
+_REFERENCE_MARGIN_M: Final = 5.0  # Readings are loaded up to this far beyond the reference scan.
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Collected:
     """Finds the observations with the mountings of an estimate."""
     traverses: Mapping[int, Traverse] = field(default_factory=dict)
     locate: Callable[[Estimate], dict[str, ObjectPose]] | None = None
-    """Finds the calibration objects that it names, with the mountings of an estimate; None where it names none."""
+    """Finds the calibration objects that it names with the mountings of an estimate; None where it names none."""
 
 
 def collect(plan: SurveyPlan, entry: CalibrationEvidence, settings: CalibrationSettings) -> Collected:
@@ -88,7 +88,7 @@ def collect(plan: SurveyPlan, entry: CalibrationEvidence, settings: CalibrationS
 def traverses_of(
     plan: SurveyPlan, readings: Sequence[Readings], settings: CalibrationSettings
 ) -> tuple[Pieces, dict[int, Traverse]]:
-    """Pieces of the drives, with the σ of their poses as the run's logs state them, or the settings."""
+    """Return pieces of the drives, with the σ of their poses from the run's logs, or from the settings."""
     pieces = Pieces.of_seconds(settings.traverse_piece_s)
     found: dict[int, Traverse] = {}
     for run in dict.fromkeys(one.drive.split(" drive ")[0] for one in readings):
@@ -102,7 +102,7 @@ def traverses_of(
 
 
 def _overlap(plan: SurveyPlan, entry: OverlapEvidence, settings: CalibrationSettings) -> Collected:
-    """Ties between drives over one place: heights of what profilers saw, planes of what lidars saw."""
+    """Return ties between drives over one place: from heights for profilers, from planes for lidars."""
     sensors = tuple(entry.sensors)
     rig = plan.survey.rig.sensors
     if entry.area is None and any(name in rig and rig[name].kind == "profiler" for name in sensors):
@@ -122,7 +122,7 @@ def _overlap(plan: SurveyPlan, entry: OverlapEvidence, settings: CalibrationSett
 
 
 def _refuse_wide(plan: SurveyPlan, entry: OverlapEvidence) -> None:
-    """Whole runs may lie far apart: refuse them before their readings are loaded."""
+    """Reject whole runs that extend too far, before their readings are loaded."""
     runs = entry.runs or list(dict.fromkeys(s.run for s, _ in plan.sources))
     boxes = []
     for run in runs:
@@ -141,7 +141,7 @@ def _refuse_wide(plan: SurveyPlan, entry: OverlapEvidence) -> None:
 
 
 def _object(plan: SurveyPlan, entry: ObjectEvidence, settings: CalibrationSettings) -> Collected:
-    """Ties of the readings on a calibration object to its known shape."""
+    """Return ties of the readings on a calibration object to its known shape."""
     reach = max(max(length, width) for length, width, _ in entry.steps) / 2 + 1.0
     area = Area(
         easting_min_m=entry.easting_m - reach, northing_min_m=entry.northing_m - reach,
@@ -158,7 +158,7 @@ def _object(plan: SurveyPlan, entry: ObjectEvidence, settings: CalibrationSettin
     ahead = np.array([np.sin(heading), np.cos(heading), 0.0])
     axes = np.stack([ahead, np.cross([0.0, 0.0, 1.0], ahead), [0.0, 0.0, 1.0]])
     ways = frame.world_from_map(world, middle + axes) - frame.world_from_map(world, middle - axes)
-    u, _, vt = np.linalg.svd(ways.T)  # the nearest rotation: the map's scale is not that of the world
+    u, _, vt = np.linalg.svd(ways.T)  # the nearest rotation, since the map's scale differs from the world's
     about = ObjectPose(frame.world_from_map(world, middle)[0], u @ vt, sigma_m=0.02, sigma_rad=0.02)
     name = f"object at {entry.easting_m:.1f}, {entry.northing_m:.1f}"
     ties = ObjectTies(readings, pieces, traverses, name, entry.steps, entry.sigma_m)
@@ -170,7 +170,7 @@ def _object(plan: SurveyPlan, entry: ObjectEvidence, settings: CalibrationSettin
 
 
 def _stop_and_go(plan: SurveyPlan, entry: StopAndGoEvidence, settings: CalibrationSettings) -> Collected:
-    """Orientation of a head from the IMU inside it."""
+    """Return the orientation of a head from the IMU inside it."""
     rig = plan.survey.rig.sensors
     for name in (entry.sensor, entry.imu):
         if name not in rig:
@@ -202,7 +202,7 @@ def _stop_and_go(plan: SurveyPlan, entry: StopAndGoEvidence, settings: Calibrati
 
 
 def _reference(plan: SurveyPlan, entry: ReferenceEvidence, settings: CalibrationSettings) -> Collected:
-    """Ties of a sensor's readings to a scan of known place."""
+    """Return ties of a sensor's readings to a georeferenced reference scan."""
     enh = _reference_map(plan, entry)
     low, high = enh[:, :2].min(axis=0) - _REFERENCE_MARGIN_M, enh[:, :2].max(axis=0) + _REFERENCE_MARGIN_M
     area = Area(
@@ -229,7 +229,7 @@ def _reference(plan: SurveyPlan, entry: ReferenceEvidence, settings: Calibration
 
 
 def _reference_map(plan: SurveyPlan, entry: ReferenceEvidence) -> Float64:
-    """Points of a reference scan on the survey's map (n, 3), m.
+    """Return the points of a reference scan on the survey's map (n, 3), m.
 
     Its time does not matter and may be left open; all else has to be stated.
     """
@@ -259,7 +259,7 @@ def _reference_map(plan: SurveyPlan, entry: ReferenceEvidence) -> Float64:
 
 
 def _thinned(readings: Sequence[Readings], pieces: Pieces, most: int) -> Seen:
-    """Readings of one sensor as one set, evenly thinned."""
+    """Return the readings of one sensor as one set, evenly thinned."""
     every = max(1, -(-sum(one.pose.size for one in readings) // most))
     rows = [np.arange(0, one.pose.size, every) for one in readings]
     poses = [one.pose[r] for one, r in zip(readings, rows, strict=True)]

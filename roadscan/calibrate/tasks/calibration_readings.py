@@ -1,4 +1,4 @@
-"""Readings of sensors in their own frames, with their poses: what a calibration looks at."""
+"""Loads readings in sensor axes, with their poses, for a calibration."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ Int64 = npt.NDArray[np.int64]
 Span = tuple[int, int]
 
 MOST_READINGS: Final = 4_000_000
-"""Of one sensor in one drive; more are thinned evenly."""
+"""Most readings of one sensor in one drive; more are thinned evenly."""
 _APART_NS: Final = 3_000_000_000
-"""A vehicle that leaves an area for longer than this is on another drive when it comes back."""
-_STEP_M: Final = 10.0
+"""If the vehicle leaves an area for longer than this, its return counts as another drive."""
+_STEP_M: Final = 10.0  # Step of the numerical derivative of the map.
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which readings."""
+    """Which readings a calibration requests."""
 
     sensors: tuple[str, ...]
     runs: tuple[str, ...] = ()
@@ -47,7 +47,7 @@ class Wanted:
 
 
 def wanted_readings(plan: SurveyPlan, wanted: Wanted) -> Iterator[Readings]:
-    """Readings with poses of all sensors, one by sensor and drive.
+    """Load readings with poses of all sensors, one set for each sensor and drive.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def _of_run(plan: SurveyPlan, wanted: Wanted, own: Sequence[tuple[ReadingSource,
 
 @dataclass(frozen=True)
 class _Near:
-    """An area of the map seen from the world frame: the map, linear about the area's middle."""
+    """An area of the map in the world frame: the map is linearised about the area's middle."""
 
     area: Area
     origin_world_m: Float64
@@ -128,7 +128,7 @@ class _Near:
         return cls(area, origin, value[0, :2], slope, min(range_max_m, 100.0))
 
     def holds(self, points_world_m: Float64, margin_m: float) -> npt.NDArray[np.bool_]:
-        """Whether points (n, 3) lie in the area, or no farther than a margin from it."""
+        """Return whether points (n, 3) lie in the area, or no farther than a margin from it."""
         away = self.origin_map_m + (points_world_m - self.origin_world_m) @ self.map_from_world.T
         a = self.area
         inside: npt.NDArray[np.bool_] = (
@@ -143,7 +143,7 @@ class _Near:
 def _drives(
     plan: SurveyPlan, wanted: Wanted, source: ReadingSource, trajectory: Trajectory, near: _Near | None
 ) -> list[Span]:
-    """Spans of time (GPS ns) in which the vehicle is near enough, one a drive."""
+    """Return spans of time (GPS ns) in which the vehicle is near enough, one for each drive."""
     spans: list[Span] = [trajectory.span_gps_ns]
     if wanted.passes:
         passes = [p for p in plan.passes if p.pass_id in wanted.passes and p.run == source.run]
@@ -168,7 +168,7 @@ def _parts(
     near: _Near | None,
     margin_m: float,
 ) -> Iterator[tuple[Float64, npt.NDArray[np.int64], Int64, Float64, Float64]]:
-    """Points, row of pose, epochs, positions, rotations: row group by row group."""
+    """Yield points, row of pose, epochs, positions, rotations for each row group."""
     groups = [
         (source, file, group)
         for source, file in own
@@ -223,7 +223,7 @@ def _sensor_points(
 def _joined(
     parts: Sequence[tuple[Float64, npt.NDArray[np.int64], Int64, Float64, Float64]], sensor: str, drive: str
 ) -> Readings:
-    """Readings of one drive, with the poses that they use, in order of time."""
+    """Return readings of one drive, with the poses that they use, in order of time."""
     points, poses, epochs, positions, rotations = [], [], [], [], []
     first = 0
     for own_points, pose, own_epochs, position, rotation in parts:

@@ -1,4 +1,4 @@
-"""Calibration of cameras: pictures and tables in, the rig file out."""
+"""Calibrates cameras: reads pictures and tables, and writes the rig file."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ Grey = npt.NDArray[np.uint8]
 
 PICTURES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 _MEASURED: Final = {"picture": pa.string(), "point": pa.string(), "u_px": pa.float64(), "v_px": pa.float64()}
-_LEAST_SIGMA_M: Final = 0.001
-_DIFFERENCE_M: Final = 10.0
+_LEAST_SIGMA_M: Final = 0.001  # Least σ of a control point that is assumed.
+_DIFFERENCE_M: Final = 10.0  # Step of the numerical derivative of the map.
 _STEEP_DEG: Final = 80.0
-"""Roll and heading of a mounting steeper than this are one angle; the whole rotation is written."""
+"""For a mounting steeper than this, roll and heading are one angle, so the whole rotation is written."""
 
 
 @dataclass(frozen=True)
 class CheckResidual:
-    """A check point in a picture: measured, and held back."""
+    """A check point measured in a picture and not used in the resection."""
 
     measured: Measured
     du_px: float
@@ -64,7 +64,7 @@ class CheckResidual:
 
 @dataclass(frozen=True)
 class CameraResection:
-    """What a resection found, and where it was written."""
+    """Result of a resection, and the file it was written to."""
 
     resection: Resection
     checks: tuple[CheckResidual, ...]
@@ -84,7 +84,7 @@ def calibrate_interior(
     date: dt.date | None = None,
     write: bool = True,
 ) -> InteriorReport:
-    """Interior orientation of a camera from pictures of a chessboard, written into the rig file.
+    """Estimate the interior orientation from pictures of a chessboard, and write it into the rig file.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def calibrate_interior(
     Raises
     ------
     ConfigError
-        where the sensor is no camera, the pictures tell too little, or the rig file cannot be changed safely.
+        where the sensor is no camera, the pictures do not suffice, or the rig file cannot be changed safely.
     """
     _camera(Rig.load(rig_file), sensor, rig_file)
     files = _picture_files(pictures)
@@ -119,7 +119,7 @@ def resect_camera(
     *,
     write: bool = True,
 ) -> CameraResection:
-    """Mounting of a camera from control points measured in its pictures, written into the rig file.
+    """Estimate a camera's mounting from control points in its pictures, and write it into the rig file.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def resect_camera(
     known = {t.name for t in checks}
     held_back = [m for m in measured if m.point in known]
     entering = [m for m in measured if m.point not in known]
-    # σ of the rig file may come from these very measurements: they would count twice.
+    # σ in the rig file may come from these very measurements, which would then count twice.
     unsure = stated.model_copy(update={"lever_arm_sigma_m": None, "boresight_sigma_deg": None})
     prior = Prior.of(unsure, settings)
     found = resect(sensor, stated.interior, prior, exposures, targets, entering, sigma_px, settings)
@@ -211,7 +211,7 @@ def _picture_files(pictures: Path | Sequence[Path]) -> list[Path]:
 
 
 def _read(files: Sequence[Path]) -> Iterator[tuple[str, Grey | None]]:
-    """Names and grey values; as the chip has them, whichever way up a viewer would show them."""
+    """Yield names and grey values as recorded, without the rotation that a viewer would apply."""
     for file in files:
         content = np.frombuffer(file.read_bytes(), np.uint8)
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
@@ -219,7 +219,7 @@ def _read(files: Sequence[Path]) -> Iterator[tuple[str, Grey | None]]:
 
 
 def _interior_values(interior: Interior) -> dict[str, Any]:
-    """As the rig file states it, to a hundredth of what is ever known of a camera."""
+    """Return the values for the rig file, rounded to a hundredth of a camera's attainable accuracy."""
     stated = interior.model_dump(exclude_none=True)
     digits = {"focal_px": 4, "principal_px": 4, "distortion": 8, "rms_px": 4}
     for key, value in stated.items():
@@ -239,7 +239,7 @@ class _Taken:
 
 
 def _pictures(store: Store, records: Sequence[LogRecord], sensor: str) -> dict[str, _Taken]:
-    """Pictures of a camera by the name that measurements use; epochs as its clock was found."""
+    """Return a camera's pictures by the name that measurements use, with corrected epochs."""
     taken = [
         _Taken(log.record.run, name, int(epoch))
         for log in taken_pictures(store, records, sensor)
@@ -255,7 +255,7 @@ def _pictures(store: Store, records: Sequence[LogRecord], sensor: str) -> dict[s
 
 
 def _measurements(file: Path, pictures: dict[str, _Taken]) -> tuple[list[Measured], set[str]]:
-    """Measurements of a CSV file, and the pictures that they are in."""
+    """Read measurements from a CSV file, and the pictures that they are in."""
     try:
         convert = pa_csv.ConvertOptions(column_types=_MEASURED | {"run": pa.string()}, strings_can_be_null=False)
         rows = pa_csv.read_csv(file, convert_options=convert)
@@ -295,7 +295,7 @@ def _exposures(
     pictures: dict[str, _Taken],
     settings: CalibrationSettings,
 ) -> tuple[list[Exposure], str]:
-    """Pictures with the body's poses and their σ, and the world frame of the poses."""
+    """Return pictures with the body's poses and their σ, and the world frame of the poses."""
     found: list[Exposure] = []
     worlds: set[str] = set()
     for run in sorted({one.run for one in pictures.values()}):
@@ -327,12 +327,12 @@ def _exposures(
 
 
 def _world_from_ned(survey: Survey, world: str, place_m: Float64) -> Float64:
-    """Axes (3, 3) of the map at a place of the world: north, east, down."""
+    """Return the axes (3, 3) of the map at a place of the world: north, east, down."""
     frame = survey.frame()
     middle = frame.map_from_world(world, place_m[None])
     steps = _DIFFERENCE_M * np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     ways = frame.world_from_map(world, middle + steps) - frame.world_from_map(world, middle - steps)
-    # Nearest rotation: the map's scale is not that of the world.
+    # The nearest rotation, since the map's scale differs from the world's.
     u, _, vt = np.linalg.svd(ways.T)
     return np.asarray(u @ vt)
 
@@ -340,7 +340,7 @@ def _world_from_ned(survey: Survey, world: str, place_m: Float64) -> Float64:
 def _targets(
     survey: Survey, store: Store, records: Sequence[LogRecord], world: str
 ) -> tuple[list[Target], list[Target]]:
-    """Control points and check points in the world frame of the poses."""
+    """Return control points and check points in the world frame of the poses."""
     files = [f for r in records for f in r.tables.get("control_points", ())]
     if not files:
         raise ConfigError("the survey has no control points", expected="[[control]] in the survey file")
@@ -361,7 +361,7 @@ def _targets(
 
 
 def _mounting_values(stated: Sensor, found: Resection) -> dict[str, Any]:
-    """Lever arm and boresight, or the whole rotation where the rig file states it so, with their σ."""
+    """Return lever arm and boresight, or the whole rotation where the rig file states it so, with their σ."""
     rotation, lever = found.mounting.arrays()
     sigma = found.found.sigma
     values: dict[str, Any] = {"lever_arm_body_m": [round(v, 6) for v in lever.tolist()]}
@@ -385,7 +385,7 @@ def _check_residuals(
     checks: Sequence[Target],
     measured: Sequence[Measured],
 ) -> tuple[CheckResidual, ...]:
-    """Observed − computed of check points, with the poses as stated."""
+    """Return observed − computed of check points, with the poses as stated."""
     pictures, points = {e.name: e for e in exposures}, {t.name: t for t in checks}
     rotation, lever = mounting.arrays()
     found = []

@@ -14,7 +14,7 @@ Float64 = npt.NDArray[np.float64]
 
 
 class AcrossSettings(NamedTuple):
-    """How an edge is sought along a road. One setting for all data."""
+    """Settings of the search for an edge along a road. One setting serves all data."""
 
     along_m: float = 1.0
     """Half the length of the window along the road."""
@@ -38,7 +38,7 @@ class AcrossSettings(NamedTuple):
 
 
 class EdgePath(NamedTuple):
-    """An edge along a road, a value a station."""
+    """An edge along a road; arrays have one value per station."""
 
     cell: npt.NDArray[np.int64]
     """(stations,) offset, in cells."""
@@ -74,13 +74,13 @@ def evidence_across(
 
 
 def counted(evidence: Float64, settings: AcrossSettings = DEFAULT) -> Float64:
-    """Evidence (σ) of any sign as it counts: its size up to the most, less what chance gives; 0 where there is none."""
+    """Return how much evidence (σ) counts: its size up to the limit, less that of chance; 0 where there is none."""
     size = np.abs(evidence)
     return np.where(np.isnan(size), 0.0, np.minimum(size, settings.most) - settings.chance)
 
 
 def path_along(found: Float64, spacing_m: tuple[float, float], settings: AcrossSettings = DEFAULT) -> EdgePath:
-    """The path of most evidence (stations, offsets) along a road."""
+    """Return the path of most evidence (stations, offsets) along a road."""
     cost = settings.farther_cost * spacing_m[1] * np.arange(found.shape[1])
     reach = max(round(settings.move_m / spacing_m[1]), 1)
     total, before = np.empty_like(found), np.empty(found.shape, np.int64)
@@ -98,7 +98,7 @@ def edge_along(
     known_edge: Float64 | None = None,
     settings: AcrossSettings = DEFAULT,
 ) -> EdgePath:
-    """The edge of a road on one side.
+    """Return the edge of a road on one side.
 
     Parameters
     ----------

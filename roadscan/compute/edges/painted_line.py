@@ -1,4 +1,4 @@
-"""Painted lines along a road, from intensities across it."""
+"""Detects painted lines along a road from intensities across it."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ Float64 = npt.NDArray[np.float64]
 LINE_M: Final = 0.6
 """Painted lines are narrower than this."""
 PAINT: Final = 0.25
-"""A painted line is so much brighter than the road beside it (share of its intensity)."""
-_NARROWEST_M: Final = 0.05
-_WIDEST_M: Final = 0.4
+"""Least contrast of a painted line: how much brighter it is than the road beside it (share of its intensity)."""
+_NARROWEST_M: Final = 0.05  # Least width of a painted line between the points of half its contrast.
+_WIDEST_M: Final = 0.4  # Greatest width.
 _ALIKE: Final = 0.6
-"""Lines with so much of the brightness of the brightest stand beside it, and the innermost is that of a lane."""
+"""Lines with at least this share of the brightest line's contrast count; the innermost of them marks the lane."""
 
 
 class PaintedLine(NamedTuple):
-    """A line across the way."""
+    """A painted line across the way."""
 
     middle_m: float
     """Place of its middle on the axis across."""
@@ -33,7 +33,7 @@ class PaintedLine(NamedTuple):
 
 
 def without_lines(grey: Float64, spacing_m: float) -> Float64:
-    """Intensities (s, o) without what is brighter than its surroundings and narrower than a painted line may be.
+    """Return intensities (s, o) without what is brighter than its surroundings and narrower than a painted line may be.
 
     spacing_m : across the road; NaN, where nothing is known, stays.
     """
@@ -45,7 +45,7 @@ def without_lines(grey: Float64, spacing_m: float) -> Float64:
 
 
 def painted_line(grey: Float64, surface: Float64, away_m: Float64) -> PaintedLine | None:
-    """The painted line on a way across a road; None where there is none.
+    """Return the painted line on a way across a road; None where there is none.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def painted_line(grey: Float64, surface: Float64, away_m: Float64) -> PaintedLin
 
 
 def _crossing(bright: Float64, away_m: Float64, start: int, step: int, level: float) -> float | None:
-    """Place at which the brightness falls below a level on the way from a cell; None where it does not."""
+    """Return where the brightness falls below a level on the way from a cell; None where it does not."""
     k = start
     while 0 <= k + step < bright.size:
         if bright[k + step] < level:

@@ -1,1 +1,1 @@
-"""Instructions on whole vector registers that Numba has no word for, each with a plain twin."""
+"""Kernels with vector instructions that Numba does not generate, each with an equivalent in NumPy."""

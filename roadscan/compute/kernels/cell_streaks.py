@@ -1,4 +1,4 @@
-"""Streaks: readings side by side that fall into one cell, found sixteen readings at a time."""
+"""Finds streaks, runs of consecutive readings in one cell, sixteen readings at a time."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from roadscan.compute.kernel_options import bare, bare_inlined
 from roadscan.compute.kernels.processor import compiles_for
 from roadscan.compute.kernels.vectors import I32, I64, constant, everywhere, instruction, load, picked, start, store
 
-AT_ONCE = 16
+AT_ONCE = 16  # Readings that one instruction handles: 32-bit lanes of a 512-bit register.
 
 _ROW = ir.VectorType(I32, AT_ONCE)
 _COMPRESSES = compiles_for("avx512f")
-"""Whether the processor stores some lanes of a register side by side."""
+"""Whether the processor can store selected lanes of a register contiguously."""
 _COMPILED = not numba.config.DISABLE_JIT
 
 
 @bare_inlined
 def _starts_one_by_one(column, row, first, end, starts, columns, rows, streaks):
-    """Note the readings from `first` to `end` − 1 whose cell is not that of the reading before."""
+    """Record the readings from `first` to `end` − 1 whose cell differs from that of the reading before."""
     for j in range(first, end):
         starts[streaks], columns[streaks], rows[streaks] = j, column[j], row[j]
         streaks += np.uint64((column[j] != column[j - np.uint64(1)]) | (row[j] != row[j - np.uint64(1)]))
@@ -31,7 +31,7 @@ def _starts_one_by_one(column, row, first, end, starts, columns, rows, streaks):
 
 @intrinsic
 def _starts_of_sixteen(typingctx, column, row, first, starts, columns, rows, streaks):
-    """As `_starts_one_by_one` for the sixteen readings from `first`; returns how many streaks there are now."""
+    """Do the same for the sixteen readings from `first`; return the number of streaks so far."""
 
     def write(context, builder, signature, arguments):
         first, streaks = arguments[2], arguments[6]
@@ -56,7 +56,7 @@ def _starts_of_sixteen(typingctx, column, row, first, starts, columns, rows, str
 
 @bare
 def find_streaks(column, row, starts, columns, rows):
-    """Where readings of another cell begin. Returns how many such streaks there are.
+    """Find where readings of another cell begin; return the number of such streaks.
 
     column, row : (n,) int32, cells of readings; starts : (n + 1,) uint32, out, each streak's first reading, n behind
     the last; columns, rows : (n,) int32, out, its cell.
@@ -74,7 +74,7 @@ def find_streaks(column, row, starts, columns, rows):
 
 @intrinsic
 def _sums_of_sixteen(typingctx, intensity, first, total, sums):
-    """Sums behind each of sixteen numbers: each is added to those 1, 2, 4 and 8 places on. Returns the last one."""
+    """Compute cumulative sums of sixteen numbers by adding each to those 1, 2, 4 and 8 places on; return the last."""
 
     def write(context, builder, signature, arguments):
         first = arguments[1]
@@ -94,7 +94,7 @@ def _sums_of_sixteen(typingctx, intensity, first, total, sums):
 
 @bare
 def sum_up(intensity, sums):
-    """Sums of the intensities before each reading: intensity : (n,) unsigned; sums : (n + 1,) uint32, out."""
+    """Compute the sums of the intensities before each reading: intensity (n,) unsigned; sums (n + 1,) uint32, out."""
     total, j, n = np.uint32(0), np.uint64(0), np.uint64(intensity.size)
     sums[0] = total
     if _COMPILED:

@@ -1,6 +1,6 @@
-"""Statistics of the columns of a small table, sixteen cells at a time, on vector registers.
+"""Statistics of the columns of a small table, sixteen cells at a time, in vector registers.
 
-Numba's own loops over such a table stay scalar: the compiler cannot know that two rows do not overlap. So the rows are
+Numba's loops over such a table stay scalar: the compiler cannot know that two rows do not overlap. So the rows are
 loaded into registers here and everything is written out as instructions: medians by a sorting network (Batcher 1968,
 "Sorting networks and their applications", odd-even mergesort). Without the compiler NumPy does the same.
 """
@@ -17,20 +17,20 @@ from roadscan.compute.kernel_options import Kernel, bare
 from roadscan.compute.kernels import vectors
 from roadscan.compute.kernels.vectors import I32, I64, everywhere, instruction
 
-LANES = 16
-LARGEST = np.int32(2**31 - 1)
+LANES = 16  # Cells that are handled at a time: 32-bit lanes of a 512-bit register.
+LARGEST = np.int32(2**31 - 1)  # Stands for a missing height in sorting.
 
-MAD_TO_SIGMA = 1.4826
-OUTLIER_SIGMAS = 3.0
+MAD_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution in median absolute deviations.
+OUTLIER_SIGMAS = 3.0  # Heights farther from the median than this many robust σ do not count.
 REACH = OUTLIER_SIGMAS * MAD_TO_SIGMA
-"""Heights count as far from the median as this many times the median distance (MAD)."""
+"""Heights up to this many median absolute deviations (MAD) from the median count."""
 
 _F64 = ir.DoubleType()
 _ROW = ir.VectorType(I32, LANES)
 
 
 def exchanges(n):
-    """Pairs (i, j), i < j, that sort n rows when each is put in order one after another."""
+    """Return pairs (i, j), i < j, that sort n rows when the rows of each pair are put in order one after another."""
     pairs = []
     p = 1
     while p < n:
@@ -48,7 +48,7 @@ def exchanges(n):
 
 
 class Lanes:
-    """Writes instructions on rows of sixteen lanes; arguments are contiguous arrays."""
+    """Writer of instructions on rows of sixteen lanes; arguments are contiguous arrays."""
 
     def __init__(self, context, builder, signature, arguments):
         self.b = builder
@@ -58,7 +58,7 @@ class Lanes:
         ]
 
     def load(self, which, k=0):
-        """Row k of an array of int32."""
+        """Load row k of an array of int32."""
         return vectors.load(self.b, self._place(which, k, _ROW), _ROW)
 
     def store(self, which, value, k=0):
@@ -70,38 +70,38 @@ class Lanes:
         return self.b.gep(start, [I64(k)])
 
     def all(self, value, kind=_ROW):
-        """The same number in every lane."""
+        """Return a row with the same number in every lane."""
         number = float(value) if isinstance(kind.element, ir.DoubleType) else int(value)
         return ir.Constant(kind, [number] * kind.count)
 
     def least(self, a, b):
-        """The smaller of two, lane by lane."""
+        """Return the smaller of two, lane by lane."""
         return self.b.select(self.b.icmp_signed("<", a, b), a, b)
 
     def most(self, a, b):
-        """The larger of two, lane by lane."""
+        """Return the larger of two, lane by lane."""
         return self.b.select(self.b.icmp_signed(">", a, b), a, b)
 
     def size(self, a):
-        """Absolute value."""
+        """Return the absolute value."""
         return self.b.select(self.b.icmp_signed("<", a, self.all(0)), self.b.neg(a), a)
 
     def ordered(self, rows, pairs):
-        """Rows sorted within each lane."""
+        """Return the rows sorted within each lane."""
         rows = list(rows)
         for i, j in pairs:
             rows[i], rows[j] = self.least(rows[i], rows[j]), self.most(rows[i], rows[j])
         return rows
 
     def picked(self, rows, index):
-        """Of each lane the row of its own index."""
+        """Return for each lane the value of the row with the lane's index."""
         found = rows[0]
         for k, row in enumerate(rows[1:], start=1):
             found = self.b.select(self.b.icmp_signed("==", index, self.all(k)), row, found)
         return found
 
     def halves(self, row, kind=I64):
-        """Both halves of a row of int32 as wider numbers."""
+        """Return both halves of a row of int32 as wider numbers."""
         wide = ir.VectorType(kind, LANES // 2)
         parts = []
         for first in (0, LANES // 2):
@@ -110,7 +110,7 @@ class Lanes:
         return parts
 
     def medians(self, n, heights, counts):
-        """Rows of `heights`, which of them each lane has, its lower median, and that of the distances from it."""
+        """Return rows of `heights`, which of them exist in each lane, and lower medians of them and their distances."""
         count = self.load(counts)
         there = [self.b.icmp_signed(">", count, self.all(k)) for k in range(n)]
         middle = self.b.ashr(self.b.sub(count, self.all(1)), self.all(1))
@@ -124,7 +124,7 @@ class Lanes:
 
 
 def generator(write):
-    """The code of an intrinsic whose instructions `write` (Lanes) writes; it returns nothing."""
+    """Build an intrinsic without return value whose instructions `write` (Lanes) writes."""
 
     def generate(context, builder, signature, arguments):
         write(Lanes(context, builder, signature, arguments))
@@ -150,7 +150,7 @@ def _medians(n):
 
 
 def reach_of(lanes, away, floor):
-    """Distance from the median up to which heights count: the larger of REACH · away and the floor, whole quanta."""
+    """Return the distance from the median up to which heights count: REACH · away or the larger floor, in quanta."""
     b, double = lanes.b, ir.VectorType(_F64, LANES // 2)
     reach = []
     for half in lanes.halves(away, _F64):
@@ -227,7 +227,7 @@ def _medians_by_numpy(heights, counts, median, deviation):
 
 
 def statistics_by_numpy(heights, counts, light, bases, floor, quantum_m, out):
-    """As the kernel of :func:`statistics_of`."""
+    """Compute in NumPy what the kernel of :func:`statistics_of` computes."""
     median, away = np.zeros(LANES, np.int32), np.zeros(LANES, np.int32)
     _medians_by_numpy(heights, counts, median, away)
     for lane in np.flatnonzero(counts):
@@ -242,7 +242,7 @@ def statistics_by_numpy(heights, counts, light, bases, floor, quantum_m, out):
 
 
 def medians_of(n: int) -> Kernel:
-    """The kernel that finds the medians of up to `n` heights a lane.
+    """Return the kernel that finds the medians of up to `n` heights a lane.
 
     Its arguments: heights (n, 16) int32, of which the first `counts` (16,) int32 of each lane count, differences of
     no more than 2³¹; median (16,) int32, out, the lower one for an even count; deviation (16,) int32, out, the lower
@@ -252,7 +252,7 @@ def medians_of(n: int) -> Kernel:
 
 
 def statistics_of(n: int) -> Kernel:
-    """The kernel that finds the statistics of up to `n` heights a lane.
+    """Return the kernel that finds the statistics of up to `n` heights a lane.
 
     Its arguments: heights, counts as for :func:`medians_of`, relative to bases (16,) int32, quanta; light (16,) int32,
     sums of intensities; floor, float64, distance from the median (quanta) up to which heights always count, else it is
@@ -262,5 +262,5 @@ def statistics_of(n: int) -> Kernel:
     return statistics_by_numpy if numba.config.DISABLE_JIT else _statistics(n)
 
 
-medians_of_16 = medians_of(16)
-statistics_of_64 = statistics_of(64)
+medians_of_16 = medians_of(16)  # Finds medians of up to 16 heights a lane.
+statistics_of_64 = statistics_of(64)  # Finds statistics of up to 64 heights a lane.

@@ -1,4 +1,4 @@
-"""Copies within kernels: a slice's assignment compiles five times as long as a loop."""
+"""Copies arrays within kernels: an assignment to a slice takes five times as long to compile as a loop."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from roadscan.compute.kernel_options import bare
 
 @bare
 def copy_values(values, out):
-    """Values (n,) → the first n of `out` (n,), in its own kind of number."""
+    """Copy values (n,) to the first n elements of `out` (n,), converted to its type."""
     for k in range(out.size):
         out[k] = values[k]

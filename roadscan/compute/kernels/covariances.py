@@ -1,4 +1,4 @@
-"""Covariances of heights on a surface, for eight groups of points side by side (a group a lane, see ``factorisation``).
+"""Covariances of heights on a surface, for eight groups of points at once (a group a lane, see ``factorisation``).
 
 The covariance of two heights falls with their distance by Wendland's C⁴ function, which is positive definite in the
 plane (Wendland 1995, "Piecewise polynomial, positive definite and compactly supported radial functions of minimal
@@ -19,11 +19,11 @@ from roadscan.compute.kernels.factorisation import ROW, rows_of
 from roadscan.compute.kernels.vectors import instruction
 
 REACH = 12.0
-"""Distance at which heights are not related any more."""
+"""Distance from which heights are uncorrelated."""
 RISE = REACH**5 / 448.0
-"""So the covariance falls by distance⁵ beyond what is even in distance, as that of a quintic spline."""
-PEAK = 3.0 * RISE
-STEEPEST = 56.0 * RISE / REACH**2
+"""Scale of the covariance at which its term in distance⁵ has the factor −1, as in a quintic spline."""
+PEAK = 3.0 * RISE  # Covariance at distance 0: the variance of a height.
+STEEPEST = 56.0 * RISE / REACH**2  # Scale of the covariance between a height and a slope.
 
 
 def _constant(value):
@@ -31,7 +31,7 @@ def _constant(value):
 
 
 def _shares(b, u, v):
-    """Distance over the reach, and what is left to it (0 beyond)."""
+    """Return distance over REACH, and 1 less it (0 beyond)."""
     square = b.fadd(b.fmul(u, u), b.fmul(v, v))
     d = b.fmul(instruction(b, "llvm.sqrt.v8f64", ROW, square), _constant(1.0 / REACH))
     left = b.fsub(_constant(1.0), d)

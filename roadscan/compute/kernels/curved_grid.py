@@ -12,12 +12,12 @@ import numpy as np
 from roadscan.compute.kernel_options import inlined, kernel
 
 MOST_JUMPS = 200
-"""Steps of the search for a point's place; a place that is not found by then lies beside the line's reach."""
+"""Most steps of the search for a point's place; a point not found by then lies outside the line's reach."""
 
 
 @kernel
 def thin_path(path, least_m, kept):
-    """Mark the places of a path that lie at least `least_m` from the one marked before.
+    """Mark the positions of a path that lie at least `least_m` from the one marked before.
 
     path : (k, 2) float64, m; kept : (k,) bool, out.
     """
@@ -31,14 +31,14 @@ def thin_path(path, least_m, kept):
 
 @inlined
 def ahead(x, y, k, vertices, left):
-    """How far a place lies beyond the side of vertex k, along the line there (m)."""
+    """Return how far a position lies beyond the side of vertex k, along the line there (m)."""
     length = math.hypot(left[k, 0], left[k, 1])
     return ((x - vertices[k, 0]) * left[k, 1] - (y - vertices[k, 1]) * left[k, 0]) / length
 
 
 @inlined
 def place(x, y, hint, vertices, left, step):
-    """Step of the line beside which a place lies, and how far along (0–1) and to the left of it (m); −1 if none."""
+    """Return a position's step of the line, the fraction along it and the offset to the left (m); −1 if none."""
     last = len(vertices) - 2
     k = min(max(hint, 0), last)
     for _ in range(MOST_JUMPS):
@@ -57,7 +57,7 @@ def place(x, y, hint, vertices, left, step):
             v = ((y - ay) * dx - (x - ax) * dy) / math.hypot(dx, dy)
             return k, t, v
         if (k == 0 and jump < 0) or (k == last and jump > 0):
-            # Half a cell before the first and behind the last vertex belongs to them.
+            # The first and last cell extend half a cell beyond the first and last vertex.
             t = begin / step if jump < 0 else 1.0 + end / step
             at = k if jump < 0 else k + 1
             length = math.hypot(left[at, 0], left[at, 1])
@@ -69,7 +69,7 @@ def place(x, y, hint, vertices, left, step):
 
 @kernel
 def accumulate_curved(x, y, height, hints, vertices, left, step, v_first, v_step, sums, counts):
-    """Add points to the cell of the grid node nearest to them.
+    """Add points to the cells of the nearest grid nodes.
 
     Parameters
     ----------

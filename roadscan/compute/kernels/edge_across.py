@@ -1,7 +1,7 @@
 """Edges of a road in a raster of stations and offsets: steps and bends across it, and the best path along it.
 
-The slope across tells the edge (P. Kumar et al. 2013, who let a snake find its way over slope, reflectance and pulse
-width). Here the evidence is a difference over its σ, and the path is the best of all by dynamic programming.
+The slope across shows the edge (P. Kumar et al. 2013, who fit a snake to slope, reflectance and pulse width). Here the
+evidence is a difference over its σ, and dynamic programming finds the best path of all.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def step_and_bend(height_m, weight, spacing_m, window, floors, step, bend):
 
 @inlined
 def line_beside(height_m, weight, s, o, side, window, spacing_m):
-    """Line through the cells of one side: height and slope at the edge, their variances, χ², and number of cells."""
+    """Fit a line to the cells of one side; return height and slope at the edge, their variances, χ², and count."""
     stations, offsets = height_m.shape
     sw, s1, s2, t0, t1, q, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
     for i in range(max(s - window[0], 0), min(s + window[0] + 1, stations)):
@@ -44,7 +44,7 @@ def line_beside(height_m, weight, s, o, side, window, spacing_m):
             c = o + side * j
             if c < 0 or c >= offsets or weight[i, c] <= 0.0:
                 continue
-            # Heights along the road follow the station's own cell.
+            # Heights along the road are taken relative to the cell of the station.
             if weight[i, o] <= 0.0:
                 continue
             w, z, d = weight[i, c], height_m[i, c] - height_m[i, o], side * j * spacing_m
@@ -64,7 +64,7 @@ def line_beside(height_m, weight, s, o, side, window, spacing_m):
 
 @kernel
 def best_path(evidence, reach, shift_cost, total, before, path):
-    """Fill `path` (stations,) with the offsets (cells) whose evidence adds up to most.
+    """Fill `path` (stations,) with the offsets (cells) whose evidence has the greatest sum.
 
     evidence : (stations, offsets), NaN: nothing known, which counts nothing. reach : cells that the path may move from
     station to station, each at `shift_cost`. total, before : room of the shape of `evidence`.

@@ -1,7 +1,7 @@
-"""Factors of eight small symmetric matrices side by side: a matrix a lane, the lanes innermost.
+"""Factorises eight small symmetric matrices at once: a matrix a lane, the lanes innermost.
 
 A vector register then holds the same element of eight matrices, and each matrix has the bits that it has alone, however
-small it is. Numba's own loops keep no sums in registers here: the compiler cannot know that two rows do not overlap.
+small it is. Numba's loops keep no sums in registers here: the compiler cannot know that two rows do not overlap.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from roadscan.compute.kernel_options import Kernel, bare
 from roadscan.compute.kernels import vectors
 from roadscan.compute.kernels.vectors import I64
 
-LANES = 8
+LANES = 8  # Matrices that are handled at once: 64-bit lanes of a 512-bit register.
 TOGETHER = 4
-"""Rows whose sums are kept in registers at once; so many rows more than there are may be computed, of anything."""
+"""Rows whose sums stay in registers at once; up to this many rows past the end may be computed, with any result."""
 ROW = ir.VectorType(ir.DoubleType(), LANES)
 
 
 def rows_of(context, builder, signature, arguments, k):
-    """The data of argument `k`, an array whose last axis are the lanes, as vectors."""
+    """Return the data of argument `k`, an array whose last axis are the lanes, as a pointer to vectors."""
     return builder.bitcast(vectors.start(context, builder, signature, arguments, k), ROW.as_pointer())
 
 

@@ -1,9 +1,9 @@
-"""Slots of heights in memory: their layout, eight heights stored as one vector, slots fetched before they are wanted.
+"""Slots of heights in memory: their layout, storing eight heights as one vector, and prefetching.
 
 A slot has 64 bytes, as long as a line of the cache: SLOT_HEIGHTS differences from the slot's base, and a header with
 their number, the sum of their intensities and the passes they are from.
 
-Written as instructions: Numba's own stores stay one by one, and it knows no way to fetch.
+Written as instructions, because Numba stores numbers one by one and cannot prefetch.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from roadscan.compute.kernel_options import Kernel
 from roadscan.compute.kernels.vectors import I8, I16, I32, everywhere, instruction, load, start, store
 
 VECTOR = 8
-"""Heights that are stored at once."""
+"""Number of heights that are stored at once."""
 LANES = 16
-"""Cells of a group."""
+"""Number of cells in a group."""
 SLOT_SIZE = 32
 """Numbers of 16 bits in a slot: the heights, then the header."""
 SLOT_HEIGHTS = 28
-"""Heights of a slot."""
+"""Number of heights in a slot."""
 SLOT_HEADERS = 8
 """Numbers of 64 bits in a slot; the last one is its header."""
 LAST = SLOT_SIZE - VECTOR
-"""Heights that a slot may hold already when a whole vector is stored behind them."""
+"""Most heights that a slot may hold before a whole vector is stored behind them."""
 FARTHEST = 32_000
 """Largest difference (quanta) between a height and the base of its slot."""
 
-COUNTS = 31
-LIGHT_SHIFT, LIGHTS = 5, (1 << 21) - 1
-WORD_SHIFT, WORDS = 26, (1 << 14) - 1
-MARK_SHIFT = 40
+COUNTS = 31  # Mask of the number of heights in a header.
+LIGHT_SHIFT, LIGHTS = 5, (1 << 21) - 1  # Lowest bit and mask of the sum of intensities.
+WORD_SHIFT, WORDS = 26, (1 << 14) - 1  # Lowest bit and mask of the word of passes.
+MARK_SHIFT = 40  # Lowest bit of the passes.
 PASSES = 24
 """A header, from its lowest bit: number of heights (5), sum of intensities (21), word (14), passes (24).
 
@@ -75,7 +75,7 @@ def _fetched(typingctx, array, at):
 
 
 def _not_fetched(array, at):
-    """Nothing to do without the compiler."""
+    """Do nothing: without the compiler there is no prefetch."""
 
 
 store_heights: Kernel = _stored_by_numpy if numba.config.DISABLE_JIT else _stored

@@ -1,6 +1,6 @@
-"""Heights of a Clough–Tocher patch at eight nodes side by side, on vector registers.
+"""Heights of a Clough–Tocher patch at eight nodes at once, in vector registers.
 
-Numba's own loop over the nodes stays scalar, and which third a node lies in is a branch that no processor foresees.
+Numba's loop over the nodes stays scalar, and the third that contains a node is a branch that no processor predicts.
 Here the control points of its third are chosen for all nodes at once. Without the compiler NumPy does the same.
 """
 
@@ -19,18 +19,18 @@ from roadscan.compute.kernels.vectors import I64, everywhere, load, store
 CORNER, EDGE, BY_CORNER, BY_EDGE, INNER, CENTRE, POINTS = 0, 3, 9, 12, 15, 18, 19
 """Where the control points of a patch begin in its row, and how many there are; the table stands in
 ``surface.clough_tocher``."""
-AT_ONCE = 8
+AT_ONCE = 8  # Nodes that are handled at once: 64-bit lanes of a 512-bit register.
 PER_EDGE = 4
 """Numbers of an edge: a point (x, y) and a direction (dx, dy)."""
 SCALE = 3 * PER_EDGE
 """Where 1 / twice the triangle's area stands, behind its three edges."""
 
 _EIGHT = ir.VectorType(ir.DoubleType(), AT_ONCE)
-_EDGES, _PATCHES, _PATCH, _X, _Y, _HEIGHTS, _FIRST = range(7)
+_EDGES, _PATCHES, _PATCH, _X, _Y, _HEIGHTS, _FIRST = range(7)  # Places of the arguments of `heights_of_eight`.
 
 
 class _Eight:
-    """Eight numbers, for which formulas are written as for NumPy's arrays."""
+    """Eight numbers in a vector, with the operators of a NumPy array."""
 
     def __init__(self, builder, value):
         self.b, self.value = builder, value
@@ -59,12 +59,12 @@ class _Eight:
         return _Eight(self.b, self.b.and_(self.value, other.value))
 
     def where(self, first, second):
-        """Lanes of `first` where this holds, of `second` elsewhere."""
+        """Return lanes of `first` where this holds, of `second` elsewhere."""
         return _Eight(self.b, self.b.select(self.value, first.value, self._of(second)))
 
 
 class _Array(np.ndarray):
-    """The same by NumPy."""
+    """The same interface as :class:`_Eight`, in NumPy."""
 
     def where(self, first, second):
         return np.where(self, first, second).view(_Array)

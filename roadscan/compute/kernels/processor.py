@@ -1,4 +1,4 @@
-"""The processor that kernels are compiled for."""
+"""Features of the processor that kernels are compiled for."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numba
 
 
 def compiles_for(*features: str) -> bool:
-    """True if kernels are compiled, and for a processor that has all these features (LLVM's names)."""
+    """Return True if kernels are compiled for a processor with all these features (LLVM's names)."""
     stated = numba.config.CPU_FEATURES
     if numba.config.DISABLE_JIT or (stated is None and numba.config.CPU_NAME is not None):
         return False

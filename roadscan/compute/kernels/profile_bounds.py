@@ -6,12 +6,12 @@ import numpy as np
 
 from roadscan.compute.kernel_options import kernel
 
-_ONE = np.uint16(1)
+_ONE = np.uint16(1)  # Subtracted from raw ranges in their type, so that 0 (no return) wraps to the largest number.
 
 
 @kernel
 def range_bounds(ranges, low, high):
-    """Write the lowest and the highest range that is a return (not 0); 0 for profiles without any.
+    """Write the lowest and the highest range of each profile's returns (not 0); 0 for profiles without any.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ def range_bounds(ranges, low, high):
         least, most = np.uint16(65535), np.uint16(0)
         for i in range(ranges.shape[1]):
             value = ranges[k, i]
-            below = np.uint16(value - _ONE)  # no return becomes the highest number
+            below = np.uint16(value - _ONE)  # 0 (no return) wraps to the largest number
             least = below if below < least else least
             most = value if value > most else most
         low[k], high[k] = np.uint16(least + _ONE), most

@@ -1,7 +1,7 @@
-"""Heights of the sixteen slots of a group as a table with a column a cell, and what their headers say.
+"""Turns the sixteen slots of a group into a table of heights with a column a cell, and reads their headers.
 
-A slot is a cell's; statistics want rows that hold heights of every cell. So the slots are turned in registers, two
-heights at a time.
+A slot has the heights of one cell; statistics need rows with heights of every cell. So the slots are transposed in
+registers, two heights at a time.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LINE = ir.VectorType(I32, LANES)
 
 
 def _turned(b, rows):
-    """Transpose 16 rows: to put every row between those of eight rows further on, four times."""
+    """Transpose 16 rows by interleaving every row with the one eight rows further on, four times."""
     halves = [[n for k in range(8) for n in (first + k, LANES + first + k)] for first in (0, LANES // 2)]
     for _ in range(4):
         rows = [picked(b, rows[k], rows[k + 8], half) for k in range(8) for half in halves]
@@ -95,10 +95,10 @@ def _chained_by_numpy(chain, first):
 
 
 open_group: Kernel = _opened_by_numpy if numba.config.DISABLE_JIT else _opened
-"""open_group(slots, first, pairs, counts, light, marks): the slots of a group, see ``simd.height_slots``.
+"""open_group(slots, first, pairs, counts, light, marks): slots of a group, see ``height_slots``.
 
 slots : (m,) int16; first : uint64, where the group begins; pairs : (SLOT_HEIGHTS / 2, LANES) int32, out, two heights
-each, relative to the bases, see ``simd.slot_statistics``; counts, light, marks : (LANES,) int32, out: heights, sum of
+each, relative to the bases, see ``slot_statistics``; counts, light, marks : (LANES,) int32, out: heights, sum of
 intensities and passes of each slot."""
 
 put_apart: Kernel = _put_apart_by_numpy if numba.config.DISABLE_JIT else _put_apart

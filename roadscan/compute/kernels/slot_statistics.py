@@ -1,4 +1,4 @@
-"""Statistics of sixteen cells of one slot each, two heights of a cell to a lane.
+"""Statistics of sixteen cells of one slot each, with two heights of a cell in a lane.
 
 The heights of a slot are differences of 16 bits, and sorting is comparing: with 16 bits a register compares 32 at
 once. The heights with even numbers of a cell stand in the lower half of its lane, those with odd numbers in the upper
@@ -28,19 +28,19 @@ from roadscan.compute.kernels.processor import compiles_for
 from roadscan.compute.kernels.vectors import I16, I32, constant, everywhere, instruction
 
 SMALLEST, LARGEST = -(1 << 15), (1 << 15) - 1
-"""Of 16 bits; no height stands so far from its base (``height_slots.FARTHEST``)."""
+"""Limits of 16-bit numbers; every height lies nearer to its base (``height_slots.FARTHEST``)."""
 APART = (1 << 16) - 1
-"""Distance from the median in places without a height: more than any has."""
+"""Distance from the median in places without a height: greater than that of any height."""
 
 _F64 = ir.DoubleType()
 _ROW = ir.VectorType(I32, LANES)
-_PAIRS = ir.VectorType(I16, 2 * LANES)
+_PAIRS = ir.VectorType(I16, 2 * LANES)  # A row of sixteen lanes with two 16-bit heights each.
 _MULTIPLIES = compiles_for("avx512bw")
-"""Whether the processor adds the products of two numbers of 16 bits each in an instruction."""
+"""Whether the processor multiplies pairs of 16-bit numbers and adds the products in one instruction."""
 
 
 class Pairs:
-    """Instructions on rows of sixteen lanes of two heights each."""
+    """Writer of instructions on rows of sixteen lanes of two heights each."""
 
     def __init__(self, lanes, rows, counts):
         """`rows`, of int32, from memory; `counts`, a row of int32, heights of each lane."""
@@ -55,36 +55,36 @@ class Pairs:
         self.network = exchanges(len(rows))
 
     def all(self, value):
-        """The same number in both halves of every lane."""
+        """Return a row with the same number in both halves of every lane."""
         return ir.Constant(_PAIRS, [value] * _PAIRS.count)
 
     def both(self, row):
-        """The lower half of each lane in both halves."""
+        """Return a row with the lower half of each lane in both halves."""
         row = self.b.and_(row, self.lanes.all(0xFFFF))
         return self.b.bitcast(self.b.or_(row, self.b.shl(row, self.lanes.all(16))), _PAIRS)
 
     def split(self, pairs):
-        """Lower and upper halves as rows of int32."""
+        """Return lower and upper halves as rows of int32."""
         row, half = self.b.bitcast(pairs, _ROW), self.lanes.all(16)
         return self.b.ashr(self.b.shl(row, half), half), self.b.ashr(row, half)
 
     def turned(self, pairs):
-        """Both halves of each lane exchanged."""
+        """Return both halves of each lane exchanged."""
         row, half = self.b.bitcast(pairs, _ROW), self.lanes.all(16)
         return self.b.bitcast(self.b.or_(self.b.shl(row, half), self.b.lshr(row, half)), _PAIRS)
 
     def lower(self, first, second, signed):
-        """The smaller of two."""
+        """Return the smaller of two."""
         compare = self.b.icmp_signed if signed else self.b.icmp_unsigned
         return self.b.select(compare("<", first, second), first, second)
 
     def upper(self, first, second, signed):
-        """The larger of two."""
+        """Return the larger of two."""
         compare = self.b.icmp_signed if signed else self.b.icmp_unsigned
         return self.b.select(compare(">", first, second), first, second)
 
     def middle(self, rows, least, most, *, signed):
-        """Of each lane the lower median of its heights, in both halves."""
+        """Return the lower median of each lane's heights, in both halves."""
         b = self.b
         rows = [
             b.select(there, row, b.select(before, self.all(least), self.all(most)))
@@ -99,7 +99,7 @@ class Pairs:
         return found
 
     def sum_of_products(self, first, second):
-        """The products of two numbers, added for both halves of each lane (int32)."""
+        """Multiply two rows and add the products of both halves of each lane (int32)."""
         if _MULTIPLIES:
             return instruction(self.b, "llvm.x86.avx512.pmaddw.d.512", _ROW, first, second)
         parts = [self.b.mul(one, other) for one, other in zip(self.split(first), self.split(second), strict=True)]
@@ -107,7 +107,7 @@ class Pairs:
 
 
 def _spread(pairs):
-    """Lowest and highest height of each lane (int32); places without a height count as the first."""
+    """Return lowest and highest height of each lane (int32); places without a height count as the first height."""
     first = pairs.both(pairs.b.bitcast(pairs.rows[0], _ROW))
     low, high = first, first
     for row, there in zip(pairs.rows, pairs.there, strict=True):
@@ -171,7 +171,7 @@ def _by_numpy(pairs, counts, light, bases, floor, quantum_m, out):
 
 
 def heights_of(pairs):
-    """Heights (2 r, 16) int32 of pairs (r, 16) int32, by NumPy."""
+    """Unpack pairs (r, 16) int32 into heights (2 r, 16) int32, in NumPy."""
     return (
         np.ascontiguousarray(pairs.view(np.int16).reshape(len(pairs), LANES, 2).transpose(0, 2, 1))
         .reshape(-1, LANES)
@@ -180,7 +180,7 @@ def heights_of(pairs):
 
 
 def slot_statistics_of(rows: int) -> Kernel:
-    """The kernel that finds the statistics of up to 2 · `rows` heights a cell.
+    """Return the kernel that finds the statistics of up to 2 · `rows` heights a cell.
 
     Its arguments: pairs (rows, 16) int32, heights 2 k and 2 k + 1 of a cell as the lower and the upper 16 bits of row
     k, relative to bases, each no more than 32,000 away; the others are those of ``column_statistics.statistics_of``.
@@ -188,4 +188,4 @@ def slot_statistics_of(rows: int) -> Kernel:
     return _by_numpy if numba.config.DISABLE_JIT else _compiled(rows)
 
 
-slot_statistics_of_8, slot_statistics_of_28 = (slot_statistics_of(rows) for rows in (4, 14))
+slot_statistics_of_8, slot_statistics_of_28 = (slot_statistics_of(rows) for rows in (4, 14))  # For 8 and 28 heights.

@@ -1,4 +1,4 @@
-"""Statistics of sixteen cells side by side, all of one pass, written to the columns of a tile as whole vectors."""
+"""Writes statistics of sixteen adjacent cells, all of one pass, to the columns of a tile as whole vectors."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from roadscan.compute.kernels.column_statistics import LANES, generator
 from roadscan.compute.kernels.vectors import I16, I32, I64, constant, everywhere, load, store
 
 _SHORTS, _DOUBLES, _FLOATS = (ir.VectorType(kind, LANES) for kind in (I16, ir.DoubleType(), ir.FloatType()))
-_OUT, _COUNTS, _COLUMN, _ROW, _CELL, _WRITTEN, _PASS, _COLUMNS = range(8)
+_OUT, _COUNTS, _COLUMN, _ROW, _CELL, _WRITTEN, _PASS, _COLUMNS = range(8)  # Places of the arguments of `store_group`.
 
 
 def _write_to(kinds, context):
-    """Writes the columns of an argument, a tuple of arrays of these types."""
+    """Writer to the columns of an argument that is a tuple of arrays of these types."""
 
     def write(lanes):
         b = lanes.b
@@ -63,4 +63,4 @@ store_group: Kernel = _stored_by_numpy if numba.config.DISABLE_JIT else _stored
 """store_group(out, counts, first_column, row_number, cell, written, pass_id, columns): statistics of sixteen cells.
 
 out : (6, 16) float64; counts : (16,) int32; first_column, row_number : uint16; cell : uint64, where the sixteen go in
-the columns; written : int32, where their passes go; pass_id : uint16; columns : ``cells.cell_columns.CellColumns``."""
+the columns; written : int32, where their passes go; pass_id : uint16; columns : ``CellColumns`` (`tiles`)."""

@@ -1,4 +1,4 @@
-"""Slots of the cells of sixteen streaks at a time, as far as these lie in one tile and have slots already."""
+"""Looks up the slots of sixteen streaks' cells at a time, where these lie in one tile and have slots already."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from roadscan.compute.kernel_options import Kernel, bare_inner
 from roadscan.compute.kernels.processor import compiles_for
 from roadscan.compute.kernels.vectors import I8, I16, I32, I64, constant, everywhere, instruction, load, start, store
 
-AT_ONCE = 16
+AT_ONCE = 16  # Streaks that one instruction handles: 32-bit lanes of a 512-bit register.
 
 _ROW = ir.VectorType(I32, AT_ONCE)
 _GATHERS = compiles_for("avx512f")
-"""Whether the processor loads sixteen numbers from anywhere at once."""
+"""Whether the processor can load sixteen numbers from arbitrary addresses at once."""
 
 
 def _gathered(builder, array, index, mask):
-    """Numbers of an array of 32 bits at sixteen places; 0 where the mask is."""
+    """Load numbers of a 32-bit array at sixteen places; 0 where the mask is not set."""
     none, array = constant(_ROW, [0] * AT_ONCE), builder.bitcast(array, I8.as_pointer())
     return instruction(builder, "llvm.x86.avx512.mask.gather.dpi.512", _ROW, none, array, index, mask, I32(4))
 

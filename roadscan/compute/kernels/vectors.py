@@ -1,42 +1,42 @@
-"""Instructions on whole vector registers, for kernels that Numba's own loops cannot express."""
+"""Vector instructions for kernels that Numba's loops cannot express."""
 
 from __future__ import annotations
 
 from llvmlite import ir
 from numba.core import cgutils
 
-I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
+I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))  # LLVM's types of whole numbers.
 
 
 def start(context, builder, signature, arguments, k):
-    """Where the data of argument `k`, an array, begin."""
+    """Return the address of the data of argument `k`, an array."""
     return context.make_array(signature.args[k])(context, builder, arguments[k]).data
 
 
 def load(builder, at, kind):
-    """A value of a type from any address."""
+    """Load a value of a type from an address."""
     value = builder.load(builder.bitcast(at, kind.as_pointer()))
     value.align = 1
     return value
 
 
 def store(builder, value, at):
-    """Write a value to any address."""
+    """Write a value to an address."""
     builder.store(value, builder.bitcast(at, value.type.as_pointer())).align = 1
 
 
 def constant(vector, values):
-    """A vector of known numbers."""
+    """Return a vector of constants."""
     return ir.Constant(vector, [int(value) for value in values])
 
 
 def picked(builder, first, second, lanes):
-    """Lanes of two vectors by their numbers, which go on from the first vector to the second."""
+    """Return lanes of two vectors by number; the second vector's lanes are numbered after the first's."""
     return builder.shuffle_vector(first, second, constant(ir.VectorType(I32, len(lanes)), lanes))
 
 
 def everywhere(builder, vector, number):
-    """A vector with a number in each lane."""
+    """Return a vector with a number in each lane."""
     nothing = ir.Constant(vector, ir.Undefined)
     return picked(builder, builder.insert_element(nothing, number, I32(0)), nothing, [0] * vector.count)
 

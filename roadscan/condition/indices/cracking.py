@@ -19,8 +19,8 @@ from roadscan.condition.lane_data import LaneData
 _TYPES: Final = ("longitudinal", "transverse", "diagonal", "alligator", "unknown")
 _SEVERITIES: Final = {"low": 0.006, "moderate": 0.019, "high": np.inf}
 """Greatest mean width of each severity (m)."""
-_STRIP_M: Final = 0.75
-_PIECE_M: Final = 0.5
+_STRIP_M: Final = 0.75  # Width of a wheel path.
+_PIECE_M: Final = 0.5  # Length of a piece of a wheel path.
 _PERCENT: Final = "cracked_wheel_path_percent"
 
 
@@ -39,7 +39,7 @@ class Cracking(ConditionIndex):
     needs_cracks: ClassVar[bool] = True
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of sections."""
+        """Return the values of sections."""
         for from_m, to_m in lane.sections_m:
             share, reason = lane.paths_share(from_m, to_m), ""
             if lane.cracks is None:

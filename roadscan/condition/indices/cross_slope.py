@@ -33,7 +33,7 @@ class CrossSlope(ConditionIndex):
     drawn: ClassVar[tuple[str, ...]] = ("cross_slope_mean_percent",)
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of each cross-section and of sections."""
+        """Return values of each cross-section and of sections."""
         c = lane.cross_sections
         slope, crown = self._slopes(lane)
         for held, name in ((slope, "cross_slope_mean_percent"), (crown, "crown_mean_mm")):
@@ -47,7 +47,7 @@ class CrossSlope(ConditionIndex):
             yield self._grade(lane, from_m, to_m)
 
     def _slopes(self, lane: LaneData) -> tuple[PerCrossSection, PerCrossSection]:
-        """By least squares over the heights that are known."""
+        """Return slopes by least squares over the known heights."""
         c = lane.cross_sections
         n, x = c.station_m.size, c.offset_m
         slope, crown, sigma_slope, sigma_crown = (np.full(n, np.nan) for _ in range(4))
@@ -60,7 +60,7 @@ class CrossSlope(ConditionIndex):
             noise = float(np.nanmedian(c.sigma_m[k])) if not np.isnan(c.sigma_m[k]).all() else np.nan
             about = x[own] - x[own].mean()
             square = about * about - np.mean(about * about)
-            # Neighbouring heights share cells: about one in three is a measurement of its own.
+            # Neighbouring heights share cells: about one in three is independent.
             roll = np.tan(lane.sigma_roll_rad)
             sigma_slope[k] = 100.0 * np.hypot(noise * np.sqrt(3.0 / np.sum(about * about)), roll)
             sigma_crown[k] = 1e3 * noise * np.sqrt(3.0 / np.sum(square * square)) * half * half
@@ -70,7 +70,7 @@ class CrossSlope(ConditionIndex):
         )
 
     def _grade(self, lane: LaneData, from_m: float, to_m: float) -> Value:
-        """From both wheel paths' heights over their way."""
+        """Return the grade from the heights of both wheel paths over their length."""
         slopes: list[float] = []
         shares: list[float] = []
         for profile in lane.profiles.values():

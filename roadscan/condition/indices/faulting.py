@@ -38,19 +38,19 @@ from roadscan.condition.profiles.quarter_car import SEVERE_M
 
 Float64 = npt.NDArray[np.float64]
 
-_NEAR_M: Final = 0.1
-_FAR_M: Final = 0.5
-_APART_M: Final = 0.5
-_LEAST_M: Final = 0.003
-_SUDDEN: Final = 0.75
-_BESIDE_M: Final = 0.3
-_HALF: Final = 0.6
-_LEAD_M: Final = 2.0
-_MM: Final = 1e3
+_NEAR_M: Final = 0.1  # Lines are fitted from this distance …
+_FAR_M: Final = 0.5  # … to this distance before and behind a joint.
+_APART_M: Final = 0.5  # Joints closer to one another are one joint.
+_LEAST_M: Final = 0.003  # Least height of a step that shows a joint.
+_SUDDEN: Final = 0.75  # Least share of a step that happens within `_NEAR_M`.
+_BESIDE_M: Final = 0.3  # Largest distance along the lane of the step in the other wheel path.
+_HALF: Final = 0.6  # Least height of that step, as a share of this one.
+_LEAD_M: Final = 2.0  # Length before and behind a section that lines reach into.
+_MM: Final = 1e3  # Millimetres in a metre.
 _PATH_HALF_M: Final = 0.375
 """Half of the width of a wheel path that a crack crosses (m)."""
 _SPACED_M: Final = 0.1
-"""A joint lies this near to where its spacing puts it (m)."""
+"""Largest distance of a joint from its place by the spacing (m)."""
 
 
 class Faulting(ConditionIndex):
@@ -69,7 +69,7 @@ class Faulting(ConditionIndex):
     lead_m: ClassVar[float] = _LEAD_M
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Steps one by one, and values of sections."""
+        """Return steps one by one, and values of sections."""
         phase_m = _phase_m(lane)
         for from_m, to_m in lane.sections_m:
             sides = {side: _Side.of(profile, from_m, to_m, lane) for side, profile in lane.profiles.items()}
@@ -117,7 +117,7 @@ class _Joint(NamedTuple):
 
 
 def _remark(joints: list[_Joint], kerbs: int) -> str:
-    """How the joints are known, which are missed, and how many steps are no joints."""
+    """Return how joints are found, which are missed, and how many steps are no joints."""
     beside = f"steps of more than {_MM * SEVERE_M:g} mm that are no joints: {kerbs}" if kerbs else ""
     return "; ".join(part for part in (_known_by(joints), beside) if part)
 
@@ -135,7 +135,7 @@ def _known_by(joints: list[_Joint]) -> str:
 def _joints(
     lane: LaneData, sides: dict[str, _Side], between_m: tuple[float, float], phase_m: float | None
 ) -> list[_Joint]:
-    """Joints of a section by station; one that several things tell counts once."""
+    """Return the joints of a section by station; one found in several ways counts once."""
     found: list[_Joint] = []
 
     def new(station_m: float) -> bool:
@@ -174,7 +174,7 @@ def _known(faults: Mapping[str, tuple[float, float, float] | None]) -> dict[str,
 
 
 def _cracked(lane: LaneData) -> Iterator[dict[str, float]]:
-    """Stations at which transverse cracks cross both wheel paths, by wheel path."""
+    """Return stations at which transverse cracks cross both wheel paths, by wheel path."""
     for crack in lane.cracks or ():
         places = {}
         for side, sign in (("left", -1.0), ("right", 1.0)):
@@ -186,7 +186,7 @@ def _cracked(lane: LaneData) -> Iterator[dict[str, float]]:
 
 
 def _phase_m(lane: LaneData) -> float | None:
-    """Station of a joint of the stated spacing; None where none is stated, or nothing shows where it lies."""
+    """Return the station of a joint of the stated spacing; None where none is stated, or its place is unknown."""
     spacing = lane.config.joint_spacing_m
     if spacing is None or lane.config.joint_station_m is not None:
         return lane.config.joint_station_m
@@ -197,7 +197,7 @@ def _phase_m(lane: LaneData) -> float | None:
             stations += [at for at, _, _ in sides[side].steps(sides[other])]
     if not stations:
         return None
-    # The most joints within reach of one another, all brought onto one slab: chance steps have no say.
+    # Use the largest group of joints that agree modulo the spacing, so that chance steps do not matter.
     around = np.asarray(stations) % spacing
     away = np.abs((around[:, None] - around + 0.5 * spacing) % spacing - 0.5 * spacing) <= 2.0 * _SPACED_M
     best = around[int(np.argmax(away.sum(axis=1)))]
@@ -206,7 +206,7 @@ def _phase_m(lane: LaneData) -> float | None:
 
 
 def _unevenness_m(found: Float64) -> float:
-    """Scatter of steps (n, 3) at all places of a section, robust, without the noise of their heights (m)."""
+    """Return the robust scatter of steps (n, 3) at all places of a section, less the noise of their heights (m)."""
     height, sigma = found[np.isfinite(found[:, :2]).all(axis=1), :2].T
     if not height.size:
         return 0.0
@@ -216,16 +216,16 @@ def _unevenness_m(found: Float64) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """What may be steps of a wheel path."""
+    """Possible steps of a wheel path."""
 
     profile: Profile
     inside: npt.NDArray[np.bool_]
-    """(n,) places of the section itself."""
+    """(n,) True for places in the section itself."""
     found: Float64
-    """(n, 3) height of a step, its standard deviation, and how much of it happens at once (m)."""
+    """(n, 3) height of a step, its standard deviation (m), and the share of it that happens at once."""
     share: float
     uneven_m: float
-    """Standard deviation of steps as the road's unevenness makes them."""
+    """Standard deviation of steps caused by the road's unevenness."""
 
     @classmethod
     def of(cls, profile: Profile, from_m: float, to_m: float, lane: LaneData) -> _Side:
@@ -239,7 +239,7 @@ class _Side:
         return cls(part, inside, found, share, _unevenness_m(found))
 
     def fault_at(self, station_m: float, reach_m: float) -> tuple[float, float, float] | None:
-        """Station (m), fault and standard deviation (mm) at a joint, or at the greatest step within reach of it.
+        """Return station (m), fault and standard deviation (mm) at a joint, or at the greatest step within reach of it.
 
         The greatest counts only where it is three standard deviations high: a level joint has none.
         """
@@ -255,12 +255,12 @@ class _Side:
         return float(self.profile.station_m[k]), *self._fault(k)
 
     def _fault(self, k: int) -> tuple[float, float]:
-        """Fault of a place and its standard deviation (mm): a rise in the direction of travel is negative."""
+        """Fault at a place and its standard deviation (mm): a rise in the direction of travel is negative."""
         height, sigma, _ = self.found[k].tolist()
         return -_MM * height, _MM * math.hypot(sigma, self.uneven_m)
 
     def steps(self, other: _Side) -> Iterator[tuple[float, float, float]]:
-        """Station (m), fault and standard deviation (mm) of each step that the other wheel path has as well."""
+        """Return station (m), fault and standard deviation (mm) of each step that the other wheel path has as well."""
         height, sigma, sudden = self.found.T
         size, station = np.abs(height), self.profile.station_m
         fits = (

@@ -41,7 +41,7 @@ SEVERE_STEP: Final = Witness(
 
 
 _NAMED: Final = 6
-"""Stations of steps that a section names; the others it counts."""
+"""Most stations of steps that a section names; the others are counted."""
 
 
 class Iri(ConditionIndex):
@@ -60,7 +60,7 @@ class Iri(ConditionIndex):
     lead_m: ClassVar[float] = LEAD_M
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of sections."""
+        """Return the values of sections."""
         for from_m, to_m in lane.sections_m:
             yield from self._section(lane, from_m, to_m)
 
@@ -84,7 +84,7 @@ class Iri(ConditionIndex):
 
 
 class _Told:
-    """What the golden car says of a wheel path in a section."""
+    """Roughness of a wheel path in a section."""
 
     def __init__(self, share: float, reason: str) -> None:
         self.local = self.sigma_local = np.nan
@@ -124,7 +124,7 @@ def _told(path: WheelPath) -> _Told:
 
 
 def _steps(on: Ride, path: WheelPath, noted: str) -> str:
-    """Where the wheel path steps as roads do not, and what was done; empty where it does not."""
+    """Describe where the wheel path steps as roads do not, and what was done; empty where it does not."""
     found = []
     station, way = path.profile.station_m, path.profile.distance_m
     broken = on.breaks[0]
@@ -140,7 +140,7 @@ def _steps(on: Ride, path: WheelPath, noted: str) -> str:
 
 
 def _sigma_of_mean(left: Cleared, right: Cleared) -> float:
-    """Standard deviation of the mean of two wheel paths: their noises are independent, the poses' wander is not."""
+    """Standard deviation of the mean of two wheel paths: noises are independent, the poses' wander is common."""
     if not np.isfinite(left.sigma + right.sigma):
         return np.nan
     spread = float(np.std(0.5 * (left.drawn + right.drawn), ddof=1))
@@ -148,7 +148,7 @@ def _sigma_of_mean(left: Cleared, right: Cleared) -> float:
 
 
 def _half_car(left: WheelPath, right: WheelPath) -> tuple[float, float]:
-    """IRI of the mean of two wheel paths, and its standard deviation; the noises of both are independent."""
+    """Return the IRI of the mean of two wheel paths, and its standard deviation; the noises of both are independent."""
     x = 0.5 * (left.profile.distance_m + right.profile.distance_m)
     on = ride(x, 0.5 * (left.tried() + right.tried(NOISES)))
     ends = Segments(*(0.5 * (a + b) for a, b in zip(left.ends, right.ends, strict=True)))

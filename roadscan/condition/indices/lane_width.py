@@ -20,12 +20,12 @@ from roadscan.condition.on_lane.lines import SPACING_M, LaneLines
 
 Float64 = npt.NDArray[np.float64]
 
-_AROUND_M: Final = 15.0
-_LEAST_PLACES: Final = 5
+_AROUND_M: Final = 15.0  # Length before and behind a place over which middles of a line are used.
+_LEAST_PLACES: Final = 5  # Least number of these middles.
 _ALIKE_M: Final = 0.15
-"""Middles farther than this from their median are those of other paint."""
+"""Middles farther than this from their median belong to other paint."""
 _SIGMA_LINE_M: Final = 0.005
-"""What the middle of a line is known to at the best: its paint is worn, and the road's axis was smoothed."""
+"""Least standard deviation of a line's middle: its paint is worn, and the road's axis was smoothed."""
 
 
 class _Side(NamedTuple):
@@ -47,7 +47,7 @@ class LaneWidth(ConditionIndex):
     lead_m: ClassVar[float] = 20.0
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of sections."""
+        """Return the values of sections."""
         for from_m, to_m in lane.sections_m:
             first, end = (math.ceil(one / SPACING_M) for one in (from_m, to_m))
             station: Float64 = SPACING_M * np.arange(first, end, dtype=np.float64)
@@ -65,7 +65,7 @@ class LaneWidth(ConditionIndex):
 
 
 def _line(lines: LaneLines, side: str, station: Float64) -> _Side:
-    """The line on one side at stations."""
+    """Return the line on one side at stations."""
     own = np.array([one == side for one in lines.side], bool)
     at, middle = lines.station_m[own], lines.own_m[own]
     place, sigma = np.full(station.size, np.nan), np.full(station.size, np.nan)
@@ -83,7 +83,7 @@ def _line(lines: LaneLines, side: str, station: Float64) -> _Side:
 
 
 def _edge(lane: LaneData, name: str, line: _Side, station: Float64) -> _Side:
-    """The line, or where it is not known the edge of the road's surface."""
+    """Return the line, or where it is not known the edge of the road's surface."""
     if lane.edges is None or not lane.edges.sides[name].beside:
         return line
     edge, sign = lane.edges.sides[name], 1.0 if name == "right" else -1.0
@@ -95,7 +95,7 @@ def _edge(lane: LaneData, name: str, line: _Side, station: Float64) -> _Side:
 
 
 def _width(sides: dict[str, _Side]) -> tuple[float, float, float]:
-    """Mean width, its standard deviation (errors along the section are taken as alike), and the share where known."""
+    """Mean width, standard deviation (errors along the section are taken as fully correlated), and known share."""
     left, right = sides["left"], sides["right"]
     width = right.own_m - left.own_m
     known = np.isfinite(width) & (width > 0.0)

@@ -30,7 +30,7 @@ from roadscan.condition.on_lane.ravelling import RavelledSection, lane_levels, r
 from roadscan.condition.on_lane.squares import TextureSquares
 
 _CM3_PER_M2: Final = 1e3
-"""Of a mean depth of a millimetre."""
+"""Volume per area (cm³/m²) of a mean depth of a millimetre."""
 
 
 class Ravelling(ConditionIndex):
@@ -47,14 +47,14 @@ class Ravelling(ConditionIndex):
     drawn: ClassVar[tuple[str, ...]] = ("ravelled_percent",)
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of sections."""
+        """Return the values of sections."""
         for (from_m, to_m), found in zip(lane.sections_m, looked_through(lane), strict=True):
             for name, value, sigma, share, reason in _of_section(lane, found):
                 yield Value(name, "section", from_m, to_m, value, sigma, share, reason)
 
 
 def looked_through(lane: LaneData) -> list[RavelledSection]:
-    """Each section of a lane with its patches."""
+    """Return each section of a lane with its patches."""
     if lane.config.heights == "surface":
         none = RavelledSection((), 0.0, 0.0, math.nan, "the reconstructed surface has no texture")
         return [none] * len(lane.sections_m)
@@ -64,7 +64,7 @@ def looked_through(lane: LaneData) -> list[RavelledSection]:
 
 
 def _squares(lane: LaneData, from_m: float, to_m: float) -> tuple[TextureSquares, npt.NDArray[np.bool_]]:
-    """Squares of a section, and which of them lie on the road; noise is no texture, so that of noisy ones is NaN."""
+    """Return the squares of a section, and which of them lie on the road; the texture of noisy ones is NaN."""
     squares, c = lane.texture.between(from_m, to_m), lane.cross_sections
     wrong_m, near_m = c.station_m[noisy(c)], lane.config.cross_section_spacing_m
     if wrong_m.size:

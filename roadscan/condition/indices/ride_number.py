@@ -26,7 +26,7 @@ from roadscan.condition.profiles.ride_number import ride_number, ride_number_of,
 Float64 = npt.NDArray[np.float64]
 
 _WIDEST_M: Final = 0.07
-"""Standard deviation of the widest window of heights, that of cells of 0.1 m."""
+"""Largest standard deviation of the weights of a height's window: that of cells of 0.1 m."""
 
 
 class RideNumber(ConditionIndex):
@@ -41,7 +41,7 @@ class RideNumber(ConditionIndex):
     lead_m: ClassVar[float] = LEAD_M
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of sections."""
+        """Return the values of sections."""
         for from_m, to_m in lane.sections_m:
             yield _of_section(lane, from_m, to_m)
 
@@ -71,6 +71,6 @@ def _profile_index(path: WheelPath, first_stream: int) -> Cleared:
 
 
 def _sigma(value: float, index: Float64, sigma: Float64) -> float:
-    """Standard deviation of a ride number, from those of the profile indices of its paths."""
+    """Return the standard deviation of a ride number, from those of the profile indices of its paths."""
     both = float(np.sqrt(np.mean(index**2)))
     return 160.0 * value * float(np.hypot(*(index * sigma))) / (2.0 * both) if both else 0.0

@@ -21,7 +21,7 @@ from roadscan.condition.road_edges.raster import STATION_M
 
 Float64 = npt.NDArray[np.float64]
 
-_MM: Final = 1e3
+_MM: Final = 1e3  # Millimetres in a metre.
 
 
 def _of_side(side: str) -> tuple[Quantity, ...]:
@@ -47,7 +47,7 @@ class RoadWidth(ConditionIndex):
     )
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values each half metre, and of sections; none where no edges are sought."""
+        """Return values each half metre, and of sections; none where no edges are requested."""
         if lane.edges is None:
             return
         left, right = (lane.edges.sides[side] for side in ("left", "right"))
@@ -69,6 +69,6 @@ def _held(quantity: str, station: Float64, value: Float64, sigma: Float64) -> Pe
 
 
 def _both(held: PerCrossSection, lane: LaneData, wanted: Sequence[tuple[str, How]]) -> Iterator[Value]:
-    """Values of the places where there is one, and of sections."""
+    """Return values of the places where there is one, and of sections."""
     yield from (one for one in held.values() if math.isfinite(one.value))
     yield from by_section(held, lane, wanted, STATION_M)

@@ -16,8 +16,8 @@ from roadscan.condition.kernels.ruts import straightedge
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.whole_sections import WholeSections
 
-_MM = 1e3
-LENGTHS_M: Final = (1.2, 1.8, 2.0, 3.0)
+_MM = 1e3  # Millimetres in a metre.
+LENGTHS_M: Final = (1.2, 1.8, 2.0, 3.0)  # Lengths of the straightedges.
 
 
 def _name(side: str, length_m: float, how: str = "") -> str:
@@ -40,7 +40,7 @@ class RutStraightedge(ConditionIndex):
     )  # fmt: skip
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of each cross-section; means of sections."""
+        """Return values of each cross-section, and means of sections."""
         c, whole = lane.cross_sections, WholeSections.of(lane)
         n = c.station_m.size
         sigma = whole.spread(_MM * whole.sigma_m * np.sqrt(1.5), n)

@@ -25,7 +25,7 @@ from roadscan.condition.of_sections.whole_sections import WholeSections
 
 Float64 = npt.NDArray[np.float64]
 
-_MM: Final = 1e3
+_MM: Final = 1e3  # Millimetres in a metre.
 _WATER: Final = (
     Quantity("water_depth_mm", "mm", "Greatest depth of water that stands in a cross-section"),
     Quantity("water_depth_max_mm", "mm", "The same, greatest of the section"),
@@ -52,7 +52,7 @@ class RutWire(ConditionIndex):
     drawn: ClassVar[tuple[str, ...]] = ("rut_depth_mean_left_mm", "rut_depth_mean_right_mm")
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of each cross-section; means and greatest values of sections."""
+        """Return values of each cross-section, and means and greatest values of sections."""
         c, whole = lane.cross_sections, WholeSections.of(lane)
         found = np.zeros((whole.rows.size, 2, 5))
         stretched_wire(c.offset_m, whole.height_m, found)

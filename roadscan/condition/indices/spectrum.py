@@ -17,7 +17,7 @@ from roadscan.condition.of_sections.wheel_paths import WheelPath, wheel_paths
 from roadscan.condition.profiles.spectrum import road_class, road_spectrum
 from roadscan.core.errors import ProfileError
 
-_CM3: Final = 1e6
+_CM3: Final = 1e6  # Cubic centimetres in a cubic metre.
 
 
 class Spectrum(ConditionIndex):
@@ -34,7 +34,7 @@ class Spectrum(ConditionIndex):
     )
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of sections."""
+        """Return the values of sections."""
         for from_m, to_m in lane.sections_m:
             paths = wheel_paths(lane, from_m, to_m)
             told = {side: _of_path(path) for side, path in paths.items()}
@@ -49,7 +49,7 @@ class Spectrum(ConditionIndex):
 
 
 def _of_path(path: WheelPath) -> tuple[float, float, float, float, str]:
-    """Density (cm³), its standard deviation, exponent, its standard deviation, and why there is none."""
+    """Density (cm³), its standard deviation, exponent, its standard deviation, and the reason if there is none."""
     if path.reason:
         return np.nan, np.nan, np.nan, np.nan, path.reason
     own, profile = path.inside, path.profile

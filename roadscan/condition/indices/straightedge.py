@@ -31,7 +31,7 @@ class Straightedge(ConditionIndex):
     lead_m: ClassVar[float] = 10.0
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of sections."""
+        """Return the values of sections."""
         for from_m, to_m in lane.sections_m:
             paths = list(wheel_paths(lane, from_m, to_m).values())
             share, reason = min(p.share for p in paths), next((p.reason for p in paths if p.reason), "")
@@ -42,7 +42,7 @@ class Straightedge(ConditionIndex):
 
 
 def _greatest(path: WheelPath, length_m: float) -> tuple[float, float]:
-    """Greatest deviation in the section (mm), and its standard deviation."""
+    """Return the greatest deviation in the section (mm), and its standard deviation."""
     away = [np.abs(straightedge_mm(path.profile.distance_m, height, length_m))[path.inside]
             for height in path.with_noise()]  # fmt: skip
     most = greatest_of(np.array(away))

@@ -21,9 +21,9 @@ from roadscan.condition.lane_data import LaneData
 _HALF_PATH_M: Final = 0.25
 """Half of the width of a wheel path (m)."""
 _SIGMA_RMS: Final = 0.05
-"""The same of a root mean square: a rut of 31 mm in cells of 50 mm takes 10 % of it, one of 12 mm 2 %."""
+"""Relative σ of a root mean square: a rut of 31 mm in cells of 50 mm takes 10 % of it, one of 12 mm 2 %."""
 _SIGMA_MODEL: Final = 0.1
-"""Standard deviation (share) of a mean profile depth from cells: what the forms of textures differ by."""
+"""Relative σ of a mean profile depth from cells, due to the different shapes of textures."""
 
 
 class Texture(ConditionIndex):
@@ -38,7 +38,7 @@ class Texture(ConditionIndex):
     drawn: ClassVar[tuple[str, ...]] = ("mpd_mean_mm", "texture_rms_mean_mm")
 
     def values(self, lane: LaneData) -> Iterator[Value]:
-        """Values of sections."""
+        """Return the values of sections."""
         away = np.abs(np.abs(lane.texture.offset_m) - lane.config.wheel_paths_m)
         paths = away <= _HALF_PATH_M
         coarse = f"cells have {1e3 * lane.cell_m:g} mm; a mean profile depth takes 10 mm or less"
@@ -57,7 +57,7 @@ class Texture(ConditionIndex):
 
 
 def _mean(values: npt.NDArray[np.float64], model: float, least_share: float) -> tuple[float, float, float, str]:
-    """Mean of the squares, its standard deviation, share of them that are known, and why there is none."""
+    """Mean of the squares, its standard deviation, the known share of them, and the reason if there is none."""
     known = values[np.isfinite(values)]
     share = known.size / values.size if values.size else 0.0
     if share < least_share or not known.size:

@@ -1,1 +1,1 @@
-"""Kernels of condition: heights in the road's own frame, vehicles that roll over a profile, wires and straightedges."""
+"""Kernels of condition: sampling of heights, quarter cars, wires and straightedges."""

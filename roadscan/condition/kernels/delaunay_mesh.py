@@ -1,8 +1,8 @@
-"""Delaunay triangulation of scattered points, point after point, decided exactly.
+"""Delaunay triangulation of scattered points by insertion, with exact decisions.
 
-Each point takes away the triangles whose circle holds it and is joined to the rim of the hole (Bowyer 1981; Watson
+Each point removes the triangles whose circle contains it and is joined to the rim of the hole (Bowyer 1981; Watson
 1981). Beyond each edge of the hull lies a triangle with the corner `beyond`, so points outside the hull need no special
-treatment. Positions are whole numbers, and every decision is that of :mod:`roadscan.surface.kernels.delaunay`.
+treatment. Positions are integers, and every decision is that of :mod:`roadscan.surface.kernels.delaunay`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from roadscan.surface.kernels.delaunay import in_circle, turn
 
 
 class Mesh(NamedTuple):
-    """A triangulation of n points and the room to work in; arrays are changed in place."""
+    """A triangulation of n points with its working memory; arrays are changed in place."""
 
     x: np.ndarray
-    """(n + 1,) int64 places (2⁻³⁶ m), at most 2⁴³ apart; the last is that of a question."""
+    """(n + 1,) int64 positions (2⁻³⁶ m), at most 2⁴³ apart; the last is that of a query."""
     y: np.ndarray
     """(n + 1,) int64."""
     triangles: np.ndarray
@@ -27,7 +27,7 @@ class Mesh(NamedTuple):
     across: np.ndarray
     """(≥ 2 n + 4, 3) int32: the triangle over the edge opposite each corner."""
     mark: np.ndarray
-    """(≥ 2 n + 4,) int64: the last question for which a triangle was in the hole; -1 before any."""
+    """(≥ 2 n + 4,) int64: last query for which a triangle was in the hole; -1 before any."""
     hole: np.ndarray
     """(≥ 2 n + 4,) int32: triangles of the hole."""
     rim: np.ndarray
@@ -37,7 +37,7 @@ class Mesh(NamedTuple):
 
 
 def mesh_of(x: np.ndarray, y: np.ndarray) -> Mesh:
-    """Room for a triangulation of points at (n,) int64 places (2⁻³⁶ m)."""
+    """Return memory for a triangulation of points at (n,) int64 positions (2⁻³⁶ m)."""
     n = len(x)
     room = 2 * n + 4
     return Mesh(
@@ -54,7 +54,7 @@ def mesh_of(x: np.ndarray, y: np.ndarray) -> Mesh:
 
 @kernel
 def holds(mesh, t, p):
-    """Whether the circle of a triangle holds point p; that of one beyond the hull is the half-plane outside."""
+    """Return whether the circle of a triangle contains point p; beyond the hull it is the half-plane outside."""
     beyond = mesh.x.size
     a, b, c = mesh.triangles[t, 0], mesh.triangles[t, 1], mesh.triangles[t, 2]
     if beyond not in (a, b, c):
@@ -75,7 +75,7 @@ def holds(mesh, t, p):
 
 @kernel
 def walk(mesh, t, p):
-    """The triangle that holds point p, or one beyond the hull that sees it, from triangle t on."""
+    """Return the triangle that contains point p, or one beyond the hull that sees it, walking from triangle t."""
     beyond = mesh.x.size
     while True:
         moved = False
@@ -94,7 +94,7 @@ def walk(mesh, t, p):
 
 @kernel
 def dig(mesh, t, p, question):
-    """Mark the triangles whose circles hold point p, from t on; returns their number and that of the rim's edges.
+    """Mark the triangles whose circles contain point p, from t on; return their number and that of the rim's edges.
 
     The triangles stand in `hole`, the edges around them, counter-clockwise each, in `rim`.
     """
@@ -122,7 +122,7 @@ def dig(mesh, t, p, question):
 
 @kernel
 def triangulate(mesh, order):
-    """Triangulate the points in `order` (n,); returns the number of triangles, those beyond the hull included.
+    """Triangulate the points in `order` (n,); return the number of triangles, including those beyond the hull.
 
     Of several points at one place the first is taken. Points on one line give no triangle.
     """
@@ -179,7 +179,7 @@ def triangulate(mesh, order):
 
 @kernel
 def join(mesh, t, p, question, count):
-    """Join point p, which triangle t's circle holds, to the triangulation; returns the number of triangles."""
+    """Join point p, which triangle t's circle contains, to the triangulation; return the number of triangles."""
     many, edges = dig(mesh, t, p, question)
     for e in range(edges):
         u = mesh.hole[e] if e < many else count + e - many

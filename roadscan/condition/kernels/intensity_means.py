@@ -1,4 +1,4 @@
-"""Mean intensities of the road at given places, each of the cells of a window along a direction."""
+"""Mean intensities of the road at given places, from the cells in a window along a direction."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, gather
 
 @kernel
 def mean_intensities(table, places, half_along, half_across, out):
-    """Mean intensities of the cells around places.
+    """Compute mean intensities of the cells around places.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Texture of squares of a lane, from the cells within them: how far heights scatter within small blocks.
+"""Texture of squares of a lane from their cells: the scatter of heights within small blocks.
 
-A block of 50 mm has a plane of its own, so that slopes, ruts and holes that are wider than it count nothing. The
-scatter of the readings within the cells is added to that of the cells, so that waves shorter than a cell are in it.
+Heights are taken from a plane through each block of 50 mm, so that wider slopes, ruts and holes do not count. The
+scatter of the readings within the cells is added to that of the cells, to include waves shorter than a cell.
 """
 
 from __future__ import annotations
@@ -14,33 +14,33 @@ from roadscan.compute.kernel_options import inlined, inner, kernel
 from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, factorise, gather, solve
 
 BLOCK_M = 0.05
-"""Edge of a block, or the cells' own where that is more (m)."""
+"""Edge of a block, at least that of a cell (m)."""
 MOST_BLOCKS = 16
-"""Blocks along an edge of a square, at the most."""
+"""Most blocks along an edge of a square."""
 FITTED = 9
-"""Blocks with so many cells get a plane of their own."""
+"""Least number of cells of a block with a plane."""
 BENT = 6
 """Terms of a surface of second degree."""
 ENOUGH_BENT = 10
-"""Cells of a square that tell one."""
+"""Least number of cells of a square that determine such a surface."""
 LEAST_FREEDOM = 5.0
-"""Readings beyond the first of their cells that tell the scatter within the cells of a block."""
+"""Least degrees of freedom of the readings within the cells of a block that determine their scatter."""
 SOUND = 0.85
-"""Share of a square's cells that lie below the level of its sound surface."""
-SUMS = 12
-N, X, Y, H, XX, XY, YY, XH, YH, HH, NOISE, FREEDOM = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11
-TEXTURE, LOSS, PEAKS, LINE, INTENSITY, SHARE, SHARED, WITHIN = 0, 1, 2, 3, 4, 5, 6, 7
+"""Share of a square's cells that lie below the level of its undamaged surface."""
+SUMS = 12  # Number of sums of a block.
+N, X, Y, H, XX, XY, YY, XH, YH, HH, NOISE, FREEDOM = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11  # Columns of the sums.
+TEXTURE, LOSS, PEAKS, LINE, INTENSITY, SHARE, SHARED, WITHIN = 0, 1, 2, 3, 4, 5, 6, 7  # Columns of the results.
 FIGURES = 8
-"""Columns of what is told of a square."""
+"""Number of results of a square."""
 LONGEST_CELL_M = 0.0101
-"""Spacing of heights that show peaks, at the most (m)."""
+"""Largest spacing of heights that show peaks (m)."""
 HALF_SEGMENT_M = 0.05
-"""Half of a segment of 100 mm, each with a peak of its own (m)."""
+"""Half of a segment of 100 mm, in each of which a peak is found (m)."""
 
 
 @inlined
 def plane(sums, b, slopes):
-    """Slopes along and across of the plane through the cells of block b; 0 where they do not tell it."""
+    """Return slopes along and across of the plane through the cells of block b; 0 where they do not determine it."""
     n = sums[b, N]
     xx = sums[b, XX] - sums[b, X] * sums[b, X] / n
     xy = sums[b, XY] - sums[b, X] * sums[b, Y] / n
@@ -56,10 +56,10 @@ def plane(sums, b, slopes):
 
 @inner
 def bent_slopes(found, count, base, half, sums, blocks, slopes):
-    """Slopes of the blocks that hold too few cells for a plane, from a surface of second degree through the square.
+    """Write slopes of blocks with too few cells for a plane, from a surface of second degree through the square.
 
-    A rut bends, so a plane through the whole square has another slope than its cells. Where the cells do not tell the
-    surface, it is that of the plane, which stands in the last row. slopes : (blocks² + 1, 2).
+    A rut bends, so a plane through the whole square has another slope than its cells. Where the cells do not determine
+    the surface, the slope is that of the plane, in the last row. slopes : (blocks² + 1, 2).
     """
     last = blocks * blocks
     for b in range(last):
@@ -88,9 +88,9 @@ def bent_slopes(found, count, base, half, sums, blocks, slopes):
 
 @inner
 def block_scatter(sums, b, slopes, cell_m):
-    """Variance of the heights of block b about its plane (m²): of its cells, and of the readings within them.
+    """Return the variance of the heights of block b about its plane (m²): of cells, plus of readings within them.
 
-    NaN where neither tells it. slopes : (blocks² + 1, 2) of the blocks, and of the whole square in the last row.
+    NaN where neither is known. slopes : (blocks² + 1, 2) of the blocks, and of the whole square in the last row.
     """
     n = sums[b, N]
     if n < 1.0:
@@ -103,7 +103,7 @@ def block_scatter(sums, b, slopes, cell_m):
         explained += across * (sums[b, YH] - sums[b, Y] * sums[b, H] / n)
         between = max(hh - explained, 0.0) / (n - 3.0)
     if sums[b, FREEDOM] >= LEAST_FREEDOM:
-        # A slope spreads the readings of a cell as well.
+        # A slope adds to the scatter of the readings of a cell.
         within = sums[b, NOISE] / sums[b, FREEDOM] - (along * along + across * across) * cell_m * cell_m / 12.0
         within = max(within, 0.0)
     return between, within
@@ -111,7 +111,7 @@ def block_scatter(sums, b, slopes, cell_m):
 
 @kernel
 def peaks(found, count, base, half, pitch, lattice, out):
-    """Mean profile depth of the lines along a square (m), and the variance of their heights (m²).
+    """Write the mean profile depth of the lines along a square (m), and the variance of their heights (m²).
 
     Lines are columns of a lattice as fine as the cells, cut into segments of 100 mm that lose their slope; the depth of
     one is the mean of the peaks of its halves. NaN without a segment that is four fifths measured.
@@ -162,7 +162,7 @@ def peaks(found, count, base, half, pitch, lattice, out):
 
 @inner
 def fill_blocks(found, count, base, half, blocks, sums):
-    """Sums of the heights and places of the cells of each block of a square, and of all in the last row.
+    """Sum up heights and positions of the cells of each block of a square, and of all in the last row.
 
     blocks : along an edge; sums : (blocks² + 1, SUMS) float64, out: heights count from base (m), places from the
     square's middle (m).
@@ -191,7 +191,7 @@ def fill_blocks(found, count, base, half, blocks, sums):
 
 @kernel
 def loss(found, count, base, half, blocks, sums, slopes, away):
-    """Mean depth of a square's cells below the level of its sound surface (m), each from the plane of its block.
+    """Return the mean depth of a square's cells below its undamaged surface (m), each from the plane of its block.
 
     NaN with fewer than four cells a block. away : (count,) room.
     """
@@ -215,7 +215,7 @@ def loss(found, count, base, half, blocks, sums, slopes, away):
 
 @kernel
 def texture_of_squares(table, places, edge_m, out):
-    """Texture of squares of a lane.
+    """Compute the texture of squares of a lane.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ def texture_of_squares(table, places, edge_m, out):
         out[i, SHARED] = shared / count
         if lit > 0.0:
             out[i, INTENSITY] = grey / lit
-        # Of the scatter within a cell, the mean of n readings keeps 1 / n.
+        # The mean of n readings keeps 1 / n of the variance within a cell.
         hidden = 1.0 - single / count
         fill_blocks(found, count, base, half, blocks, sums)
         for b in range(blocks * blocks + 1):

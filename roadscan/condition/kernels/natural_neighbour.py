@@ -1,9 +1,9 @@
-"""Natural-neighbour interpolation (Sibson 1981), exact, of scattered points onto a raster.
+"""Exact natural-neighbour interpolation (Sibson 1981) of scattered points onto a raster.
 
-A place put among the points would take its Voronoi cell from those of its natural neighbours; the areas taken are
-their weights. The circles of the Delaunay triangles that hold the place (Watson 1992) name the neighbours, and the
-centres of these circles, with those of the circles through the place and the edges around them, are the corners of
-what is taken. With the slopes of the field at the points the values have a continuous slope themselves (Sibson's C1).
+A query point inserted among the points would take its Voronoi cell from those of its natural neighbours; the areas
+taken are their weights. The Delaunay triangles whose circles contain the point (Watson 1992) give the neighbours, and
+the centres of these circles, with those of the circles through the point and the edges around them, are the corners of
+these areas. With the slopes of the field at the points the values have a continuous slope themselves (Sibson's C1).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from roadscan.compute.kernel_options import inlined, inner, kernel
 from roadscan.condition.kernels.delaunay_mesh import dig, walk
 
 STEP_M = 2.0**-36
-"""Unit of whole-number places."""
+"""Unit of integer positions (m)."""
 WIDEST = 4e4
 """Squared distance of a circle's centre to the area taken, above which digits are lost: there the linear value of the
 triangle is taken. It concerns flat triangles at the hull."""
@@ -24,7 +24,7 @@ triangle is taken. It concerns flat triangles at the hull."""
 
 @inlined
 def circle_centre(ax, ay, bx, by):
-    """Centre of the circle through the origin and two places; not finite where they lie on a line."""
+    """Return the centre of the circle through the origin and two places; not finite where they lie on a line."""
     twice = 2.0 * (ax * by - ay * bx)
     a, b = ax * ax + ay * ay, bx * bx + by * by
     if twice == 0.0:
@@ -51,7 +51,7 @@ def circle_centres(mesh, count, centres):
 
 @kernel
 def linear(mesh, t, value):
-    """The value at the asked place of the plane through triangle t's corners."""
+    """Return the value at the query point of the plane through triangle t's corners."""
     q = mesh.x.size - 1
     total, weighed = 0.0, 0.0
     for k in range(3):
@@ -66,10 +66,10 @@ def linear(mesh, t, value):
 
 @inner
 def sibson(mesh, centres, value, slopes, weight, arriving, t, question):
-    """Sibson's value at the place asked, which triangle t holds; slopes : (n, 2) of the field at the points, or (0, 2).
+    """Return Sibson's value at the query point in triangle t; slopes: (n, 2) of the field at the points, or (0, 2).
 
-    Each side of the area taken from one neighbour is a side of the next one's, the other way round, so the doubled
-    areas are summed up side by side, in any order.
+    Each side of the area taken from one neighbour is a side of the next one's in the opposite direction, so the doubled
+    areas are summed up over sides, in any order.
     """
     q = mesh.x.size - 1
     many, edges = dig(mesh, t, q, question)
@@ -85,7 +85,7 @@ def sibson(mesh, centres, value, slopes, weight, arriving, t, question):
         for j in range(3):
             a, b, v = mesh.triangles[u, (j + 1) % 3], mesh.triangles[u, (j + 2) % 3], mesh.across[u, j]
             if mesh.mark[v] == question:
-                if v < u:  # the other triangle adds this side
+                if v < u:  # the adjacent triangle adds this side
                     continue
                 corner = mesh.triangles[v, 0]
                 nx = centres[v, 0] + STEP_M * np.float64(mesh.x[corner] - mesh.x[q])
@@ -107,7 +107,7 @@ def sibson(mesh, centres, value, slopes, weight, arriving, t, question):
 
 @kernel
 def _weighed(mesh, value, slopes, weight, arriving, t, edges, widest):
-    """Close the areas along the cell of the place asked, and weigh the values."""
+    """Close the areas along the cell of the query point, and weight the values."""
     total, weighed = 0.0, 0.0
     for e in range(edges):
         a, b = mesh.rim[e, 0], mesh.rim[e, 1]
@@ -125,7 +125,7 @@ def _weighed(mesh, value, slopes, weight, arriving, t, edges, widest):
 
 @kernel
 def _bent(mesh, value, slopes, weight, edges, plain, total):
-    """Sibson's C1 value: the plain one and the planes at the neighbours, weighed by distance (Sibson 1981)."""
+    """Return Sibson's C1 value: the plain one and the planes at the neighbours, weighted by distance (Sibson 1981)."""
     q = mesh.x.size - 1
     near, far, square, planes = 0.0, 0.0, 0.0, 0.0
     for e in range(edges):
@@ -142,7 +142,7 @@ def _bent(mesh, value, slopes, weight, edges, plain, total):
 
 @kernel
 def slopes_of_points(mesh, count, centres, value, slopes):
-    """Fill `slopes` (n, 2) with those of the field at the points, of the planes that fit their neighbours best.
+    """Fill `slopes` (n, 2) of the field at the points, from the planes that fit their neighbours best.
 
     A neighbour at distance d counts by the length of the border of both Voronoi cells over d³, so that the slopes of
     a field x² + y² are exact, and at the hull, where cells have no end, by 1/d².
@@ -185,7 +185,7 @@ def slopes_of_points(mesh, count, centres, value, slopes):
 
 @kernel
 def natural_neighbour_raster(mesh, count, centres, value, slopes, west_south, step, out):
-    """Fill `out` (rows, columns) with Sibson's values at places a step apart; NaN outside the hull.
+    """Fill `out` (rows, columns) with Sibson's values at places one step apart; NaN outside the hull.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""A linear quarter car over a profile of any spacing, solved exactly from sample to sample.
+"""Rolls a linear quarter car over a profile of any spacing, with the exact solution from sample to sample.
 
-The profile is linear between its samples. The tyre envelops it: the slope that the car feels over a step is that of the
-profile's moving average at the middle of the step, held over the step, as World Bank Technical Paper 46 (Sayers,
-Gillespie, Paterson 1986) has it for steps of 250 mm. Under a held slope s each of the car's two pairs of
-conjugate modes follows its own equation, whose solution over a step d is c ← exp(p·d)·(c + w·s) − w·s.
+The profile is linear between its samples. The tyre envelops it: the slope under the car is constant over a step, that
+of the profile's moving average at the middle of the step, as World Bank Technical Paper 46 (Sayers, Gillespie, Paterson
+1986) has it for steps of 250 mm. Under a constant slope s each of the car's two pairs of conjugate modes follows a
+separate equation, whose solution over a step d is c ← exp(p·d)·(c + w·s) − w·s.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import numpy as np
 from roadscan.compute.kernel_options import inlined, inner, kernel
 
 _SAME_STEP_M = 1e-9
-"""Steps that differ by less are one: stations at 100 km are rounded to 15 pm."""
-_BLOCK = 256
+"""Steps whose difference is smaller count as equal: stations at 100 km are rounded to 15 pm."""
+_BLOCK = 256  # Samples per block.
 _PER_M = 2000.0
-"""Growths tabled for a metre of travel."""
+"""Number of tabulated growths per metre of travel."""
 
 
 class QuarterCar(NamedTuple):
@@ -27,29 +27,29 @@ class QuarterCar(NamedTuple):
     pole_per_m: tuple[complex, complex]
     """Eigenvalues with positive imaginary part (1/m of travel)."""
     weight: tuple[complex, complex]
-    """Deflection of each mode under a slope of one, with its sign turned."""
+    """Deflection of each mode under a slope of one, with reversed sign."""
     growth: np.ndarray
-    """(steps, 2) complex128, what a mode is multiplied by over 0, ½, 1 … mm; as far as the longest step."""
+    """(steps, 2) complex128, factor of a mode over 0, ½, 1 … mm, up to the longest step."""
 
 
 class Rules(NamedTuple):
-    """What of a profile is rolled over."""
+    """Rules for rolling over a profile."""
 
     envelope_m: float
     """Length of the moving average (m)."""
     ahead_m: float
-    """How far the middle of the moving average lies ahead of the middle of a step (m)."""
+    """Distance of the middle of the moving average ahead of the middle of a step (m)."""
     start_m: float
-    """The car begins at rest on the mean slope of so many metres; shorter pieces are left out."""
+    """The car starts at rest on the mean slope of this length; shorter pieces are left out."""
     longest_step_m: float
-    """A wider step is a gap, and the car begins anew behind it (m)."""
+    """A wider step is a gap, behind which the car starts again (m)."""
     highest_step_m: float
-    """So does it behind a jump that is higher (m)."""
+    """Behind a higher jump the car starts again too (m)."""
 
 
 @inlined
 def _growth(pole, near, rest):
-    """exp(pole · step) from its value at the nearest half of a millimetre and the rest of the step (m).
+    """Return exp(pole · step) from its value at the nearest half of a millimetre and the rest of the step (m).
 
     With poles of at most 18 per metre the series is exact to 2 parts in 1e14.
     """
@@ -59,7 +59,7 @@ def _growth(pole, near, rest):
 
 @inner
 def _feel(xs, hs, rules, slope, grade):
-    """Slope (n,) that the tyre feels over the step before each sample; `slope[0]` is that of the start.
+    """Compute the slope (n,) under the tyre over the step before each sample; `slope[0]` is that of the start.
 
     grade : (n,) float64, room for the slopes of the profile itself.
     """
@@ -87,7 +87,7 @@ def _feel(xs, hs, rules, slope, grade):
 
 @inner
 def _grow(steps, car, growth):
-    """What both modes (block, 2) are multiplied by over the steps (block,) of a block."""
+    """Compute the growth of both modes (block, 2) over the steps (block,) of a block."""
     p1, p2 = car.pole_per_m
     for i in range(steps.size):
         whole = int(_PER_M * steps[i] + 0.5)
@@ -98,9 +98,9 @@ def _grow(steps, car, growth):
 
 @inner
 def _roll_piece(xs, hs, car, rules, squared, response_m, measured_m):
-    """Roll over a piece without gaps, which is as long as the start at least; sums go on from the first element."""
+    """Roll over a piece without gaps that is at least as long as the start; sums continue from the first element."""
     response, measured = response_m[0], measured_m[0]
-    slope = response_m  # an element is read before its sum is written: fresh memory would take as long as the rolling
+    slope = response_m  # an element is read before its sum is written, since fresh memory takes as long as the rolling
     _feel(xs, hs, rules, slope, measured_m)
     w1, w2 = car.weight
     a1, b1, a2, b2 = w1.real, w1.imag, w2.real, w2.imag
@@ -151,7 +151,7 @@ def _roll_valid(xs, hs, car, rules, squared, response_m, measured_m):
 
 @inner
 def _to_all(x_m, xs, sums, out):
-    """Sums at samples with a height, made sums at all samples: linear between."""
+    """Interpolate sums at samples with a height linearly to all samples."""
     last, k = xs.size - 1, 0
     for i in range(x_m.size):
         while k < last and xs[k + 1] <= x_m[i]:

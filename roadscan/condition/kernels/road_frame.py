@@ -1,4 +1,4 @@
-"""Places of a road line: stations and offsets into eastings and northings, by cubic pieces between its nodes."""
+"""Converts stations and offsets of a road line into eastings and northings, by cubic pieces between its nodes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from roadscan.compute.kernel_options import inlined, kernel
 
 @inlined
 def slope(nodes, k, axis):
-    """Change of a coordinate from node to node at node k, fourth order inside the line, lower at its ends."""
+    """Return the change of a coordinate per node at node k, of fourth order inside the line, lower at its ends."""
     last = len(nodes) - 1
     if 2 <= k <= last - 2:
         outer = nodes[k + 2, axis] - nodes[k - 2, axis]
@@ -25,7 +25,7 @@ def slope(nodes, k, axis):
 
 @inlined
 def along(nodes, k, t, axis):
-    """A coordinate at the share t between nodes k and k + 1, and its change from node to node there."""
+    """Return a coordinate at fraction t between nodes k and k + 1, and its change per node there."""
     here, after = nodes[k, axis], nodes[k + 1, axis]
     d0, d1 = slope(nodes, k, axis), slope(nodes, k + 1, axis)
     step = after - here
@@ -36,7 +36,7 @@ def along(nodes, k, t, axis):
 
 @kernel
 def place(nodes, first, station, offset, out):
-    """Place points beside a line whose nodes are 1 m apart.
+    """Compute positions of points beside a line whose nodes are 1 m apart.
 
     A place depends on the three nodes before it and the three after it. The line goes on straight beyond its ends.
 

@@ -1,4 +1,4 @@
-"""Depth of ruts in cross-sections: below a stretched wire, below a straightedge, and below the level of water."""
+"""Depth of ruts in cross-sections: below a stretched wire, below a straightedge, and of standing water."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from roadscan.compute.kernel_options import inlined, kernel
 
 @inlined
 def upper_hull(x, h, first, end, hull):
-    """Points of x[first:end], h[first:end] that a wire over them touches, ascending into hull; how many."""
+    """Find points of x[first:end], h[first:end] that a wire over them touches, ascending in hull; return the number."""
     count = 0
     for k in range(first, end):
         while count > 1:
@@ -26,7 +26,7 @@ def upper_hull(x, h, first, end, hull):
 
 @kernel
 def wire_places(x, h, out):
-    """Places on which a wire over one cross-section rests, into out (m,) int64; returns how many.
+    """Find the places on which a wire over one cross-section rests, into out (m,) int64; return their number.
 
     x, h : (m,) float64, ascending offsets and heights, finite, m.
     """
@@ -35,7 +35,7 @@ def wire_places(x, h, out):
 
 @kernel
 def gaps(x, h, hull, out):
-    """Depth of a cross-section below a wire over it, normal to the wire, into out (m,) float64 (m); contacts in hull.
+    """Compute the depth of a cross-section below a wire, normal to it, into out (m,) float64 (m); contacts in hull.
 
     Returns how many contacts there are.
     """
@@ -51,14 +51,14 @@ def gaps(x, h, hull, out):
 
 @kernel
 def stretched_wire(x, h, out):
-    """Ruts below a wire that is stretched over a cross-section from end to end, in its left and its right half.
+    """Compute ruts below a wire stretched over a cross-section from end to end, in its left and right half.
 
     Parameters
     ----------
     x : (m,) float64, ascending, m, 0 in the middle; h : (n, m) float64, heights, finite, m.
     out : (n, 2, 5) float64, out, of the left and the right half: greatest depth, normal to the wire (m); width over
         which the depth is more than a tenth of that (m); area between wire and road (m²); place of the greatest depth
-        (m); and the variance of the depth for heights of variance 1 that err apart.
+        (m); and the variance of the depth for independent heights of variance 1.
     """
     m = x.size
     hull, gap = np.empty(m, np.int64), np.zeros(m)
@@ -83,7 +83,7 @@ def stretched_wire(x, h, out):
 
 @inlined
 def width(x, gap, deepest):
-    """Extent around a place over which the depth is more than a tenth of that there (m); depths are linear between."""
+    """Return the extent around a place over which the depth is above a tenth of that there (m); linear between."""
     first, last, tenth = deepest, deepest, 0.1 * gap[deepest]
     while first > 0 and gap[first - 1] > tenth:
         first -= 1
@@ -99,10 +99,10 @@ def width(x, gap, deepest):
 
 @kernel
 def straightedge(x, h, length, out):
-    """Greatest depth below a straightedge laid across the road anywhere, in its left and its right half.
+    """Compute the greatest depth below a straightedge anywhere across the road, in its left and right half.
 
-    The edge rests on the two points beside its own middle that it touches; beyond the ends of the cross-section it
-    hangs in the air.
+    The edge rests on the two points on both sides of its middle that it touches; beyond the ends of the cross-section
+    it is unsupported.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def straightedge(x, h, length, out):
 
 @kernel
 def water(h, out):
-    """Depth of the water that stands in a cross-section before it runs off to a side.
+    """Compute the depth of the water that stands in a cross-section before it runs off to a side.
 
     h : (n, m) float64, heights, finite, m; out : (n, m) float64, out, m.
     """

@@ -1,7 +1,7 @@
-"""Heights of the road at given places, from the cells of the tiles around: a local surface through nearby cells.
+"""Heights of the road at given places, from a local surface through nearby cells of the tiles around.
 
-Cells are visited by row and column of the map, whatever the tiles that they came in, so that a height has the same
-bits for any choice of tiles that holds its cells.
+Cells are visited by row and column of the map, whatever their tiles, so that a height has the same bits for any set of
+tiles that contains its cells.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ import numpy.typing as npt
 from roadscan.compute.kernel_options import inlined, kernel
 
 MOST_CELLS = 4096
-"""Cells of a window that are looked at; of a denser window those of its first rows."""
+"""Most cells of a window that are used; of a denser window those of its first rows."""
 ENOUGH_CELLS = 100.0
-"""Of a window of four times as many cells and more, one in two rows and columns is looked at, and so on."""
+"""In windows of four times as many cells and more, one in two rows and columns is used, and so on."""
 OUTLIER = 3.0 * 1.4826
-"""Cells this many median distances from the first surface are left out of the second."""
+"""Cells this many median absolute deviations from the first surface are left out of the second."""
 LEAST_SCALE_M = 0.0005
-"""Median distances count as at least this (m)."""
+"""Least median absolute deviation that is assumed (m)."""
 GROSS_M = 0.01
-"""The same before there is a surface: cells count from the window's median height (m)."""
-TERMS = 4
+"""The same before there is a surface: deviations count from the window's median height (m)."""
+TERMS = 4  # Terms of the local surface.
 LEAST_FREEDOM = 0.05
-"""Share of the weights of a window that its surface has to leave free: with less, residuals are rounding."""
+"""Least share of a window's weights that its surface leaves free: with less, residuals are rounding errors."""
 
 
 class CellTable(NamedTuple):
-    """Cells of some tiles, tile after tile, each tile's by row and column."""
+    """Cells of some tiles, tile after tile, each sorted by row and column."""
 
     slot: npt.NDArray[np.int32]
-    """(rows, columns) which tile of the table lies here, −1 for none."""
+    """(rows, columns) index of the tile here, −1 for none."""
     first: npt.NDArray[np.int64]
     """(2,) row and column on the map of the tile at slot[0, 0]."""
     row_start: npt.NDArray[np.int64]
-    """(tiles, edge + 1) where the cells of a tile's row begin."""
+    """(tiles, edge + 1) first cell of each row of a tile."""
     column: npt.NDArray[np.int32]
     """(n,) column of the cell in its tile."""
     height: npt.NDArray[np.float64]
@@ -45,11 +45,11 @@ class CellTable(NamedTuple):
     noise: npt.NDArray[np.float32]
     """(n,) sum of the squared deviations of the cell's readings (m²), NaN where it is not known."""
     readings: npt.NDArray[np.float32]
-    """(n,) readings."""
+    """(n,) number of readings."""
     intensity: npt.NDArray[np.float32]
     """(n,) mean intensity of the readings, NaN where there is none."""
     passes: npt.NDArray[np.float32]
-    """(n,) drives that they come from."""
+    """(n,) number of drives with readings in it."""
     cell: npt.NDArray[np.float64]
     """(2,) edges of a cell, east and north (m)."""
     edge: npt.NDArray[np.int64]
@@ -57,7 +57,7 @@ class CellTable(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Room for the cells of a window."""
+    """Memory for the cells of a window."""
 
     along: npt.NDArray[np.float64]
     across: npt.NDArray[np.float64]
@@ -66,12 +66,12 @@ class Cells(NamedTuple):
     noise: npt.NDArray[np.float64]
     readings: npt.NDArray[np.float64]
     at: npt.NDArray[np.int64]
-    """Their places in the table."""
+    """Their indices in the table."""
 
 
 @inlined
 def first_from(column, low, high, wanted):
-    """First place in column[low:high] (ascending) that is not below `wanted`."""
+    """Return the first index in column[low:high] (ascending) whose value is not below `wanted`."""
     while low < high:
         middle = (low + high) // 2
         if column[middle] < wanted:
@@ -83,7 +83,7 @@ def first_from(column, low, high, wanted):
 
 @kernel
 def gather(table, place, half_along, half_across, stride, found):
-    """Cells within a window that lies along a direction; returns how many.
+    """Collect the cells within a window that lies along a direction; return their number.
 
     place : (4,) float64, easting, northing (m), and the unit vector of the direction.
     half_along, half_across : float64, half of the window's extents (m).
@@ -133,7 +133,7 @@ def gather(table, place, half_along, half_across, stride, found):
 
 @inlined
 def fill_terms(found, k, terms):
-    """Terms of the local surface at cell k."""
+    """Compute the terms of the local surface at cell k."""
     terms[0] = 1.0
     terms[1] = found.along[k]
     terms[2] = found.across[k]
@@ -142,7 +142,7 @@ def fill_terms(found, k, terms):
 
 @kernel
 def factorise(normal, size, factor):
-    """Cholesky factor of the leading part of a matrix; how many rows of it are sound.
+    """Compute the Cholesky factor of the leading part of a matrix; return the number of independent rows.
 
     normal, factor : (4, 4) float64; size : rows wanted. A row that the ones before it nearly say is not sound.
     """
@@ -162,7 +162,7 @@ def factorise(normal, size, factor):
 
 @inlined
 def solve(factor, size, right, out):
-    """Solve the factored system for `right`."""
+    """Solve the factorised system for `right`."""
     for i in range(size):
         value = right[i]
         for k in range(i):
@@ -177,7 +177,7 @@ def solve(factor, size, right, out):
 
 @kernel
 def fit(found, count, wanted, base, out):
-    """Fit a local surface to the cells of a window; returns its terms that could be told.
+    """Fit a local surface to the cells of a window; return the number of terms that are determined.
 
     found : Cells; count : how many; wanted : 3 for a plane, 4 for one that bends across.
     base : float64, height that the cells' count from (m).
@@ -204,7 +204,7 @@ def fit(found, count, wanted, base, out):
 
 @kernel
 def residuals(found, count, base, surface, out):
-    """Distances of a window's cells from a fitted surface, out (count,) float64 (m)."""
+    """Compute distances of a window's cells from a fitted surface, out (count,) float64 (m)."""
     terms = np.zeros(TERMS)
     for k in range(count):
         fill_terms(found, k, terms)
@@ -216,7 +216,7 @@ def residuals(found, count, base, surface, out):
 
 @kernel
 def sigma(found, count, size, away, told):
-    """Standard deviation of the height in the middle (m), from how the cells of the window scatter about a surface.
+    """Return the standard deviation of the height in the middle (m), from the scatter of cells about a surface.
 
     Cells are taken as measurements of one variance. Residuals of a weighted fit X, with A = (X'WX)⁻¹, have
     E[Σ w r²] = σ² (Σ w − tr(A X'W²X)), whatever the weights. How the readings scatter within a cell says nothing of it:
@@ -261,7 +261,7 @@ def sigma(found, count, size, away, told):
 
 @kernel
 def sample(table, places, half_along, half_across, bend, out):
-    """Heights of the road at places, each from the cells of a window along a direction.
+    """Compute heights of the road at places, each from the cells of a window along a direction.
 
     A weighted surface (weights fall linearly to the window's sides) is fitted twice, the second time without the cells
     that lie far from the first. NaN where the window holds too little, or its cells lie on one side of the place.
@@ -299,7 +299,7 @@ def sample(table, places, half_along, half_across, bend, out):
         if size < 3:
             continue
         out[i, 0] = base + surface[0]
-        # A rut bends across the road whether or not the surface may: what it bends by is no error.
+        # A rut bends across the road even if the surface may not: this bend is no error.
         told = fit(found, count, TERMS, base, surface)
         residuals(found, count, base, surface, away)
         out[i, 1] = sigma(found, count, size, away, told)
@@ -307,7 +307,7 @@ def sample(table, places, half_along, half_across, bend, out):
 
 @inlined
 def central(found, count):
-    """Whether a window's cells lie around its middle, and not on one side of it."""
+    """Return whether a window's cells lie around its middle, and not on one side of it."""
     total, s, o = 0.0, 0.0, 0.0
     for k in range(count):
         total += found.weight[k]
@@ -318,7 +318,7 @@ def central(found, count):
 
 @inlined
 def leave_out(found, count, away, least):
-    """Take the weight of cells that lie far from the surface; median distances count as at least `least` (m)."""
+    """Set the weight of cells far from the surface to 0; median distances count as at least `least` (m)."""
     scale = max(np.median(np.abs(away[:count])), least)
     for k in range(count):
         if abs(away[k]) > OUTLIER * scale:

@@ -1,4 +1,4 @@
-"""Steps of a longitudinal profile: the difference of the lines on both sides of a place."""
+"""Steps of a longitudinal profile: differences of the lines fitted on both sides of a place."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from roadscan.compute.kernel_options import inlined, kernel
 
 @inlined
 def line_at(x, h, sigma, first, end, at):
-    """Height at a place of the line that fits h[first:end] best, and its variance; NaN with fewer than three."""
+    """Return height at a place and variance of the best line through h[first:end]; NaN with fewer than three."""
     n, sx, sy, sxx, sxy = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(first, end):
         if np.isnan(h[k]):
@@ -36,7 +36,7 @@ def line_at(x, h, sigma, first, end, at):
 
 @kernel
 def step_heights(x, h, sigma, reach, out):
-    """Height of the step at each place of a profile, as if there were one.
+    """Compute the height of a possible step at each place of a profile.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def step_heights(x, h, sigma, reach, out):
         low, low_variance = line_at(x, h, sigma, before, before_end, x[k])
         high, high_variance = line_at(x, h, sigma, behind, behind_end, x[k])
         out[k, 0] = high - low
-        # Neighbouring heights share cells: about one in three is a measurement of its own.
+        # Neighbouring heights share cells: about one in three is independent.
         out[k, 1] = math.sqrt(3.0 * (low_variance + high_variance))
         a, b = before_end - 1, behind
         slope = 0.5 * (

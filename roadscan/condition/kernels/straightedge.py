@@ -1,4 +1,4 @@
-"""Wheels and beams on a profile."""
+"""Rolls wheels and beams over a profile."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from roadscan.compute.kernel_options import kernel
 
 @kernel
 def roll_wheel(xs, hs, radius_m, out):
-    """Heights of the lowest point of a wheel that rolls over a profile, at each of its samples.
+    """Compute heights of the lowest point of a wheel that rolls over a profile, at each of its samples.
 
     xs, hs : (n,) float64, stations ascending and heights, all finite (m).
     out : (n,) float64, out: highest h(x + u) + √(r² − u²) − r within the radius (m).
@@ -28,7 +28,7 @@ def roll_wheel(xs, hs, radius_m, out):
 
 @kernel
 def roll_beam(xs, wheel_m, length_m, longest_step_m, out):
-    """How far the middle wheel of a rolling beam stands above its end wheels' mean, at each sample under the middle.
+    """Compute the height of a rolling beam's middle wheel above its end wheels' mean, at each sample.
 
     xs, wheel_m : (n,) float64, stations ascending and heights of the wheels' lowest points (m).
     longest_step_m : a beam over a wider step measures nothing (m).

@@ -1,1 +1,1 @@
-"""What indices take of a section of a lane: whole cross-sections, and wheel paths with a lead."""
+"""Prepares sections of a lane for indices: whole cross-sections, and wheel paths with a lead."""

@@ -1,11 +1,11 @@
-"""Wheel paths of a section as indices of roughness take them: with a lead, gaps bridged, and draws of their noise.
+"""Wheel paths of a section for indices of roughness: with a lead, bridged gaps, and simulated noise.
 
-A height is a mean over a window, which takes short waves, and it holds noise, which adds roughness. The profile gets
-back what the same window takes of it again (van Cittert's iteration, twice), and the power of the noise alone is taken
-from that of an index (:func:`without_noise`).
+A height is a mean over a window, which dampens short waves, and it contains noise, which adds roughness. The waves are
+restored by van Cittert's iteration (twice), and the power of the noise alone is subtracted from that of an index
+(:func:`without_noise`).
 
-Where neighbouring heights differ as at a wall, it is not known where between them it stands. In the draws it stands
-anywhere: half a sample to each side of a pothole is some per cent of its share in the roughness.
+Where neighbouring heights differ as at a wall, the place of the wall between them is unknown. In the simulations it is
+drawn at random: half a sample on each side of a pothole is some per cent of its share in the roughness.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from roadscan.condition.profiles.segments import Segments
 Float64 = npt.NDArray[np.float64]
 
 LEAD_M: Final = 100.0
-"""A quarter car begins so far before a section, or where the profile begins."""
+"""A quarter car starts this far before a section, or where the profile begins."""
 NOISES: Final = 12
-"""Profiles with added noise, from whose spread a standard deviation is told."""
+"""Number of profiles with added noise, whose spread gives a standard deviation."""
 MOST_NOISE: Final = 0.75
-"""Share of the power of an index that may be noise."""
+"""Largest share of noise in the power of an index."""
 _SIGMA_NOISE: Final = 0.3
-"""Standard deviation (share) of the power of the noise: that of heights comes from some nine cells each."""
-_ROUNDS: Final = 2
+"""Standard deviation (share) of the noise's power: that of heights comes from some nine cells each."""
+_ROUNDS: Final = 2  # Iterations of sharpening.
 _MARGIN: Final = 64
-"""Places beside a profile whose noise may reach into it."""
+"""Places beside a profile whose noise may affect it."""
 _WANDER_STREAM: Final = 1000
-"""First stream of random numbers of the poses' wander; those of noise are below."""
+"""First stream of random numbers of the poses' wander; streams of noise are below."""
 _HIDDEN_PER_M: Final = 0.5
-"""Heads look at their lines under angles of up to 27 degrees (m/m)."""
-_MOST_HIDDEN_M: Final = 0.15
+"""Hidden length behind a wall per metre of its height: heads view at angles of up to 27 degrees (m/m)."""
+_MOST_HIDDEN_M: Final = 0.15  # Largest hidden length.
 _POOR_TIMES: Final = 10.0
-"""A stretch whose σ is so many times the median is not measured: lidars reach beyond the profilers at both ends of a
-drive, with σ of millimetres that would count as roughness."""
-_WALL_STREAM: Final = 2000
+"""A stretch whose σ is this many times the median is not measured: lidars reach beyond the profilers at both ends
+of a drive, with σ of millimetres that would count as roughness."""
+_WALL_STREAM: Final = 2000  # First stream of random numbers of walls.
 _WALL_SLOPE: Final = 0.3
-"""Neighbours that are farther apart in height than this share of the spacing are a wall: no road is so steep."""
+"""A step between neighbours above this share of the spacing is a wall: no road is so steep."""
 LEAST_M: Final = 20.0
-"""Sections that are shorter, and shorter than sections shall be, have no roughness: lanes begin and end in them."""
+"""Shorter sections (and shorter than stated) have no roughness: lanes begin and end in them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,27 +60,27 @@ class WheelPath:
     ends: Segments
     """The section's ends along the path."""
     inside: npt.NDArray[np.bool_]
-    """(n,) heights that lie in the section."""
+    """(n,) True for heights in the section."""
     share: float
-    """Share of the section that was measured."""
+    """Measured share of the section."""
     reason: str
-    """Why it has no roughness; empty where it has one."""
+    """Reason why it has no roughness; empty where it has one."""
     spacing_m: float
     cell_m: float
     window_m2: float
-    """Variance of the window along the road that a height is a mean over."""
+    """Variance of the window along the road over which a height is a mean."""
     wander_m2_per_m: float = 0.0
-    """Variance a metre by which the heights of the poses wander at random, alike in both wheel paths."""
+    """Variance of the random walk of the poses' heights per metre, common to both wheel paths."""
     walls: tuple[slice, ...] = ()
     """From the last height before each wall to the first behind it."""
 
     def with_noise(self, first_stream: int = 0) -> Float64:
-        """(1 + 12, n) heights, and the same with noise and wander added; NaN where nothing is known of the noise."""
+        """Return (1 + 12, n) heights, and the same with noise and wander added; NaN where the noise is unknown."""
         height, errors = self.profile.height_m[None], noise(self.profile, self.spacing_m, self.cell_m, first_stream)
         return np.concatenate([height, height + errors + self.wander() + self.moved_walls(first_stream)])
 
     def moved_walls(self, first_stream: int = 0) -> Float64:
-        """(12, n) what walls add to the heights (m) where they stand elsewhere between the heights that they part."""
+        """(12, n) changes of the heights (m) where walls stand elsewhere between the heights that they separate."""
         added = np.zeros((NOISES, self.profile.height_m.size))
         if not self.walls:
             return added
@@ -89,20 +89,20 @@ class WheelPath:
             height = self.profile.height_m[wall]
             steps, rise = height.size - 1, height[-1] - height[0]
             for row, at in zip(added, steps * share[:, wall.start], strict=True):
-                last = min(int(at), steps - 1)  # it stands behind this height, so far in steps
+                last = min(int(at), steps - 1)  # the wall stands behind this height, in steps
                 beyond = at - last - 0.5
                 moved = np.where(np.arange(height.size) <= last, height[0], height[-1])
-                moved[last + (beyond > 0.0)] -= rise * beyond  # a line between two heights has its wall in the middle
+                moved[last + (beyond > 0.0)] -= rise * beyond  # interpolation puts the wall in the middle
                 row[wall] += moved - height
         return added
 
     def wander(self) -> Float64:
-        """(12, n) random walks of the poses' heights, the same in both wheel paths and in every run."""
+        """Return (12, n) random walks of the poses' heights, the same in both wheel paths and in every run."""
         drawn = _drawn(_WANDER_STREAM, _numbers(self.profile, self.spacing_m), 0)
         return np.cumsum(math.sqrt(self.wander_m2_per_m * self.spacing_m) * drawn, axis=1)
 
     def tried(self, first_stream: int = 0) -> Float64:
-        """(2 + 2 · 12, n) sharpened: heights, heights less so, heights with all errors added, and the noise alone."""
+        """Return (2 + 2 · 12, n) sharpened: heights, heights less so, heights with all errors, and noise alone."""
         noisy = self.with_noise(first_stream)
         alone = noise(self.profile, self.spacing_m, self.cell_m, first_stream)
         once = self.sharpened(noisy[:1], _ROUNDS - 1)
@@ -110,7 +110,7 @@ class WheelPath:
         return np.concatenate([sharp[:1], once, sharp[1:]])
 
     def sharpened(self, height_m: Float64, rounds: int = _ROUNDS) -> Float64:
-        """(k, n) heights with what their window took of short waves; beside gaps they stay as they are."""
+        """Return (k, n) heights with the short waves restored that their window took; unchanged beside gaps."""
         if not self.window_m2:
             return height_m
         at, window = _window(max(math.sqrt(6.0 * self.window_m2), 1.5 * self.spacing_m), self.spacing_m)
@@ -125,7 +125,7 @@ class WheelPath:
 
 
 def wheel_paths(lane: LaneData, from_m: float, to_m: float) -> dict[str, WheelPath]:
-    """Both wheel paths of a section, by side."""
+    """Return both wheel paths of a section, by side."""
     before, after = (LEAD_M, 10.0) if lane.sign > 0 else (10.0, LEAD_M)
     spacing = lane.config.profile_spacing_m
     found = {}
@@ -146,10 +146,10 @@ def wheel_paths(lane: LaneData, from_m: float, to_m: float) -> dict[str, WheelPa
 
 
 def _well_measured(part: Profile, gap_m: float) -> Profile:
-    """The profile without both ends, where these are known far worse than most of it, as where a lidar alone reached.
+    """Remove both ends of the profile where σ is far larger than in most of it, as where a lidar alone reached.
 
-    What is short between such stretches is left out with them. Within the profile all heights stay: those on the walls
-    of a pothole have a great σ, too.
+    Short parts between such stretches are left out as well. Inside the profile all heights stay, since those on the
+    walls of a pothole have a large σ too.
     """
     known = np.flatnonzero(np.isfinite(part.sigma_m))
     if known.size < 2:
@@ -168,9 +168,9 @@ def _well_measured(part: Profile, gap_m: float) -> Profile:
 
 
 def walls_of(measured_m: Float64, height_m: Float64, spacing_m: float) -> tuple[slice, ...]:
-    """Where heights differ from the one measured before as at a wall, and on in the same direction.
+    """Return the runs of heights that rise or fall as steeply as a wall, each in one direction.
 
-    A wall may hide the floor at its foot from the sensor, up to half a metre of it a metre of height: heights there are
+    A wall may hide the floor at its foot from the sensor, up to half a metre per metre of height: heights there are
     those of the ground beyond, so the wall may stand that much farther out.
 
     measured_m, height_m : (n,) heights with their gaps, and with these bridged; NaN where there is none (m).
@@ -194,30 +194,30 @@ def walls_of(measured_m: Float64, height_m: Float64, spacing_m: float) -> tuple[
 
 
 def greatest_of(rows: Float64) -> Float64:
-    """(k,) greatest known value of each row; NaN where none is known."""
+    """Return (k,) greatest known value of each row; NaN where none is known."""
     return np.array([np.nanmax(one) if np.isfinite(one).any() else np.nan for one in rows])
 
 
 def spread_of(tried: Float64) -> float:
-    """Standard deviation of a value (1 + draws,): the first is that without noise."""
+    """Return the standard deviation of a value (1 + draws,), of which the first is without noise."""
     return float(np.sqrt(np.mean((tried[1:] - tried[0]) ** 2)))
 
 
 class Cleared(NamedTuple):
-    """A value without what noise adds to it."""
+    """A value without the contribution of noise."""
 
     value: float
     """NaN where noise makes more than three quarters of its power."""
     sigma: float
     reason: str
     drawn: Float64 = np.zeros(0)
-    """(12,) values with errors added, less the mean of these."""
+    """(12,) values with errors added, less their mean."""
     rest: float = 0.0
-    """What `sigma` holds beside the spread of these."""
+    """Part of `sigma` besides the spread of these."""
 
 
 def without_noise(tried: Float64) -> Cleared:
-    """An index of roughness (26,) of :meth:`WheelPath.tried`, less the power that noise alone has."""
+    """Return an index of roughness (26,) of :meth:`WheelPath.tried`, less the power of the noise alone."""
     value, once, noisy, alone = tried[0], tried[1], tried[2 : 2 + NOISES], tried[2 + NOISES :]
     if not np.isfinite(alone).all():
         return Cleared(float(value), np.nan, "")
@@ -234,7 +234,7 @@ def without_noise(tried: Float64) -> Cleared:
 
 
 def bridged(profile: Profile, largest_gap_m: float) -> Profile:
-    """The profile with its short gaps bridged by straight lines."""
+    """Return the profile with short gaps bridged by straight lines."""
     known = np.flatnonzero(~np.isnan(profile.height_m))
     if known.size < 2:
         return profile
@@ -250,7 +250,7 @@ def bridged(profile: Profile, largest_gap_m: float) -> Profile:
 def _judged(
     part: Profile, inside: npt.NDArray[np.bool_], between_m: tuple[float, float], lane: LaneData
 ) -> tuple[float, str]:
-    """Share of a section that was measured, and why it can have no roughness."""
+    """Return the measured share of a section, and the reason why it can have no roughness."""
     length, spacing, limit = between_m[1] - between_m[0], lane.config.profile_spacing_m, RULES.envelope_m
     due, measured = length / spacing, float(np.count_nonzero(~np.isnan(part.height_m[inside])))
     share = min(1.0, measured / max(due, 1.0))
@@ -268,7 +268,7 @@ def _judged(
 
 
 def _beyond_ends(part: Profile, inside: npt.NDArray[np.bool_], between_m: tuple[float, float]) -> float:
-    """Length of a section (m) that lies before the first height of the lane or behind the last one."""
+    """Return the length of a section (m) before the first height of the lane or behind the last one."""
     known = ~np.isnan(part.height_m)
     station = part.station_m[known & inside]
     outside = part.station_m[known & ~inside]
@@ -284,7 +284,7 @@ def _ends(part: Profile, from_m: float, to_m: float) -> Segments:
 
 
 def noise(part: Profile, spacing_m: float, cell_m: float, first_stream: int = 0) -> Float64:
-    """(k, n) errors as the noise of the readings makes them: those of neighbours are alike, for they share cells.
+    """Return (k, n) simulated errors from the noise of the readings; neighbours share cells and so errors.
 
     They are drawn from counters of the place, so a section has the same ones in every run.
     """
@@ -294,12 +294,12 @@ def noise(part: Profile, spacing_m: float, cell_m: float, first_stream: int = 0)
 
 
 def _numbers(part: Profile, spacing_m: float) -> npt.NDArray[np.int64]:
-    """(n,) number of each place along the road."""
+    """Return (n,) number of each place along the road."""
     return np.rint(part.station_m / spacing_m).astype(np.int64)
 
 
 def _drawn(first_stream: int, number: npt.NDArray[np.int64], margin: int, window: Float64 | None = None) -> Float64:
-    """(12, n) normal numbers of places, each stream smoothed by a window that reaches no farther than the margin."""
+    """Return (12, n) normal numbers of places, each stream smoothed by a window no wider than the margin."""
     low, high = int(number.min()) - margin, int(number.max()) + margin + 1
     out = np.empty((NOISES, number.size))
     for k in range(NOISES):
@@ -310,12 +310,12 @@ def _drawn(first_stream: int, number: npt.NDArray[np.int64], margin: int, window
 
 
 def _window(half_m: float, spacing_m: float) -> tuple[Float64, Float64]:
-    """Places of a window (m), and their weights, which fall linearly to its ends."""
+    """Return places of a window (m), and their weights, which fall linearly to its ends."""
     reach = max(math.ceil(half_m / spacing_m - 1e-9) - 1, 0)
     at = spacing_m * np.arange(-reach, reach + 1, dtype=np.float64)
     return at, 1.0 - np.abs(at) / half_m
 
 
 def _normal(stream: int, block: int) -> Float64:
-    """1024 normal numbers of a block of places."""
+    """Return 1024 normal numbers of a block of places."""
     return np.random.Generator(np.random.Philox(key=[stream, block & 0xFFFFFFFF])).standard_normal(1024)

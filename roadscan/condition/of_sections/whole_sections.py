@@ -1,4 +1,4 @@
-"""Cross-sections without holes, as kernels take them."""
+"""Cross-sections without holes, in the form that kernels take."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 _NOISIER: Final = 10.0
-"""Times that of the lane: readings of another kind of sensor. Of one kind, σ varies by two or three."""
+"""Factor on the lane's σ that shows readings of another kind of sensor; within one kind σ varies two- or threefold."""
 _NOISY_M: Final = 1e-3
-"""Below, noise adds less to a depth than a rut has: the greatest depth under a wire lies some three σ too deep."""
+"""Below this σ, noise adds less to a depth than a rut has: the depth under a wire is some three σ too large."""
 
 
 def noisy(c: CrossSections) -> Bool:
-    """(n,) True where σ of a cross-section's heights is over ten times that of the lane and over 1 mm.
+    """Return (n,) True where σ of a cross-section's heights is over ten times that of the lane and over 1 mm.
 
     So it is where a drive ends, and a lidar alone saw the road from afar: noise makes depths and texture there.
     """
@@ -31,27 +31,27 @@ def noisy(c: CrossSections) -> Bool:
 
 
 def _sigma_of(sigma_m: Float64) -> Float64:
-    """(n,) medians of rows; NaN where none is known."""
+    """Return (n,) medians of rows; NaN where none is known."""
     rows = (row[~np.isnan(row)] for row in sigma_m)
     return np.array([np.median(own) if own.size else np.nan for own in rows], np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class WholeSections:
-    """Cross-sections of which enough was measured; what lacks in them is bridged by straight lines."""
+    """Cross-sections of which enough was measured; missing heights are bridged by straight lines."""
 
     rows: npt.NDArray[np.int64]
-    """(k,) which of the lane's cross-sections they are."""
+    """(k,) their indices among the lane's cross-sections."""
     height_m: Float64
     """(k, m)"""
     sigma_m: Float64
     """(k,) median standard deviation of a height; NaN where not known."""
     noisy: Bool
-    """(n,) which of the lane's cross-sections are left out for their noise (:func:`noisy`)."""
+    """(n,) True for the lane's cross-sections that are left out for their noise (:func:`noisy`)."""
 
     @classmethod
     def of(cls, lane: LaneData) -> WholeSections:
-        """Those that are not noisy, with at least the share `least_share` measured: both ends too, but for a tenth."""
+        """Select those that are not noisy, with at least `least_share` measured, also of both ends, but for a tenth."""
         c = lane.cross_sections
         known = ~np.isnan(c.height_m)
         m = c.offset_m.size
@@ -65,7 +65,7 @@ class WholeSections:
         return cls(rows, height, _sigma_of(c.sigma_m[rows]), left_out)
 
     def spread(self, values: Float64, count: int) -> Float64:
-        """(count,) values of all cross-sections of the lane: NaN where too little was measured."""
+        """Expand (count,) values to all cross-sections of the lane: NaN where too little was measured."""
         out = np.full(count, np.nan)
         out[self.rows] = values
         return out

@@ -1,1 +1,1 @@
-"""What shows on a lane's surface: its texture by squares, patches that have lost stones, and the lines beside it."""
+"""Features of a lane's surface: texture by squares, ravelled patches, and painted lines beside it."""

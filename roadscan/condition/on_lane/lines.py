@@ -1,4 +1,4 @@
-"""Painted lines along the borders of a lane, from the intensities of cells across them."""
+"""Finds painted lines along the borders of a lane, from the intensities of cells across them."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from roadscan.condition.road_line import Lane, RoadLine
 Float64 = npt.NDArray[np.float64]
 
 SPACING_M: Final = 0.5
-"""Distance between the places along the lane where lines are sought; intensities are means over as much."""
+"""Distance between the places along the lane at which lines are sought; intensities are means over it."""
 LINE_REACH_M: Final = 1.2
-"""How far beyond the border of a lane intensities are looked at."""
-_STEP_M: Final = 0.025
+"""Distance beyond the border of a lane up to which intensities are used."""
+_STEP_M: Final = 0.025  # Spacing of intensities across the lane.
 _BESIDE_M: Final = 0.8
-"""How far inside and outside the border a line may be."""
-_SIDES: Final = {"left": -1.0, "right": 1.0}
+"""Largest distance of a line from the border, inside and outside."""
+_SIDES: Final = {"left": -1.0, "right": 1.0}  # Signs of offsets.
 
 
 @dataclass(frozen=True, eq=False)
 class LaneLines:
-    """Painted lines beside a lane, a row a place along it where one was seen."""
+    """Painted lines beside a lane, one row for each place where one was seen."""
 
     station_m: Float64
     """(n,)"""
@@ -43,7 +43,7 @@ class LaneLines:
 
 
 def lane_lines(table: CellTable, line: RoadLine, lane: Lane, between_m: tuple[float, float]) -> LaneLines:
-    """Painted lines beside a lane at multiples of 0.5 m of station in [from, to)."""
+    """Return painted lines beside a lane at multiples of 0.5 m of station in [from, to)."""
     first, end = (math.ceil(one / SPACING_M - 1e-9) for one in between_m)
     station: Float64 = SPACING_M * np.arange(first, end, dtype=np.float64)
     half = 0.5 * lane.width_m

@@ -1,4 +1,4 @@
-"""Patches of a lane that have lost stones: squares whose texture is coarser than that of sound ones around them."""
+"""Finds ravelled patches of a lane: squares with a coarser texture than undamaged ones around them."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 LEAST_RATIO: Final = 1.15
-"""A square's texture is coarser by so much at least, and by :data:`_SIGMAS` of its section's own spread."""
-_SIGMAS: Final = 5.0
-LEAST_AREA_M2: Final = 0.12
+"""Least ratio of a square's texture to its section's; it also exceeds it by :data:`_SIGMAS` of the section's spread."""
+_SIGMAS: Final = 5.0  # Least excess of a coarse square's texture.
+LEAST_AREA_M2: Final = 0.12  # Least area of a patch.
 LEAST_SQUARES: Final = 250
-"""Squares that tell what the texture of a section is."""
+"""Least number of squares that determine the texture of a section."""
 _SHARED: Final = 0.5
-"""Squares of which more was measured by several drives are held against one another alone: drives differ."""
+"""Squares measured by several drives to a larger share are compared with one another only, since drives differ."""
 _DIFFERS: Final = 3.0
-"""Intensities differ where a patch's median is so many standard deviations of its section's squares off."""
+"""Intensities differ where a patch's median is off by this many standard deviations of its section's squares."""
 SEVERITIES: Final = {"low": 1.4, "moderate": 2.0, "high": math.inf}
-"""Texture of a patch over that of its section, at the most. The limits are roadscan's own."""
+"""Largest ratio of a patch's texture to its section's, by severity. The limits are roadscan's choice."""
 _LANE_SHARE: Final = 0.25
-"""The lane's texture is what so many of its sections stay below."""
+"""The lane's texture is this quantile of its sections'."""
 _SOUND_SHARE: Final = 0.2
-"""A row across the lane is partly sound where so many of its squares are like the lane."""
+"""A row across the lane is partly undamaged where at least this share of its squares is like the lane."""
 _SOUND_ROWS: Final = 0.5
-"""So many rows are partly sound where a section has lost stones, and is not of another surface."""
-_CROSS: Final = scipy.ndimage.generate_binary_structure(2, 1)
-_SQUARE: Final = scipy.ndimage.generate_binary_structure(2, 2)
+"""Least share of such rows in a section that has lost stones and is not of another surface."""
+_CROSS: Final = scipy.ndimage.generate_binary_structure(2, 1)  # Neighbours by edges.
+_SQUARE: Final = scipy.ndimage.generate_binary_structure(2, 2)  # Also by corners.
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +50,15 @@ class RavelledPatch:
     the direction of travel."""
     area_m2: float
     sigma_area_m2: float
-    """Its border may run anywhere within a square's width; errors along it are taken as alike."""
+    """1 σ: the border may lie anywhere within a square's width; errors along it are taken as fully correlated."""
     texture_mm: float
     """Root mean square texture, median of its squares."""
     ratio: float
-    """That over the texture of the section."""
+    """Ratio of that to the texture of the section."""
     sigma_ratio: float
-    """From the spread of its squares."""
+    """1 σ from the spread of its squares."""
     loss_mm: float
-    """Mean depth of lost material over its area, above that of the section; NaN where cells do not tell it."""
+    """Mean depth of lost material over its area, above that of the section; NaN where unknown."""
     contrast: float
     """Share by which its intensity is higher than that of the section; NaN without intensities."""
     severity: str
@@ -67,19 +67,19 @@ class RavelledPatch:
 
 @dataclass(frozen=True, eq=False)
 class RavelledSection:
-    """A section of a lane, looked through for patches."""
+    """A section of a lane that was searched for patches."""
 
     patches: tuple[RavelledPatch, ...]
     measured_m2: float
     """Area of its squares whose texture was judged."""
     share: float
-    """The same over the area of all of its squares."""
+    """Share of that in the area of all squares."""
     background_mm: float
-    """Texture of its sound squares: the median of all, or that of the lane."""
+    """Texture of its undamaged squares: the median of all, or that of the lane."""
     reason: str = ""
-    """Why it was not judged."""
+    """Reason why it was not judged."""
     remark: str = ""
-    """What is to be known of it."""
+    """Remark on the result."""
 
 
 class Level(NamedTuple):
@@ -87,11 +87,11 @@ class Level(NamedTuple):
 
     middle: float
     limit: float
-    """A square is coarser where it lies above the middle by more."""
+    """A square is coarse where it exceeds the middle by more."""
 
 
 def lane_levels(sections: Sequence[tuple[TextureSquares, Bool]]) -> dict[bool, Level]:
-    """Texture of the lane: the lower quartile of that of its sections, of squares of one drive and of several."""
+    """Lane's texture: the lower quartile of that of its sections, for squares of one drive and of several."""
     found: dict[bool, list[Level]] = {False: [], True: []}
     for squares, inside in sections:
         texture, kinds = _by_kind(squares, inside)
@@ -103,14 +103,14 @@ def lane_levels(sections: Sequence[tuple[TextureSquares, Bool]]) -> dict[bool, L
 def ravelled_section(
     squares: TextureSquares, inside: Bool, lane: Mapping[bool, Level] = MappingProxyType({})
 ) -> RavelledSection:
-    """Patches of a section whose squares (n, m) are given.
+    """Return the patches of a section whose squares (n, m) are given.
 
-    The logarithm of a square's texture is held against the median of its section and the spread of its lower half,
+    The logarithm of a square's texture is compared with the median of its section and the spread of its lower half,
     which patches do not widen. Where more than half of a section has lost stones, that median is of lost stones: so
-    where it is coarser than the lane, and half of the rows across the lane hold some squares that are like the lane,
-    squares are held against the lane. Where rows are coarser from border to border, the surface is another one as far
-    as can be told: the section's own median counts, and a remark says so.
-    A patch ends halfway between its own texture and that of sound squares, and with its section.
+    where it is coarser than the lane, and half of the rows across the lane contain some squares that are like the lane,
+    squares are compared with the lane. Where rows are coarser from border to border, the surface seems to be another
+    one: squares are compared with the section's median, and a remark says so.
+    A patch ends halfway between its texture and that of undamaged squares, and with its section.
 
     inside : (n, m) squares that lie on the road; lane : of :func:`lane_levels`.
     """
@@ -138,7 +138,7 @@ def ravelled_section(
 
 
 def _by_kind(squares: TextureSquares, inside: Bool) -> tuple[Float64, dict[bool, Bool]]:
-    """Logarithms of texture (n, m), NaN where not known, and squares of one drive and of several, where enough."""
+    """Return logarithms of texture (n, m), NaN where unknown, and squares of one drive and of several, where enough."""
     with np.errstate(invalid="ignore", divide="ignore"):
         texture = np.log(squares.texture_mm)
     texture[~(np.isfinite(texture) & inside)] = np.nan
@@ -154,7 +154,7 @@ def _level(texture: Float64) -> Level:
 
 
 def _mixed(texture: Float64, own: Bool, lane: Level) -> bool:
-    """Whether half of the rows across the lane hold squares that are like the lane."""
+    """Return whether half of the rows across the lane contain squares that are like the lane."""
     rows = own.any(axis=1)
     alike = own & (np.nan_to_num(texture, nan=np.inf) < lane.middle + 0.5 * lane.limit)
     share = alike[rows].sum(axis=1) / own[rows].sum(axis=1)
@@ -163,7 +163,7 @@ def _mixed(texture: Float64, own: Bool, lane: Level) -> bool:
 
 def _patches(squares: TextureSquares, excess: Float64, judged: Bool, limits: Float64) -> Iterator[RavelledPatch]:
     coarse = judged & (np.nan_to_num(excess, nan=-np.inf) > limits)
-    # Holes of one square are closed; what is one square wide is no patch.
+    # Holes of one square are closed; patches one square wide are dropped.
     coarse |= scipy.ndimage.binary_closing(np.pad(coarse, 1), _CROSS)[1:-1, 1:-1] & judged
     label, count = scipy.ndimage.label(scipy.ndimage.binary_opening(coarse, np.ones((2, 2))), _SQUARE)
     sound = judged & ~scipy.ndimage.binary_dilation(coarse, _SQUARE)
@@ -203,7 +203,7 @@ def _measured(squares: TextureSquares, excess: Float64, own: Bool, sound: Bool) 
 
 
 def _contrast(intensity: Float64, own: Bool, sound: Bool) -> tuple[float, bool]:
-    """Contrast of a patch's intensity, and whether it differs from that of the section."""
+    """Return the contrast of a patch's intensity, and whether it differs from that of the section."""
     inside, around = intensity[own & np.isfinite(intensity)], intensity[sound & np.isfinite(intensity)]
     if not inside.size or not around.size or np.median(around) <= 0.0:
         return math.nan, False

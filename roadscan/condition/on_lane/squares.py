@@ -28,8 +28,8 @@ Float64 = npt.NDArray[np.float64]
 SQUARE_M: Final = 0.2
 """Edge of a square (m): two segments of a texture profile."""
 LEAST_SHARE: Final = 0.5
-"""Share of a square that has to hold cells."""
-_MM: Final = 1e3
+"""Least share of a square that is covered by cells."""
+_MM: Final = 1e3  # Millimetres in a metre.
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,33 +39,33 @@ class TextureSquares:
     station_m: Float64
     """(n,) of the squares' middles, ascending."""
     offset_m: Float64
-    """(m,) of the same from the lane's middle, positive to the right in the direction of travel."""
+    """(m,) offsets of the squares' middles from the lane's middle, positive to the right in the direction of travel."""
     texture_mm: Float64
     """(n, m) root mean square of the heights within 50 mm about their plane; NaN where it is not known, as below."""
     loss_mm: Float64
-    """(n, m) mean depth below the level of the sound surface."""
+    """(n, m) mean depth below the level of the undamaged surface."""
     mpd_mm: Float64
-    """(n, m) mean profile depth, as :func:`texture_squares` takes it from cells."""
+    """(n, m) mean profile depth, computed from cells by :func:`texture_squares`."""
     intensity: Float64
     """(n, m) mean intensity."""
     passes_share: Float64
-    """(n, m) share of the cells that several drives measured."""
+    """(n, m) share of the cells measured by several drives."""
 
     def between(self, from_m: float, to_m: float) -> TextureSquares:
-        """Squares whose middle lies in [from, to)."""
+        """Return squares whose middle lies in [from, to)."""
         own = (self.station_m >= from_m) & (self.station_m < to_m)
         held = {one.name: getattr(self, one.name)[own] for one in fields(self) if one.name != "offset_m"}
         return replace(self, **held)
 
 
 def columns_of(lane: Lane) -> Float64:
-    """(m,) offsets of the middles of the squares of a lane from its middle (m)."""
+    """Return (m,) offsets of the middles of the squares of a lane from its middle (m)."""
     count = int(lane.width_m / SQUARE_M + 1e-6)
     return SQUARE_M * (np.arange(count, dtype=np.float64) - 0.5 * (count - 1))
 
 
 def texture_squares(table: CellTable, line: RoadLine, lane: Lane, between_m: tuple[float, float]) -> TextureSquares:
-    """Texture of the squares of a lane whose middles lie between two stations.
+    """Return the texture of the squares of a lane whose middles lie between two stations.
 
     The mean profile depth is that of lines along the lane with a height a cell, cut into segments of 100 mm as in
     ISO 13473-1, without its low-pass: waves shorter than two cells do not show, and the means of cells dampen others.

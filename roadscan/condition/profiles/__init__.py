@@ -1,1 +1,1 @@
-"""Indices of longitudinal profiles, wherever these come from: roughness, texture, spectra, straightedges."""
+"""Indices of longitudinal profiles from any source: roughness, texture, spectra, straightedges."""

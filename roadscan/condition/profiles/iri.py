@@ -1,4 +1,4 @@
-"""International roughness index: what the golden car's suspension travels on a metre of road, at 80 km/h.
+"""International roughness index: travel of the golden car's suspension per metre of road, at 80 km/h.
 
 Sources: World Bank Technical Paper 46 (Sayers, Gillespie, Paterson 1986: equations, parameters, start, check table);
 Sayers, *On the calculation of IRI from longitudinal road profile* (1995: moving average of 250 mm). They are the
@@ -33,13 +33,13 @@ class SegmentIri(NamedTuple):
 
 
 def iri_of(on: Ride, segments: Segments) -> SegmentIri:
-    """IRI of segments, from the golden car's ride (:func:`roadscan.condition.profiles.ride.ride`)."""
+    """Return the IRI of segments, from the golden car's ride (:func:`roadscan.condition.profiles.ride.ride`)."""
     means, shares = on.means(segments)
     return SegmentIri(1e3 * means, shares)
 
 
 def rolling_iri(on: Ride, length_m: float = LOCAL_M) -> Floats:
-    """IRI of the stretch of `length_m` around each sample (profiles, n); NaN within half of it of the ends.
+    """Return the IRI over `length_m` around each sample (profiles, n); NaN within half of it of the ends.
 
     The continuous report of localised roughness, as AASHTO R 54 has it with 7.62 m (public descriptions).
     """
@@ -52,12 +52,12 @@ def rolling_iri(on: Ride, length_m: float = LOCAL_M) -> Floats:
 
 
 def mean_roughness_index(iri_left_m_per_km: Floats, iri_right_m_per_km: Floats) -> Floats:
-    """MRI (m/km): the mean of the IRI of two wheel paths (AASHTO R 43, public descriptions)."""
+    """Return the MRI (m/km): the mean of the IRI of two wheel paths (AASHTO R 43, public descriptions)."""
     return 0.5 * (iri_left_m_per_km + iri_right_m_per_km)
 
 
 def half_car_ride(x_m: npt.ArrayLike, left_m: npt.ArrayLike, right_m: npt.ArrayLike) -> Ride:
-    """The golden car's ride on the mean of two wheel paths; its IRI is the half-car roughness index, HRI.
+    """Return the golden car's ride on the mean of two wheel paths; its IRI is the half-car roughness index, HRI.
 
     Bumps of one side that are dips of the other cancel, so HRI ≤ MRI (Sayers 1989, *Two quarter-car models for
     defining road roughness: IRI and HRI*).

@@ -27,19 +27,19 @@ class MeanProfileDepth(NamedTuple):
     stdev_mm: float
     """Standard deviation of the depths (mm, n − 1); NaN of fewer than two."""
     valid: int
-    """Segments that are valid."""
+    """Number of valid segments."""
     segments: int
-    """Segments that begin in the stretch."""
+    """Number of segments that begin in the stretch."""
 
 
 def segment_depth_mm(height_mm: Floats) -> float:
-    """Depth (mm) of a segment from its heights (n,): peaks of both halves, their mean, above the mean of all."""
+    """Return the depth (mm) of a segment from its heights (n,): mean of both halves' peaks above the mean of all."""
     middle = height_mm.size // 2
     return float(0.5 * (height_mm[:middle].max() + height_mm[middle:].max()) - height_mm.mean())
 
 
 def mean_profile_depth(segments: Sequence[TextureSegment]) -> MeanProfileDepth:
-    """MPD of segments taken together."""
+    """Return the MPD of segments taken together."""
     depths = np.array([segment_depth_mm(one.height_mm) for one in segments if not one.note])
     enough = depths.size > 0 and 2 * depths.size >= len(segments)
     return MeanProfileDepth(
@@ -51,11 +51,11 @@ def mean_profile_depth(segments: Sequence[TextureSegment]) -> MeanProfileDepth:
 
 
 def mean_profile_depths(segments: Sequence[TextureSegment], stretches: Segments) -> list[MeanProfileDepth]:
-    """MPD of each stretch, from the segments that begin in it."""
+    """Return the MPD of each stretch, from the segments that begin in it."""
     begin = np.array([one.from_m for one in segments])
     found = []
     for first, last in zip(stretches.from_m, stretches.to_m, strict=True):
-        # A segment of 100 mm that begins on a border, but for rounding, begins behind it.
+        # A segment of 100 mm that begins on a border, up to rounding, begins behind it.
         inside = np.flatnonzero((begin >= first - 1e-6) & (begin < last - 1e-6)).tolist()
         found.append(mean_profile_depth([segments[k] for k in inside]))
     return found

@@ -1,4 +1,4 @@
-"""Samples of a profile that are no road, and the steps in which its heights are held."""
+"""Finds samples of a profile that are not road, and the step to which its heights are rounded."""
 
 from __future__ import annotations
 
@@ -32,54 +32,54 @@ PROFILE_STEPS: Final = Witness(
 )
 
 _LEAST_REPEATED: Final = 10
-"""Samples over which heights are seen to change, at the least."""
+"""Least number of samples over which heights are seen to change."""
 _STEPS_CHANGED: Final = 10.0
-"""Elsewhere, heights change by so many steps over a third as many samples, in the middle of all places."""
+"""Elsewhere, heights change by this many steps over a third as many samples, in the median."""
 _TIMES: Final = 3
-"""The top of a wave is flat for some of the samples over which its flanks change so much, not for three times these."""
+"""Ratio of these numbers: the top of a wave is flat for some samples, not for three times those of its flanks."""
 _LEAST_OTHERS: Final = 100
-"""Samples beside them that tell how heights change; a drawn check profile of straight lines has fewer."""
+"""Least number of other samples that show how heights change; a drawn check profile of lines has fewer."""
 _CLOSE_M: Final = 0.1
-"""Spacing up to which a sample that stands alone is narrower than any pothole (m)."""
+"""Largest spacing at which a single sample is narrower than any pothole (m)."""
 _SPIKE_M: Final = 0.015
-"""Joints and stones are lower; a tyre bridges what is as narrow (m)."""
+"""Least height of a spike: joints and stones are lower; a tyre bridges what is as narrow (m)."""
 _SPIKE_SLOPE: Final = 0.3
-"""Slope up and down again, from sample to sample."""
-_SPIKE_SIGMAS: Final = 10.0
+"""Least slope up and down again, from sample to sample."""
+_SPIKE_SIGMAS: Final = 10.0  # Least height of a spike, in usual scatters.
 _AGREE: Final = 0.5
-"""Neighbours of a spike differ by less than this share of its height."""
+"""Largest difference of a spike's neighbours, as a share of its height."""
 _ON_STEP: Final = 0.02
-"""Share of a step by which heights may lie beside one: they were converted, and written with few digits."""
+"""Share of a step by which heights may deviate from one: they were converted, and written with few digits."""
 _BENDS: Final = 30
-"""Rounded heights bend by a step in so many places at least; a drawn check profile has few corners."""
+"""Least number of places in which rounded heights bend by a step; a drawn check profile has few corners."""
 NOTABLE: Final = 0.05
-"""Share of an index from which on rounding is told."""
+"""Share of an index from which on rounding is reported."""
 
 
 class SoundHeights(NamedTuple):
-    """Heights of a profile without what is no road."""
+    """Heights of a profile without samples that are not road."""
 
     height_m: Floats
-    """(n,), NaN where nothing was measured or what was is left out."""
+    """(n,) heights; NaN where nothing was measured or a sample is left out."""
     stuck: Bool
-    """(n,) samples that repeat a height."""
+    """(n,) True for samples that repeat a height."""
     spike: Bool
-    """(n,) samples that stand alone."""
+    """(n,) True for spikes."""
     step_m: float
     """Step to which the heights are rounded; 0 where they are not."""
 
     def rounded_again(self) -> Floats:
-        """(2, n) heights with errors of as much rounding added, within half a step up and down (m).
+        """Return (2, n) heights with simulated errors of as much rounding, within half a step up and down (m).
 
-        In the first, each sample has its own error; in the second, samples that were rounded to one height, one after
-        the other, share theirs. Errors are so where a road changes by more than a step a sample, and by less.
+        In the first, errors of samples are independent, as where a road changes by more than a step a sample; in the
+        second, successive samples of one rounded height share an error, as where it changes by less.
         """
         shared = np.concatenate([[0], np.cumsum(np.diff(self.height_m) != 0.0)])
         drawn = self.step_m * np.random.default_rng(1).uniform(-0.5, 0.5, shared.size)
         return np.asarray(self.height_m + np.stack([drawn, drawn[shared]]), np.float64)
 
     def findings(self, x_m: Floats, whose: str) -> list[Finding]:
-        """What was left out; `x_m` (n,) stations (m), `whose` names the profile."""
+        """Return what was left out; `x_m` (n,) stations (m), `whose` names the profile."""
         found = []
         if self.stuck.any():
             at = x_m[self.stuck]
@@ -97,10 +97,10 @@ class SoundHeights(NamedTuple):
 
 
 def sound_heights(x_m: Floats, height_m: Floats, *, spikes: bool = True) -> SoundHeights:
-    """Heights of a profile without repeated ones and without spikes.
+    """Return heights of a profile without repeated ones and without spikes.
 
-    A height repeats itself where so many samples have it, one after the other, that heights elsewhere change by ten
-    steps over a third of them. Where most of the others lie on straight lines, as in a drawn check profile, none does.
+    A height counts as repeated where a run of samples has it, and heights elsewhere change by ten steps over a third of
+    that length. Where most of the others lie on straight lines, as in a drawn check profile, none does.
     A spike is one sample that rises or falls by more than 15 mm and by ten times the usual scatter, steeper than 0.3,
     between neighbours that agree; it is sought where samples lie within 0.1 m.
 
@@ -121,7 +121,7 @@ def sound_heights(x_m: Floats, height_m: Floats, *, spikes: bool = True) -> Soun
 
 
 def too_high_by(index: Floats, again: Floats) -> Floats:
-    """How much of an index (segments,) is rounding, from that of heights that were rounded again (2, segments).
+    """Return the excess of an index (segments,) due to rounding, from that of heights rounded again (2, segments).
 
     Errors of rounding are not those of the road, so that their squares add up; of the two ways to err, the worse one.
     """
@@ -129,7 +129,7 @@ def too_high_by(index: Floats, again: Floats) -> Floats:
 
 
 def _step(h: Floats) -> float:
-    """The step on which all heights lie; 0 for none."""
+    """Return the step on which all heights lie; 0 for none."""
     values = np.unique(np.round(h, 9))
     if values.size < 3:
         return 0.0
@@ -141,13 +141,13 @@ def _step(h: Floats) -> float:
 
 
 def _jumps_about(h: Floats, step_m: float) -> bool:
-    """Whether heights jump about on their steps as rounded ones do; those of drawn lines lie on steps of their own."""
+    """Return whether heights jump between steps as rounded ones do; drawn lines have steps by themselves."""
     bend = np.abs(h[2:] - 2.0 * h[1:-1] + h[:-2])
     return int(np.count_nonzero(bend > 0.5 * step_m)) >= _BENDS
 
 
 def _repeated(h: Floats, step_m: float) -> Bool:
-    """Samples behind the first of a run of equal heights that is too long for this road."""
+    """Return samples after the first of a run of equal heights that is too long for this road."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
     out = np.zeros(h.size, np.bool_)
@@ -169,7 +169,7 @@ def _repeated(h: Floats, step_m: float) -> Bool:
 
 
 def _is_measured(h: Floats, lag: int, step_m: float) -> bool:
-    """Whether heights bend about, as those of a road do, in most places."""
+    """Return whether heights bend in most places, as those of a road do."""
     if h.size < max(_LEAST_OTHERS, 2 * lag + 1):
         return False
     bend = np.abs(h[2 * lag :] - 2.0 * h[lag:-lag] + h[: -2 * lag])
@@ -177,14 +177,14 @@ def _is_measured(h: Floats, lag: int, step_m: float) -> bool:
 
 
 def _alone(x_m: Floats, h: Floats) -> Bool:
-    """Samples that stand alone."""
+    """Return samples that are spikes: higher or lower than both neighbours."""
     if h.size < _LEAST_OTHERS:
         return np.zeros(h.size, np.bool_)
     wide = np.maximum(np.diff(x_m)[:-1], np.diff(x_m)[1:])
     wide = np.concatenate([wide[:1], wide, wide[-1:]])
     off = np.abs(h[1:-1] - 0.5 * (h[:-2] + h[2:]))
     usual = scatter_about(off, 0.0)
-    # The first and the last sample have neighbours on one side alone: the two beside them.
+    # The first and last sample have neighbours on one side only: the two beside them.
     off = np.concatenate([[abs(h[0] - h[1])], off, [abs(h[-1] - h[-2])]])
     apart = np.concatenate([[abs(h[1] - h[2])], np.abs(h[2:] - h[:-2]), [abs(h[-2] - h[-3])]])
     high = off > np.maximum(max(_SPIKE_M, _SPIKE_SIGMAS * usual), _SPIKE_SLOPE * wide)

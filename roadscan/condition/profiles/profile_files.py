@@ -1,4 +1,4 @@
-"""Files of longitudinal profiles: text and ERD in, ERD out. Units are read or stated, never guessed."""
+"""Reads longitudinal profiles from text and ERD files, and writes ERD. Units are read or stated, never guessed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048, "in": 0.02
 _SPELT = {"metre": "m", "meter": "m", "metres": "m", "meters": "m", "millimetres": "mm", "millimeters": "mm",
           "feet": "ft", "foot": "ft", "inch": "in", "inches": "in", "mils": "mil"}  # fmt: skip
 _EVEN_M = 1e-6
-"""Stations of an ERD file are even: theirs may differ by so much (m)."""
+"""Largest difference between stations of an ERD file and even ones (m)."""
 
 
 @dataclass(frozen=True)
@@ -33,14 +33,14 @@ class ProfileFile:
     height_m: Floats
     """(profiles, n) heights, NaN where there is none (m)."""
     names: tuple[str, ...]
-    """Names of the profiles, as the file has them."""
+    """Names of the profiles in the file."""
     rejects: tuple[tuple[int, str], ...]
-    """Lines that could not be read: their number, and what stands there."""
+    """Lines that could not be read: their number, and their text."""
 
 
 @dataclass(frozen=True)
 class StatedUnits:
-    """What a user states of a file that does not say it itself."""
+    """What a user states that the file does not."""
 
     x: str | None = None
     """Unit of stations: m, cm, mm, ft, in, mil."""
@@ -51,7 +51,7 @@ class StatedUnits:
 
 
 def read_profile(path: str | Path, stated: StatedUnits | None = None) -> ProfileFile:
-    """Profiles of a file: ERD, or columns of text.
+    """Read the profiles of a file: ERD, or columns of text.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def write_erd(
     Raises
     ------
     ProfileError
-        where stations are not even, or a height is missing: the format knows neither.
+        where stations are not even, or a height is missing: the format supports neither.
     """
     x = stations_of(x_m)
     heights = heights_of(height_m, x.size)
@@ -164,7 +164,7 @@ def _check_order(x: Floats, records: npt.NDArray[np.int64]) -> None:
 
 
 def _chosen(columns: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Columns by name, or by number from 1."""
+    """Return columns by name, or by number from 1."""
     found = []
     for one in columns:
         if one in names:
@@ -177,7 +177,7 @@ def _chosen(columns: Sequence[str], names: Sequence[str]) -> list[int]:
 
 
 def _scale(written: str, stated: str | None, option: str, what: str) -> float:
-    """Metres in a unit: the file's own, else the stated one."""
+    """Return metres in a unit: the file's, else the stated one."""
     own = written.strip().lower()
     own = _SPELT.get(own, own)
     if own and stated is not None and stated != own:

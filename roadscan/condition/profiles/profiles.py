@@ -1,4 +1,4 @@
-"""Longitudinal profiles: what they must be, where they are broken, and what is wrong with one that is no road."""
+"""Checks of longitudinal profiles: valid input, gaps and jumps, and heights that are not a road."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from roadscan.core.errors import ProfileError
 Floats = npt.NDArray[np.float64]
 
 STEEPEST = 0.3
-"""A profile whose slope over 250 mm is steeper than this in half of its places is no road (a ratio)."""
+"""Largest slope over 250 mm of a road in half of its places (a ratio)."""
 
 
 FINEST_CLASS_M = 0.25
@@ -22,7 +22,7 @@ FINEST_CLASS_M = 0.25
 
 
 class Breaks(NamedTuple):
-    """Where a profile is broken (m along it)."""
+    """Gaps and jumps of a profile (m along it)."""
 
     gap_from_m: Floats
     """Last samples before gaps."""
@@ -33,11 +33,11 @@ class Breaks(NamedTuple):
     severe_m: Floats
     """Middles of steps that are high and kept, as those of kerbs."""
     wide_m: Floats
-    """Middles of steps of more than 0.25 m that are no gap."""
+    """Middles of steps of more than 0.25 m between samples that are no gap."""
 
 
 def stations_of(x_m: npt.ArrayLike) -> Floats:
-    """Stations (n,) of a profile, ascending (m).
+    """Return stations (n,) of a profile, ascending (m).
 
     Raises
     ------
@@ -63,7 +63,7 @@ def stations_of(x_m: npt.ArrayLike) -> Floats:
 
 
 def heights_of(height_m: npt.ArrayLike, samples: int) -> Floats:
-    """Heights (profiles, samples), also of one profile (m).
+    """Return heights (profiles, samples), also for one profile (m).
 
     Raises
     ------
@@ -79,7 +79,7 @@ def heights_of(height_m: npt.ArrayLike, samples: int) -> Floats:
 
 
 def breaks_of(x_m: Floats, height_m: Floats, rules: Rules) -> Breaks:
-    """Gaps and jumps of a profile; `x_m`, `height_m` (n,), NaN where there is no height."""
+    """Return gaps and jumps of a profile; `x_m`, `height_m` (n,), NaN where there is no height."""
     there = np.isfinite(height_m)
     xs, hs = x_m[there], height_m[there]
     step = np.diff(xs)
@@ -92,7 +92,7 @@ def breaks_of(x_m: Floats, height_m: Floats, rules: Rules) -> Breaks:
 
 
 def fault_of(x_m: Floats, height_m: Floats, rules: Rules) -> str:
-    """Why a profile can be given no index, or nothing; `x_m`, `height_m` (n,), NaN where there is no height."""
+    """Why a profile can have no index, or an empty text; `x_m`, `height_m` (n,), NaN where there is no height."""
     there = np.isfinite(height_m)
     xs, hs = x_m[there], height_m[there]
     if xs.size < 2:
@@ -114,7 +114,7 @@ def fault_of(x_m: Floats, height_m: Floats, rules: Rules) -> str:
 
 
 def raise_fault(fault: str, **place: Any) -> None:
-    """Refuse a profile with a fault.
+    """Raise an error for a profile with a fault.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The quarter cars of the ride indices, as the modes that the kernel rolls over a profile.
+"""Quarter cars of the ride indices, as the modes that the kernel rolls over a profile.
 
 Equations of motion (World Bank Technical Paper 46; Sayers and Karamihas, The Little Book of Profiling, 1998), with all
 quantities divided by the sprung mass, z_s and z_u the heights of body and wheel, h that of the road:
@@ -30,18 +30,18 @@ A step of 0.5 m is the widest of the World Bank's class 2: a wider one is a gap.
 0.3 m deep: between two samples no road climbs 0.5 m, which is a fault of the data.
 """
 COARSEST_M = 0.306
-"""A sample a foot is the coarsest that is in use, its stations rounded to a millimetre (m)."""
+"""Coarsest spacing in use: a sample a foot, with stations rounded to a millimetre (m)."""
 SEVERE_M = 0.1
-"""A step between neighbours that is higher is kept and noted: a kerb, a pothole's edge, or a fault of the data (m)."""
+"""A higher step between neighbours is kept and noted: a kerb, a pothole's edge, or a fault of the data (m)."""
 _EVEN: Final = 0.02
-"""Steps of even spacing differ from the usual one by this share of it at the most, or by a rounded millimetre."""
-_EVEN_M: Final = 0.0011
+"""Largest deviation of even steps from the usual one, as a share of it, …"""
+_EVEN_M: Final = 0.0011  # … or rounding of stations to millimetres.
 _EVEN_SHARE: Final = 0.9
-"""Share of the steps that have the usual length where spacing is even: lost samples leave some that are longer."""
+"""Least share of steps of the usual length where spacing is even: lost samples leave some longer ones."""
 
 
 def usual_step_m(x_m: Floats) -> float:
-    """The usual distance between stations (m), or NaN where they are not evenly spaced."""
+    """Return the usual distance between stations (m), or NaN where they are not evenly spaced."""
     step = np.diff(x_m)
     usual = float(np.median(step))
     alike = np.abs(step - usual) <= max(_EVEN * usual, _EVEN_M)
@@ -49,7 +49,7 @@ def usual_step_m(x_m: Floats) -> float:
 
 
 def rules_at(usual_m: float) -> Rules:
-    """The rules for a profile with so many metres between its stations; NaN for uneven spacing.
+    """Return the rules for a profile with this many metres between its stations; NaN for uneven spacing.
 
     ASTM E1926 averages over the whole number of steps that is nearest to 250 mm (Sayers 1995: from 167 mm on the slope
     of the step itself counts). Its average of an even number of steps lies half a step ahead. For uneven spacing the
@@ -62,7 +62,7 @@ def rules_at(usual_m: float) -> Rules:
 
 
 def quarter_car(k1: float, k2: float, c: float, mu: float) -> QuarterCar:
-    """Modes of a quarter car at 80 km/h.
+    """Return the modes of a quarter car at 80 km/h.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def quarter_car(k1: float, k2: float, c: float, mu: float) -> QuarterCar:
         ]
     )
     poles, shapes = np.linalg.eig(motion)
-    # At rest on a slope of one both masses have that slope; this state in modes, times what each adds to the stroke.
+    # At rest on a slope of one, both masses have that slope; this state in modes, times their share in the stroke.
     at_rest = np.linalg.solve(shapes, np.array([1.0, 0.0, 1.0, 0.0], dtype=complex))
     stroke = 2.0 * (shapes[0] - shapes[2]) * at_rest
     first, second = sorted((k for k in range(4) if poles[k].imag > 0.0), key=lambda k: poles[k].imag)

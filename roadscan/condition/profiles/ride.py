@@ -1,4 +1,4 @@
-"""The response of a quarter car to longitudinal profiles, and its mean over any stretch."""
+"""Response of a quarter car to longitudinal profiles, and its mean over any stretch."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from roadscan.condition.profiles.segments import Segments
 Floats = npt.NDArray[np.float64]
 Note: TypeAlias = Literal["start", "gap", "jump", "step", "uneven", "short"]
 NOTES: Final[tuple[Note, ...]] = get_args(Note)
-"""What a segment's note may say, in the order in which it says it."""
+"""Possible words of a segment's note, in their order."""
 
 
 @dataclass(frozen=True)
 class Ride:
-    """What a quarter car felt on profiles that share their stations."""
+    """Response of a quarter car to profiles that share their stations."""
 
     x_m: Floats
     """(n,) stations (m)."""
@@ -32,12 +32,12 @@ class Ride:
     breaks: tuple[Breaks, ...]
     """Gaps and jumps of each profile."""
     faults: tuple[str, ...]
-    """Why a profile can be given no index; empty where it can."""
+    """Reason why a profile can have no index; empty where it can."""
     even: bool
     """Whether its stations are evenly spaced, as ASTM E1926 takes them."""
 
     def means(self, segments: Segments, least_share: float = 0.5) -> tuple[Floats, Floats]:
-        """Means of the response over segments, and the share of each segment that was rolled over.
+        """Return means of the response over segments, and the share of each segment that was rolled over.
 
         Returns
         -------
@@ -56,7 +56,7 @@ class Ride:
         return means, np.minimum(shares, 1.0)
 
     def notes(self, segments: Segments, nominal_m: float | None = None) -> list[list[str]]:
-        """What to know of each profile's segments, as words with commas between them; empty where there is nothing.
+        """Return notes on each profile's segments, as words separated by commas; empty where there is nothing.
 
         `start`: the car begins in it, so its first 11 m depend on how it begins. `gap`: more than half a metre was not
         measured, or more than a foot of it is missing. `jump`: a step that no road has was left out. `step`: one of
@@ -66,16 +66,16 @@ class Ride:
                 for row in range(len(self.faults))]  # fmt: skip
 
     def accuracy_class(self, segments: Segments) -> npt.NDArray[np.int64]:
-        """(segments,) class of the World Bank that the widest step of a segment allows: 1 to 0.25 m, 2 to 0.5 m.
+        """Return (segments,) class of the World Bank by the widest step of a segment: 1 to 0.25 m, 2 to 0.5 m.
 
-        The class says nothing of how well heights were measured.
+        The class does not depend on the accuracy of the heights.
         """
         wide = np.sort(np.concatenate([broken.wide_m for broken in self.breaks]))
         first, behind = (np.searchsorted(wide, ends) for ends in segments)
         return np.where(behind > first, 2, 1)
 
     def _over(self, sums: Floats, segments: Segments) -> Floats:
-        """Differences of sums over segments."""
+        """Return differences of sums over segments."""
         return np.interp(segments.to_m, self.x_m, sums) - np.interp(segments.from_m, self.x_m, sums)
 
     def _note(self, row: int, k: int, segments: Segments, nominal_m: float | None) -> str:
@@ -95,7 +95,7 @@ class Ride:
 
 
 def ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike, car: QuarterCar = GOLDEN_CAR, *, squared: bool = False) -> Ride:
-    """The response of a quarter car to profiles of any spacing up to a foot, regular or not.
+    """Return the response of a quarter car to profiles of any spacing up to a foot, regular or not.
 
     The state passes from sample to sample by the exact solution of the equations of motion. The car begins at rest on
     the mean slope of the first 11 m, and so it does behind each gap of more than 0.5 m and each jump of more than

@@ -36,17 +36,17 @@ class RideNumber(NamedTuple):
 
 
 def ride_number_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> Ride:
-    """The ride of its car on profiles; see :func:`roadscan.condition.profiles.ride.ride` for parameters and errors."""
+    """Its car's ride on profiles; see :func:`roadscan.condition.profiles.ride.ride` for parameters and errors."""
     return ride(x_m, height_m, RIDE_NUMBER_CAR, squared=True)
 
 
 def ride_number_of(on: Ride, segments: Segments) -> RideNumber:
-    """Ride number of one wheel path, or of several together, from the ride of its car."""
+    """Return the ride number of one wheel path, or of several together, from the ride of its car."""
     squares, shares = on.means(segments)
     return RideNumber(ride_number(np.sqrt(squares)), np.sqrt(squares), shares)
 
 
 def ride_number(profile_index: Floats) -> Floats:
-    """Ride number (k,) of wheel paths together, from their profile indices (paths, k)."""
+    """Return the ride number (k,) of wheel paths together, from their profile indices (paths, k)."""
     rating: Floats = 5.0 * np.exp(-160.0 * np.sqrt(np.mean(profile_index**2, axis=0)))
     return rating

@@ -1,4 +1,4 @@
-"""Segments of a road that an index is told for: of one length, or between fixed stations."""
+"""Segments of a road with one value of an index each: of one length, or between fixed stations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class Segments(NamedTuple):
-    """Where segments begin and end."""
+    """Beginnings and ends of segments."""
 
     from_m: Floats
     """(segments,) station of the beginning (m)."""
@@ -25,7 +25,7 @@ class Segments(NamedTuple):
 def segments_of(
     first_m: float, last_m: float, length_m: float | None = None, stations_m: Sequence[float] | None = None
 ) -> Segments:
-    """Segments between two stations.
+    """Divide the way between two stations into segments.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def segments_of(
         return Segments(np.array([first_m]), np.array([last_m]))
     if not 0.0 < length_m < np.inf:
         raise ProfileError(f"segments of {length_m:g} m", expected="a finite length above 0 m")
-    # A rest of less than a millionth of a segment is rounding.
+    # A remainder of less than a millionth of a segment is rounding.
     count = max(1, int(np.ceil((last_m - first_m) / length_m - 1e-6)))
     ends = np.asarray(first_m + length_m * np.arange(count + 1), np.float64)
     ends[-1] = last_m

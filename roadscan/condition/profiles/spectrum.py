@@ -22,7 +22,7 @@ from roadscan.core.errors import ProfileError
 Floats = npt.NDArray[np.float64]
 
 REFERENCE_PER_M = 0.1
-"""Spatial frequency n0 that C belongs to (cycles a metre)."""
+"""Spatial frequency n0 at which C is defined (cycles a metre)."""
 FIT_PER_M = (0.011, 2.83)
 """Range of the fit (cycles a metre)."""
 CLASS_LIMITS_M3 = 1e-6 * np.array([32.0, 128.0, 512.0, 2048.0, 8192.0, 32768.0, 131072.0])
@@ -30,13 +30,13 @@ CLASS_LIMITS_M3 = 1e-6 * np.array([32.0, 128.0, 512.0, 2048.0, 8192.0, 32768.0, 
 WINDOW_M = 100.0
 """Length of the windows of Welch's method (m)."""
 SHORTEST_M = 25.0
-"""The shortest piece without gaps that a spectrum is made of (m)."""
+"""Length of the shortest piece without gaps that is used (m)."""
 THINNEST_BANDS = 5
-"""Bands that a fit needs."""
+"""Least number of bands for a fit."""
 
 
 class RoadSpectrum(NamedTuple):
-    """One-sided spectrum of a profile, and what was fitted to it."""
+    """One-sided spectrum of a profile, and the fit to it."""
 
     frequency_per_m: Floats
     """(k,) spatial frequencies, without 0 (cycles a metre)."""
@@ -45,23 +45,23 @@ class RoadSpectrum(NamedTuple):
     roughness_m3: float
     """C: the fitted density at 0.1 cycles a metre (m³)."""
     sigma_roughness_m3: float
-    """Its standard deviation, from how the bands scatter about the fitted line (m³)."""
+    """Standard deviation of C, from the scatter of bands about the fitted line (m³)."""
     waviness: float
     """w: the fitted exponent."""
     sigma_waviness: float
-    """Its standard deviation, likewise."""
+    """Standard deviation of w, likewise."""
     road_class: str
     """A to H, by C."""
     fit_per_m: tuple[float, float]
-    """Frequencies that the fit saw (cycles a metre)."""
+    """Range of frequencies in the fit (cycles a metre)."""
     windows_m: float
     """Length of the windows (m)."""
     measured_m: float
-    """Length of the pieces that windows were laid on (m)."""
+    """Length of the pieces that were used (m)."""
 
 
 def road_spectrum(x_m: npt.ArrayLike, height_m: npt.ArrayLike, window_m: float = WINDOW_M) -> RoadSpectrum:
-    """Spectrum by Welch's method: Hann windows that overlap by half, each less its straight line.
+    """Compute the spectrum by Welch's method: Hann windows that overlap by half, each less its straight line.
 
     Pieces between gaps of more than a foot and jumps of more than 0.1 m are put to regular stations, at their median
     spacing, and their spectra averaged by length.
@@ -105,12 +105,12 @@ def road_spectrum(x_m: npt.ArrayLike, height_m: npt.ArrayLike, window_m: float =
 
 
 def road_class(roughness_m3: float) -> str:
-    """Class of ISO 8608, A to H, of a density at 0.1 cycles a metre (m³)."""
+    """Return the class of ISO 8608, A to H, of a density at 0.1 cycles a metre (m³)."""
     return "ABCDEFGH"[int(np.searchsorted(CLASS_LIMITS_M3, roughness_m3))]
 
 
 def _pieces(x: Floats, height: Floats) -> list[tuple[Floats, Floats]]:
-    """Stations and heights between gaps and jumps."""
+    """Return stations and heights between gaps and jumps."""
     there = np.isfinite(height)
     xs, hs = x[there], height[there]
     broken = (np.diff(xs) > COARSEST_M) | (np.abs(np.diff(hs)) > RULES.highest_step_m)
@@ -119,7 +119,7 @@ def _pieces(x: Floats, height: Floats) -> list[tuple[Floats, Floats]]:
 
 
 def _fitted(frequency: Floats, density: Floats) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
-    """C and w, a standard deviation behind each, and the range that the fit saw; over means of thirds of an octave."""
+    """Fit C and w to means over thirds of an octave; return them with standard deviations, and the range of the fit."""
     inside = (frequency >= FIT_PER_M[0]) & (frequency <= FIT_PER_M[1]) & (density > 0.0)
     n, g = frequency[inside], density[inside]
     band = np.floor(3.0 * np.log2(n / FIT_PER_M[0])).astype(np.int64)

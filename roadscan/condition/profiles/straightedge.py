@@ -1,4 +1,4 @@
-"""Rolling straightedge: how far its middle stands above or below the line between its end wheels.
+"""Rolling straightedge: height of its middle above or below the line between its end wheels.
 
 The beam stands on a wheel at either end and has a third in its middle, whose height above the mean of the other two is
 the deviation, as the rolling straightedges of EN 13036-5/-7 and of US specifications (3 m, 10 ft, 16 ft) measure it
@@ -24,7 +24,7 @@ LENGTHS_M = {"3 m": 3.0, "10 ft": 3.048, "16 ft": 4.8768}
 def straightedge_mm(
     x_m: npt.ArrayLike, height_m: npt.ArrayLike, length_m: float = 3.0, *, wheel_radius_m: float = 0.0
 ) -> Floats:
-    """Deviation (n,) of the middle of a rolling straightedge at each sample, positive over a bump (mm).
+    """Return the deviation (n,) of a rolling straightedge's middle at each sample, positive over a bump (mm).
 
     NaN where the beam reaches beyond the profile, stands over a gap of more than a foot, or has no height under its
     middle.

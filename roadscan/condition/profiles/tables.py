@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 Floats = npt.NDArray[np.float64]
 
 FLATTEST_M_PER_KM = 0.1
-"""No road has a lower IRI: what has one was measured in another unit, or is no road."""
+"""Least IRI of a road: a lower one was measured in another unit, or is no road."""
 ROUGHEST_M_PER_KM = 30.0
-"""Nor a higher one: on the World Bank's scale, tracks with erosion gullies end at 20 m/km."""
+"""Largest IRI of a road: on the World Bank's scale, tracks with erosion gullies end at 20 m/km."""
 FINEST_STEP_M = 5e-5
-"""Finer steps of heights are no roughness: class 1 of the smoothest roads takes 0.125 mm."""
+"""Finer steps of heights do not affect roughness: class 1 of the smoothest roads takes 0.125 mm."""
 FINEST_STEP_MM = 0.01
-"""Nor texture."""
+"""Finer steps of heights do not affect texture."""
 FLATTEST_MM = 0.02
-"""No road has a lower mean profile depth."""
+"""Least mean profile depth of a road."""
 
 
 def iri(
@@ -45,7 +45,7 @@ def iri(
     stations_m: Sequence[float] | None = None,
     names: Sequence[str] = (),
 ) -> pd.DataFrame:
-    """IRI and ride number of one profile, or of several that share their stations.
+    """Compute IRI and ride number of one profile, or of several that share their stations.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def iri(
 def localised_roughness(
     x_m: npt.ArrayLike, height_m: npt.ArrayLike, limit_m_per_km: float, *, length_m: float = LOCAL_M
 ) -> pd.DataFrame:
-    """Stretches where the rolling IRI of a profile is above a limit.
+    """Return stretches where the rolling IRI of a profile is above a limit.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def mpd(
     to_m: float | None = None,
     settings: TextureSettings | None = None,
 ) -> pd.DataFrame:
-    """Mean profile depth and RMS texture of a texture profile.
+    """Compute mean profile depth and RMS texture of a texture profile.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def mpd(
 
 
 def _sound_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> tuple[Ride, list[SoundHeights]]:
-    """The golden car's ride on profiles none of which has a fault, and their heights without what is no road."""
+    """Return the golden car's ride on profiles without faults, and their heights without samples that are not road."""
     x = stations_of(x_m)
     heights = [sound_heights(x, row) for row in heights_of(height_m, x.size)]
     on = ride(x, np.stack([one.height_m for one in heights]))
@@ -231,14 +231,14 @@ def _sound_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> tuple[Ride, list
 
 
 def _rounding(x: Floats, sound: SoundHeights, parts: Segments, found: Floats) -> Floats:
-    """How much of the IRI of segments (m/km) is rounding."""
+    """Return the part of the IRI of segments (m/km) that is due to rounding."""
     if sound.step_m < FINEST_STEP_M:
         return np.zeros_like(found)
     return too_high_by(found, iri_of(ride(x, sound.rounded_again()), parts).iri_m_per_km)
 
 
 def _left_out(x: Floats, sound: Sequence[SoundHeights], parts: Segments, k: int) -> list[str]:
-    """Words for the samples of a segment that were left out."""
+    """Return words for the samples of a segment that were left out."""
     inside = (x >= parts.from_m[k]) & (x <= parts.to_m[k])
     told = {"stuck": [one.stuck for one in sound], "spikes": [one.spike for one in sound]}
     return [word for word, masks in told.items() if any((mask & inside).any() for mask in masks)]
@@ -254,7 +254,7 @@ def _findings(x: Floats, sound: Sequence[SoundHeights], names: Sequence[str]) ->
 
 
 def _joined(on: Ride, parts: Segments, segment_m: float | None, found: Floats) -> list[str]:
-    """Notes of all profiles together, each word once."""
+    """Join the notes of all profiles, each word once."""
     of_all = on.notes(parts, segment_m)
     flat = np.atleast_1d((found < FLATTEST_M_PER_KM).any(axis=0))
     wild = np.atleast_1d((found > ROUGHEST_M_PER_KM).any(axis=0))

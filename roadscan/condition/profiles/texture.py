@@ -1,4 +1,4 @@
-"""Texture profiles made ready for their indices, in the steps of ISO 13473-1:2019.
+"""Prepares texture profiles for their indices, in the steps of ISO 13473-1:2019.
 
 Dropouts are bridged, samples averaged over 0.5 mm, spikes replaced, waves shorter than 2.4 mm filtered out, and the
 profile is cut into segments of 100 mm whose slope is removed. The standard's text was not at hand. The steps, their
@@ -26,15 +26,15 @@ Floats = npt.NDArray[np.float64]
 SEGMENT_MM = 100.0
 """Length of a segment (mm)."""
 HIGHEST_STEP_MM = 20.0
-"""Where the heights on both sides of a place differ by more, the profile jumps: no texture is so deep (mm)."""
+"""Largest step between the heights on both sides of a place: no texture is so deep (mm)."""
 _LEVEL_MM = 20.0
-"""Length on each side of a place whose median heights are compared: longer than stones and narrow cracks (mm)."""
+"""Length on each side of a place over which medians are compared: longer than stones and narrow cracks (mm)."""
 _LEAST_STEP_MM = 1.0
-"""A lower step changes the depth of its segment by less than half of this (mm)."""
+"""Least step: a lower one changes the depth of its segment by less than half of this (mm)."""
 _STEP_SIGMAS = 6.0
-"""A step stands out from what the texture itself makes of these medians by so many of their standard deviations."""
+"""A step exceeds this many standard deviations of the medians' differences due to texture."""
 COARSEST = 1.01
-"""Spacing of samples over that of the resampled profile, at the most."""
+"""Largest spacing of samples over that of the resampled profile."""
 
 
 class TextureSettings(Strict):
@@ -56,17 +56,17 @@ class TextureSegment(NamedTuple):
     """A segment of a texture profile, its slope removed."""
 
     from_m: float
-    """Where it begins (m)."""
+    """Its beginning (m)."""
     to_m: float
-    """Where it ends (m)."""
+    """Its end (m)."""
     height_mm: Floats
-    """(n,) heights about the straight line that fits them best (mm)."""
+    """(n,) heights above the best straight line (mm)."""
     dropout_share: float
     """Share of it without a reading."""
     spike_share: float
-    """Share of its resampled heights that were spikes."""
+    """Share of its resampled heights that are spikes."""
     note: str
-    """Why it is not valid: `dropouts`, `spikes`, `jump`; empty where it is."""
+    """Why it is not valid: `dropouts`, `spikes`, `jump`; empty for a valid one."""
 
 
 def texture_segments(
@@ -77,7 +77,7 @@ def texture_segments(
     from_m: float | None = None,
     to_m: float | None = None,
 ) -> list[TextureSegment]:
-    """Segments of 100 mm, from a station on; a rest of less than 90 mm is left out.
+    """Cut a profile into segments of 100 mm, from a station on; a rest of less than 90 mm is left out.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def texture_segments(
     wanted = (x >= origin_m - 1e-9) & (x < (np.inf if to_m is None else to_m))
     if wanted.sum() < 2:
         raise ProfileError(f"{wanted.sum()} samples between {from_m} and {to_m} m", expected="a texture profile")
-    # Millimetres as they were recorded, to the nanometre: the rounding of metres is taken off again.
+    # Millimetres as recorded, to the nanometre: this removes the rounding of metres.
     along_mm, height_mm = np.round(1e3 * x[wanted], 6) - np.round(1e3 * origin_m, 6), height_mm[wanted]
     _check(along_mm, height_mm, chosen)
     place_mm, resampled_mm, read = _resample(along_mm, _bridged(along_mm, height_mm), chosen.resampled_mm)
@@ -159,7 +159,7 @@ def _check(along_mm: Floats, height_mm: Floats, settings: TextureSettings) -> No
 
 
 def _bridged(place_mm: Floats, height_mm: Floats) -> Floats:
-    """Heights with dropouts filled linearly; beyond the first and last reading by these."""
+    """Fill dropouts linearly; beyond the first and last reading with these."""
     there = np.isfinite(height_mm)
     if there.all():
         return height_mm
@@ -169,8 +169,8 @@ def _bridged(place_mm: Floats, height_mm: Floats) -> Floats:
 
 
 def _resample(along_mm: Floats, height_mm: Floats, step_mm: float) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
-    """Means over (k·step, (k+1)·step], placed at its end; and whether any sample lies there, else it is bridged."""
-    # A sample on a border falls where its binary number does, as in captif-slp: 1e-5 mm of MPD depend on it.
+    """Return means over (k·step, (k+1)·step], placed at its end; and whether any sample lies there, else bridged."""
+    # A sample on a border is assigned by its binary value, as in captif-slp: 1e-5 mm of MPD depend on it.
     last = np.maximum(np.ceil(along_mm / step_mm), 1.0).astype(np.int64)
     count = np.bincount(last)[1:]
     total = np.bincount(last, weights=height_mm)[1:]
@@ -181,7 +181,7 @@ def _resample(along_mm: Floats, height_mm: Floats, step_mm: float) -> tuple[Floa
 
 
 def _spikes(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool_]:
-    """Samples on both sides of a step that is too steep."""
+    """Return samples on both sides of a step that is too steep."""
     steep = np.abs(np.diff(height_mm)) >= settings.spike_ratio * settings.resampled_mm
     spike = np.zeros(height_mm.size, np.bool_)
     spike[1:] |= steep
@@ -190,7 +190,7 @@ def _spikes(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool
 
 
 def _jumps(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool_]:
-    """Samples at which the profile steps to another level.
+    """Return samples at which the profile steps to another level.
 
     The medians of the heights on both sides are compared. Their differences scatter by the texture; a step is one that
     stands out, and lies where the means on both sides differ most.
@@ -203,13 +203,13 @@ def _jumps(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool_
         return jump
 
     def rises(smooth_mm: Floats) -> Floats:
-        """From the stretch that ends before a sample to the one that begins with it: sample `size` and those behind."""
+        """Return differences between the stretch from a sample on and the stretch that ends before it."""
         middle = size // 2
         behind, before = smooth_mm[size + middle :], smooth_mm[middle:]
         return behind[: samples - 2 * size + 1] - before[: samples - 2 * size + 1]
 
     levels = rises(median_filter(height_mm, size, mode="nearest"))
-    levels = np.abs(levels - np.median(levels))  # less the slope of the road
+    levels = np.abs(levels - np.median(levels))  # without the slope of the road
     limit = max(_LEAST_STEP_MM, _STEP_SIGMAS * SIGMA_OF_MAD * float(np.median(levels)))
     high = levels > min(limit, HIGHEST_STEP_MM)
     means = np.abs(rises(uniform_filter1d(height_mm, size, mode="nearest")))
@@ -224,21 +224,21 @@ def _low_passed(height_mm: Floats, settings: TextureSettings) -> Floats:
 
     cut_off = 2.0 * settings.resampled_mm / settings.shortest_wave_mm
     if cut_off >= 1.0:
-        return height_mm  # no wave is shorter
+        return height_mm  # the low-pass would change nothing
     return np.asarray(sosfiltfilt(butter(2, cut_off, output="sos"), height_mm), np.float64)
 
 
 def _segment_of(place_mm: Floats) -> npt.NDArray[np.int64]:
-    """Number of the segment of each place; one on a border belongs to the segment before it."""
+    """Return the number of each place's segment; a place on a border belongs to the segment before it."""
     return np.asarray(np.maximum(np.ceil(np.round(place_mm / SEGMENT_MM, 9)) - 1, 0), np.int64)
 
 
 def segment_rms_mm(height_mm: Floats) -> float:
-    """Root mean square (mm) of the heights (n,) of a segment whose slope was removed."""
+    """Return the root mean square (mm) of the heights (n,) of a segment whose slope was removed."""
     return float(np.sqrt(np.mean(np.square(height_mm))))
 
 
 def rms_texture_mm(segments: Sequence[TextureSegment]) -> float:
-    """Root of the mean of the squares over all valid segments (mm); NaN where fewer than half are valid."""
+    """Return the root of the mean of squares over all valid segments (mm); NaN where fewer than half are valid."""
     squares = [segment_rms_mm(one.height_mm) ** 2 for one in segments if not one.note]
     return float(np.sqrt(np.mean(squares))) if squares and 2 * len(squares) >= len(segments) else np.nan

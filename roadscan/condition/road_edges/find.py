@@ -1,11 +1,11 @@
 """Edges of a road's surface on one side of its lanes, from heights and intensities beside them.
 
 After P. Kumar, C. P. McElhinney, P. Lewis and T. McCarthy, *An automated algorithm for extracting road edges from
-terrestrial mobile LiDAR data* (ISPRS Journal 85, 2013): the slope across the road tells its edge, and intensity and
-pulse width where the slope does not. They let a snake find its way over rasters of the three; here each change across
+terrestrial mobile LiDAR data* (ISPRS Journal 85, 2013): the slope across the road shows its edge, and intensity and
+pulse width where the slope does not. They fit a snake to rasters of the three; here each change across
 the road is measured in standard deviations, and the best path is found by dynamic programming
 (:mod:`roadscan.compute.edges.across`). Pulse widths are in no table of roadscan. Where neither heights nor intensities
-tell an edge, the line painted along the border of the lane stands for it.
+show an edge, the line painted along the border of the lane is used.
 """
 
 from __future__ import annotations
@@ -27,35 +27,35 @@ Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 KINDS: Final = ("kerb", "drop", "slope", "intensity", "marking", "polygon")
-"""What an edge is told by: a step up, a step down, a change of slope, one of intensity, a painted line, a polygon."""
+"""Evidence of an edge: a step up, a step down, a change of slope, one of intensity, a painted line, a polygon."""
 INNER_M: Final = 1.2
-"""The raster begins this far inside the first place where an edge may be."""
+"""The raster begins this far inside the first possible place of an edge."""
 NEAREST_M: Final = 0.8
-"""An edge lies at least this far from a lane's middle."""
+"""Least distance of an edge from a lane's middle."""
 _INSIDE_LANE_M: Final = 0.5
-"""How far inside a lane's border its road's edge may be."""
-_SIGMA_HEIGHT_M: Final = 0.005
+"""Largest distance of the road's edge inside a lane's border."""
+_SIGMA_HEIGHT_M: Final = 0.005  # Standard deviation of a height.
 _SIGMA_GREY: Final = 0.08
-"""Standard deviation of an intensity (share of that of the road), before what its neighbours say of it."""
+"""Standard deviation of an intensity (share of that of the road), without regard to its neighbours."""
 _GREY: Final = AcrossSettings(floor_step_m=0.08, floor_bend=1e6)
-"""A change of the intensity by less than 8 % is none, and its slope tells nothing."""
+"""Settings for intensity: a change of less than 8 % does not count, nor does its slope."""
 _STEP: Final = 4.0
-"""Evidence (σ) of a step beside which a change of slope tells nothing."""
+"""Evidence (σ) of a step beside which a change of slope does not count."""
 _TRUST: Final = (1.0, 1.0, 0.95, 0.7)
-"""How much the evidence of a step up or down, of a slope and of the intensity counts where several tell an edge."""
-_AROUND: Final = 3
-_ROUNDS: Final = 3
-_LEAST_EVIDENCE: Final = 0.6
-_LINE_INSIDE_M: Final = 0.8
+"""Weights of the evidence of a step up or down, of a slope and of the intensity where several show an edge."""
+_AROUND: Final = 3  # Cells on each side of a path from which its position is taken.
+_ROUNDS: Final = 3  # Iterations of this position.
+_LEAST_EVIDENCE: Final = 0.6  # Least mean evidence (σ) of an edge.
+_LINE_INSIDE_M: Final = 0.8  # Largest distance of an edge line inside the lane's border.
 _LINE_OUTSIDE_M: Final = 0.8
-"""How far inside and outside the lane's border its edge line may be."""
-_SMOOTHED_M: Final = 3.5
-_SPREAD_M: Final = 10.0
+"""Largest distance of an edge line outside the lane's border."""
+_SMOOTHED_M: Final = 3.5  # Length of the smoothing.
+_SPREAD_M: Final = 10.0  # Length over which scatter is estimated.
 _KIND_M: Final = 10.0
-"""What an edge is told by is judged over this length."""
-_STEP_NEAR_M: Final = 0.15
+"""Length over which the kind of evidence is determined."""
+_STEP_NEAR_M: Final = 0.15  # Heights between this distance …
 _STEP_FAR_M: Final = 0.65
-"""Heights between these distances from an edge tell its step."""
+"""… and this distance from an edge determine its step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +63,11 @@ class SideEdge:
     """The edge of the road on one side, station by station."""
 
     away_m: Float64
-    """(s,) its distance from the line that the raster counts from; NaN where it is not known."""
+    """(s,) its distance from the origin line of the raster; NaN where unknown."""
     sigma_m: Float64
-    """(s,) standard deviation of that."""
+    """(s,) standard deviation of the distance."""
     kind: npt.NDArray[np.int8]
-    """(s,) what tells it: places in :data:`KINDS`; −1 where it is not known."""
+    """(s,) kind of evidence: index in :data:`KINDS`; −1 where unknown."""
     evidence: Float64
     """(s,) mean evidence (σ) around the station."""
     drop_m: Float64
@@ -77,18 +77,18 @@ class SideEdge:
 
 
 def first_m(lane_width_m: float) -> float:
-    """Least distance of an edge from the middle of a lane (m)."""
+    """Return the least distance of an edge from the middle of a lane (m)."""
     return max(NEAREST_M, 0.5 * lane_width_m - _INSIDE_LANE_M)
 
 
 def find_edge(raster: SideRaster, lane_width_m: float, largest_sigma_m: float) -> SideEdge:
-    """The edge on one side; distances count from the middle of the outermost lane."""
+    """Find the edge on one side; distances count from the middle of the outermost lane."""
     spacing = (STATION_M, OFFSET_M)
     step, bend = evidence_across(raster.height_m, np.full(raster.height_m.shape, _SIGMA_HEIGHT_M), spacing)
     grey = _relative(raster)
     surface = without_lines(grey, OFFSET_M)
     change, _ = evidence_across(surface, np.full(grey.shape, _SIGMA_GREY), spacing, _GREY)
-    # Beside a step the slopes of both sides differ as well.
+    # Slopes also differ on both sides of a step.
     stepped = scipy.ndimage.maximum_filter(np.nan_to_num(np.abs(step)), (1, 2 * round(DEFAULT.across_m / OFFSET_M) + 1))
     bend = np.where(stepped >= _STEP, 0.0, bend)
     up, down = np.where(step > 0.0, step, 0.0), np.where(step < 0.0, step, 0.0)
@@ -116,7 +116,7 @@ def find_edge(raster: SideRaster, lane_width_m: float, largest_sigma_m: float) -
 
 
 def _relative(raster: SideRaster) -> Float64:
-    """Intensities (s, o) as shares of the lane's; NaN where there are none."""
+    """Return intensities (s, o) as shares of the lane's; NaN where there are none."""
     inner = raster.intensity[raster.away_m[None, :].repeat(len(raster.intensity), 0) <= NEAREST_M + INNER_M]
     inner = inner[np.isfinite(inner)]
     level = float(np.median(inner)) if inner.size else 0.0
@@ -124,7 +124,7 @@ def _relative(raster: SideRaster) -> Float64:
 
 
 def _lasting(change: Float64, surface: Float64) -> Float64:
-    """Changes of intensity (σ), no more of each than the mean intensities of both sides differ by."""
+    """Limit changes of intensity (σ) to the difference of the mean intensities of both sides."""
     size = (2 * round(DEFAULT.along_m / STATION_M) + 1, round(DEFAULT.across_m / OFFSET_M))
     size = (size[0], size[1] + 1 - size[1] % 2)
     known = np.isfinite(surface)
@@ -139,7 +139,7 @@ def _lasting(change: Float64, surface: Float64) -> Float64:
 
 
 def _edge_line(bright: Float64, raster: SideRaster, lane_width_m: float) -> tuple[Bool, Float64, Float64]:
-    """Where a line is painted along the border of the lane: whether, its distance, and its evidence, (s,) each."""
+    """Find a line painted along the border of the lane: whether it exists, its distance and its evidence, (s,) each."""
     border = 0.5 * lane_width_m
     near = (raster.away_m >= max(border - _LINE_INSIDE_M, NEAREST_M)) & (raster.away_m <= border + _LINE_OUTSIDE_M)
     columns = np.flatnonzero(near)
@@ -150,7 +150,7 @@ def _edge_line(bright: Float64, raster: SideRaster, lane_width_m: float) -> tupl
 
 
 def _places(found: Float64, cell: npt.NDArray[np.int64], away_m: Float64) -> Float64:
-    """Distances (s,) of evidence (s, o) beside the cells of a path: its middle over three cells to each side."""
+    """Return distances (s,) of the middle of evidence (s, o) over three cells on each side of a path."""
     at = away_m[cell]
     for _ in range(_ROUNDS):
         near = np.rint((at - away_m[0]) / OFFSET_M).astype(np.int64)[:, None] + np.arange(-_AROUND, _AROUND + 1)
@@ -164,7 +164,7 @@ def _places(found: Float64, cell: npt.NDArray[np.int64], away_m: Float64) -> Flo
 
 
 def _judged(kinds: Float64, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """(s,) the kind of evidence (kinds, s, o) that is strongest beside a path around each station."""
+    """Return (s,) the kind of evidence (kinds, s, o) that is strongest beside a path around each station."""
     near = np.clip(cell[:, None] + np.arange(-_AROUND, _AROUND + 1), 0, kinds.shape[2] - 1)
     beside = np.take_along_axis(kinds, np.broadcast_to(near, (len(kinds), *near.shape)), axis=2).max(axis=2)
     around = scipy.ndimage.uniform_filter1d(beside, _cells(_KIND_M), axis=1, mode="nearest")
@@ -173,10 +173,10 @@ def _judged(kinds: Float64, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64
 
 
 def smoothed(away_m: Float64, known: Bool, kind: npt.NDArray[np.int8]) -> tuple[Float64, Float64]:
-    """Distances (s,) smoothed along the road within runs of known ones of one kind, and their standard deviations.
+    """Return distances (s,) smoothed along runs of one kind of edge, and their standard deviations.
 
-    The standard deviation is that of the single places about the smooth line, as their median difference within 10 m
-    tells it, and that of a cell's width.
+    The standard deviation combines that of the single places about the smooth line, from their median difference
+    within 10 m, and that of a cell's width.
     """
     out, sigma = np.array(away_m), np.full(away_m.size, np.nan)
     group = np.where(known, kind.astype(np.int64) + 1, 0)
@@ -202,7 +202,7 @@ def _odd(count: int) -> int:
 
 
 def drops(raster: SideRaster, away_m: Float64) -> tuple[Float64, Float64]:
-    """Height (s,) of the road's surface above the ground beside it at its edge (m), and its standard deviation.
+    """Return the height (s,) of the road's surface above the ground beside its edge (m), and its standard deviation.
 
     Straight lines are fitted to the heights from 0.15 to 0.65 m inside and outside the edge; NaN where either side has
     fewer than three. The median of five stations is taken, so that single things beside the road do not count.
@@ -223,7 +223,7 @@ def drops(raster: SideRaster, away_m: Float64) -> tuple[Float64, Float64]:
 
 
 def _line_at_edge(height: Float64, beyond: Float64) -> tuple[Float64, Float64]:
-    """Heights (s,) at the edge of straight lines through some heights (s, k) beside it, and their variances."""
+    """Return heights (s,) at the edge of straight lines through heights (s, k) beside it, and their variances."""
     good = np.isfinite(height)
     n = good.sum(axis=1)
     enough = n >= 3
@@ -239,7 +239,7 @@ def _line_at_edge(height: Float64, beyond: Float64) -> tuple[Float64, Float64]:
 
 
 def _median_of_five(value: Float64) -> Float64:
-    """(s,) medians of known values of five stations; NaN where the middle one is not known."""
+    """Return (s,) medians of known values of five stations; NaN where the middle one is unknown."""
     padded = np.pad(value, 2, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 5)
     known = np.isfinite(value)

@@ -1,4 +1,4 @@
-"""Edges of the road as a lane sees them: on its left and right in the direction of travel."""
+"""Edges of the road in lane coordinates: left and right in the direction of travel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class LaneEdge:
-    """The edge of the road on one side of a lane, a value a station; NaN where it is not known."""
+    """The edge of the road on one side of a lane, a value a station; NaN where unknown."""
 
     away_m: Float64
     """(n,) distance from the lane's middle, positive outward."""
@@ -27,7 +27,7 @@ class LaneEdge:
     sigma_drop_m: Float64
     """(n,)"""
     beside: bool
-    """Whether no other lane lies between."""
+    """True where no other lane lies between."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class EdgesOnLane:
     """By side in the direction of travel: left and right."""
 
     def inside(self, station_m: Float64, own_m: Float64) -> npt.NDArray[np.bool_]:
-        """Whether places (n,) lie between the edges, by station and offset from the lane's middle.
+        """Return whether places (n,) lie between the edges, by station and offset from the lane's middle.
 
         Offsets are positive to the right in the direction of travel. Where an edge is not known, it bounds nothing.
         """
@@ -65,7 +65,7 @@ class EdgeRows:
 def edges_on_lane(
     rows: Mapping[str, EdgeRows], lane: Lane, between_m: tuple[float, float], beside: Mapping[str, bool]
 ) -> EdgesOnLane:
-    """The edges beside a lane between two stations.
+    """Return the edges beside a lane between two stations.
 
     Parameters
     ----------

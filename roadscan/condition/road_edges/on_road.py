@@ -19,10 +19,10 @@ from roadscan.condition.road_line import Lane, RoadLine
 Float64 = npt.NDArray[np.float64]
 
 SIDES: Final = {"left": -1.0, "right": 1.0}
-"""Sides of the reference line, and the sign of offsets there."""
+"""Sides of the reference line, with the sign of offsets there."""
 LEAD_M: Final = 15.0
-"""Edges depend on the road so far before and behind them."""
-_LEAST_STATIONS: Final = 5
+"""Length of road before and behind edges on which they depend."""
+_LEAST_STATIONS: Final = 5  # Least length of a run with one outermost lane.
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class RoadStretch:
 
 @dataclass(frozen=True, eq=False)
 class EdgeOfSide:
-    """The edge on one side of the reference line, a value a station; NaN where it is not known."""
+    """The edge on one side of the reference line, a value a station; NaN where unknown."""
 
     start_m: Float64
     """(s,) offset of the middle of the outermost lane on this side from the reference line, positive to the right."""
@@ -48,7 +48,7 @@ class EdgeOfSide:
 
 @dataclass(frozen=True, eq=False)
 class RoadEdges:
-    """Edges of a stretch, at its whole multiples of :data:`STATION_M`, the last one included."""
+    """Edges of a stretch at multiples of :data:`STATION_M`, including the last one."""
 
     station_m: Float64
     """(s,)"""
@@ -66,11 +66,11 @@ class RoadSurface:
     width_m: float
     """Mean width."""
     sigma_width_m: float
-    """Standard deviation of that; errors of one side are taken as alike, since neighbours share them."""
+    """Standard deviation of the mean width; errors of one side are taken as fully correlated."""
 
 
 def reach_m(lanes: Sequence[Lane], reach_beyond_m: float) -> float:
-    """How far from the reference line an edge of these lanes may lie (m)."""
+    """Return how far from the reference line an edge of these lanes may lie (m)."""
     away = [float(np.abs(lane.offset_m).max(initial=0.0)) + 0.5 * lane.width_m for lane in lanes]
     return max(away, default=0.0) + reach_beyond_m + 1.0
 
@@ -82,13 +82,13 @@ def road_edges(
     largest_sigma_m: float,
     polygons: shapely.Geometry | None = None,
 ) -> RoadEdges:
-    """Edges of a stretch of road.
+    """Find the edges of a stretch of road.
 
     Parameters
     ----------
     points : of the tiles on its way, on the map; piece : the stretch, its line and lanes longer by :data:`LEAD_M`.
     reach_beyond_m : how far beyond the outermost lane's border an edge is sought; largest_sigma_m : edges with a larger
-        standard deviation are not told.
+        standard deviation are left out.
     polygons : the road's surface on the map, where it is stated: its borders are the edges.
     """
     between = (piece.from_m - LEAD_M, piece.to_m + LEAD_M)
@@ -117,7 +117,7 @@ def road_edges(
 
 
 def _outermost(lanes: Sequence[Lane], station: Float64, side: float) -> tuple[Float64, npt.NDArray[np.int64]]:
-    """Offset (s,) of the middle of the outermost lane on a side, and its place in `lanes`; −1 where there is none."""
+    """Return the offset (s,) of the middle of the outermost lane on a side, and its index in `lanes`; −1 for none."""
     start, which = np.full(station.size, np.nan), np.full(station.size, -1)
     for number, lane in enumerate(lanes):
         offset = lane.offsets(station)
@@ -128,7 +128,7 @@ def _outermost(lanes: Sequence[Lane], station: Float64, side: float) -> tuple[Fl
 
 
 def _runs(lane_of: npt.NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """First and end of stations with one outermost lane."""
+    """Return first and end of runs of stations with one outermost lane."""
     ends = np.flatnonzero(np.diff(lane_of, prepend=-2, append=-2))
     for first, end in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
         if lane_of[first] >= 0 and end - first >= _LEAST_STATIONS:
@@ -147,7 +147,7 @@ def _stated(away: Float64, drop: Float64, sigma_drop: Float64) -> SideEdge:
 
 
 def _borders(polygons: shapely.Geometry, line: RoadLine, station: Float64, start: Float64, out_m: float) -> Float64:
-    """(s,) distance from places on a lane to where the way outward leaves the polygons; NaN where it does not."""
+    """Return (s,) distance from a lane outward to the border of the polygons; NaN where there is none."""
     inner, outer = line.places(station, start)[:, :2], line.places(station, start + out_m)[:, :2]
     ways = shapely.linestrings(np.stack([inner, outer], axis=1))
     shapely.prepare(polygons)
@@ -163,7 +163,7 @@ def _borders(polygons: shapely.Geometry, line: RoadLine, station: Float64, start
 
 
 def road_surfaces(edges: RoadEdges, line: RoadLine) -> Iterator[RoadSurface]:
-    """The road's surface, a polygon for each run of stations with both edges."""
+    """Return the road's surface, a polygon for each run of stations with both edges."""
     left, right = edges.sides["left"], edges.sides["right"]
     both = np.isfinite(left.offset_m) & np.isfinite(right.offset_m)
     for first, end in runs_of(both).tolist():

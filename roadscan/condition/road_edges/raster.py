@@ -1,4 +1,4 @@
-"""Heights and intensities beside a road's lanes, from cells: a raster of stations and of distances from a line."""
+"""Rasters of heights and intensities beside a road's lanes, by station and distance from a line."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from roadscan.tiles.cells import TileCells
 
 Float64 = npt.NDArray[np.float64]
 
-STATION_M: Final = 0.5
+STATION_M: Final = 0.5  # Extent of a cell along the road.
 OFFSET_M: Final = 0.1
-"""Extents of a cell of the raster, along and across the road."""
+"""Extent of a cell across the road."""
 TALLEST_M: Final = 0.5
-"""What stands higher above the road beside it is no ground."""
+"""Higher points than this above the road beside them are no ground."""
 
 
 @dataclass(frozen=True, eq=False)
 class TilePoints:
-    """Blocks of a tile's cells, at most half of a cell of the raster wide, each with the means of its readings."""
+    """Blocks of a tile's cells, at most half a raster cell wide, each with the means of its readings."""
 
     place_m: Float64
     """(n, 2) easting and northing."""
@@ -37,7 +37,7 @@ class TilePoints:
 
 @dataclass(frozen=True, eq=False)
 class GroundPoints:
-    """Points of some tiles, by their place along a road."""
+    """Points of some tiles in coordinates along a road."""
 
     station_m: Float64
     """(n,)"""
@@ -68,7 +68,7 @@ class SideRaster:
 
 
 def tile_points(cells: TileCells, corner_m: tuple[float, float], cell_m: float) -> TilePoints:
-    """Blocks of a tile's cells.
+    """Return blocks of a tile's cells.
 
     corner_m : easting and northing of the tile's south-west corner; cell_m : edge of its cells.
     """
@@ -89,7 +89,7 @@ def tile_points(cells: TileCells, corner_m: tuple[float, float], cell_m: float) 
 
 
 def ground_points(points: Sequence[TilePoints], line: RoadLine, between_m: tuple[float, float]) -> GroundPoints:
-    """The points of tiles whose station lies between two, tile after tile."""
+    """Return the points of tiles whose station lies between two, tile after tile."""
     from scipy.spatial import cKDTree  # slow to import
 
     place = np.concatenate([np.empty((0, 2)), *(p.place_m for p in points)])
@@ -107,7 +107,7 @@ def ground_points(points: Sequence[TilePoints], line: RoadLine, between_m: tuple
 def side_raster(
     points: GroundPoints, side: float, station_m: Float64, start_m: Float64, between_m: tuple[float, float]
 ) -> SideRaster:
-    """The raster of one side.
+    """Return the raster of one side.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def side_raster(
     shape = (station_m.size, count)
     cell, weight = (row * count + column)[inside], points.readings[inside]
     height = _mean(cell, points.height_m[inside], weight, shape)
-    # Of what stands on the ground, or hangs over it, the heights are not those of the ground.
+    # Heights of objects on or above the ground are not those of the ground.
     inner = height[:, : round(1.0 / OFFSET_M)]
     known = np.isfinite(inner).any(axis=1)
     if known.any():
@@ -138,13 +138,13 @@ def side_raster(
 
 
 def _fall(first: int, count: int) -> Float64:
-    """(o,) greatest difference of height to the road that ground may have: some steps, and slopes of a third."""
+    """Return (o,) greatest height difference between road and ground: some steps, and slopes of a third."""
     most: Float64 = TALLEST_M + np.maximum(OFFSET_M * (first + np.arange(count)), 0.0) / 3.0
     return most
 
 
 def _mean(cell: npt.NDArray[np.int64], value: Float64, weight: Float64, shape: tuple[int, int]) -> Float64:
-    """Weighed means (s, o) of values by cell, NaN where there is none."""
+    """Return weighted means (s, o) of values by cell, NaN where there is none."""
     good = np.isfinite(value)
     size = shape[0] * shape[1]
     base = float(np.median(value[good])) if good.any() else 0.0

@@ -14,7 +14,7 @@ from roadscan.condition.roughness_regions.raster import IntensityRaster
 from roadscan.core.extras import cv2
 
 _EDGE_CELLS: Final = 3
-"""How far the edge of a cluster can move out when it is drawn halfway between it and the road."""
+"""Largest movement of a cluster's edge outward to halfway between its intensity and that of the road."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +25,11 @@ class Cluster:
     columns: npt.NDArray[np.int64]
 
     def area_m2(self, raster: IntensityRaster) -> float:
-        """Area of the cells."""
+        """Return the area of the cells."""
         return float(self.rows.size * raster.cell_m**2)
 
     def hull(self, raster: IntensityRaster, edge_intensity: float | None = None) -> shapely.Polygon:
-        """Convex hull in the frame of the raster (m): of the cells.
+        """Return the convex hull of the cells in the frame of the raster (m).
 
         edge_intensity : its corners lie where the local mean, linear from centre to centre, has this intensity.
         """
@@ -40,7 +40,7 @@ class Cluster:
         return shapely.convex_hull(shapely.MultiPoint(raster.corner_m + raster.cell_m * np.concatenate(ends)))
 
     def _ends(self, raster: IntensityRaster, edge: float) -> Iterator[npt.NDArray[np.float64]]:
-        """Places (n, 2), in cells, where the cluster ends to each of four sides."""
+        """Return places (n, 2), in cells, where the cluster ends on each of four sides."""
         own = np.pad(np.zeros(raster.values.shape, bool), 1)
         own[self.rows + 1, self.columns + 1] = True
         value = np.pad(raster.local_mean, 1, constant_values=np.nan)
@@ -53,7 +53,7 @@ class Cluster:
             yield np.column_stack([self.columns[last] + 0.5 + way * side[1], self.rows[last] + 0.5 + way * side[0]])
 
     def at_half(self, raster: IntensityRaster, intensity: float) -> Cluster:
-        """The cluster with its edge where the local mean has an intensity, at most three cells out.
+        """Return the cluster with its edge where the local mean has an intensity, at most three cells farther out.
 
         It stays as it is if none is left.
         """
@@ -71,9 +71,9 @@ class Cluster:
 def clusters_of(
     raster: IntensityRaster, dim_below: int, least_area_m2: float, among: Sequence[Cluster] | None = None
 ) -> tuple[list[Cluster], int]:
-    """Clusters of cells of at most an 8-bit value, from the first row on, and how many are smaller than an area.
+    """Return clusters of cells up to an 8-bit value, from the first row on, and the number of those below an area.
 
-    among : clusters whose cells alone are looked at.
+    among : clusters; only their cells are used.
     """
     dim = raster.measured & (raster.values <= dim_below)
     if among is not None:

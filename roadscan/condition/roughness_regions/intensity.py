@@ -1,4 +1,4 @@
-"""Intensity: normalised for range and incidence, and parted into three classes."""
+"""Normalises intensity for range and incidence, and divides it into three classes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy.typing as npt
 Float64 = npt.NDArray[np.float64]
 
 _STEEPEST_RAD: Final = np.radians(80.0)
-"""Beyond it the cosine is held, lest glancing returns outshine all others."""
+"""Largest angle of incidence that is corrected: beyond it, the cosine is constant, lest glancing returns dominate."""
 
 
 def normalised_intensity(
     intensity: Float64, range_m: Float64, incidence_rad: Float64, reference_range_m: float
 ) -> Float64:
-    """(n,) intensities as from `reference_range_m` at right angles: I · (R / R₀)² / cos θ.
+    """Return (n,) intensities as from `reference_range_m` at right angles: I · (R / R₀)² / cos θ.
 
     The lidar equation of an extended Lambertian target (Höfle & Pfeifer 2007, equation 6, without the atmosphere). For
     sensors whose intensity is the received power; one that has already been corrected for range stays as it is.
@@ -31,7 +31,7 @@ def normalised_intensity(
 
 
 def range_and_incidence(points_m: Float64, sensor_m: Float64, normal: Float64) -> tuple[Float64, Float64]:
-    """Ranges (n,) (m) and angles of incidence (n,) (rad) of points seen from sensors.
+    """Return ranges (n,) (m) and angles of incidence (n,) (rad) of points seen from sensors.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def range_and_incidence(points_m: Float64, sensor_m: Float64, normal: Float64) -
 
 
 def three_classes(values: npt.NDArray[np.uint8]) -> tuple[int, int] | None:
-    """Two thresholds t₁ < t₂ that part 8-bit values into ≤ t₁, ≤ t₂ and above (Otsu 1979, three classes).
+    """Return two thresholds t₁ < t₂ that divide 8-bit values into ≤ t₁, ≤ t₂ and above (Otsu 1979, three classes).
 
     Of all pairs, the one with the greatest variance between the classes, of equals the first; None with fewer than
     three different values.
@@ -55,7 +55,7 @@ def three_classes(values: npt.NDArray[np.uint8]) -> tuple[int, int] | None:
     weight, moment = np.cumsum(counts), np.cumsum(counts * np.arange(256))
 
     def between(q: Float64, m: Float64) -> Float64:
-        """Weight times squared mean: what a class adds to the variance between classes, but for a constant."""
+        """Weight times squared mean: a class's contribution to the variance between classes, up to a constant."""
         return np.divide(m * m, q, out=np.zeros_like(m), where=q > 0.0)
 
     first, second = weight[:, None], weight[None, :]

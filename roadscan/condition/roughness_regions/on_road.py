@@ -1,4 +1,4 @@
-"""Sections of a road for roughness regions: points from cells, on the lanes, between two stations."""
+"""Sections of a road for roughness regions: points from cells on the lanes between two stations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from roadscan.tiles.cells import TileCells
 Float64 = npt.NDArray[np.float64]
 
 _FINER: Final = 4.0
-"""Survey cells are joined to blocks of at most this part of a raster cell: closer points tell no more."""
+"""Survey cells are joined to blocks of at most this fraction of a raster cell: closer points add no information."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Stretch:
 def points_of(
     cells: TileCells, corner_m: tuple[float, float], survey_cell_m: float, raster_cell_m: float
 ) -> RoadPoints:
-    """The cells of a tile as points: blocks of cells, each with the means of its readings.
+    """Return the cells of a tile as points: blocks of cells, each with the means of its readings.
 
     corner_m : easting and northing of the tile's south-west corner.
     """
@@ -58,7 +58,7 @@ def points_of(
 
 
 def section_regions(points: Sequence[RoadPoints], piece: Stretch, settings: RoughnessRegionsConfig) -> SectionRegions:
-    """The roughness regions of one section of a road.
+    """Find the roughness regions of one section of a road.
 
     Parameters
     ----------
@@ -92,6 +92,6 @@ _COLUMNS: Final = ("x_m", "y_m", "height_m", "intensity", "readings")
 
 
 def station_and_offset(line: RoadLine, place_m: tuple[float, float], guess_m: float) -> tuple[float, float]:
-    """Station and offset of a place near a station."""
+    """Return station and offset of a place near a station."""
     station, offset = line.along(np.array([place_m]), guess_m)
     return float(station[0]), float(offset[0])

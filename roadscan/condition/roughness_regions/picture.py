@@ -1,4 +1,4 @@
-"""Picture of roughness regions: their outlines over the intensities of their sections."""
+"""Draws the outlines of roughness regions over the intensities of their sections."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from roadscan.core.canvas import empty_figure
 
-_DOTS_PER_INCH: Final = 110
-_WIDTH_IN: Final = 7.0
+_DOTS_PER_INCH: Final = 110  # Resolution.
+_WIDTH_IN: Final = 7.0  # Width of a section.
 _OUTLINE: Final = "#d7301f"
 
 
@@ -28,7 +28,7 @@ class DrawnSection:
     corner_m: tuple[float, float]
     cell_m: float
     outlines_m: tuple[npt.NDArray[Any], ...]
-    """(k, 2) each."""
+    """(k, 2) outline of each region."""
 
 
 def draw_regions(path: Path, sections: Sequence[DrawnSection]) -> None:

@@ -1,4 +1,4 @@
-"""Points of a section of road: their canonical order, their rotation, and the pyramid that thins them out."""
+"""Points of a section of road: canonical order, rotation, and the pyramid that thins them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RoadPoints:
-    """Points (n,) of a section of road, of a lidar, of a profiler, or cells that stand for several readings."""
+    """Points (n,) of a section of road: readings, or cells that stand for several readings."""
 
     x_m: Float64
     """Easting, or way along the road where the points are rotated."""
@@ -25,7 +25,7 @@ class RoadPoints:
     intensity: Float64
     """On any scale that begins at 0."""
     readings: Float64
-    """How many readings a point stands for."""
+    """Number of readings for which a point stands."""
 
     def __len__(self) -> int:
         return int(self.x_m.size)
@@ -39,7 +39,7 @@ class RoadPoints:
         intensity: npt.ArrayLike,
         readings: npt.ArrayLike = 1.0,
     ) -> RoadPoints:
-        """The points in canonical order (northing, easting, height, intensity), whatever order they came in.
+        """Return the points in canonical order (northing, easting, height, intensity).
 
         Parameters
         ----------
@@ -63,11 +63,11 @@ class RoadPoints:
         return cls(*(c[order] for c in columns))
 
     def take(self, rows: npt.NDArray[np.generic]) -> RoadPoints:
-        """The points at `rows`: places or a mask."""
+        """Return the points at `rows`: indices or a mask."""
         return RoadPoints(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def rotated(self, origin_m: tuple[float, float], heading_rad: float) -> RoadPoints:
-        """The points about an origin, turned about the vertical so that the heading points along x.
+        """Return the points about an origin, turned about the vertical so that the heading points along x.
 
         heading_rad : mean heading of the vehicle, clockwise from north.
         """
@@ -77,14 +77,14 @@ class RoadPoints:
 
 
 def rotated_back(xy_m: Float64, origin_m: tuple[float, float], heading_rad: float) -> Float64:
-    """Easting and northing (n, 2) of places along and to the left (n, 2); undoes :meth:`RoadPoints.rotated`."""
+    """Return easting and northing (n, 2) of places along and to the left (n, 2); undoes :meth:`RoadPoints.rotated`."""
     sin, cos = math.sin(heading_rad), math.cos(heading_rad)
     x, y = xy_m[:, 0], xy_m[:, 1]
     return np.column_stack([origin_m[0] + x * sin - y * cos, origin_m[1] + x * cos + y * sin])
 
 
 def pyramid(points: RoadPoints, cell_m: float, levels: int) -> list[RoadPoints]:
-    """The points, and as many levels that are thinned out ever more (Crawford 2009, window-size filter).
+    """Return the points, and as many increasingly thinned levels (Crawford 2009, window-size filter).
 
     The windows of the first level are two cells wide, those of each further level twice as wide as before. Of each
     window the point is kept whose intensity is nearest to the window's mean, of equals the first; a level is thinned

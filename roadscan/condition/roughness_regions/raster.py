@@ -15,7 +15,7 @@ from roadscan.core.extras import cv2
 
 Float64 = npt.NDArray[np.float64]
 
-_BRIGHTEST: Final = 255
+_BRIGHTEST: Final = 255  # Largest 8-bit value.
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class IntensityRaster:
     """Intensity that 255 stands for."""
 
     def cells_at(self, x_m: Float64, y_m: Float64) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Rows and columns (n,) of the cells at places, held inside the raster."""
+        """Return rows and columns (n,) of the cells at places, clipped to the raster."""
         rows, columns = self.values.shape
         column, row = (
             np.floor(v / self.cell_m).astype(np.int64) - round(c / self.cell_m)
@@ -46,14 +46,14 @@ class IntensityRaster:
         return np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
 
     def intensity(self, value: float) -> float:
-        """The intensity that an 8-bit value stands for."""
+        """Return the intensity of an 8-bit value."""
         return self.dimmest + (self.brightest - self.dimmest) * value / _BRIGHTEST
 
 
 def intensity_raster(
     points: RoadPoints, thinned: RoadPoints, cell_m: float, largest_gap_m: float, clip_share: float
 ) -> IntensityRaster | None:
-    """The raster of thinned points, by natural neighbours, on an 8-bit scale; None where no cell has a value.
+    """Return the 8-bit raster of thinned points by natural neighbours; None where no cell has a value.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def intensity_raster(
     known = np.sort(found[measured])
     clipped = int(clip_share * (known.size - 1))
     dimmest, brightest = float(known[clipped]), float(known[known.size - 1 - clipped])
-    # Equal intensities differ by what weighing leaves of their last digits.
+    # Interpolated equal intensities differ by rounding.
     scale = _BRIGHTEST / (brightest - dimmest) if brightest - dimmest > 1e-9 * abs(brightest) else 0.0
     grey = np.clip(np.rint((np.where(measured, found, dimmest) - dimmest) * scale), 0, _BRIGHTEST).astype(np.uint8)
     return IntensityRaster(
@@ -88,7 +88,7 @@ def intensity_raster(
 
 
 def _local_mean(points: RoadPoints, corner_m: tuple[float, float], cell_m: float, shape: tuple[int, int]) -> Float64:
-    """(rows, columns) means of the points of 3 × 3 cells."""
+    """Return (rows, columns) means of the points of 3 × 3 cells."""
     at = [np.floor((v - c) / cell_m).astype(np.int64) for v, c in zip((points.x_m, points.y_m), corner_m, strict=True)]
     cell = np.clip(at[1], 0, shape[0] - 1) * shape[1] + np.clip(at[0], 0, shape[1] - 1)
     sums = [
@@ -108,7 +108,7 @@ def _local_mean(points: RoadPoints, corner_m: tuple[float, float], cell_m: float
 
 
 def closed(grey: npt.NDArray[np.uint8], measured: npt.NDArray[np.bool_], edge_cells: int) -> npt.NDArray[np.uint8]:
-    """The raster after dilation and erosion by a square; cells that are not measured take no part."""
+    """Return the raster after dilation and erosion by a square; unmeasured cells are excluded."""
     square = np.ones((edge_cells, edge_cells), np.uint8)
     wide = cv2.dilate(
         np.where(measured, grey, 0).astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0

@@ -5,7 +5,7 @@ XLII-1/W1, section 2): road surface, rotation by the mean heading, first level o
 raster by natural neighbours, 8 bits, closing, three-class Otsu thresholds, connected dim cells, convex hulls, filters
 by density and by the deviation of heights, rotation back.
 
-Beyond the paper: heights are judged against the section's road surface, so that a grade counts nothing; thresholds are
+Beyond the paper: heights are judged against the section's road surface, so that a grade has no effect; thresholds are
 taken from cells on that surface, so that vehicles do not move them; a region has to be dimmer than the road around it,
 and its edge runs where the intensity is halfway between both; a cluster that is no dimmer is the road itself, and its
 cells are parted again, so that a small patch is found on a road without another; and a region's roughness is measured
@@ -35,13 +35,13 @@ Float64 = npt.NDArray[np.float64]
 
 NO_CONTRAST: Final = "no_contrast"
 _ROUNDS: Final = 8
-"""How often cells that turn out to be the road itself are parted again."""
-_NONE: Final = np.empty(0, np.uint8)
+"""Most times that cells which turn out to be the road itself are classified again."""
+_NONE: Final = np.empty(0, np.uint8)  # Values of no cell.
 
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """What the clusters of a section are judged by."""
+    """Data by which the clusters of a section are judged."""
 
     raster: IntensityRaster
     points: RoadPoints
@@ -55,13 +55,13 @@ class Region:
     """A dim cluster and its measures; the outline is its convex hull."""
 
     outline: shapely.Polygon
-    """In the frame of the section; on the map once it is rotated back."""
+    """Outline in the frame of the section; on the map once it is rotated back."""
     fate: str
     """reported, small, sparse, off_the_surface or no_contrast."""
     area_m2: float
-    """Of the hull."""
+    """Area of the hull."""
     dim_area_m2: float
-    """Of the dim cells."""
+    """Area of the dim cells."""
     readings: float
     density_per_m2: float
     height_sigma_m: float
@@ -71,12 +71,12 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class SectionRegions:
-    """What was found in a section."""
+    """Result for a section."""
 
     clusters: tuple[Region, ...]
-    """All dim clusters of at least the least area, with their fates, from dim cells nearest to the section's start."""
+    """All dim clusters of at least the least area, with their outcomes, from dim cells nearest the section's start."""
     small: int
-    """Dim clusters below the least area."""
+    """Number of dim clusters below the least area."""
     dim_below: float
     """Threshold t₁ as an intensity; NaN without one."""
     bright_above: float
@@ -84,7 +84,7 @@ class SectionRegions:
     thresholds: tuple[int, int] | None
     """t₁ and t₂ on the 8-bit scale."""
     measured_m2: float
-    """Ground of the raster that was measured."""
+    """Measured area of the raster."""
     readings: float
     raster: IntensityRaster | None
     """The closed raster."""
@@ -94,11 +94,11 @@ class SectionRegions:
 
     @property
     def regions(self) -> list[Region]:
-        """Those that are reported."""
+        """Return the reported regions."""
         return [one for one in self.clusters if one.fate == "reported"]
 
     def local_outlines(self) -> list[Float64]:
-        """Corners (k, 2) of their outlines in the frame of the raster (m)."""
+        """Return corners (k, 2) of their outlines in the frame of the raster (m)."""
         corners = [shapely.get_coordinates(one.outline) for one in self.regions]
         ones = np.ones(1)
         return [
@@ -116,7 +116,7 @@ def find_regions(
     settings: RoughnessRegionsConfig,
     road: shapely.Geometry | None = None,
 ) -> SectionRegions:
-    """The roughness regions of a section.
+    """Find the roughness regions of a section.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def find_regions(
 def _off_surface(
     raster: IntensityRaster, thinned: RoadPoints, surface: RoadSurface, limit_m: float
 ) -> npt.NDArray[np.bool_]:
-    """(rows, columns) cells with a thinned point off the road's surface, and their neighbours."""
+    """Return (rows, columns) cells with a thinned point off the road's surface, and their neighbours."""
     above = np.abs(surface.residuals_m(thinned.x_m, thinned.y_m, thinned.height_m)) > limit_m
     mask = np.zeros(raster.values.shape, np.uint8)
     x, y = thinned.x_m[above], thinned.y_m[above]
@@ -211,7 +211,7 @@ def _judged(cluster: Cluster, section: Section) -> Region:
 
 
 def _within(points: RoadPoints, shape: shapely.Polygon) -> npt.NDArray[np.bool_]:
-    """(n,) which points lie in a polygon."""
+    """Return (n,) which points lie in a polygon."""
     west, south, east, north = shape.bounds
     box = (points.x_m >= west) & (points.x_m <= east) & (points.y_m >= south) & (points.y_m <= north)
     inside: npt.NDArray[np.bool_] = np.zeros(len(points), bool)

@@ -1,4 +1,4 @@
-"""How rough a region is: its heights and its intensity against the road around it."""
+"""Severity of a region: its heights and its intensity relative to the road around it."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ class Severity(NamedTuple):
     contrast: float
     """Share by which its median intensity is lower than that of the road around."""
     intensity: float
-    """Median of its points."""
+    """Median intensity of its points."""
     residual_mean_m: float
     """Mean height above the surface of the road around: negative where it has sunk."""
     residual_sigma_m: float
     """Standard deviation of these heights: the roughness (Kumar et al. 2015)."""
     around_sigma_m: float
-    """The same of the road around, by the median of its absolute residuals: what noise and texture amount to."""
+    """The same for the road around, by the median of its absolute residuals: noise and texture."""
 
 
-UNKNOWN: Final = Severity(*5 * (float("nan"),))
+UNKNOWN: Final = Severity(*5 * (float("nan"),))  # Nothing was measured around it.
 
 
 def severity(own: RoadPoints, around: RoadPoints) -> Severity:
-    """Measures of a region's points against those of the road around it.
+    """Compute measures of a region's points relative to those of the road around it.
 
     The surface is one of the second degree, by a robust fit (Tukey's biweight) to the road around: Kumar et al. (2015)
     fit a grid of the points themselves, which follows what it is to measure.

@@ -1,4 +1,4 @@
-"""Robust surfaces of the road: what heights are judged against."""
+"""Robust surfaces of the road, relative to which heights are judged."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from roadscan.compute.robust import scatter_about
 
 Float64 = npt.NDArray[np.float64]
 
-_ROUNDS: Final = 12
+_ROUNDS: Final = 12  # Iterations of a robust fit.
 _TUKEY: Final = 4.685
-"""Residuals beyond so many standard deviations count nothing (Tukey's biweight, 95 % efficient)."""
-_LEAST_SPREAD_M: Final = 1e-4
+"""Residuals beyond this many standard deviations have no weight (Tukey's biweight, 95 % efficient)."""
+_LEAST_SPREAD_M: Final = 1e-4  # Least spread of residuals that is assumed.
 _LOWEST_M: Final = 1.0
 """Edge of the squares whose low points show the road beside and below vehicles (m)."""
-_LOW_SHARE: Final = 0.2
+_LOW_SHARE: Final = 0.2  # Quantile of the low points of a square.
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,14 @@ class RoadSurface:
     """(6,) of 1, x, y, x², x y, y², with x and y from the middle in units of the scale."""
 
     def residuals_m(self, x_m: Float64, y_m: Float64, height_m: Float64) -> Float64:
-        """(n,) heights above the surface."""
+        """Return (n,) heights above the surface."""
         x, y = (x_m - self.middle_m[0]) / self.scale_m, (y_m - self.middle_m[1]) / self.scale_m
         above: Float64 = height_m - self.middle_m[2] - np.sum(_powers(x, y) * self.terms, axis=1)
         return above
 
 
 def fit(x_m: Float64, y_m: Float64, height_m: Float64) -> RoadSurface | None:
-    """The surface of the second degree through points (n,), by reweighted least squares (Tukey's biweight).
+    """Fit the surface of second degree through points (n,), by reweighted least squares (Tukey's biweight).
 
     None with fewer than twelve points, or points on a line.
     """
@@ -51,7 +51,7 @@ def fit(x_m: Float64, y_m: Float64, height_m: Float64) -> RoadSurface | None:
     terms = np.zeros(6)
     for _ in range(_ROUNDS):
         weighed = powers * weight[:, None]
-        # Sums without BLAS: the same bits for any number of its threads.
+        # Sums without BLAS, so that the bits do not depend on its number of threads.
         normal = np.array([[np.sum(weighed[:, a] * powers[:, b]) for b in range(6)] for a in range(6)])
         if np.linalg.matrix_rank(normal, tol=1e-9 * float(normal[0, 0])) < 6:
             return None
@@ -63,7 +63,7 @@ def fit(x_m: Float64, y_m: Float64, height_m: Float64) -> RoadSurface | None:
 
 
 def road_below(x_m: Float64, y_m: Float64, height_m: Float64) -> RoadSurface | None:
-    """The road's surface of a whole section, vehicles on it or not: through the low points of each square metre."""
+    """Fit the road's surface of a section, with or without vehicles, through the low points of each square metre."""
     if not x_m.size:
         return None
     column, row = (np.floor(v / _LOWEST_M).astype(np.int64) for v in (x_m, y_m))

@@ -1,1 +1,1 @@
-"""The road's condition: reference lines, stretches of lanes, values of indices, sections."""
+"""Tasks of the road's condition: reference lines, stretches of lanes, values of indices, sections."""

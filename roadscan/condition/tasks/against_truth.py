@@ -1,4 +1,4 @@
-"""Values of condition beside those that the true heights of a simulated survey give at the same places."""
+"""Compares values of condition with those from the true heights of a simulated survey at the same places."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from roadscan.tiles.tasks.wanted_products import product_context
 
 Float64 = npt.NDArray[np.float64]
 HeightAt: TypeAlias = Callable[[Float64, Float64], Float64]
-"""True heights (n,) at eastings and northings (n,)."""
+"""Function that gives true heights (n,) at eastings and northings (n,)."""
 
 
 @dataclass(frozen=True)
 class Compared:
-    """A value, and what the true surface gives."""
+    """A value, and that of the true surface."""
 
     road: str
     lane: str
@@ -34,7 +34,7 @@ class Compared:
 
 
 def compared_values(session: Session, height_at: HeightAt) -> Iterator[Compared]:
-    """All values of the store beside those of the truth; the profiles and cross-sections have to be made."""
+    """Return all values of the store beside those of the truth; profiles and cross-sections have to be computed."""
     config = ConditionConfig.stated(session.survey)
     if config is None:
         return
@@ -54,7 +54,7 @@ def compared_values(session: Session, height_at: HeightAt) -> Iterator[Compared]
 
 
 def true_lane(group: Group, lane: LaneData, height_at: HeightAt) -> LaneData:
-    """The lane with the true heights at its places."""
+    """Return the lane with the true heights at its places."""
     profiles = {side: _true_profile(profile, height_at) for side, profile in lane.profiles.items()}
     cross = lane.cross_sections
     n, m = cross.height_m.shape

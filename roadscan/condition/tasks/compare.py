@@ -1,4 +1,4 @@
-"""Two surveys of a road: their sections matched, and the change of every quantity."""
+"""Compares two surveys of a road: matches their sections, and computes the change of every quantity."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class Changes:
 
     @property
     def changed(self) -> int:
-        """Number of rows whose change is more than chance."""
+        """Number of rows with a significant change."""
         return sum(row in ("larger", "smaller") for row in self.table["verdict"].to_pylist())
 
     def summary(self) -> list[tuple[str, ...]]:
-        """Of each quantity its name, the number of sections that were compared, and that of each verdict."""
+        """Return for each quantity its name, the number of compared sections, and the number of each verdict."""
         counted = self.table.group_by(["quantity", "verdict"]).aggregate([([], "count_all")]).to_pylist()
         counts = {(row["quantity"], row["verdict"]): int(row["count_all"]) for row in counted}
         rows = []
@@ -68,7 +68,7 @@ class Changes:
         return rows
 
     def write(self, file: Path) -> None:
-        """Write them: CSV where the name ends so, else GeoParquet with the sections' lines.
+        """Write the rows: CSV for that suffix, else GeoParquet with the sections' lines.
 
         Raises
         ------
@@ -84,7 +84,7 @@ class Changes:
 
 
 def compare_surveys(before: Session, after: Session) -> Changes:
-    """Changes of the condition from one survey to another of the same road.
+    """Return changes of the condition from one survey to another of the same road.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Reference lines and lanes of a survey: found from its drives or a layer, kept as two small tables."""
+"""Reference lines and lanes of a survey: found from its drives or a layer, stored as two small tables."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ LINES: Final = "reference_lines"
 LANES: Final = "lanes"
 _UNIT: Final = "all"
 _STEP_M: Final = 0.25
-"""A position is kept where it lies in another cube of this edge than the one before."""
+"""Edge of the cubes by which positions are thinned: one is kept in each cube passed."""
 _POSITION: Final = ["epoch_gps_ns", *(f"{a}_world_m" for a in "xyz")]
 _LINE_SETTINGS: Final = (
     "reference", "layer_crs", "layer_options", "lanes", "same_road_m", "smoothing_m", "lane_smoothing_m",
@@ -51,15 +51,15 @@ _LINE_SETTINGS: Final = (
 
 @dataclass(frozen=True, eq=False)
 class Roads:
-    """Lines and lanes as they are stored."""
+    """Lines and lanes from the store."""
 
     lines: dict[str, RoadLine]
-    """By road."""
+    """Lines by road."""
     lanes: tuple[Lane, ...]
 
 
 def lines_key(plan: SurveyPlan, config: ConditionConfig) -> str:
-    """Key of the two tables: ways of the passes, settings, layer and code."""
+    """Return the key of the two tables: paths of the passes, settings, layer and code."""
     drives = [[[f.digest for f in source.files], _stated(one)] for one, source in _driven(plan)]
     accuracy = [f.digest for r in plan.records for f in r.tables.get("trajectory_accuracy", ())]
     layer = _layer_file(plan, config)
@@ -75,7 +75,7 @@ def _stated(one: LanePass) -> list[object]:
 
 
 def _driven(plan: SurveyPlan) -> Iterator[tuple[LanePass, TrajectorySource]]:
-    """Passes whose run has a trajectory, by number."""
+    """Return passes whose run has a trajectory, by number."""
     placed = {s.run for s, _ in plan.sources if s.trajectory is not None}
     for one in sorted(plan.passes, key=lambda p: p.pass_id):
         if one.run in placed:
@@ -94,12 +94,12 @@ def find_lines(plan: SurveyPlan, config: ConditionConfig) -> Roads:
 
 
 def roads_key(plan: SurveyPlan) -> str:
-    """Key of the lines and lanes of :func:`survey_roads`."""
+    """Return the key of the lines and lanes of :func:`survey_roads`."""
     return lines_key(plan, ConditionConfig.stated(plan.survey) or ConditionConfig())
 
 
 def survey_roads(plan: SurveyPlan, manifest: Manifest) -> tuple[Roads, str]:
-    """Lines and lanes of a survey, and their key: as the stage `condition` stored them, or found now.
+    """Return lines and lanes of a survey, and their key: as the stage `condition` stored them, or found now.
 
     A survey without a section `[condition]` has those of its drives.
     """
@@ -119,7 +119,7 @@ def write_lines(plan: SurveyPlan, config: ConditionConfig, key: str) -> list[Out
 
 
 def _with_roll(plan: SurveyPlan, lanes: Sequence[Lane]) -> list[Lane]:
-    """The lanes with the standard deviations of roll and height of their drives, and how these heights wander."""
+    """Return lanes with σ of roll and height of their drives, and the random walk of these heights."""
     settings = plan.survey.config.navigation.calibration
     known = {
         one.pass_id: (*usual_pose_sigma(plan.store, plan.records, source, settings), _wander(plan, one, source))
@@ -140,7 +140,7 @@ def _with_roll(plan: SurveyPlan, lanes: Sequence[Lane]) -> list[Lane]:
 
 
 def _wander(plan: SurveyPlan, one: LanePass, source: TrajectorySource) -> float:
-    """Variance a metre of travel by which the heights of a pass's poses wander at random (m²/m)."""
+    """Return the variance of the random walk of a pass's heights per metre of travel (m²/m)."""
     rows = list(_rows(plan.store, one, source))
     if not rows:
         return 0.0
@@ -164,7 +164,7 @@ def check_layer(survey: Survey) -> None:
 
 
 def stated_lines(plan: SurveyPlan, config: ConditionConfig) -> list[StatedLine]:
-    """Lines of the survey file's layer; none where it has none.
+    """Return the lines of the survey file's layer; none where it has none.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def stated_lines(plan: SurveyPlan, config: ConditionConfig) -> list[StatedLine]:
 
 
 def _path_m(plan: SurveyPlan, one: LanePass, source: TrajectorySource) -> npt.NDArray[np.float64]:
-    """(k, 2) easting and northing along a pass."""
+    """Return (k, 2) easting and northing along a pass."""
     parts = [np.zeros((0, 3)), *_positions(plan.store, one, source)]
     world = np.concatenate(parts)
     frame: MapFrame = plan.ground.map
@@ -215,7 +215,7 @@ def _positions(store: Store, one: LanePass, source: TrajectorySource) -> Iterato
 def _rows(
     store: Store, one: LanePass, source: TrajectorySource
 ) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]]:
-    """Epochs (n,) and positions (n, 3) in the world frame, row group by row group."""
+    """Yield epochs (n,) and positions (n, 3) in the world frame, row group by row group."""
     for file in sorted(source.files, key=lambda f: f.span or (0, 0)):
         if file.span is not None and (file.span[1] < one.start_gps_ns or file.span[0] >= one.end_gps_ns):
             continue
@@ -289,12 +289,12 @@ def _write(
 
 
 def current_lines(manifest: Manifest, key: str) -> bool:
-    """Whether both tables are there and up to date."""
+    """Return whether both tables exist and are current."""
     return all(manifest.is_current(name, _UNIT, key) for name in (LINES, LANES))
 
 
 def load_roads(store: Store, manifest: Manifest, context: ProductContext) -> Roads:
-    """Lines and lanes as they were stored; none where there are no tables yet."""
+    """Load lines and lanes; empty where there are no tables yet."""
     records = [manifest.get(name, _UNIT) for name in (LINES, LANES)]
     if records[0] is None or records[1] is None:
         return Roads({}, ())

@@ -1,4 +1,4 @@
-"""Pictures of condition: a strip chart of each lane and kilometre, and its cross-sections at two ruts."""
+"""Pictures of condition: a strip chart for each lane and kilometre, and cross-sections at two of its ruts."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ PICTURES: Final = "condition_pictures"
 STRIP: Final = "strip"
 CROSS_SECTION: Final = "cross_section"
 _SURE: Final = 2.0
-"""Where few readings lie, σ is several times that of the lane; elsewhere it varies by a third."""
+"""Largest σ relative to the lane's: it is several times as large where few readings lie; else it varies by a third."""
 RUT_M: Final = 5.0
-"""A rut goes on for longer than this; a pothole is shorter than half of it, so that a median over it passes it by."""
+"""Length of the median over cross-sections: a rut is longer; a pothole is shorter than half of it."""
 _DEPTHS: Final = ("rut_depth_left_mm", "rut_depth_right_mm")
 
 
@@ -72,7 +72,7 @@ def plan_pictures(tasks: Sequence[GroupTask], manifest: Manifest) -> list[Pictur
 
 
 def due_pictures(tasks: Sequence[PictureTask], manifest: Manifest) -> list[PictureTask]:
-    """Those that are missing or stale."""
+    """Return those that are missing or stale."""
     return [t for t in tasks if not manifest.is_current(PICTURES, t.unit, t.key)]
 
 
@@ -117,7 +117,7 @@ def _of_quantity(rows: pa.Table, name: str) -> Strip:
 
 
 def _crossing(path: Path, task: GroupTask, values: pa.Table) -> bool:
-    """The cross-sections at the typical and at the deepest rut; False where none is known."""
+    """Draw the cross-sections at the typical and at the deepest rut; return False where none is known."""
     lane: LaneData = load_lane(task)
     whole = WholeSections.of(lane)
     if not whole.rows.size:
@@ -146,12 +146,11 @@ def _crossing(path: Path, task: GroupTask, values: pa.Table) -> bool:
 def chosen_ruts(
     station_m: npt.NDArray[np.float64], depths_mm: npt.NDArray[np.float64], sigmas_mm: npt.NDArray[np.float64]
 ) -> dict[str, tuple[int, npt.NDArray[np.float64]]]:
-    """Numbers of the cross-sections to be shown, with both depths (2,) as medians over `RUT_M`; none without a depth.
+    """Return the cross-sections to show, with both depths (2,) as medians over `RUT_M`; empty without a depth.
 
-    `typical` is where the deeper rut is as deep as in the median, `deepest` where it is deepest. Both are the
-    cross-section there whose own depths are nearest to the medians: one through a pothole is not. Where σ is more
-    than `_SURE` times that of the lane, as where a drive ends and few readings lie, noise makes depths: none is chosen
-    there.
+    `typical` is where the deeper rut has its median depth, `deepest` where it is deepest. Of the cross-sections there,
+    the one whose depths are nearest to the medians is taken, which leaves out potholes. None is chosen where σ is more
+    than `_SURE` times that of the lane, as at the end of a drive with few readings, since noise then makes depths.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Ravelled patches of groups of sections: what was surveyed of a lane → their outlines and a picture."""
+"""Computes ravelled patches of groups of sections, with their outlines and a picture."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from roadscan.tiles.tasks.tiles import TaskResult
 RAVELLING: Final = "ravelling_patches"
 RAVELLING_PICTURES: Final = "ravelling_pictures"
 _FINE_M: Final = 0.5
-"""Sides of an outline are no longer than this, so that it follows a bend."""
+"""Largest length of an outline's sides, so that it follows bends."""
 
 
 @dataclass(frozen=True, eq=False)
 class PatchTask:
-    """A group of sections to be looked through. Sent to workers: it holds no data."""
+    """A group of sections to search for patches. Sent to workers: it holds no data."""
 
     task: GroupTask
     key: str
@@ -53,7 +53,7 @@ class PatchTask:
 
 
 def plan_patches(tasks: Sequence[GroupTask]) -> list[PatchTask]:
-    """A task for each group of sections."""
+    """Return a task for each group of sections."""
     code = code_digest("roadscan.condition.tasks.ravelling:patches_of_group")
     found = []
     for task in tasks:
@@ -73,7 +73,7 @@ def due_patches(tasks: Sequence[PatchTask], manifest: Manifest) -> list[PatchTas
 
 
 def patches_of_group(one: PatchTask) -> TaskResult:
-    """Write patches and picture of a group (runs on a worker)."""
+    """Compute patches and write them and the picture of a group (runs on a worker)."""
     try:
         lane = load_lane(one.task)
         found = list(zip(lane.sections_m, looked_through(lane), strict=True))
@@ -86,7 +86,7 @@ Found = Sequence[tuple[tuple[float, float], RavelledSection]]
 
 
 def _write(one: PatchTask, found: Found) -> OutputRecord:
-    """GeoParquet of the patches; no file without any."""
+    """Write the patches as GeoParquet; no file without any."""
     schema, task = table_schema(RAVELLING), one.task
     both = sorted(_rows(task.group, found), key=lambda row: (row[0]["station_m"], row[0]["offset_m"]))
     if not both:
@@ -132,7 +132,7 @@ def _rows(group: Group, found: Found) -> Iterator[tuple[dict[str, Any], shapely.
 
 
 def _on_map(group: Group, patch: RavelledPatch) -> shapely.Geometry:
-    """The outline of a patch in the map CRS."""
+    """Return the outline of a patch in the map CRS."""
     fine = shapely.segmentize(shapely.simplify(patch.outline, 1e-6), _FINE_M)
     xy = shapely.get_coordinates(fine)
     places = group.line.places(xy[:, 0], group.lane.offsets(xy[:, 0], xy[:, 1]))[:, :2]
@@ -140,7 +140,7 @@ def _on_map(group: Group, patch: RavelledPatch) -> shapely.Geometry:
 
 
 def _draw(one: PatchTask, lane: LaneData, found: Found) -> OutputRecord:
-    """Picture of the sections with patches; no file without any."""
+    """Draw the sections with patches; no file without any."""
     drawn = []
     for (from_m, to_m), section in found:
         if section.patches:

@@ -1,4 +1,4 @@
-"""Edges of the roads: cells of the tiles beside the lanes → a table of edges by station, and the road's surface."""
+"""Computes edges of roads from cells beside the lanes: a table of edges by station, and the road's surface."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ class EdgePiece:
 
     stretch: RoadStretch
     cells: tuple[OutputRecord, ...]
-    """Records of the tiles beside it that hold cells."""
+    """Records of the tiles beside it with cells."""
     polygons: bytes
-    """The road's surface near it as WKB, where it is stated; empty otherwise."""
+    """The stated road surface near it as WKB; empty where none is stated."""
     key: str
 
     @property
@@ -70,7 +70,7 @@ class EdgePiece:
 
 
 def edge_unit(road: str, number: int) -> str:
-    """Name of a piece of a road in the manifest."""
+    """Return the name of a piece of a road in the manifest."""
     return f"{road}/{number:06d}"
 
 
@@ -93,15 +93,15 @@ def check_edge_polygons(survey: Survey) -> None:
 
 @dataclass(frozen=True, eq=False)
 class StatedSurface:
-    """The road's surface as the survey file's layer of polygons has it."""
+    """The road's surface from the survey file's layer of polygons."""
 
     shape: shapely.Geometry
     digests: tuple[str, ...]
-    """Of the layer's files."""
+    """Digests of the layer's files."""
 
 
 def stated_surface(plan: SurveyPlan, settings: RoadEdgesConfig | None) -> StatedSurface | None:
-    """The polygons of the survey file; None where it states none."""
+    """Return the polygons of the survey file; None where it states none."""
     if settings is None or settings.polygons is None:
         return None
     path = plan.survey.resolve(settings.polygons)
@@ -116,7 +116,7 @@ def plan_edges(
     settings: RoadEdgesConfig | None,
     stated: StatedSurface | None,
 ) -> list[EdgePiece]:
-    """All pieces of roads with a lane and a tile with cells beside it; none without settings."""
+    """Return all pieces of roads with a lane and a tile with cells beside it; empty without settings."""
     if settings is None:
         return []
     common = key_of(
@@ -149,12 +149,12 @@ def plan_edges(
 
 
 def due_edges(pieces: Sequence[EdgePiece], manifest: Manifest) -> list[EdgePiece]:
-    """Those that are missing or stale."""
+    """Return those that are missing or stale."""
     return [p for p in pieces if not all(manifest.is_current(n, p.unit, p.key) for n in _OUTPUTS)]
 
 
 def edges_of_pieces(task: EdgeTask) -> TaskResult:
-    """Write edges and surface of the pieces of a task (runs on a worker)."""
+    """Compute and write edges and surface of the pieces of a task (runs on a worker)."""
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     damaged: set[str] = set()
@@ -209,7 +209,7 @@ def _write_edges(task: EdgeTask, piece: EdgePiece, found: RoadEdges) -> OutputRe
 
 
 def _write_surface(task: EdgeTask, piece: EdgePiece, found: RoadEdges) -> OutputRecord:
-    """GeoParquet of the road's surface; no file where nowhere both edges are known."""
+    """Write the road's surface as GeoParquet; no file where both edges are known nowhere."""
     schema = table_schema(SURFACES)
     parts = list(road_surfaces(found, piece.stretch.line))
     if not parts:

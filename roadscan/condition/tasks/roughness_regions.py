@@ -1,4 +1,4 @@
-"""Roughness regions along the roads: cells of the tiles on the way → a table of regions, of sections, and a picture."""
+"""Computes roughness regions along roads from cells: a table of regions, one of sections, and a picture."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ REGION_SECTIONS: Final = "roughness_sections"
 REGION_PICTURES: Final = "roughness_pictures"
 _OUTPUTS: Final = (REGIONS, REGION_SECTIONS, REGION_PICTURES)
 _PIECE_SECTIONS: Final = 10
-"""Sections to a file; each is computed by itself."""
+"""Sections in a file; each is computed independently."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Piece:
     number: int
     sections_m: tuple[tuple[float, float], ...]
     cells: tuple[OutputRecord, ...]
-    """Records of the tiles on its way that hold cells."""
+    """Records of the tiles along it with cells."""
     key: str
 
     @property
@@ -66,7 +66,7 @@ RegionTask: TypeAlias = PieceTask[Piece, RoughnessRegionsConfig]
 def plan_pieces(
     roads: Roads, tiles: Mapping[TileId, OutputRecord], grid: TileGrid, settings: RoughnessRegionsConfig | None
 ) -> list[Piece]:
-    """All pieces of roads that have a tile with cells on their way; none without settings."""
+    """Return all pieces of roads with a tile with cells; empty without settings."""
     if settings is None:
         return []
     common = key_of(code_digest(f"{__name__}:regions_of_pieces"), settings.model_dump(mode="json"), grid)
@@ -100,7 +100,7 @@ def due_pieces(pieces: Sequence[Piece], manifest: Manifest) -> list[Piece]:
 
 
 def regions_of_pieces(task: RegionTask) -> TaskResult:
-    """Write regions, sections and picture of the pieces of a task (runs on a worker)."""
+    """Compute and write regions, sections and picture of the pieces of a task (runs on a worker)."""
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     damaged: set[str] = set()
@@ -156,7 +156,7 @@ def _write_sections(task: RegionTask, piece: Piece, found: Sequence[SectionRegio
 
 
 def _write_regions(task: RegionTask, piece: Piece, found: Sequence[SectionRegions]) -> OutputRecord:
-    """GeoParquet of the regions; no file without any."""
+    """Write the regions as GeoParquet; no file without any."""
     schema = table_schema(REGIONS)
     both = [(ends, r) for ends, one in zip(piece.sections_m, found, strict=True) for r in one.regions]
     if not both:
@@ -203,7 +203,7 @@ def _known(value: float) -> float | None:
 
 
 def _draw(task: RegionTask, piece: Piece, found: Sequence[SectionRegions]) -> OutputRecord:
-    """Picture of the sections with regions; no file without any."""
+    """Draw the sections with regions; no file without any."""
     drawn = [
         DrawnSection(f"{piece.line.road}, station {a:g} to {b:g} m", one.raster.values, one.raster.measured,
                      one.raster.corner_m, one.raster.cell_m, tuple(one.local_outlines()))

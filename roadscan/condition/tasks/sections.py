@@ -1,4 +1,4 @@
-"""The section table: all values of sections, a row a section and lane, as GeoParquet, CSV and GeoPackage."""
+"""Writes the section table, a row for each section and lane, as GeoParquet, CSV and GeoPackage."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ _SIGMAS: Final = {
     "sigma_ravelled_percent": ("ravelled_percent",),
     "sigma_lane_width_m": ("lane_width_m",),
 }
-"""Columns of standard deviations, and the quantities whose greatest they hold."""
+"""Columns of standard deviations, with the quantities whose greatest σ each contains."""
 _SAID: Final = {"lane_width_from": "lane_width_m", "iso_8608_class": "psd_worse_cm3"}
-"""Columns that hold the remark of a quantity: what it was taken from, or its class."""
+"""Columns with the remark of a quantity: the origin of its value, or its class."""
 _MAIN: Final = ("mri_m_per_km", "rut_depth_mean_left_mm", "rut_depth_mean_right_mm", "cross_slope_mean_percent")
-"""Quantities whose share stands in the row."""
+"""Quantities whose measured share is in the row."""
 
 
 @dataclass(frozen=True, eq=False)
 class SectionFiles:
-    """What the section table is made of."""
+    """Inputs of the section table."""
 
     store: Store
     context: ProductContext
@@ -66,7 +66,7 @@ class SectionFiles:
 def plan_sections(
     store: Store, manifest: Manifest, roads: Roads, units: Sequence[str], context: ProductContext
 ) -> SectionFiles:
-    """The files of the section table, from the values of these units."""
+    """Return the files of the section table, from the values of these units."""
     held = manifest.of(VALUES)
     values = tuple(held[u] for u in sorted(units) if u in held)
     code = code_digest("roadscan.condition.tasks.sections:write_sections")
@@ -76,7 +76,7 @@ def plan_sections(
 
 
 def due_files(files: SectionFiles, manifest: Manifest) -> list[str]:
-    """Names of the files that are missing or stale."""
+    """Return names of the files that are missing or stale."""
     return [name for name in _WRITERS if not manifest.is_current(SECTIONS, name, files.key)]
 
 
@@ -98,7 +98,7 @@ def write_sections(files: SectionFiles) -> list[OutputRecord]:
 
 
 def section_table(files: SectionFiles) -> tuple[pa.Table, npt.NDArray[Any]]:
-    """Rows of ``schemas/condition_sections.toml``, and the middle of the lane along each (m)."""
+    """Return rows of ``schemas/condition_sections.toml``, and the middle of the lane along each (m)."""
     long = _of_sections(files)
     schema = table_schema(SECTIONS).arrow()
     if not long.num_rows:
@@ -141,7 +141,7 @@ def _of_sections(files: SectionFiles) -> pa.Table:
 
 
 def _not_measured(values: pa.Table) -> dict[str, list[str]]:
-    """Quantities that no section has a value of, by the reason that is given in most of them."""
+    """Return quantities without a value in any section, by the most frequent reason."""
     known = set(values.filter(pc.is_valid(values["value"]))["quantity"].to_pylist())
     reasons: dict[str, list[str]] = {}
     for quantity, reason in zip(values["quantity"].to_pylist(), values["reason"].to_pylist(), strict=True):
@@ -154,7 +154,7 @@ def _not_measured(values: pa.Table) -> dict[str, list[str]]:
 
 
 def known_sections(manifest: Manifest) -> tuple[int, dict[str, list[str]]] | None:
-    """Number of sections in the section table, and the quantities that none has, by reason; None without a table."""
+    """Return the number of sections in the table, and the quantities that none has, by reason; None without a table."""
     record = manifest.get(SECTIONS, _TABLE)
     if record is None or not record.detail:
         return None
@@ -163,7 +163,7 @@ def known_sections(manifest: Manifest) -> tuple[int, dict[str, list[str]]] | Non
 
 
 def _reasons(own: pd.DataFrame) -> str | None:
-    """What is said of a section's values, each thing once."""
+    """Return remarks on a section's values, each once."""
     said: dict[str, list[str]] = {}
     for quantity, value, reason in zip(own["quantity"], own["value"], own["reason"], strict=True):
         if isinstance(reason, str) and (quantity not in _SAID.values() or np.isnan(value)):
@@ -178,7 +178,7 @@ def _middle(line: RoadLine, lane: Lane, from_m: float, to_m: float) -> shapely.L
 
 
 def _typed(rows: pd.DataFrame, schema: pa.Schema) -> pa.Table:
-    """Columns of the schema in their order, then those that other packages add."""
+    """Return columns of the schema in order, then those that other packages add."""
     import pandas as pd  # slow to import
 
     columns: dict[str, pa.Array] = {}
@@ -204,4 +204,4 @@ _WRITERS: Final[dict[str, Callable[[Path, pa.Table, npt.NDArray[Any], ProductCon
     f"{SECTIONS}.csv": _write_csv,
     f"{SECTIONS}.gpkg": write_layer,
 }
-"""The files and what writes each."""
+"""Functions that write the files, by name."""

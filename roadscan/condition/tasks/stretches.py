@@ -1,7 +1,6 @@
-"""Stretches of lanes: cells of the tiles on the way → profiles, cross-sections, texture and painted lines.
+"""Samples stretches of lanes from cells: profiles, cross-sections, texture and painted lines.
 
-What a row says depends on the cells around its place and on the line there, so it has the same bits whatever the
-stretches.
+A row depends on the cells around its place and on the line there, so it has the same bits however the lane is divided.
 """
 
 from __future__ import annotations
@@ -39,16 +38,16 @@ from roadscan.tiles.tasks.tiles import TaskResult
 
 PROFILES: Final = "profiles_longitudinal"
 SURFACE_FILES: Final = "surface"
-"""Product whose files hold the reconstructed surface."""
+"""Product whose files contain the reconstructed surface."""
 CROSS_SECTIONS: Final = "cross_sections"
 LANE_TEXTURE: Final = "lane_texture"
 LANE_LINES: Final = "lane_line_offsets"
 OF_STRETCHES: Final = (CROSS_SECTIONS, PROFILES, LANE_TEXTURE, LANE_LINES)
-"""Tables of which a stretch has a file each."""
+"""Tables with one file for each stretch."""
 STRETCH_M: Final = 50
-"""Length of a stretch; changes no height."""
-_TASK_STRETCHES: Final = 8
-_TILES_KEPT: Final = 12
+"""Length of a stretch; it does not affect heights."""
+_TASK_STRETCHES: Final = 8  # Stretches in a task.
+_TILES_KEPT: Final = 12  # Tiles whose cells stay in memory.
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +59,7 @@ class Stretch:
     from_m: float
     to_m: float
     cells: tuple[OutputRecord, ...]
-    """Records of the tiles on its way that hold cells."""
+    """Records of the tiles along it with cells."""
     key: str
 
     @property
@@ -70,13 +69,13 @@ class Stretch:
 
 
 def unit_of(lane: Lane, number: int) -> str:
-    """Name of a stretch in the manifest."""
+    """Return the name of a stretch in the manifest."""
     return f"{lane.road}/{lane.name}/{number:06d}"
 
 
 @dataclass(frozen=True, eq=False)
 class StretchTask:
-    """Some stretches one after another. Sent to workers: it holds no data."""
+    """A sequence of stretches. Sent to workers: it holds no data."""
 
     store: Store
     grid: TileGrid
@@ -90,14 +89,14 @@ class StretchTask:
         return tuple(s.unit for s in self.stretches)
 
     def singly(self) -> list[StretchTask]:
-        """A task for each stretch."""
+        """Return a task for each stretch."""
         return [replace(self, stretches=(one,)) for one in self.stretches]
 
 
 def plan_stretches(
     roads: Roads, tiles: Mapping[TileId, OutputRecord], grid: TileGrid, config: SectionConfig
 ) -> list[Stretch]:
-    """All stretches that have a tile with cells on their way, lane by lane."""
+    """Return all stretches with a tile with cells, lane by lane."""
     code = code_digest("roadscan.condition.tasks.stretches:survey_stretches")
     names = set(SectionConfig.model_fields) - {"section_m", "largest_gap_m", "least_share", "lane_width_m"}
     settings = {name: value for name, value in config.model_dump(mode="json").items() if name in names}
@@ -134,14 +133,14 @@ def _box(b: Bounds) -> shapely.Polygon:
 
 
 def due_stretches(stretches: Sequence[Stretch], manifest: Manifest) -> list[Stretch]:
-    """Those that are missing or stale."""
+    """Return those that are missing or stale."""
     return [s for s in stretches if not all(manifest.is_current(n, s.unit, s.key) for n in OF_STRETCHES)]
 
 
 def stretch_tasks(
     due: Sequence[Stretch], store: Store, context: ProductContext, config: SectionConfig
 ) -> list[StretchTask]:
-    """Tasks of neighbouring stretches of a lane."""
+    """Return tasks of neighbouring stretches of a lane."""
     tasks: list[StretchTask] = []
     for _, own in itertools.groupby(due, key=lambda s: (s.lane.road, s.lane.name)):
         tasks += [StretchTask(store, context.grid, config, context, some) for some in _batches(list(own))]
@@ -154,7 +153,7 @@ def _batches(own: Sequence[Stretch]) -> Iterator[tuple[Stretch, ...]]:
 
 
 def survey_stretches(task: StretchTask) -> TaskResult:
-    """Write the tables of the stretches of a task (runs on a worker)."""
+    """Compute and write the tables of the stretches of a task (runs on a worker)."""
     tiles = _Tiles(task.store, task.context)
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
@@ -171,14 +170,14 @@ def survey_stretches(task: StretchTask) -> TaskResult:
 
 
 class _Tiles:
-    """Cells of the tiles of some stretches, the last ones kept."""
+    """Cells of the tiles of some stretches; the latest ones stay in memory."""
 
     def __init__(self, store: Store, context: ProductContext) -> None:
         self._store, self._context = store, context
         self._kept: dict[str, TileCells] = {}
 
     def read(self, record: OutputRecord) -> TileCells:
-        """Cells of a tile."""
+        """Return the cells of a tile."""
         cells = self._kept.pop(record.unit, None)
         if cells is None:
             edge = self._context.grid.cells_per_edge
@@ -195,7 +194,7 @@ class _Tiles:
 
 
 def _write(store: Store, one: Stretch, held: LaneHeights) -> Iterator[OutputRecord]:
-    """The files of a stretch."""
+    """Write the files of a stretch."""
     columns_of = (_cross_columns, _profile_columns, _texture_columns, _line_columns)
     for name, columns in zip(OF_STRETCHES, (make(one, held) for make in columns_of), strict=True):
         schema = table_schema(name)
@@ -274,7 +273,7 @@ def _line_columns(one: Stretch, held: LaneHeights) -> dict[str, pa.Array]:
 
 
 def _lists(values: npt.NDArray[np.float64]) -> pa.Array:
-    """A list of 32-bit floats for each row of values (rows, count)."""
+    """Return a list of 32-bit floats for each row of values (rows, count)."""
     rows, count = values.shape
     ends = np.arange(0, rows * count + 1, max(count, 1), dtype=np.int32)[: rows + 1]
     element = pa.field("element", pa.float32(), nullable=False)

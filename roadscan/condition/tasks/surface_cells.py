@@ -1,4 +1,4 @@
-"""Cells of the reconstructed surface: what a tile's file of the product `surface` says, as cells."""
+"""Reads a tile's file of the product `surface` as cells."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from roadscan.tiles.product import ProductContext
 
 
 def check_surface_cells(survey: Survey) -> None:
-    """Raise :class:`ConfigError` where heights of the surface are asked for and there is none on the tiles' cells."""
+    """Raise :class:`ConfigError` where surface heights are requested and there is no surface on the tiles' cells."""
     config, surface = ConditionConfig.stated(survey), SurfaceConfig.stated(survey)
     if config is None or config.heights == "cells":
         return
@@ -40,7 +40,7 @@ def check_surface_cells(survey: Survey) -> None:
 
 
 def read_surface(store: Store, record: OutputRecord, cells_per_edge: int, context: ProductContext) -> TileCells:
-    """Heights of a tile's surface as cells of one reading each, whose spread is not known."""
+    """Return heights of a tile's surface as cells of one reading each, with unknown spread."""
     import rasterio  # slow to import
 
     with rasterio.MemoryFile(read_recorded(store, record)) as file, file.open() as raster:

@@ -1,4 +1,4 @@
-"""Tasks that each make some files: their records are kept as they end, and a task that dies is tried once more."""
+"""Runs tasks that make several files each: records are stored as they end, and a failed task is tried once more."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Splittable(Protocol):
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Names of its units."""
+        """Return the names of its units."""
 
     def singly(self) -> list[Self]:
-        """A task for each unit."""
+        """Return a task for each unit."""
 
 
 T = TypeVar("T", bound=Splittable)
@@ -43,7 +43,7 @@ S = TypeVar("S", bound=Strict)
 
 @dataclass(frozen=True, eq=False)
 class PieceTask(Generic[P, S]):
-    """Pieces of roads and the settings with which they are looked through. Sent to workers: it holds no data."""
+    """Pieces of roads, with settings for their computation. Sent to workers: it holds no data."""
 
     store: Store
     grid: TileGrid
@@ -57,7 +57,7 @@ class PieceTask(Generic[P, S]):
         return tuple(p.unit for p in self.pieces)
 
     def singly(self) -> list[Self]:
-        """A task for each piece."""
+        """Return a task for each piece."""
         return [replace(self, pieces=(one,)) for one in self.pieces]
 
 
@@ -68,7 +68,7 @@ def run_units(
     compute: Compute,
     report: Callable[[int, int], None],
 ) -> list[tuple[str, str]]:
-    """Do all tasks and keep their records; returns units that failed, with the reason."""
+    """Run all tasks and store their records; return units that failed, with the reason."""
     total = sum(len(task.units) for task in tasks)
     failures: list[tuple[str, str]] = []
     again: list[T] = []

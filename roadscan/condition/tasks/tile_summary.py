@@ -1,4 +1,4 @@
-"""The table of condition by tile: what is known of the lanes that lie in each, a row a tile."""
+"""Writes the table of condition by tile: a row for each tile, with values of the lanes in it."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from roadscan.tiles.products.geo_table import write_geo_table
 TILES: Final = "condition_tiles"
 _FILE: Final = f"{TILES}.parquet"
 _PER_M: Final = 2
-"""Places of a lane's middle that are counted for a metre of it."""
+"""Places of a lane's middle that are counted per metre."""
 _RUTS: Final = ("rut_depth_left_mm", "rut_depth_right_mm")
 _MEANS: Final = {
     "mri_m_per_km": "mri_m_per_km", "ride_number": "ride_number",
     "cracked_wheel_path_percent": "cracked_wheel_path_percent", "mpd_mean_mm": "mpd_mean_mm",
     "texture_rms_mean_mm": "texture_rms_mean_mm", "ravelled_percent": "ravelled_percent",
 }  # fmt: skip
-"""Columns that are means of a quantity of sections, each section counted by its length in the tile."""
+"""Columns that are means of a quantity of sections, weighted by their length in the tile."""
 _GREATEST: Final = {"mri_max_m_per_km": "mri_m_per_km", "faulting_max_mm": "faulting_max_mm"}
-"""Columns that are its greatest value."""
+"""Columns that are the greatest value of a quantity."""
 
 
 def due_tiles(files: SectionFiles, manifest: Manifest) -> str:
-    """Key of the table where it is missing or stale, else empty."""
+    """Return the key of the table where it is missing or stale, else an empty string."""
     code = code_digest("roadscan.condition.tasks.tile_summary:write_tiles")
     placed = [(r.unit, r.digest) for name in (LINES, LANES) for r in manifest.of(name).values()]
     key = key_of(code, files.key, sorted(placed), files.context.grid)
@@ -62,7 +62,7 @@ def write_tiles(files: SectionFiles, key: str) -> OutputRecord:
 
 
 def tile_rows(files: SectionFiles) -> list[tuple[dict[str, Any], shapely.Polygon]]:
-    """Rows of ``schemas/condition_tiles.toml`` with their outlines, by row and column of the grid."""
+    """Return rows of ``schemas/condition_tiles.toml`` with their outlines, by row and column of the grid."""
     grid = files.context.grid
     found: dict[TileId, _Sums] = {}
     ways = {(lane.road, lane.name): _Way.of(files.roads.lines[lane.road], lane, files) for lane in files.roads.lanes}
@@ -85,7 +85,7 @@ def tile_rows(files: SectionFiles) -> list[tuple[dict[str, Any], shapely.Polygon
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """Places of a lane's middle, and the tiles in which they lie."""
+    """Places of a lane's middle, and the tiles that contain them."""
 
     station_m: npt.NDArray[np.float64]
     tile: npt.NDArray[np.int64]
@@ -98,14 +98,14 @@ class _Way:
         return cls(station, np.floor(places / files.context.grid.size_m).astype(np.int64))
 
     def counts(self, own: slice) -> Iterator[tuple[TileId, int]]:
-        """Tiles of some of the places, with their number."""
+        """Return the tiles of some of the places, with their number."""
         tiles, counts = np.unique(self.tile[own], axis=0, return_counts=True)
         for (column, row), count in zip(tiles.tolist(), counts.tolist(), strict=True):
             yield TileId(column, row), count
 
 
 class _Sums:
-    """What is summed up of a tile."""
+    """Sums over a tile."""
 
     def __init__(self) -> None:
         self.lanes: set[tuple[str, str]] = set()
@@ -116,13 +116,13 @@ class _Sums:
         self.share = [0.0, 0]
 
     def add(self, quantity: str, weight: float, value: float, sigma: float) -> None:
-        """Take a value in."""
+        """Add a value."""
         sums = self.weighed.setdefault(quantity, np.zeros(3))
         sums += weight * np.array([1.0, value, sigma * sigma])
         self.greatest[quantity] = max(self.greatest.get(quantity, value), value)
 
     def row(self) -> dict[str, Any]:
-        """Its columns."""
+        """Return its columns."""
         row: dict[str, Any] = {
             "lanes": len(self.lanes),
             "lane_length_m": self.places / _PER_M,
@@ -139,13 +139,13 @@ class _Sums:
         return None if held is None else float(held[1] / held[0])
 
     def _sigma(self, quantity: str) -> float | None:
-        """Errors along a road are taken as alike: the root mean square."""
+        """Return the root mean square: errors along a road are taken as fully correlated."""
         held = self.weighed.get(quantity)
         return None if held is None or np.isnan(held[2]) else float(np.sqrt(held[2] / held[0]))
 
 
 def _values(files: SectionFiles) -> Iterator[tuple[str, str, Sequence[Mapping[str, Any]]]]:
-    """Values that the table is made of, a file at a time, with their road and lane."""
+    """Yield the values for the table, one file at a time, with their road and lane."""
     wanted = pa.array(sorted({*_MEANS.values(), *_GREATEST.values(), *_RUTS}))
     for record in files.values:
         table = files.store.parse_table(read_recorded(files.store, record), record.path)

@@ -1,4 +1,4 @@
-"""Tiles beside a piece of a road."""
+"""Selects tiles beside a piece of a road."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from roadscan.core.ids import TileId
 
 
 def tiles_beside(line: RoadLine, from_m: float, to_m: float, away_m: float, grid: TileGrid) -> list[TileId]:
-    """Tiles with a place at most so far from a line between two stations, by row and column."""
+    """Return tiles within a distance of a line between two stations, by row and column."""
     station = np.arange(from_m, to_m + 1.0)
     strip = shapely.LineString(line.places(station, 0.0)[:, :2]).buffer(away_m)
     boxes = [(t, grid.bounds(t)) for t in grid.tiles_in(Bounds(*strip.bounds))]

@@ -1,4 +1,4 @@
-"""Values of the indices: what was surveyed of a lane along some sections → table `condition_values`."""
+"""Computes values of the indices for sections of a lane: the table `condition_values`."""
 
 from __future__ import annotations
 
@@ -48,21 +48,21 @@ from roadscan.tiles.tasks.tiles import TaskResult
 
 VALUES: Final = "condition_values"
 _FINDINGS: Final = "findings"
-"""Member of a record's detail that holds them."""
+"""Member of a record's detail with findings."""
 _GROUP_M: Final = 1000.0
-"""Sections are computed together over about this length; ravelling takes the lane's texture of it."""
+"""Approximate length of sections computed together, over which ravelling takes the lane's texture."""
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Some sections of a lane, one after another; it holds no data."""
+    """A sequence of sections of a lane; it holds no data."""
 
     line: RoadLine
     lane: Lane
     number: int
     sections_m: tuple[tuple[float, float], ...]
     profiles: tuple[OutputRecord, ...]
-    """Records of the stretches of profiles on its way, and before and behind it."""
+    """Records of the stretches of profiles along it, and before and behind it."""
     cross_sections: tuple[OutputRecord, ...]
     texture: tuple[OutputRecord, ...]
     lines: tuple[OutputRecord, ...]
@@ -70,14 +70,14 @@ class Group:
     cracks: OutputRecord | None
     """Record of the table of cracks, where there is one."""
     edges: tuple[OutputRecord, ...] | None
-    """Records of the road's edges on its way; None where none are sought."""
+    """Records of the road's edges along it; None where none are requested."""
     beside: Mapping[str, bool]
-    """Whether no other lane lies between this one and the edge, by side in the direction of travel."""
+    """True where no other lane lies between this one and the edge, by side in the direction of travel."""
     indices: tuple[tuple[str, str], ...]
     """Names of the indices to compute, with the keys of their values."""
 
     def unit(self, index: str) -> str:
-        """Name of an index's values in the manifest."""
+        """Return the name of an index's values in the manifest."""
         return f"{index}/{self.lane.road}/{self.lane.name}/{self.number:05d}"
 
 
@@ -97,14 +97,14 @@ class GroupTask:
         return tuple(self.group.unit(name) for name, _ in self.group.indices)
 
     def singly(self) -> list[GroupTask]:
-        """A task for each index."""
+        """Return a task for each index."""
         return [replace(self, group=replace(self.group, indices=(one,))) for one in self.group.indices]
 
 
 def plan_groups(
     roads: Roads, manifest: Manifest, config: SectionConfig, cell_m: float, *, with_edges: bool
 ) -> list[Group]:
-    """All groups of sections, with all indices; `with_edges` says whether the road's edges are sought."""
+    """Return all groups of sections, with all indices; `with_edges`: whether the road's edges are requested."""
     held = {name: dict(manifest.of(name)) for name in OF_STRETCHES}
     indices, cracks = condition_indices(), manifest.get("cracks", "cracks.parquet")
     of_cracks = None if cracks is None else cracks.digest
@@ -154,7 +154,7 @@ def plan_groups(
 
 
 def _beside(lane: Lane, lanes: Sequence[Lane]) -> dict[str, bool]:
-    """Whether no other lane lies on a side of a lane, by side in the direction of travel."""
+    """Return whether no other lane lies on a side of a lane, by side in the direction of travel."""
     found = {"left": True, "right": True}
     for other in lanes:
         first, last = max(lane.first_m, other.first_m), min(lane.last_m, other.last_m)
@@ -168,14 +168,14 @@ def _beside(lane: Lane, lanes: Sequence[Lane]) -> dict[str, bool]:
 
 
 def sections_of(lane: Lane, section_m: float) -> list[tuple[int, float, float]]:
-    """Number, begin and end of each section of a lane: multiples of the length, cut at the lane's ends."""
+    """Return number, begin and end of each section of a lane: multiples of the length, cut at the lane's ends."""
     first, last = int(lane.first_m // section_m), int(np.ceil(lane.last_m / section_m))
     cut = [(k, max(k * section_m, lane.first_m), min((k + 1) * section_m, lane.last_m)) for k in range(first, last)]
     return [(k, float(a), float(b)) for k, a, b in cut if b - a > 0.5]
 
 
 def due_groups(groups: Sequence[Group], manifest: Manifest) -> list[Group]:
-    """Groups with the indices whose values are missing or stale."""
+    """Return groups with the indices whose values are missing or stale."""
     found = []
     for one in groups:
         due = tuple((name, key) for name, key in one.indices if not manifest.is_current(VALUES, one.unit(name), key))
@@ -216,13 +216,13 @@ def _write(task: GroupTask, index: ConditionIndex, key: str, lane: LaneData) -> 
 
 
 def value_findings(manifest: Manifest) -> list[Finding]:
-    """What is doubted of the heights that the values in the store come from."""
+    """Return findings on the heights from which the stored values come."""
     records = (record for _, record in sorted(manifest.of(VALUES).items()))
     return [Finding.of(one) for record in records for one in record.figures().get(_FINDINGS, ())]
 
 
 def values_table(lane: Lane, index: ConditionIndex, values: Sequence[Value]) -> pa.Table:
-    """Rows of ``schemas/condition_values.toml``."""
+    """Return rows of ``schemas/condition_values.toml``."""
     units = {q.name: q.unit for q in index.quantities}
     n = len(values)
 
@@ -247,7 +247,7 @@ def values_table(lane: Lane, index: ConditionIndex, values: Sequence[Value]) -> 
 
 
 def load_lane(task: GroupTask) -> LaneData:
-    """What was surveyed of a group's lane."""
+    """Load the profiles, cross-sections and features of a group's lane."""
     group = task.group
     profiles = _tables(task.store, group.profiles, table_schema(PROFILES).arrow())
     crossings = _tables(task.store, group.cross_sections, table_schema(CROSS_SECTIONS).arrow())
@@ -277,7 +277,7 @@ def load_lane(task: GroupTask) -> LaneData:
 
 
 def _edges(task: GroupTask) -> EdgesOnLane | None:
-    """The road's edges beside the lane along the group; None where none are sought."""
+    """Return the road's edges beside the lane along the group; None where none are requested."""
     group = task.group
     if group.edges is None:
         return None
@@ -291,7 +291,7 @@ def _edges(task: GroupTask) -> EdgesOnLane | None:
 
 
 def _on_road(cross: CrossSections, edges: EdgesOnLane) -> CrossSections:
-    """Cross-sections without heights beyond the road's edges."""
+    """Return cross-sections without heights beyond the road's edges."""
     inside = np.array([edges.inside(np.full(cross.offset_m.size, s), cross.offset_m) for s in cross.station_m])
     inside = inside.reshape(cross.height_m.shape)
     height, sigma = (np.where(inside, values, np.nan) for values in (cross.height_m, cross.sigma_m))
@@ -299,7 +299,7 @@ def _on_road(cross: CrossSections, edges: EdgesOnLane) -> CrossSections:
 
 
 def _cracks(task: GroupTask) -> tuple[CrackOnLane, ...] | None:
-    """Cracks near the lane along the group; None where there is no table of cracks, or no index asks for it."""
+    """Return cracks near the lane along the group; None where there is no table of cracks, or no index needs it."""
     group, known = task.group, condition_indices()
     if group.cracks is None or not any(known[name].needs_cracks for name, _ in group.indices):
         return None
@@ -372,7 +372,7 @@ def _lines(table: pa.Table) -> LaneLines:
 
 
 def _lists(table: pa.Table, name: str, count: int) -> npt.NDArray[np.float64]:
-    """(rows, count) values of a column of lists."""
+    """Return (rows, count) values of a column of lists."""
     flat = table[name].combine_chunks().flatten().to_numpy().astype(np.float64)
     held: npt.NDArray[np.float64] = flat.reshape(table.num_rows, count)
     return held

@@ -1,4 +1,4 @@
-"""What the stage `condition` has to do: lines, stretches and values there are against those there should be."""
+"""Compares existing lines, stretches and values with required ones, to find the work of the stage `condition`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ MADE = (
 
 @dataclass(frozen=True)
 class ConditionWork:
-    """What there is to do, as far as that can be told before the parts before it are done."""
+    """Work of the stage, as far as it is known before its earlier parts are done."""
 
     lines_key: str = ""
     lines_due: bool = False
@@ -61,22 +61,22 @@ class ConditionWork:
     """Groups of sections whose ravelled patches are written."""
     due_patches: Sequence[PatchTask] = ()
     edges: Sequence[EdgePiece] = ()
-    """Pieces of roads whose edges are sought."""
+    """Pieces of roads whose edges are due."""
     due_edges: Sequence[EdgePiece] = ()
     pieces: Sequence[Piece] = ()
-    """Of roads, to be looked through for roughness regions."""
+    """Pieces of roads whose roughness regions are due."""
     due_pieces: Sequence[Piece] = ()
     gone: Sequence[OutputRecord] = field(default=())
     """Outputs that are no longer due."""
 
     @property
     def values_due(self) -> int:
-        """How many indices of groups are due."""
+        """Number of indices of groups that are due."""
         return sum(len(one.indices) for one in self.due_groups)
 
 
 def plan_condition(session: Session) -> ConditionWork:
-    """Compare what there is with what there should be; what waits for the lines is not told yet."""
+    """Compare existing outputs with required ones; what waits for the lines is not known yet."""
     config, manifest = ConditionConfig.stated(session.survey), session.manifest
     if config is None:
         return ConditionWork(gone=manifest.beside(set(MADE), ()))

@@ -1,1 +1,1 @@
-"""Poses, and readings placed on the map with them."""
+"""Kernels that interpolate poses and georeference readings."""

@@ -1,4 +1,4 @@
-"""Least and greatest raw range of each block of readings."""
+"""Least and greatest raw range of each block of readings in a profile."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from roadscan.compute.kernel_options import kernel
 
 @kernel
 def block_ranges(ranges, size):
-    """Least and greatest raw range of each block of readings.
+    """Return the least and greatest raw range of each block of readings.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Extent of the carriageway in a profile: the surface that is connected, without a step, with most readings.
+"""Finds the carriageway in a profile: the surface, connected without a step, with the most readings.
 
 Step 4 of :mod:`roadscan.georeference.segmentation`.
 """
@@ -12,29 +12,29 @@ from roadscan.compute.kernels.copies import copy_values
 from roadscan.georeference.kernels.readings import CLASS_KEPT
 
 CLASS_SCATTERED, CLASS_OFF_ROAD = 10, 12
-"""Classes of objects that the road goes on behind, and of what lies beyond its edge."""
+"""Classes of objects behind which the road continues, and of readings beyond the road's edge."""
 
 SETTINGS = (
     "bin", "share", "gate", "scatter_factor", "scatter_readings", "grazing", "chord", "step", "noise_factor", "slope",
     "window", "window_readings", "bridge",
 )  # fmt: skip
-"""Order of the `settings` tuple; lengths in metres, angles in radians (``model.segmentation``)."""
+"""Order of the `settings` tuple; lengths in metres, angles in radians (``georeference.segmentation``)."""
 (
     BIN, SHARE, GATE, SCATTER_FACTOR, SCATTER_READINGS, GRAZING, CHORD, STEP, NOISE_FACTOR, SLOPE,
     WINDOW, WINDOW_READINGS, BRIDGE,
 ) = range(13)  # fmt: skip
 
-PENDING_ABOVE, PENDING_BELOW = np.uint8(254), np.uint8(255)
+PENDING_ABOVE, PENDING_BELOW = np.uint8(254), np.uint8(255)  # Set until the road is found to continue or end.
 REJOIN = 3
-"""So many readings on the line, one after another, say that the road goes on behind an object or a hole."""
+"""The road continues behind an object or a hole if this many readings in a row lie on its line."""
 
 NO_LINE = (0.0,) * 5
-"""Sums of a line through no reading."""
+"""Sums of a line before its first reading."""
 
 
 @inlined
 def line_at(line, y):
-    """Value at y of the least-squares line of the sums `line`: count, Σy, Σup, Σy², Σy up."""
+    """Return the height at y of the least-squares line with the sums `line`: count, Σy, Σup, Σy², Σy up."""
     count, sum_y, sum_up, sum_yy, sum_y_up = line
     spread = count * sum_yy - sum_y * sum_y
     slope = (count * sum_y_up - sum_y * sum_up) / spread if spread > 1e-6 * count * count else 0.0
@@ -43,7 +43,7 @@ def line_at(line, y):
 
 @inlined
 def counted_in(line, y, up, sign):
-    """The sums of a line with one more reading, or with one less for sign −1."""
+    """Return the sums of a line after adding a reading, or after removing one for sign −1."""
     return (
         line[0] + sign,
         line[1] + sign * y,
@@ -55,7 +55,7 @@ def counted_in(line, y, up, sign):
 
 @inner
 def follow_road(y, up, height, spread, start, way, settings, trail, head, line, kinds):
-    """Step 4: go outwards from reading `start` as long as the readings carry on the road's line.
+    """Step 4: follow the road outwards from reading `start` as long as readings continue its line.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def follow_road(y, up, height, spread, start, way, settings, trail, head, line, 
             most = step + spread[j] + slope * gap
             fits = abs(over) <= most
             if since >= 0 and not fits:
-                # The line has followed a hole down and up; the level before it, above the datum, is that behind it.
+                # The line has passed through a hole: the road behind it is as high above the datum as before it.
                 before = (height[trail[tail]] + height[trail[tail + 1]] + height[trail[tail + 2]]) / 3.0
                 near = step + spread[j]
                 deepest = before
@@ -123,7 +123,7 @@ def follow_road(y, up, height, spread, start, way, settings, trail, head, line, 
 
 @inner
 def road_from(start, y, up, height, spread, settings, trail, kinds):
-    """Step 4 from one reading on: both ways, beginning with the line through the readings around it.
+    """Step 4 from one reading: follow the road both ways, beginning with the line through the readings around it.
 
     Readings that begin the line differ from the start by no more than the gate in `height`.
 
@@ -135,7 +135,7 @@ def road_from(start, y, up, height, spread, settings, trail, kinds):
     window, window_readings = settings[WINDOW], np.int64(settings[WINDOW_READINGS])
     for way in (-1, 1):
         line, head = NO_LINE, np.int64(0)
-        # The line begins behind the start, so that both ways begin with the same readings.
+        # The line includes readings on both sides of the start, so both ways begin with the same readings.
         first = start
         while (
             first - way >= 0
@@ -156,7 +156,7 @@ def road_from(start, y, up, height, spread, settings, trail, kinds):
 
 @inner
 def count_kept(kinds):
-    """How many readings are road."""
+    """Return the number of readings classified as road."""
     kept = 0
     for j in range(kinds.size):
         kept += kinds[j] == CLASS_KEPT
@@ -165,7 +165,7 @@ def count_kept(kinds):
 
 @kernel
 def mark_off_road(y, up, height, spread, settings, trail, trial, best, kinds):
-    """Step 4: readings that are not connected with the carriageway: the connected surface with most readings.
+    """Step 4: mark readings off the carriageway, which is the connected surface with the most readings.
 
     The middle reading is tried first; others only where it reaches less than half of all.
     best, trial : (n,) uint8, scratch.

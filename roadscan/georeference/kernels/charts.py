@@ -1,4 +1,4 @@
-"""Map coordinates of world positions, from local expansions of the map projection.
+"""Map coordinates of world positions from local expansions of the map projection.
 
 A chart is the second-order expansion of the map about the centre of a small box of world space (see
 ``roadscan.georeference.charts``). The box is chosen by the pose, so a point never depends on which other readings were
@@ -31,7 +31,7 @@ class Charts(NamedTuple):
 
 @inlined
 def box_of(px, py, pz, lattice):
-    """Indices of the box that holds a world position (m); lattice : of :class:`Charts`."""
+    """Return the indices of the box that contains a world position (m); lattice: see :class:`Charts`."""
     return (
         np.int64(math.floor(px / lattice[0]) - lattice[1]),
         np.int64(math.floor(py / lattice[0]) - lattice[2]),
@@ -41,7 +41,7 @@ def box_of(px, py, pz, lattice):
 
 @inlined
 def chart_index(box, lattice, table, centres):
-    """Chart of a box, −1 where none was made; lattice, table, centres : of :class:`Charts`."""
+    """Return the chart of a box, −1 where there is none; lattice, table, centres: see :class:`Charts`."""
     x, y, z = box
     chart = table[x % table.shape[0], y % table.shape[1], z % table.shape[2]]
     if chart < 0:
@@ -57,7 +57,7 @@ def chart_index(box, lattice, table, centres):
 
 @inlined
 def expansion(coefficients, k, a):
-    """Coefficients of map coordinate `a` in chart `k`, a tuple; coefficients : of :class:`Charts`."""
+    """Return the coefficients of map coordinate `a` in chart `k` as a tuple; coefficients: see :class:`Charts`."""
     c = coefficients
     return (
         c[k, a, 0], c[k, a, 1], c[k, a, 2], c[k, a, 3], c[k, a, 4],
@@ -67,7 +67,7 @@ def expansion(coefficients, k, a):
 
 @inlined
 def map_value(c, dx, dy, dz):
-    """One map coordinate (m) at an offset (m) from the chart's centre, with its expansion `c`."""
+    """Return a map coordinate (m) at an offset (m) from the chart's centre, from its expansion `c`."""
     return (
         c[0]
         + dx * (c[1] + c[4] * dx + c[5] * dy + c[6] * dz)

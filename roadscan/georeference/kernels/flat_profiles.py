@@ -1,7 +1,7 @@
-"""Planes and points of profiles that are measured at once, near the sensor.
+"""Georeferences profiles whose readings are taken at one instant near the sensor.
 
 All readings of such a profile have one pose and lie in one plane, a few metres across. There the map is linear to a
-few µm (``points.flat_profiles`` holds the reach to that), so each map coordinate is
+few µm (``georeference.flat_profiles`` limits the reach accordingly), so each map coordinate is
 
     value = anchor + p + q · y + r · z
 
@@ -38,11 +38,11 @@ from roadscan.georeference.kernels.readings import (
 )
 from roadscan.poses.kernels.poses import find_interval
 
-HALF = np.float32(0.5)
+HALF = np.float32(0.5)  # Added before rounding down, in the type of the heights.
 
 
 class FlatProfiles(NamedTuple):
-    """Rays of a profile about its middle."""
+    """Rays of a profile relative to its middle."""
 
     rays: npt.NDArray[np.float32]
     """(4, m) y and z of the rays' origins from the middle (m), y and z of their directions."""
@@ -56,7 +56,7 @@ class FlatProfiles(NamedTuple):
 
 @bare_inlined
 def anchored(form, middle, quanta_per_m):
-    """A form of ``profile_forms`` about the profile's middle (y, z): anchor in whole quanta, and (p, q, r)."""
+    """Return a form of ``profile_forms`` about the profile's middle (y, z): anchor in whole quanta, and (p, q, r)."""
     y, z = middle
     value = form_value(form, y, z) * quanta_per_m
     anchor = np.int64(math.floor(value))
@@ -69,13 +69,13 @@ def anchored(form, middle, quanta_per_m):
 
 @bare_inlined
 def on_plane(plane, y, z):
-    """Value of a plane (p, q, r)."""
+    """Return the value of a plane (p, q, r) at y, z."""
     return plane[0] + plane[1] * y + plane[2] * z
 
 
 @bare_inlined
 def planes_of(epoch, k, middle, georeference):
-    """Planes of a profile's easting, northing and height, with the lowest and highest height kept above the anchor.
+    """Return the planes of a profile's easting, northing and height, and the height limits above the anchor.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def planes_of(epoch, k, middle, georeference):
 
 @bare_inlined
 def class_of(raw, height, raw_limits, heights):
-    """Class of a reading that a filter leaves out; `height` above the anchor."""
+    """Return the class of a reading that a filter leaves out; `height` counts from the anchor."""
     if raw == 0:
         return CLASS_NO_RETURN
     if raw < raw_limits[0]:
@@ -112,7 +112,7 @@ def class_of(raw, height, raw_limits, heights):
 
 @bare_inlined
 def fate_of(kind):
-    """Fate of a class other than kept."""
+    """Return the counter of a class other than kept."""
     if kind == CLASS_NO_RETURN:
         return NO_RETURN
     if kind == CLASS_NO_POSE:
@@ -122,7 +122,7 @@ def fate_of(kind):
 
 @bare
 def georeference_flat_profiles(epochs, ranges, flat, georeference, window, out):
-    """Place the readings of profiles and write points of those in the window. Returns how many points were written.
+    """Georeference profiles and write the points in the window; return the number of points written.
 
     Parameters
     ----------

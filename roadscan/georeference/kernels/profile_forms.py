@@ -1,4 +1,4 @@
-"""Map coordinates over the plane of a profile that is measured at once: quadratic forms of its y and z."""
+"""Map coordinates over the plane of a profile taken at one instant, as quadratic forms of its y and z."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from roadscan.georeference.kernels.charts import box_of, chart_index, expansion,
 from roadscan.poses.kernels.poses import attitude_at, interval, position_at
 
 NO_FORMS = ((0.0,) * 6,) * 4
-"""Forms of a reading without a pose."""
+"""Forms that stand in where there is no pose."""
 
 
 @inlined
 def profile_form(c, ox, oy, oz, axis_y, axis_z):
-    """A map coordinate over the profile's plane: (constant, y, z, y², y z, z²) coefficients.
+    """Return a map coordinate over the profile's plane as (constant, y, z, y², y z, z²) coefficients.
 
     c : expansion of the coordinate; ox, oy, oz : sensor origin from the chart's centre (m);
     axis_y, axis_z : the sensor's y and z axes in the world (its x does not occur in a profile).
@@ -35,13 +35,13 @@ def profile_form(c, ox, oy, oz, axis_y, axis_z):
 
 @inlined
 def form_value(f, y, z):
-    """Value of :func:`profile_form` at sensor coordinates y, z (m)."""
+    """Return the value of :func:`profile_form` at sensor coordinates y, z (m)."""
     return f[0] + y * (f[1] + f[3] * y + f[4] * z) + z * (f[2] + f[5] * z)
 
 
 @kernel
 def profile_forms(epoch, k, georeference):
-    """Map coordinates of a profile's plane at one epoch (GPS ns), in trajectory interval `k`.
+    """Return the map coordinates of a profile's plane at one epoch (GPS ns), in trajectory interval `k`.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""How far readings can reach on the map, from poses alone: the tiles that a row group may touch.
+"""Bounds where readings can lie on the map from poses alone: the tiles that a row group may touch.
 
-What a sensor may have seen at one instant is a box in its own frame: of a profile the rectangle from its nearest to
-its farthest range, of a lidar the box around its returns. Between two instants of an unbroken trajectory,
+What a sensor may have seen at one instant is a box in its frame: of a profile the rectangle from its nearest to its
+farthest range, of a lidar the box around its returns. Between two instants of an unbroken trajectory,
 
     map(p, t) ∈ (1 − s) A₀(p) + s A₁(p) ⊕ margin,   s = (t − t₀) / (t₁ − t₀)
 
@@ -25,34 +25,34 @@ from roadscan.georeference.kernels.tile_set import add_tile, mark_zonotope, take
 from roadscan.poses.kernels.poses import attitude_at, find_interval, interval, position_at
 
 SLACK_M = 0.001
-"""Rounding: float32 coordinates to 1 km, whole quanta, nanoseconds."""
+"""Allowance for rounding: float32 coordinates to 1 km, whole quanta, nanoseconds."""
 CHART_SLACK = 4e-13
 """Disagreement of neighbouring charts over distance³ (1/m²): sixteen times 1/R², the Earth's radius R."""
 STEP_M = 1.0
-"""A box moves about so far between two poses looked at, if its way does not bend by more than BEND_M before."""
-BEND_M = 0.03
+"""A box moves by about this between two evaluated poses, unless its path bends by BEND_M sooner."""
+BEND_M = 0.03  # Departure from a straight path at which another pose is evaluated.
 FAR_STEP_M, FAR_BEND_M = 3.0, 0.05
 """The same for boxes of returns, which are far larger."""
 LEAST_STEP_NS = 100_000
-"""Time between two poses looked at, at least: poses that jump widen the margin, they do not stop the loop."""
+"""Least time between two evaluated poses: poses that jump then widen the margin and do not stop the loop."""
 MOST_TILES = 8192
-"""Tiles of a row group at most."""
+"""Most tiles of a row group."""
 SAMPLE_M = 5.0
-"""Readings of a piece are shared out to places so far apart along the range."""
+"""The readings of a piece are distributed over places at this spacing along the range."""
 
 FIRST, LAST, SINE, COSINE, OFFSET, HALF_WIDTH, HALF_SINE, HALF_COSINE, BLOCK = range(9)
 """Columns of a profile's pieces, see :class:`SpannedProfiles`."""
 
 
 class SpannedProfiles(NamedTuple):
-    """Profiles of row groups, of which the spans of ranges are known."""
+    """Profiles of row groups whose range spans are known."""
 
     epochs: npt.NDArray[np.int64]
     """(n,) GPS ns of each profile's first reading, ascending in a group."""
     low: npt.NDArray[np.uint16]
     """(n, m) least raw range of the readings of each block, 0 without any."""
     high: npt.NDArray[np.uint16]
-    """(n, m) greatest raw range alike."""
+    """(n, m) greatest raw range, likewise."""
     starts: npt.NDArray[np.int64]
     """(g + 1,) first profile of each group."""
     pieces: npt.NDArray[np.float64]
@@ -67,19 +67,19 @@ class SpannedProfiles(NamedTuple):
 
 @inlined
 def norm3(x, y, z):
-    """Length of a vector."""
+    """Return the length of a vector."""
     return math.sqrt(x * x + y * y + z * z)
 
 
 @inlined
 def norm_of(a, b, x, y, z):
-    """Length of the vector of a |first| + b |second| … of three axes' coefficients (second, third)."""
+    """Return the length of the vector of a |first| + b |second| … of three axes' coefficients (second, third)."""
     return norm3(a * abs(x[0]) + b * abs(x[1]), a * abs(y[0]) + b * abs(y[1]), a * abs(z[0]) + b * abs(z[1]))
 
 
 @inner
 def motion_bounds(poses):
-    """Largest speed and acceleration of the body in each interval.
+    """Return the largest speed and acceleration of the body in each interval.
 
     With φ(t) the rotation vector of an interval, ω = J(φ) φ' where |J| ≤ 1 and |J'| ≤ |φ'| / 2 (J = ∫₀¹ exp(−s φ) ds;
     Solà 2018, eq. 143), so |R b|' ≤ |φ'| |b| and |R b|'' ≤ (|ω|² + |ω'|) |b| ≤ (3/2 |φ'|² + |φ''|) |b|.
@@ -116,7 +116,7 @@ def motion_bounds(poses):
 
 @kernel
 def stretch(k, since, until, arm, step_m, bend_m, poses, motion):
-    """How far to go from `since` (ns), in interval `k`, before the next pose is looked at; at most to `until`.
+    """Return how far to go from `since` (ns), in interval `k`, before another pose is evaluated; at most to `until`.
 
     arm : m, of the farthest point from the body's origin; step_m, bend_m : how far that point may move, and depart from
     a straight way; motion : from :func:`motion_bounds`.
@@ -147,7 +147,7 @@ def stretch(k, since, until, arm, step_m, bend_m, poses, motion):
 
 @inner
 def chart_near(px, py, pz, within, charts):
-    """Chart of a world position, or of one `within` metres along the axes; −1 where there is none."""
+    """Return the chart of a world position, or of one `within` metres along the axes; −1 where there is none."""
     lattice, table, centres = charts.lattice, charts.table, charts.centres_world_m
     chart = chart_index(box_of(px, py, pz, lattice), lattice, table, centres)
     for corner in range(8):
@@ -168,7 +168,7 @@ def chart_near(px, py, pz, within, charts):
 
 @inlined
 def gradient(c, x, y, z):
-    """Gradient of a map coordinate at an offset (m) from the chart's centre, with its expansion `c`."""
+    """Return the gradient of a map coordinate at an offset (m) from the chart's centre, from its expansion `c`."""
     return (
         c[1] + 2.0 * c[4] * x + c[5] * y + c[6] * z,
         c[2] + c[5] * x + 2.0 * c[7] * y + c[8] * z,
@@ -178,7 +178,7 @@ def gradient(c, x, y, z):
 
 @inlined
 def curvature(c):
-    """Frobenius norm of the quadratic part of an expansion (1/m)."""
+    """Return the Frobenius norm of the quadratic part of an expansion (1/m)."""
     return math.sqrt(
         c[4] * c[4] + c[7] * c[7] + c[9] * c[9] + 0.5 * (c[5] * c[5] + c[6] * c[6] + c[8] * c[8])
     )  # fmt: skip
@@ -186,7 +186,7 @@ def curvature(c):
 
 @inlined
 def along_axes(c, x, y, z, r, b):
-    """A map coordinate at the sensor's origin, and its slopes along the sensor's axes.
+    """Return a map coordinate at the sensor's origin, and its slopes along the sensor's axes.
 
     c : expansion; x, y, z : body from the chart's centre (m); r : world from body (9,); b : mounting (12,).
     """
@@ -205,13 +205,13 @@ def along_axes(c, x, y, z, r, b):
     )
 
 
-NOWHERE = (0.0,) * 8
-NO_DISK = (0.0, 0.0, math.inf)
+NOWHERE = (0.0,) * 8  # A frame that stands in where there is no chart.
+NO_DISK = (0.0, 0.0, math.inf)  # Disk without a limit.
 
 
 @inlined
 def pose_at(epoch, k, poses):
-    """Position and attitude at an epoch of interval `k`."""
+    """Return position and attitude at an epoch of interval `k`."""
     c = interval(poses.coefficients, k)
     u = (epoch - poses.knots[k]) / (poses.knots[k + 1] - poses.knots[k])
     return position_at(c, u), attitude_at(c, u)
@@ -219,7 +219,7 @@ def pose_at(epoch, k, poses):
 
 @inner
 def frames_between(k0, t0, k1, t1, speed, bend, reach, moved_m, georeference):
-    """The sensor's frame on the map between two instants of an unbroken piece of the trajectory.
+    """Return the sensor's frame on the map between two instants of an unbroken piece of the trajectory.
 
     For a fixed point p of the sensor's frame, |p| ≤ reach, g(t) is a map coordinate of it. Its slope is continuous
     (cubic Hermite), so it departs from the chord of g(t₀), g(t₁) by at most (t₁ − t₀)² / 8 · max |g''| (error of linear
@@ -274,7 +274,7 @@ def frames_between(k0, t0, k1, t1, speed, bend, reach, moved_m, georeference):
 
 @inner
 def nearest_and_farthest(low, high, block, first, end):
-    """Least of the `low` and greatest of the `high` (n, m) of rows with a reading, and how many rows that are."""
+    """Return the least `low`, the greatest `high` (n, m) of the rows with a reading, and the number of these rows."""
     near, far, rows = 65535, 0, 0
     for i in range(first, end):
         if high[i, block] > 0:
@@ -286,7 +286,7 @@ def nearest_and_farthest(low, high, block, first, end):
 
 @inner
 def mark_piece(pieces, p, nearest_m, farthest_m, readings, frames, found, count):
-    """Add the tiles of one piece of a profile, swept between two poses; returns how many tiles there are.
+    """Add the tiles of one piece of a profile, swept between two poses; return the number of tiles.
 
     pieces : (p, 9) as of :class:`SpannedProfiles`, p the one meant; readings : how many to share out;
     frames : (middle, half, margin) of :func:`frames_between`.
@@ -321,7 +321,7 @@ def mark_piece(pieces, p, nearest_m, farthest_m, readings, frames, found, count)
 
 @inner
 def mark_profiles(t0, t1, first, end, profiles, limits, frames, found, count):
-    """Add the tiles of all pieces of some profiles between two poses; returns how many tiles there are.
+    """Add the tiles of all pieces of some profiles between two poses; return the number of tiles.
 
     t0, t1 : GPS ns of the poses; first, end : the profiles that have readings between them; profiles : SpannedProfiles.
     """
@@ -333,7 +333,7 @@ def mark_profiles(t0, t1, first, end, profiles, limits, frames, found, count):
         if not at_once or np.int64(pieces[p, BLOCK]) != block:
             block = np.int64(pieces[p, BLOCK])
             a, b = first, end
-            if not at_once:  # a nanosecond more: epochs of readings are rounded
+            if not at_once:  # one nanosecond more, since epochs of readings are rounded
                 while a < b and epochs[a] + math.ceil(pieces[p, LAST] * reading_period_ns) + 1 < t0:
                     a += 1
                 while a < b and epochs[b - 1] + math.floor(pieces[p, FIRST] * reading_period_ns) - 1 > t1:
@@ -349,7 +349,7 @@ def mark_profiles(t0, t1, first, end, profiles, limits, frames, found, count):
 
 @kernel
 def reach_of_profiles(profiles, georeference, allowance, tile_m):
-    """Tiles that the profiles of row groups may touch.
+    """Return the tiles that the profiles of row groups may touch.
 
     Parameters
     ----------
@@ -416,7 +416,7 @@ def reach_of_profiles(profiles, georeference, allowance, tile_m):
 
 @inlined
 def disk_radius(m, reach):
-    """Horizontal reach on the map (m): the greatest singular value of the frame's slopes times the reach."""
+    """Return the horizontal reach on the map (m): the greatest singular value of the frame's slopes times the reach."""
     ee = m[1] * m[1] + m[2] * m[2] + m[3] * m[3]
     nn = m[5] * m[5] + m[6] * m[6] + m[7] * m[7]
     en = m[1] * m[5] + m[2] * m[6] + m[3] * m[7]
@@ -443,7 +443,7 @@ def mark_box(centre, edge, reach, frames, found, count):
 
 @inner
 def share_out(readings, e, n, found, count):
-    """Share readings out over tiles by their distance from a place: as 1 / (d² + tile²)."""
+    """Distribute readings over tiles by their distance from a place, with weights 1 / (d² + tile²)."""
     tile_m, _, tiles, weights = found
     total = 0.0
     for i in range(count):
@@ -456,7 +456,7 @@ def share_out(readings, e, n, found, count):
 
 @kernel
 def reach_of_returns(spans, boxes, readings, georeference, allowance, tile_m):
-    """Tiles that the returns of row groups may touch.
+    """Return the tiles that the returns of row groups may touch.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Structures of georeferencing: readings, what places them on the map, and the points that are written.
+"""Structures of georeferencing: readings, the geometry that georeferences them, and the points that are written.
 
     p_world = t + R_world←body · (R_body←sensor · p_sensor + l_body)
     map     = chart(p_world)
@@ -19,28 +19,28 @@ from roadscan.georeference.kernels.charts import Charts
 from roadscan.poses.kernels.poses import PoseIntervals
 
 KEPT, NO_POSE, RANGE, HEIGHT, OUTSIDE, NO_RETURN = 0, 1, 2, 3, 4, 5
-"""Fates of a reading, the indices of the kernels' `fates` counters."""
-FATES = 6
+"""Outcomes of a reading: indices of the kernels' `fates` counters."""
+FATES = 6  # Number of these counters.
 
 CLASS_KEPT, CLASS_NO_RETURN, CLASS_NO_POSE, CLASS_TOO_NEAR, CLASS_TOO_FAR, CLASS_TOO_LOW, CLASS_TOO_HIGH = range(7)
-"""Classes of a reading; the window counts in its fate only."""
+"""Classes of a reading; a reading outside the window has only an outcome."""
 
 
 class Limits(NamedTuple):
-    """What is kept of readings (m); infinite where there is no limit."""
+    """Limits of the readings that are kept (m); infinite where there is no limit."""
 
     range_min_m: float
     range_max_m: float
     height_min_m: float
-    """Of the map's heights."""
+    """Limits of heights on the map."""
     height_max_m: float
     above_body_min_m: float
-    """Of heights above the body's origin."""
+    """Limits of heights above the body's origin."""
     above_body_max_m: float
 
 
 class Georeference(NamedTuple):
-    """What places the readings of one sensor."""
+    """The geometry that georeferences the readings of one sensor."""
 
     mounting: tuple[float, ...]
     """(12,) body from sensor, row by row, then the lever arm in body axes (m)."""
@@ -62,7 +62,7 @@ class Returns(NamedTuple):
 
 
 class MirrorProfiles(NamedTuple):
-    """Profiles of a turning mirror, which measures one reading after another."""
+    """Profiles of a rotating mirror, which takes one reading after another."""
 
     epochs: npt.NDArray[np.int64]
     """(n,) GPS ns of each profile's first reading."""
@@ -79,14 +79,14 @@ class MirrorProfiles(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Places of readings on the map, written by kernels."""
+    """Map positions of readings, written by kernels."""
 
     east: npt.NDArray[np.float64]
-    """(n,) whole quanta, floor(metres · quanta_per_m + ½); of no meaning where the class is not CLASS_KEPT."""
+    """(n,) whole quanta, floor(metres · quanta_per_m + ½); undefined where the class is not CLASS_KEPT."""
     north: npt.NDArray[np.float64]
-    """(n,) alike."""
+    """(n,) likewise."""
     height: npt.NDArray[np.float64]
-    """(n,) alike."""
+    """(n,) likewise."""
     classes: npt.NDArray[np.uint8]
     """(n,) CLASS_KEPT, or why the reading is left out."""
     intervals: npt.NDArray[np.int32]
@@ -94,7 +94,7 @@ class Placed(NamedTuple):
 
 
 class Window(NamedTuple):
-    """Tiles whose points are wanted."""
+    """The range of tiles whose points are requested."""
 
     tile_quanta: int
     """Edge of a tile."""
@@ -103,7 +103,7 @@ class Window(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Points of the readings that are kept and lie in the window, written by kernels one behind another."""
+    """Points of the readings that are kept and lie in the window, appended by kernels."""
 
     rows: npt.NDArray[np.int32]
     """(n,) index of the return, or of the profile."""
@@ -116,14 +116,14 @@ class Points(NamedTuple):
     fates: npt.NDArray[np.int64]
     """(≥ FATES,) in/out, counts of all readings by fate."""
     classes: npt.NDArray[np.uint8]
-    """(n,) class of every reading, kept or not; or (0,) where not wanted."""
+    """(n,) class of every reading, kept or not; (0,) where not requested."""
 
 
 @inlined
 def tile_and_rest(quanta, tile_quanta):
-    """Tile number of a coordinate (quanta, int64), and its quanta from the tile's edge.
+    """Return the tile number of a coordinate (quanta, int64), and its quanta from the tile's edge.
 
-    A floored division without the slow instruction: multiply, then mend the last unit.
+    A floored division without the slow instruction: multiply, then correct the last unit.
     """
     tile = np.int64(math.floor(quanta * (1.0 / tile_quanta)))
     rest = quanta - tile * tile_quanta
@@ -138,7 +138,7 @@ def tile_and_rest(quanta, tile_quanta):
 
 @inlined
 def is_wanted(column, row, tiles):
-    """True for a tile inside a window; tiles : of :class:`Window`."""
+    """Return True for a tile inside a window; tiles: see :class:`Window`."""
     return tiles[0] <= column < tiles[2] and tiles[1] <= row < tiles[3]
 
 

@@ -1,4 +1,4 @@
-"""Ranges without those of readings that did not hit the road, which become 0 (no return)."""
+"""Removes readings off the road from profiles: their ranges become 0 (no return)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from roadscan.compute.kernel_options import kernel
 
 @kernel
 def keep_road(kinds, first_kind, ranges, counts):
-    """Silence the readings of the classes from `first_kind` on, and count them.
+    """Set the ranges of readings of the classes from `first_kind` on to 0, and count them.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Which readings of a profile hit the road: histogram threshold, height, second derivative and angle, connection.
+"""Finds the readings of a profile that hit the road: histogram threshold, height, second derivative, angle, connection.
 
 The steps and how each is read are described in :mod:`roadscan.georeference.segmentation`. All of it happens in the
-plane of the profile, in the sensor's own axes: y across, *up* = −z.
+plane of the profile, in the sensor's axes: y across, *up* = −z.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ CLASS_ABOVE, CLASS_GRAZING = 9, 11
 """Classes of readings that did not hit the road; 7 and 8 belong to passes and centre lines."""
 
 HYPOTHESES = 9
-"""Pieces of a profile whose lines are tried as the road's."""
-REFINEMENTS = 4
+"""Number of pieces of a profile whose lines are tried as the road's."""
+REFINEMENTS = 4  # Times that the parabola of the datum is fitted again to the readings near it.
 SAMPLES = 256
-"""About so many readings of a profile are asked whether they agree with a line."""
+"""About this many readings of a profile are tested for agreement with a line."""
 HISTOGRAM_REACH_M = 1.0
-"""Readings farther than this above or below the datum are not in the histogram."""
+"""Readings farther above or below the datum do not enter the histogram."""
 FEWEST = 8
 """Profiles with fewer returns have no road."""
-NOISE_SAMPLES = 100
+NOISE_SAMPLES = 100  # Readings per profile from which its noise is estimated.
 LEAST_NOISE_M = 1e-4
-"""Noise is not taken for smaller: ranges are rounded, too."""
+"""Least noise that is assumed, since ranges are rounded."""
 LEAST_DZ = 0.2
-"""Beams nearer to the horizontal have an error of height as if they fell by so much a metre."""
+"""For beams nearer to the horizontal, the height error is taken as if they fell by this much per metre."""
 
 
 @inner
 def profile_points(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up, index):
-    """Returns of one profile within the range limits, in the order of their readings.
+    """Write the returns of one profile within the range limits, in the order of their readings.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def profile_points(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up, index
 
 @inner
 def place_readings(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up):
-    """Class and place (m,) of every reading; arguments of :func:`profile_points`. Alone, the loop vectorises."""
+    """Write class and position (m,) of every reading; arguments of :func:`profile_points`. It vectorises by itself."""
     low, high = np.uint16(raw_limits[0]), np.uint16(raw_limits[1])
     for j in range(raw.size):
         distance = scale[0] + scale[1] * raw[j]
@@ -82,13 +82,13 @@ def place_readings(raw, y0, z0, dy, dz, scale, raw_limits, classes, y, up):
 
 @inlined
 def parabola_at(p, y):
-    """Value of a parabola (1, y, y²)."""
+    """Return the value of a parabola (1, y, y²)."""
     return p[0] + y * (p[1] + y * p[2])
 
 
 @kernel
 def fitted(y, up, first, end, stride, near, gate, bent):
-    """Least-squares line, or parabola where `bent`, through readings within `gate` (m) of the parabola `near`.
+    """Fit a line, or a parabola where `bent`, to readings within `gate` (m) of the parabola `near`.
 
     `near` is kept where too few readings or too short a piece determine nothing.
     """
@@ -129,7 +129,7 @@ def fitted(y, up, first, end, stride, near, gate, bent):
 
 @inner
 def road_datum(y, up, gate):
-    """The road's own level in a profile: a parabola (1, y, y²; m) and the y that it counts from.
+    """Return the road's level in a profile: a parabola (1, y, y²; m) and the y that it counts from.
 
     Lines through pieces of the profile are tried, that with most readings within `gate` (m) wins; a parabola is then
     fitted to the readings near it, several times. So neither a car's side nor a pavement beside a kerb bends it.
@@ -159,7 +159,7 @@ def road_datum(y, up, gate):
 
 @kernel
 def height_threshold(height, bin_m, share, counts):
-    """Step 1 of the segmentation: the threshold of the heights.
+    """Step 1 of the segmentation: return the threshold of the heights.
 
     Parameters
     ----------
@@ -190,20 +190,20 @@ def height_threshold(height, bin_m, share, counts):
     second = first
     while second + 1 < bins and counts[second + 1] >= share * counts[first] and counts[second + 1] > 0:
         second += 1
-    # Where in its bin the road's level lies is chance, so the peak may reach a bin's width beyond N2.
+    # The road's level lies anywhere within its bin, so the peak may reach one bin width beyond N2.
     return low + (second + 2) * bin_m
 
 
 @inner
 def mark_above(height, threshold, kinds):
-    """Step 2: readings higher than the threshold."""
+    """Step 2: mark readings higher than the threshold."""
     for j in range(height.size):
         kinds[j] = CLASS_ABOVE if height[j] > threshold else CLASS_KEPT
 
 
 @inner
 def curvatures(y, up, bend):
-    """Step 3 (i): how far each reading stands above the line through its two neighbours (n,), m.
+    """Step 3 (i): return how far each reading lies above the line through its two neighbours (n,), m.
 
     It is the second difference −z″ · (y₊ − y)(y − y₋) / 2: free of the spacing, which makes z″ itself incomparable.
     """
@@ -220,7 +220,7 @@ def curvatures(y, up, bend):
 
 @inner
 def range_noise(bend, index, dz, kinds, sample):
-    """Standard deviation of the ranges (m) as the profile itself shows it: from the median of :func:`curvatures`.
+    """Return the standard deviation of the ranges (m), estimated from the profile's median of :func:`curvatures`.
 
     A range error e on level ground shifts the height by e · dz, and a second difference has 1.5 times the variance of a
     height; the median of |x| is 0.6745 σ. Texture counts as noise, and objects of a few readings do not count.
@@ -245,7 +245,7 @@ def range_noise(bend, index, dz, kinds, sample):
 
 @inner
 def mark_scattered(bend, index, dz, noise, factor, neighbours, sums, kinds):
-    """Step 3 (i): readings that stand out upwards, `factor` times more than the readings around them.
+    """Step 3 (i): mark readings that stand out upwards `factor` times more than the readings around them.
 
     bend : (n,); sums : (n + 1,) scratch. The two readings beside one share it in their second differences and do
     not count as neighbours. Large ones count no more than 10 σ, lest one hides another.
@@ -267,7 +267,7 @@ def mark_scattered(bend, index, dz, noise, factor, neighbours, sums, kinds):
 
 @inlined
 def is_grazing(y, up, j, k, beam_y, beam_up, sine):
-    """True where the chord from reading j to k makes a smaller angle with the beam than that of `sine`."""
+    """Return True where the chord from reading j to k meets the beam at a smaller angle than that of `sine`."""
     a, b = y[k] - y[j], up[k] - up[j]
     cross = a * beam_up - b * beam_y
     return cross * cross < sine * sine * (a * a + b * b)
@@ -275,14 +275,14 @@ def is_grazing(y, up, j, k, beam_y, beam_up, sine):
 
 @inlined
 def is_near(y, up, j, k, least):
-    """True where the readings j and k are less than √least (m) apart."""
+    """Return True where the readings j and k are less than √least (m) apart."""
     a, b = y[k] - y[j], up[k] - up[j]
     return a * a + b * b < least
 
 
 @inner
 def mark_grazing(y, up, index, dy, dz, sine, chord, kinds):
-    """Step 3 (ii): readings where beam and surface meet at less than the limit, seen from both sides.
+    """Step 3 (ii): mark readings where beam and surface meet at less than the limit, seen from both sides.
 
     The surface is the chord to the next reading at least `chord` (m) away on each side; dy, dz : (m,) rays.
     """
@@ -307,7 +307,7 @@ def mark_grazing(y, up, index, dy, dz, sine, chord, kinds):
 
 @kernel
 def segment_profiles(ranges, y0, z0, dy, dz, scale, raw_limits, settings, classes):
-    """Class of every reading of profiles; each profile is judged alone.
+    """Classify every reading of profiles; each profile is judged by itself.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Places between ticks: of many epochs, linear between places that are known at multiples of a step of time."""
+"""Interpolates positions linearly between ticks, the multiples of a time step at which they are known."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from roadscan.compute.kernel_options import kernel
 
 @kernel
 def between_ticks(epochs, step, first, number, at, out):
-    """Interpolate places.
+    """Interpolate positions at epochs.
 
     Parameters
     ----------
@@ -17,7 +17,7 @@ def between_ticks(epochs, step, first, number, at, out):
     out : (3, n) float64, out.
     """
     i, length = 0, float(step)
-    while i < epochs.size:  # epochs follow one another, so that a tick holds many of them
+    while i < epochs.size:  # epochs ascend, so many of them share a tick
         tick = epochs[i] // step
         begin, row, last = tick * step, number[tick - first], i + 1
         while last < epochs.size and begin <= epochs[last] < begin + step:

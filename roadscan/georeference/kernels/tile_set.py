@@ -1,4 +1,4 @@
-"""Sets of tiles: what a row group touches, collected tile by tile, with a weight each."""
+"""Sets of tiles with weights: the tiles that a row group touches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SPREAD = np.uint64(0x9E3779B97F4A7C15)
 
 
 class TileSet(NamedTuple):
-    """A set of tiles of a fixed size, made once and emptied between row groups; its user counts the tiles."""
+    """A set of tiles of fixed capacity, reused for all row groups; the caller keeps the number of tiles."""
 
     tile_m: float
     """Edge of a tile."""
@@ -29,13 +29,13 @@ class TileSet(NamedTuple):
 
 @kernel
 def tile_set(most, tile_m):
-    """An empty set of up to `most` tiles, a power of two; tile_m : edge of a tile."""
+    """Return an empty set for up to `most` tiles, a power of two; tile_m: edge of a tile."""
     return TileSet(tile_m, np.zeros(4 * most, np.int32), np.zeros((most, 3), np.int64), np.zeros(most))
 
 
 @kernel
 def add_tile(column, row, weight, found, count):
-    """Add a tile, or weight to one that is there; returns how many tiles there are, −1 where the set is full."""
+    """Add a tile, or add weight to one in the set; return the number of tiles, −1 where the set is full."""
     _, slots, tiles, weights = found
     mask = np.int64(slots.size - 1)
     key = (np.uint64(np.int64(column)) << np.uint64(32)) ^ (np.uint64(np.int64(row)) & np.uint64(0xFFFFFFFF))
@@ -58,7 +58,7 @@ def add_tile(column, row, weight, found, count):
 
 @inlined
 def strip(e, n, total, margin):
-    """Strip along a direction (e, n) that holds a zonotope: x + slope · y lies in [−width, width].
+    """Return the strip along a direction (e, n) that contains a zonotope: x + slope · y lies in [−width, width].
 
     total : Σ |n × g| over the zonotope's generators g. Directions along the rows say nothing of x.
     """
@@ -69,7 +69,7 @@ def strip(e, n, total, margin):
 
 @inlined
 def crossed(e, n, g):
-    """Σ |(e, n) × g_i| over four generators (e0, n0, e1, n1, …)."""
+    """Return Σ |(e, n) × g_i| over four generators (e0, n0, e1, n1, …)."""
     return (
         abs(e * g[1] - n * g[0]) + abs(e * g[3] - n * g[2]) + abs(e * g[5] - n * g[4]) + abs(e * g[7] - n * g[6])
     )  # fmt: skip
@@ -77,7 +77,7 @@ def crossed(e, n, g):
 
 @inlined
 def inside(slope, width, y0, y1, low, high):
-    """Part of [low, high] that a strip leaves of a row of tiles between y0 and y1."""
+    """Return the part of [low, high] in a row of tiles between y0 and y1 that lies in a strip."""
     a, b = slope * y0, slope * y1
     return max(low, -width - max(a, b)), min(high, width - min(a, b))
 
@@ -135,7 +135,7 @@ def mark_zonotope(centre_e, centre_n, g, margin, disk, found, count):
 
 @kernel
 def empty(found, count):
-    """Empty a set of `count` tiles, or one that was full (−1)."""
+    """Empty a set of `count` tiles, or a full one (−1)."""
     if count < 0:
         found.slots[:] = 0
     for i in range(count):
@@ -144,7 +144,7 @@ def empty(found, count):
 
 @kernel
 def take(group, found, count, made, out_tiles, out_readings):
-    """Write a group's tiles behind the `made` rows of the output, and empty the set.
+    """Append a group's tiles to the `made` rows of the output, and empty the set.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def take(group, found, count, made, out_tiles, out_readings):
     if made + max(count, 0) > out_readings.size:
         size = 2 * (made + count)
         more_tiles, more_readings = np.empty((size, 3), np.int64), np.empty(size, np.int64)
-        for i in range(made):  # a slice's assignment takes four seconds to compile, for the text of its error
+        for i in range(made):  # a slice assignment takes four seconds to compile, because of its error message
             more_readings[i] = out_readings[i]
             for k in range(3):
                 more_tiles[i, k] = out_tiles[i, k]

@@ -1,4 +1,4 @@
-"""Points of readings with an epoch each: placed chunk by chunk, those wanted written one behind another."""
+"""Writes points of readings with an epoch each, chunk by chunk."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from roadscan.georeference.kernels.timed_readings import CHUNK, place_mirror, pl
 
 @kernel
 def places(n):
-    """Arrays for the places of n readings."""
+    """Return arrays for the map positions of n readings."""
     return Placed(np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.uint8), np.empty(n, np.int32))
 
 
 @bare_inner
 def keep_points(first, n, made, placed, window, out):
-    """Append the readings that are kept and lie in the window; write the classes of all where they are wanted.
+    """Append the readings that are kept and lie in the window; write the classes of all where requested.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def keep_points(first, n, made, placed, window, out):
 
 @kernel
 def georeference_returns(returns, georeference, window, out):
-    """Place returns and write points of those in the window. Returns how many points were written.
+    """Georeference returns and write the points in the window; return the number of points written.
 
     returns : Returns; georeference : Georeference; window : Window; out : Points of as many rows as there are returns.
     """
@@ -70,7 +70,7 @@ def georeference_returns(returns, georeference, window, out):
 
 @kernel
 def georeference_mirror(profiles, georeference, window, out):
-    """Place the readings of a mirror's profiles and write points of those in the window. Returns how many.
+    """Georeference the readings of a mirror's profiles and write the points in the window; return their number.
 
     profiles : MirrorProfiles; others as in :func:`georeference_returns`, with a row of `out` for each reading.
     """

@@ -1,16 +1,16 @@
-"""Map coordinates of readings with an epoch each: returns of a spinning lidar, readings of a turning mirror.
+"""Map coordinates of readings with an epoch each: returns of a spinning lidar, readings of a rotating mirror.
 
-Poses are not evaluated a reading. Each interval between two knots of the trajectory is cut into equal *pose
+Poses are not evaluated for each reading. An interval between two knots of the trajectory is cut into equal *pose
 steps* no longer than :data:`STEP_NS`; the exact pose is taken at four epochs of a step, a third of it apart, and
 sensor origin, sensor axes and the body's height run between them as cubics in time. A cubic through four points
 d apart departs from its function f by at most d⁴ max|f⁗| / 24 (Lagrange's remainder). Positions between knots are
 cubics, so they stay exact. A point at distance r of a body that turns at ω with the angular acceleration α and
 the angular jerk β has |f⁗| ≤ r (ω⁴ + 6 ω² α + 3 α² + 4 ω β). For 100 m, 300 °/s and 5 rad/s² that is
-1.65·10⁵ m/s⁴, and with d = 1.7 ms the departure is 0.05 µm, whatever the body's own acceleration; 1 µm is reached
+1.65·10⁵ m/s⁴, and with d = 1.7 ms the departure is 0.05 µm, whatever the body's acceleration; 1 µm is reached
 at β = 1,400 rad/s³, more than a sudden change of α by 5 rad/s² makes of the trajectory's interpolation.
 
-Steps hang on the trajectory's knots alone, never on the readings: a point does not depend on which others are
-placed with it, no step crosses a knot, and gaps begin and end exactly where they do. A step's chart is that of
+Steps depend on the trajectory's knots alone, never on the readings: a point does not depend on which others are
+georeferenced with it, no step crosses a knot, and gaps begin and end exactly where they do. A step's chart is that of
 its middle: in 5 ms the vehicle goes far less than the margin of a chart.
 """
 
@@ -40,16 +40,16 @@ from roadscan.poses.kernels.poses import attitude_at, find_interval, interval, p
 STEP_NS = 5_000_000
 """Longest pose step: one an interval of a trajectory at 200 Hz."""
 CHUNK = 2048
-"""Readings placed at once: their buffers stay in a core's own second cache, and a pose step serves most of them."""
+"""Readings per chunk: the buffers stay in a core's second-level cache, and a pose step serves most of a chunk."""
 
 FIRST_EPOCH, END_EPOCH = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 ORIGIN, AXES, BODY_HEIGHT, SENSOR_AT = 0, 3, 12, 13
-"""What :func:`sensor_at` writes: 3 of the origin, 9 of the axes, the body's height; and how many."""
+"""Columns that :func:`sensor_at` writes: 3 of the origin, 9 of the axes, the body's height; and their number."""
 
 
 @inlined
 def sensor_at(c, u, b, centre, height_chart, out):
-    """Sensor origin (m, from a chart's centre), its axes as matrix world ← sensor row by row, the body's height (m)."""
+    """Write sensor origin (m, from a chart's centre), axes as matrix world ← sensor by rows, and body height (m)."""
     px, py, pz = position_at(c, u)
     r = attitude_at(c, u)
     px, py, pz = px - centre[0], py - centre[1], pz - centre[2]
@@ -64,7 +64,7 @@ def sensor_at(c, u, b, centre, height_chart, out):
 
 @bare_inner
 def pose_step(epoch, k, georeference, nodes, motion):
-    """The pose step that holds an epoch (GPS ns); `k` is the interval to search from.
+    """Compute the pose step that contains an epoch (GPS ns); `k` is the interval to search from.
 
     Parameters
     ----------
@@ -116,25 +116,25 @@ def pose_step(epoch, k, georeference, nodes, motion):
                 motion[2, a] = (9.0 * outer - 9.0 * inner) / 16.0
                 motion[3, a] = (9.0 * outer_step - 27.0 * inner_step) / 16.0
     if k == n - 2 and end == knots[n - 1]:
-        end += 1  # the last knot itself still belongs to the last interval
+        end += 1  # the last knot belongs to the last interval
     return first, end, k, chart, per_ns
 
 
 @inlined
 def cubic(motion, a):
-    """Coefficients 1, s, s², s³ of the a-th of a step's motion."""
+    """Return the coefficients 1, s, s², s³ of the a-th of a step's motion."""
     return motion[0, a], motion[1, a], motion[2, a], motion[3, a]
 
 
 @inlined
 def at(c, s):
-    """Value of a cubic at s."""
+    """Return the value of a cubic at s."""
     return c[0] + s * (c[1] + s * (c[2] + s * c[3]))
 
 
 @bare_inner
 def place_step(step, motion, georeference, readings, begin, end, out):
-    """Place readings `begin` to `end` − 1, of one pose step; see :func:`place_ranged`.
+    """Georeference readings `begin` to `end` − 1, all of one pose step; see :func:`place_ranged`.
 
     One loop without branches: it vectorises. step : (3,) tuple, the step's first epoch, part of it a ns, its chart.
     """
@@ -170,13 +170,13 @@ def place_step(step, motion, georeference, readings, begin, end, out):
 
 @inlined
 def returns_of(readings, first, end):
-    """Readings `first` to `end` − 1 of :class:`Returns`."""
+    """Return readings `first` to `end` − 1 of :class:`Returns`."""
     return Returns(readings.epochs[first:end], readings.x[first:end], readings.y[first:end], readings.z[first:end])
 
 
 @inlined
 def placed_of(out, first, end):
-    """Places `first` to `end` − 1 of :class:`Placed`."""
+    """Return positions `first` to `end` − 1 of :class:`Placed`."""
     return Placed(
         out.east[first:end], out.north[first:end], out.height[first:end], out.classes[first:end],
         out.intervals[first:end],
@@ -185,7 +185,7 @@ def placed_of(out, first, end):
 
 @inner
 def place_ranged(readings, georeference, out, fates):
-    """Place readings whose classes say already what their ranges are worth.
+    """Georeference readings whose ranges are classified already.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ def place_ranged(readings, georeference, out, fates):
 
 @kernel
 def place_returns(start, end, returns, georeference, out, fates):
-    """Place returns `start` to `end` − 1 of a spinning lidar (or any readings with an epoch and a position each).
+    """Georeference returns `start` to `end` − 1 of a spinning lidar (or any readings with epoch and position each).
 
     Call it for about :data:`CHUNK` returns at a time; how they are divided changes no bit of a result.
 
@@ -253,7 +253,7 @@ def place_returns(start, end, returns, georeference, out, fates):
 
 @kernel
 def place_mirror(start, end, profiles, georeference, out, fates):
-    """Place profiles `start` to `end` − 1 of a turning mirror: every reading has its own epoch.
+    """Georeference profiles `start` to `end` − 1 of a rotating mirror; every reading has an epoch.
 
     Call it for as many profiles as make about :data:`CHUNK` readings.
 

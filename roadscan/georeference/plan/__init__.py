@@ -1,1 +1,1 @@
-"""What places the readings of a survey: sources, mountings, road, centre lines, drives."""
+"""The plan of a survey: sources, mountings, road segmentation, centre lines, corrections."""

@@ -1,4 +1,4 @@
-"""The layer of centre lines that points are cut to: read once a process, widened line by line."""
+"""The layer of centre lines that limits points to the road: read once a process, widened line by line."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ CLASS: Final = "class"
 
 @dataclass(frozen=True)
 class CentreLines:
-    """Which layer points are cut to, and how far beside its lines. Sent to workers: it holds no data."""
+    """The centre-line layer and the distances kept beside its lines. Sent to workers: it holds no data."""
 
     path: Path
     digests: tuple[str, ...]
-    """Content of the layer's files: a changed layer is another one."""
+    """Digests of the layer's files, so that a changed layer counts as another one."""
     crs: str | None
     width: str
     """"buffer", "class", or the attribute with the road's width."""
@@ -47,7 +47,7 @@ class CentreLines:
 
     @classmethod
     def of(cls, survey: Survey) -> CentreLines | None:
-        """What the survey file states, None where points are not cut."""
+        """Return what the survey file states; None where points are not limited to centre lines."""
         stated = survey.config.filters
         if stated.centre_line is None:
             return None
@@ -68,19 +68,19 @@ class CentreLines:
         )
 
     def key(self) -> list[object]:
-        """What shapes tiles; where the file lies does not."""
+        """Key of all that changes tiles; the place of the file does not."""
         return [RoadLines.version, self.digests, self.crs, self.width, self.buffer_m, self.margin_m, self.options]
 
 
 @functools.lru_cache(maxsize=2)
 def load_buffer(stated: CentreLines, frame: MapFrame) -> CentreLineBuffer:
-    """Read the lines and find how far beside each points are kept.
+    """Read the lines and determine the distance kept beside each.
 
     Raises
     ------
     FormatError, ConfigError, CrsError
-        if the layer cannot be read as stated, if it has no line, or if a feature cannot be used: the road along it
-        would be cut away without a word.
+        if the layer cannot be read as stated, if it has no line, or if a feature cannot be used: points along it would
+        be removed silently.
     """
     options = RoadLinesOptions.model_validate_json(stated.options)
     layer = LineLayer.of(stated.path, options, stated.crs)
@@ -100,7 +100,7 @@ def load_buffer(stated: CentreLines, frame: MapFrame) -> CentreLineBuffer:
 
 
 def _all_lines(layer: LineLayer, place: Place, stated: CentreLines) -> list[Lines]:
-    """Every line of the layer; attributes that do not matter here are not read, so they cannot be at fault."""
+    """Return every line of the layer; unused attributes are not read, so an invalid one causes no error."""
     needed: set[str] = set() if stated.width == BUFFER else {"class", "lanes", "width"}
     plain = replace(layer, columns={what: name if what in needed else None for what, name in layer.columns.items()})
     parts: list[Lines] = []
@@ -117,7 +117,7 @@ def _all_lines(layer: LineLayer, place: Place, stated: CentreLines) -> list[Line
 
 
 def _half_widths_m(lines: Lines, stated: CentreLines) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Distance (n,) kept beside each line (m)."""
+    """Return the distance (n,) kept beside each line (m)."""
     if stated.width == BUFFER:
         return np.full(lines.width_m.size, stated.buffer_m)
     own = lines.width_m / 2 + stated.margin_m

@@ -1,4 +1,4 @@
-"""The corrections that hold, and digests of those that place readings of a span of time: what makes a tile stale."""
+"""The corrections in force, and digests of those that affect a span of time, by which stale tiles are found."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ UInt64 = npt.NDArray[np.uint64]
 
 @dataclass(frozen=True)
 class KnownCorrections:
-    """Corrections of all runs and of the mountings of all sensors, as the tables hold them."""
+    """Corrections of all runs and of the mountings of all sensors, as stored in the tables."""
 
     by_run: Mapping[str, Corrections]
     mountings: MountingChanges = field(default_factory=dict)
 
     @classmethod
     def load(cls, store: Store) -> Self:
-        """What the table says. Damage is told here, before tiles are asked to bear it."""
+        """Read the tables. Damage is reported here, before tiles depend on it."""
         return cls(load_all_corrections(store), load_mounting_changes(store))
 
     def allowance(self, run: str, sensor: str) -> Allowance:
-        """Corrections that bounds on the recorded poses of a run and the stated mounting of a sensor leave room for.
+        """Return the allowance for corrections in bounds on a run's recorded poses and a sensor's stated mounting.
 
         Raises
         ------
@@ -57,10 +57,10 @@ class KnownCorrections:
             ) from None
 
     def digests(self, source: ReadingSource, spans_gps_ns: Int64, max_gap_s: float) -> UInt64:
-        """Digest (n,) of the corrections that place readings of spans (n, 2) of time; 0 where there are none.
+        """Return a digest (n,) of the corrections that affect readings of spans (n, 2) of time; 0 where there are none.
 
-        It is that of the mounting, and the sum of the digests of the knots around each span, with as much beyond it as
-        interpolation looks at.
+        It combines that of the mounting and the sum of the digests of the knots in each span, and beyond it as far as
+        interpolation uses them.
         """
         own = self.by_run.get(source.run)
         mounted = np.uint64(0) if source.trajectory is None else self._mounting_digest(source.run, source.sensor)
@@ -81,12 +81,12 @@ class KnownCorrections:
 
     @cached_property
     def _sums(self) -> dict[str, UInt64]:
-        """Of each run the sums (k + 1,) of the digests of the knots before each, modulo 2⁶⁴."""
+        """Return for each run the sums (k + 1,) of the digests of the knots before each, modulo 2⁶⁴."""
         return {run: np.append(np.uint64(0), np.cumsum(_digests(own))) for run, own in self.by_run.items()}
 
 
 def beyond_ns(source: ReadingSource, max_gap_s: float) -> int:
-    """How far beyond their own epochs (ns) the poses reach that place and judge the readings of a source."""
+    """Return how far beyond their epochs (ns) poses affect the readings of a source."""
     geometry = source.attribute.get("scan_geometry") or {}
     profile_s = float(geometry.get("reading_period_ns", 0.0)) * int(geometry.get("readings", 1)) / NS_PER_S
     turns = WINDOW_NS + TICK_NS if source.road is not None and source.road.turns is not None else 0
@@ -94,7 +94,7 @@ def beyond_ns(source: ReadingSource, max_gap_s: float) -> int:
 
 
 def _digests(corrections: Corrections) -> UInt64:
-    """A digest (k,) of each knot: its epoch and its six values."""
+    """Return a digest (k,) of each knot: its epoch and its six values."""
     columns = [corrections.epochs_gps_ns, *corrections.north_east_down_m.T, *corrections.roll_pitch_heading_rad.T]
     rows = np.column_stack([np.ascontiguousarray(column).view(np.uint64) for column in columns])
     found = b"".join(hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rows)

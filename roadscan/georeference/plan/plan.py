@@ -1,4 +1,4 @@
-"""The plan of a survey: sources of readings, ground, passes; everything a stage starts from."""
+"""The plan of a survey: sources of readings, map settings and passes, from which every stage starts."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ from roadscan.store.logs import NAVIGATION, DataFile, LogRecord
 from roadscan.store.store import Store
 
 DatedMountings: TypeAlias = Mapping[tuple[str, str], Sequence[tuple[int, Mounting]]]
-"""Calibrated mountings by run ('*' for all) and sensor, with the epochs from which they hold, ascending."""
+"""Calibrated mountings by run ('*' for all) and sensor, with the epochs from which they apply, ascending."""
 
 _SAME_MOUNTING = 1e-3
-"""Mountings that differ by less (m, or in the rotation's elements) are one."""
+"""Mountings that differ by less (m, or in the rotation's elements) count as equal."""
 
 
 @dataclass(frozen=True)
 class SurveyPlan:
-    """What stages after ingest know of a survey."""
+    """What stages after ingest know about a survey."""
 
     survey: Survey
     store: Store
@@ -54,13 +54,13 @@ class SurveyPlan:
     """Each sensor's readings in each run, with their data files."""
     passes: tuple[LanePass, ...]
     centre_lines: CentreLines | None
-    """Layer that points are cut to."""
+    """Layer that limits points to the road."""
     tile_key: str
-    """Hash of all that shapes any tile, beside its readings."""
+    """Hash of all that changes any tile, besides its readings."""
     apart: tuple[Fault, ...] = ()
-    """Logs that do not overlap the poses of their run: none of their readings is a source."""
+    """Logs that do not overlap the poses of their run: none of their readings is used."""
     corrections: KnownCorrections = field(default_factory=lambda: KnownCorrections({}))
-    """Corrections of the poses that hold now."""
+    """Corrections of the poses in force."""
 
     @property
     def raw_bytes(self) -> int:
@@ -73,25 +73,25 @@ class SurveyPlan:
         return utc_from_gps_ns(min(p.start_gps_ns for p in self.passes)).date()
 
     def pass_key(self, run: str) -> list[object]:
-        """What makes a run's tiles stale when its passes change: ids, and the spans that the survey file states."""
+        """Key by which a run's tiles become stale when its passes change: ids, and the spans in the survey file."""
         stated = [(p.id, p.start, p.end) for p in self.survey.config.passes if p.run == run]
         return list(stated) or [p.pass_id for p in self.passes if p.run == run]
 
     def corrected_anew(self) -> SurveyPlan:
-        """The same with the corrections that the table holds now."""
+        """Return the plan with the corrections that the table contains now."""
         corrections = KnownCorrections.load(self.store)
         sources = tuple((_with_room(source, corrections), files) for source, files in self.sources)
         return replace(self, sources=sources, corrections=corrections)
 
     def slices(self) -> list[RawSlice]:
-        """All data files, whole."""
+        """Return all data files, whole."""
         return [RawSlice.whole(source, f) for source, files in self.sources for f in files]
 
 
 def plan_survey(
     survey: Survey, store: Store, calibrated: DatedMountings | None = None, records: Sequence[LogRecord] | None = None
 ) -> SurveyPlan:
-    """Put together what the tables and the survey file say; reads no readings.
+    """Build the plan from the tables and the survey file; reads no readings.
 
     `calibrated` stand in for the table of mountings where they are given, `records` for those of the survey's logs and
     trajectories.
@@ -160,13 +160,13 @@ class NothingToPlaceError(RunError):
 
 
 def yields_readings(log_format: str) -> bool:
-    """Whether logs of a format (or computed trajectories, by what computes them) hold readings to place."""
+    """Return whether logs of a format (or trajectories computed by a method) contain readings to georeference."""
     known = log_formats().get(log_format)
     return known is not None and not set(DATA_TABLES).isdisjoint(known.yields)
 
 
 def _mounted_rig(rig: Rig, records: Sequence[LogRecord]) -> Rig:
-    """The rig with what the logs say of the mounting of their sensors, where the rig file states none."""
+    """Return the rig with the mountings that logs state, where the rig file states none."""
     sensors = dict(rig.sensors)
     for name, sensor in rig.sensors.items():
         own = [r for r in records if r.sensor == name and (r.tables.get("scans") or r.tables.get("returns"))]
@@ -235,7 +235,7 @@ def _sources(
 
 
 def _with_room(source: ReadingSource, corrections: KnownCorrections) -> ReadingSource:
-    """A source with the correction of its mounting, whose footprints leave room for corrections."""
+    """Return a source with the change of its mounting, whose footprints allow for corrections."""
     if source.trajectory is None:
         return source
     change = change_of(corrections.mountings, source.run, source.sensor)
@@ -243,7 +243,7 @@ def _with_room(source: ReadingSource, corrections: KnownCorrections) -> ReadingS
 
 
 def mountings_of(run: str, sensor: str, nominal: Mounting, calibrated: DatedMountings) -> Mountings:
-    """The rig file's mounting of a sensor, until the first calibrated one of its run (or of all), and so on."""
+    """Return a sensor's mountings: the rig file's until the first calibrated one of its run (or of all), and so on."""
     dated = list(of_run(calibrated, run, sensor) or [])
     if not dated or dated[0][0] > 0:
         dated = [(0, nominal), *dated]
@@ -251,9 +251,9 @@ def mountings_of(run: str, sensor: str, nominal: Mounting, calibrated: DatedMoun
 
 
 def trajectory_source(run: str, records: Sequence[LogRecord]) -> TrajectorySource:
-    """Where the poses of a run lie, or :class:`ConfigError` where that is not one trajectory."""
+    """Return the source of a run's poses; raises :class:`ConfigError` where that is not one trajectory."""
     own = [r for r in records if r.run == run and r.tables.get("trajectory")]
-    own = [r for r in own if r.sensor == NAVIGATION] or own  # what was computed stands in for what was logged
+    own = [r for r in own if r.sensor == NAVIGATION] or own  # a computed trajectory replaces the recorded one
     worlds = {r.attributes["world_frame"] for r in own}
     if len(worlds) != 1:
         raise ConfigError(
@@ -265,7 +265,7 @@ def trajectory_source(run: str, records: Sequence[LogRecord]) -> TrajectorySourc
 
 
 def empty_passes(plan: SurveyPlan) -> list[tuple[str, str]]:
-    """Passes during which no log has readings, and why that is so."""
+    """Return passes during which no log has readings, with the reason."""
     spans = _run_spans(plan.sources)
     found: list[tuple[str, str]] = []
     for one in plan.passes:
@@ -289,7 +289,7 @@ def _passes(
 def _run_spans(
     sources: Sequence[tuple[ReadingSource, tuple[DataFile, ...]]]
 ) -> dict[RunId, tuple[int, int]]:  # fmt: skip
-    """First and last epoch (GPS ns) of the readings of each run."""
+    """Return the first and last epoch (GPS ns) of the readings of each run."""
     spans: dict[RunId, tuple[int, int]] = {}
     for source, files in sources:
         run = RunId(source.run)
@@ -302,12 +302,12 @@ def _run_spans(
 
 
 def _profile_ns(source: ReadingSource) -> int:
-    """Time from a profile's epoch to that of its last reading (ns)."""
+    """Return the time from a profile's epoch to its last reading (ns)."""
     geometry = source.attribute.get("scan_geometry", {})
     return math.ceil(float(geometry.get("reading_period_ns", 0.0)) * int(geometry.get("readings", 1)))
 
 
 @found_once
 def plan_of(session: Session) -> SurveyPlan:
-    """What places the readings: sources, ground, passes."""
+    """Return the plan of the session's survey."""
     return plan_survey(session.survey, session.store, records=records_of(session))

@@ -1,4 +1,4 @@
-"""Which sensors' profiles are segmented, and what of that the keys of tiles hold."""
+"""Decides which sensors' profiles are segmented, and what of that enters the keys of tiles."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from roadscan.core.settings.segmentation import RoadSegmentation
 from roadscan.georeference.sources import ReadingSource
 
 _LEAST_COSINE: Final = 0.5
-"""Of the angle between a profile's normal and the driving direction, and between the sensor's z and straight down."""
+"""Least cosine of the angles between a profile's normal and the driving direction, and between z and straight down."""
 
 
 def road_of(settings: RoadSegmentation | None, sensor: str, table: str, mounting: Mounting) -> RoadSegmentation | None:
-    """Settings of the segmentation for a sensor's readings of a table; None where they are not segmented.
+    """Return the segmentation settings for a sensor's readings of a table; None where they are not segmented.
 
     Raises
     ------
@@ -38,13 +38,13 @@ def road_of(settings: RoadSegmentation | None, sensor: str, table: str, mounting
 
 
 def looks_across(mounting: Mounting) -> bool:
-    """Whether a sensor's profiles lie across the road and its z points down to it, each to less than 60°."""
+    """Return whether a sensor's profiles lie across the road and its z points down to it, each to less than 60°."""
     forward, _, down = mounting.body_from_sensor
     return abs(forward[0]) > _LEAST_COSINE and down[2] > _LEAST_COSINE
 
 
 def check_road(settings: RoadSegmentation | None, sources: Sequence[ReadingSource]) -> None:
-    """Raise ConfigError where the survey file asks for segmentation and there is nothing to segment."""
+    """Raise ConfigError where the survey file requests segmentation and there is nothing to segment."""
     scans = any(source.table == "scans" for source in sources)  # none where the log of the only profiler is damaged
     if settings is None or not scans or any(source.road is not None for source in sources):
         return
@@ -57,5 +57,5 @@ def check_road(settings: RoadSegmentation | None, sources: Sequence[ReadingSourc
 
 
 def road_key(source: ReadingSource) -> list[object]:
-    """What makes tiles stale when the segmentation of a source changes; nothing where it is not segmented."""
+    """Return the key by which tiles become stale when a source's segmentation changes; empty where it has none."""
     return [] if source.road is None else [source.road.model_dump(mode="json", exclude={"sensors"})]

@@ -1,1 +1,1 @@
-"""Clocks of sensors from motion that they share with others."""
+"""Estimates clocks of sensors from motion that several sensors measure."""

@@ -1,4 +1,4 @@
-"""The coarse lag between two recordings of one motion: how well each shift explains what was felt."""
+"""Finds the coarse lag between two recordings of one motion, from the variance that each shift explains."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 STEP_S: Final = 0.05
-"""Bins of the coarse search."""
+"""Width of the bins of the coarse search."""
 _CLEAR: Final = 1.5
-"""The best shift is clear where it leaves so many times less than the next one, or explains so many times more."""
+"""The best shift is unambiguous if it leaves this many times less than the next, or explains as many times more."""
 _LEAST_SHARE: Final = 0.5
-"""Shifts that leave a smaller share of the bins in common than this of the best are not looked at."""
-_LEAST_BINS: Final = 40
-_AXES: Final = 3
+"""Shifts with fewer common bins than this share of those of the best shift are not considered."""
+_LEAST_BINS: Final = 40  # Least number of common bins of a shift.
+_AXES: Final = 3  # Axes of an angular rate, which a rotation maps.
 _LOBE: Final = 0.5
-"""The main peak reaches to where half of what it explains is left."""
+"""The main peak extends to where half of the explained variance is left."""
 
 
 @dataclass(frozen=True)
 class Lag:
-    """The best shift of a recording, and the best one beside its peak."""
+    """The best shift of a recording, and the best one outside its peak."""
 
     since_s: float
     """Middle of the recording, since the motion's origin by the sensor's clock."""
     lag_s: float
-    """Added to the sensor's epochs, it explains best what was felt."""
+    """Lag that explains the recording best when it is added to the sensor's epochs."""
     explained: float
-    """Share of the variance that it explains, 0–1."""
+    """Share of the variance that the motion explains at this lag, 0–1."""
     next_lag_s: float
     next_explained: float
-    """Of the best shift outside the main peak; 0 where there is none."""
+    """The same for the best shift outside the main peak; 0 where there is none."""
     at_edge: bool
-    """The best shift is the largest one looked at."""
+    """True where the best shift is the largest one considered."""
 
     @property
     def is_clear(self) -> bool:
-        """True where no other shift comes near."""
+        """True where no other shift is nearly as good."""
         if self.at_edge or self.explained <= 0.0:
             return False
         left, next_left = 1.0 - self.explained, 1.0 - self.next_explained
@@ -53,7 +53,7 @@ class Lag:
 
 
 def coarse_lag(felt: Felt, motion: Motion, search_s: float, about_s: float = 0.0) -> Lag | None:
-    """Shift within `about_s` ± `search_s` that explains a recording best; None where too little of it is known.
+    """Return the shift within `about_s` ± `search_s` that explains a recording best; None where too little is known.
 
     The sensor's orientation need not be known: for each shift the share of variance that the motion explains in the
     axes that suit it best, by Fourier transforms over the bins that both have (masked correlation, Padfield, IEEE
@@ -94,7 +94,7 @@ def _best(lags: Float64, explained: Float64, middle_s: float) -> Lag:
 
 
 def _lobe(explained: Float64, best: int) -> tuple[int, int]:
-    """First and last shift of the main peak: down to half of it, and on to the next valley."""
+    """Return first and last shift of the main peak: down to half of it, and on to the next minimum."""
     edges = []
     for step in (-1, 1):
         at = best
@@ -107,7 +107,7 @@ def _lobe(explained: Float64, best: int) -> tuple[int, int]:
 
 
 def _binned(felt: Felt, since_s: Float64, edges: Int64) -> tuple[Float64, Bool]:
-    """Mean rates (b, c) in the bins between `edges` (b + 1,), and where a bin has samples around it (b,)."""
+    """Return mean rates (b, c) in the bins between `edges` (b + 1,), and which bins have samples around them (b,)."""
     if felt.is_total:
         totals = felt.values
     else:
@@ -131,7 +131,7 @@ def _rates(motion: Motion, edges_s: Float64) -> tuple[Float64, Bool]:
 def _explained(
     values: Float64, has_values: Bool, rates: Float64, has_rates: Bool, shifts: int, *, same_sign: bool
 ) -> Float64:
-    """Share of variance (shifts,) that rates explain, when values begin 0, 1 … bins after them; NaN: not known.
+    """Explained share of variance (shifts,), for values that begin 0, 1 … bins after the rates; NaN: unknown.
 
     same_sign : values are the rates themselves; otherwise they are the rates in other axes, or a mixture.
     """
@@ -139,7 +139,7 @@ def _explained(
     size = fft.next_fast_len(rates.shape[0] + values.shape[0])
 
     def together(a: Float64, b: Float64) -> Float64:
-        """Σ a[k] · b[k + shift] for each shift."""
+        """Return Σ a[k] · b[k + shift] for each shift."""
         product: Float64 = fft.irfft(np.conj(fft.rfft(a, size)) * fft.rfft(b, size), size)[:shifts]
         return product
 
@@ -169,7 +169,7 @@ def _explained(
 
 
 def _by_rotation(xx: Float64, xy: Float64) -> Float64:
-    """Variance (s,) of y that x explains in the axes that suit best: Wahba's problem (Markley 1988).
+    """Return the variance (s,) of y that x explains after the best rotation: Wahba's problem (Markley 1988).
 
     xx, xy : (s, k, k) covariances, k = 3, or 1 where y is x.
     """
@@ -183,7 +183,7 @@ def _by_rotation(xx: Float64, xy: Float64) -> Float64:
 
 
 def _by_mixing(xx: Float64, xy: Float64) -> Float64:
-    """Variance (s,) of y (s, p, c) that any mixture of x explains: a regression for each shift."""
+    """Variance (s,) of y (s, p, c) that a linear combination of x explains, by a regression for each shift."""
     trace = np.maximum(np.einsum("sii->s", xx), 1e-300)
     held = xx + (1e-9 * trace)[:, None, None] * np.eye(xx.shape[1])
     explained: Float64 = np.einsum("sic,sic->s", xy, np.linalg.solve(held, xy))

@@ -1,4 +1,4 @@
-"""The clock of a sensor from motion that it shares with one whose clock is right."""
+"""Estimates the clock of a sensor from a motion that another sensor with a right clock measured too."""
 
 from __future__ import annotations
 
@@ -21,50 +21,50 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _CHUNK_S: Final = 300.0
-"""The coarse lag is found in pieces of this length: a bad clock drifts away from a lag of the whole."""
+"""The coarse lag is found in pieces of this length, since a drifting clock has no single lag."""
 _SOME: Final = 0.1
-"""A shift that explains less of what was felt points nowhere."""
-_ROUNDS: Final = 25
+"""A shift that explains a smaller share of the variance is not used."""
+_ROUNDS: Final = 25  # Most rounds of the adjustment.
 _LEARNING: Final = 2
-"""Rounds after which the noise is known."""
-_SETTLED_S: Final = 1e-7
+"""Number of rounds in which the noise is estimated; then it is kept."""
+_SETTLED_S: Final = 1e-7  # The estimate is final when it moves by less than this …
 _SETTLED: Final = 0.02
-"""The estimate stands when it moves by less than this, or this share of its σ."""
-_LONG: Final = 12
+"""… or by less than this share of its σ."""
+_LONG: Final = 12  # After this many rounds a wider limit applies:
 _SWAYING: Final = 0.25
-"""After so many rounds an estimate that sways by this share of its σ stands, too: windows at the edge of being outliers
+"""An estimate that still changes by this share of its σ is final, too: windows at the edge of being outliers
 come and go."""
 _GAIN: Final = (0.5, 2.0)
-"""Rates that are so many times those of the other sensor are in another unit."""
+"""Rates outside this range of ratios to those of the other sensor are in another unit."""
 _OTHER_UNIT: Final = 20.0
-"""The same, before noise and offset are known."""
+"""The same limit before noise and offset are known."""
 
 
 @dataclass(frozen=True)
 class MotionFit:
-    """A clock that was found from motion."""
+    """A clock that was estimated from motion."""
 
     correction: ClockCorrection
     residuals: Residuals
     explained: float
-    """Share of the variance of what was felt that the motion explains, 0–1."""
+    """Share of the variance that the motion explains, 0–1."""
     gain: float
-    """What was felt is so many times what it should have been."""
+    """Ratio of the measured to the expected motion."""
     scale: float
-    """Factor that the windows' scatter asked their σ to be multiplied by."""
+    """Factor on the σ of the windows, from their scatter."""
 
 
 def clock_from_motion(felt: Felt, motion: Motion, *, search_s: float, drift: Drift, what: str) -> MotionFit:
-    """Offset and drift of the clock that stamped `felt`, so that it fits `motion`.
+    """Return offset and drift of the clock that stamped `felt`, so that it fits `motion`.
 
     Coarse lags of pieces first, then maximum likelihood: with F the motion's rates (or totals), continuous in time,
 
         felt(e) = A · F(e + offset + drift · (e − reference)) + b + noise,
 
     where the matrix A (orientation, scale, lever arms) and a constant b a window of time are not known. Gauss–Newton
-    steps: each window gives the lag that its residuals ask for, with the σ that its noise and motion allow; a robust
+    steps: each window gives a lag from its residuals, with a σ from its noise and motion; a robust
     line through the lags corrects offset and drift. At the end the lags scatter about zero, and their scatter is
-    held against their σ.
+    compared with their σ.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def clock_from_motion(felt: Felt, motion: Motion, *, search_s: float, drift: Dri
     Raises
     ------
     NavigationError
-        where the motion does not tell the lag: too little of it, periodic, or an offset beyond `search_s`.
+        where the motion does not determine the lag: too little of it, periodic, or an offset beyond `search_s`.
     """
     _check_units(felt, motion, what)
     start = _start(felt, motion, search_s, drift, what)
@@ -98,7 +98,7 @@ def clock_from_motion(felt: Felt, motion: Motion, *, search_s: float, drift: Dri
 
 
 def _start(felt: Felt, motion: Motion, search_s: float, drift: Drift, what: str) -> Line:
-    """Line through the coarse lags of pieces, or the lag of the whole."""
+    """Return the line through the coarse lags of pieces, or the lag of the whole."""
     pieces = _pieces(felt)
     found = [lag for piece in pieces if (lag := coarse_lag(piece, motion, search_s)) is not None]
     clear = [lag for lag in found if lag.is_clear]
@@ -113,7 +113,7 @@ def _start(felt: Felt, motion: Motion, search_s: float, drift: Drift, what: str)
 
 
 def _pieces(felt: Felt) -> list[Felt]:
-    """The recording in pieces of about five minutes."""
+    """Return the recording in pieces of about five minutes."""
     since = (felt.epochs_gps_ns - felt.epochs_gps_ns[0]).astype(np.float64) / NS_PER_S
     count = max(1, round(since[-1] / _CHUNK_S))
     cuts = np.searchsorted(since, np.linspace(0.0, since[-1], count + 1)[1:-1])
@@ -122,7 +122,7 @@ def _pieces(felt: Felt) -> list[Felt]:
 
 
 def _check(lags: Lags, line: Line, start: Line, what: str) -> None:
-    """Refuse an estimate that left the coarse lag's peak, or that is in another unit."""
+    """Reject an estimate that left the coarse lag's peak, or that is in another unit."""
     away = np.abs(line.at(lags.middle_s) - start.at(lags.middle_s)).max()
     if line.sigma_offset_s > STEP_S or np.count_nonzero(line.used) < LEAST_WINDOWS:
         raise _too_little(what, f"the offset would be known to {line.sigma_offset_s:.2g} s only")
@@ -133,7 +133,7 @@ def _check(lags: Lags, line: Line, start: Line, what: str) -> None:
 
 
 def _check_units(felt: Felt, motion: Motion, what: str) -> None:
-    """Refuse what cannot be the same motion in the same unit."""
+    """Reject a motion that cannot be the same in the same unit."""
     steps, knots = (np.diff(e) / NS_PER_S for e in (felt.epochs_gps_ns, motion.epochs_gps_ns))
     rates = np.diff(felt.values, axis=0) / steps[:, None] if felt.is_total else felt.values
     moves = np.diff(motion.totals[:, :1] if motion.leads else motion.totals, axis=0) / knots[:, None]

@@ -1,4 +1,4 @@
-"""The picture of a clock's residuals: what pairs of stamps or windows of motion say beside the estimate."""
+"""Draws a clock's residuals: pairs of stamps or windows of motion less the estimate."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 Float64 = npt.NDArray[np.float64]
 
-_UNITS: Final = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
+_UNITS: Final = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))  # Factor and name of each unit of time.
 _BLUE, _GREY, _BAND = "#1f5fa8", "#9a9a9a", "#cfe0f2"
 _NORMALISED: Final = 5.0
-"""Widest normalised residual that the histogram shows."""
+"""Widest normalised residual in the histogram."""
 
 
 @dataclass(frozen=True)
 class ClockPicture:
-    """What is drawn."""
+    """Content of the picture."""
 
     title: str
     method: str
@@ -35,7 +35,7 @@ class ClockPicture:
 
 
 def draw_clock(path: Path, picture: ClockPicture) -> None:
-    """Write the residuals over time, and their distribution against the one that their σ promise, as PNG."""
+    """Write a PNG with the residuals over time, and their distribution compared with that of their σ."""
     figure = empty_figure(10.0, 4.4, 120)
     over_time, spread = figure.subplots(1, 2, width_ratios=[3.2, 1.0])
     figure.suptitle(f"{picture.title}\n{_summary(picture)}", fontsize=9, x=0.01, ha="left")
@@ -49,7 +49,7 @@ def _draw_over_time(axes: Axes, picture: ClockPicture) -> None:
     origin = int(r.epochs_gps_ns.min())
     since = (r.epochs_gps_ns - origin).astype(np.float64) / NS_PER_S
     scale, unit = _unit(r)
-    # Poor windows have long bars: the axis is as high as those need that count.
+    # Poor windows have long error bars: the axis covers those of the windows with weight.
     high = float(np.max((np.abs(r.residual_s) + r.sigma_s)[r.used], initial=3.0 * c.sigma_offset_s)) / scale * 1.15
     margin = max(0.02 * float(np.ptp(since)), 0.5)
     left, right = float(since.min()) - margin, float(since.max()) + margin
@@ -65,7 +65,7 @@ def _draw_over_time(axes: Axes, picture: ClockPicture) -> None:
                 markersize=3.5, elinewidth=0.7, label=label,
             )  # fmt: skip
     for at, value in zip(since, r.residual_s / scale, strict=True):
-        if abs(value) > high:  # beyond the axis: said in words
+        if abs(value) > high:  # written as text beyond the axis
             side = "left" if at < (left + right) / 2 else "right"
             axes.text(at, np.copysign(0.9 * high, value), f" {value:+.4g} {unit} ", fontsize=7, color=_GREY, ha=side)
     late = _is_late(r)
@@ -95,7 +95,7 @@ def _draw_spread(axes: Axes, r: Residuals) -> None:
 
 
 def _is_late(r: Residuals) -> bool:
-    """True for delays, which are never below zero: those of arrivals at a host."""
+    """Return True for delays, which are never negative: those of arrivals at a host."""
     return bool(r.used.sum() > 2 and (r.residual_s >= 0.0).all())
 
 

@@ -1,4 +1,4 @@
-"""Motion as signals of time: what a sensor felt, and what the poses say it should have felt."""
+"""Motion as signals of time: measured by a sensor, and expected from the poses."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 EARTH_RATE_RAD_PER_S: Final = 7.292115e-5
-"""WGS 84."""
+"""Angular rate of the Earth (WGS 84)."""
 _GAP: Final = 5.0
-"""Samples farther apart than so many usual intervals leave a gap between them."""
+"""Samples farther apart than this many usual intervals leave a gap."""
 _REACH: Final = 4.0
-"""Beside gaps and ends, splines are not trusted over so many widths of the filter."""
-_SMOOTH_KNOTS: Final = 2.0
+"""Splines are not used within this many widths of the filter from gaps and ends."""
+_SMOOTH_KNOTS: Final = 2.0  # Least width (1 σ) of the filter, in intervals of the knots.
 _SMOOTH_S: Final = 0.01
-"""Width (1 σ) of the filter that derivatives are taken behind."""
+"""Width (1 σ) of the filter under which derivatives are computed."""
 _FINEST_S: Final = 0.01
-"""Samples and knots that are closer are averaged, or left out: vehicles do not move faster."""
+"""Least interval of samples and knots; closer ones are averaged or left out, since vehicles do not move faster."""
 _MOST_KNOTS: Final = 1_000_000
-"""Of a whole run: three hours at 100 a second, longer ones coarser."""
+"""Most knots of a run: three hours at 100 a second; longer runs have coarser knots."""
 
 
 @dataclass(frozen=True)
 class Felt:
-    """What a sensor felt, by its own clock."""
+    """Measurements of a sensor, by its clock."""
 
     epochs_gps_ns: Int64
     """(n,) strictly ascending."""
@@ -50,11 +50,11 @@ class Felt:
 
     @cached_property
     def interval_s(self) -> float:
-        """Usual time from sample to sample."""
+        """Usual time between samples."""
         return float(np.median(np.diff(self.epochs_gps_ns))) / NS_PER_S
 
     def averaged(self, interval_s: float) -> Felt:
-        """Means of neighbouring samples, about `interval_s` apart; totals stay as they are."""
+        """Return means of neighbouring samples, about `interval_s` apart; totals stay unchanged."""
         count = round(interval_s / self.interval_s)
         if self.is_total or count < 2:
             return self
@@ -69,32 +69,32 @@ class Felt:
 
 @dataclass(frozen=True)
 class Motion:
-    """What sensors should feel, continuous in GPS time: totals between knots, cubic splines."""
+    """Expected measurements, continuous in GPS time: totals at knots, with cubic splines between them."""
 
     epochs_gps_ns: Int64
     """(k,) knots, strictly ascending."""
     totals: Float64
     """(k, p) integrals of the rates: angles (rad) and distance (m)."""
     leads: bool = False
-    """The first of them is what the sensor counts, with the same sign; otherwise its axes are not known."""
+    """True where the first column is what the sensor counts, with the same sign; otherwise its axes are not known."""
 
     @property
     def origin_gps_ns(self) -> int:
-        """Epoch from which the splines count."""
+        """Origin of the splines' time."""
         return int(self.epochs_gps_ns[0])
 
     def since_s(self, epochs_gps_ns: Int64) -> Float64:
-        """(n,) seconds from the origin to epochs (n,)."""
+        """Return (n,) seconds from the origin to epochs (n,)."""
         since: Float64 = (epochs_gps_ns - self.origin_gps_ns).astype(np.float64) / NS_PER_S
         return since
 
     @cached_property
     def interval_s(self) -> float:
-        """Usual time from knot to knot."""
+        """Usual time between knots."""
         return float(np.median(np.diff(self.epochs_gps_ns))) / NS_PER_S
 
     def at(self, since_s: Float64, *, total: bool) -> tuple[Float64, Float64]:
-        """Rates or totals, and their change a second, (n, p) each.
+        """Return rates or totals, and their derivatives by time, (n, p) each.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class Motion:
         return np.asarray(self._spline(since_s, order)), np.asarray(self._spline(since_s, order + 1))
 
     def smooth(self, since_s: Float64, *, total: bool) -> tuple[Float64, Float64, Float64]:
-        """The same, and the change's own change, without what is mostly noise.
+        """Return the filtered values, and their first and second derivatives by time.
 
         Errors of the knots are many times larger in what changes, and depend on how far a time lies from a knot.
         """
@@ -113,7 +113,7 @@ class Motion:
         return first, second, third
 
     def known(self, since_s: Float64) -> Bool:
-        """(n,) False outside the knots, in gaps, and beside both."""
+        """Return (n,) False outside the knots, in gaps, and beside both."""
         interval = np.searchsorted(self._knots_s, since_s, side="right") - 1
         inside = (interval >= 0) & (interval < self._sound.size)
         return inside & self._sound[np.clip(interval, 0, self._sound.size - 1)]
@@ -124,7 +124,7 @@ class Motion:
 
     @cached_property
     def _sound(self) -> Bool:
-        """(k − 1,) intervals whose splines are trusted."""
+        """(k − 1,) intervals whose splines are used."""
         sound = np.diff(self._knots_s) <= _GAP * self.interval_s
         beside = math.ceil(_REACH * self._width_knots)
         for at in (-1, *np.flatnonzero(~sound), sound.size):
@@ -133,7 +133,7 @@ class Motion:
 
     @property
     def _width_knots(self) -> float:
-        """1 σ of the filter."""
+        """Width (1 σ) of the filter, in knots."""
         return max(_SMOOTH_KNOTS, _SMOOTH_S / self.interval_s)
 
     @cached_property
@@ -142,27 +142,27 @@ class Motion:
 
     @cached_property
     def _smooth(self) -> scipy.interpolate.CubicSpline:
-        # Knots are smoothed with their times: they need not be even, and steady motion stays as it is.
+        # Knots are smoothed with their times, so they need not be even, and steady motion stays unchanged.
         both = np.column_stack([self._knots_s, self.totals])
         smooth = scipy.ndimage.gaussian_filter1d(both, self._width_knots, axis=0, mode="nearest")
         return scipy.interpolate.CubicSpline(smooth[:, 0], smooth[:, 1:])
 
 
 def felt_by_imu(imu: ImuReadings, finest_s: float) -> Felt:
-    """Angular rates of an IMU, averaged to no more than `finest_s` apart."""
+    """Return angular rates of an IMU, averaged where samples are closer than `finest_s`."""
     felt = _felt(imu.epochs_gps_ns, imu.angular_rate_rad_per_s, is_total=False)
     return felt.averaged(max(finest_s, _FINEST_S))
 
 
 def felt_by_encoder(odometer: OdometerReadings) -> Felt:
-    """Distance that an encoder counts; its speed where the log states no distance."""
+    """Return the distance that an encoder counts; its speed where the log states no distance."""
     if np.isfinite(odometer.distance_m).sum() >= 2:
         return _felt(odometer.epochs_gps_ns, odometer.distance_m[:, None], is_total=True)
     return _felt(odometer.epochs_gps_ns, odometer.speed_m_per_s[:, None], is_total=False)
 
 
 def turning(trajectory: Trajectory) -> Motion:
-    """Angles about body forward, right, down against inertial space, from a trajectory's attitudes.
+    """Return angles about body forward, right, down relative to inertial space, from a trajectory's attitudes.
 
     The Earth's turn is added where the world turns with it.
     """
@@ -175,14 +175,14 @@ def turning(trajectory: Trajectory) -> Motion:
 
 
 def turning_of_imu(imu: ImuReadings) -> Motion:
-    """Angles about the axes of an IMU, whose stamps are right."""
+    """Return angles about the axes of an IMU whose stamps are right."""
     felt = _felt(imu.epochs_gps_ns, imu.angular_rate_rad_per_s, is_total=False)
     interval_s = np.diff(felt.epochs_gps_ns)[:, None] / NS_PER_S
     return _motion(felt.epochs_gps_ns, 0.5 * (felt.values[1:] + felt.values[:-1]) * interval_s)
 
 
 def driving(trajectory: Trajectory, *, backwards_counts_down: bool) -> Motion:
-    """Distance forward, and angles about right and down (what a wheel off the reference point drives beside it).
+    """Return distance forward, and angles about right and down, which change the distance of a wheel off the origin.
 
     A wheel at l (body) drives forward at v + ω_right · l_down − ω_down · l_right.
 
@@ -210,7 +210,7 @@ def _felt(epochs: Int64, values: Float64, *, is_total: bool) -> Felt:
 
 
 def _motion(epochs: Int64, increments: Float64, *, leads: bool = False) -> Motion:
-    """Totals of increments (k − 1, p), at no more knots than vehicles and memory ask for."""
+    """Return totals of increments (k − 1, p), thinned to the necessary number of knots."""
     totals = np.concatenate([np.zeros((1, increments.shape[1])), np.cumsum(increments, axis=0)])
     span_s = float(epochs[-1] - epochs[0]) / NS_PER_S
     finest_s = max(_FINEST_S, span_s / _MOST_KNOTS)
@@ -219,7 +219,7 @@ def _motion(epochs: Int64, increments: Float64, *, leads: bool = False) -> Motio
 
 
 def _turns(trajectory: Trajectory) -> Float64:
-    """(k − 1, 3) rotation vectors from knot to knot, body axes."""
+    """Return (k − 1, 3) rotation vectors from knot to knot, body axes."""
     if trajectory.epochs_gps_ns.size < 2:
         raise NavigationError("the trajectory holds fewer than two poses", expected="poses of the whole run")
     before, after = trajectory.quaternion_world_from_body[:-1], trajectory.quaternion_world_from_body[1:]

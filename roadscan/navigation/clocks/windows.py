@@ -1,4 +1,4 @@
-"""A recording in windows of time: the lag that each asks for, as its noise and motion allow."""
+"""Divides a recording into windows of time, and estimates the lag of each with its σ."""
 
 from __future__ import annotations
 
@@ -16,54 +16,54 @@ Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-LEAST_SAMPLES: Final = 20
-LEAST_WINDOWS: Final = 3
-_WINDOWS: Final = 30
-_WINDOW_OF_RATES_S: Final = (2.0, 10.0)
+LEAST_SAMPLES: Final = 20  # Least number of samples of a window.
+LEAST_WINDOWS: Final = 3  # Least number of windows.
+_WINDOWS: Final = 30  # Approximate number of windows of a recording.
+_WINDOW_OF_RATES_S: Final = (2.0, 10.0)  # Shortest and longest window of rates.
 _WINDOW_OF_TOTALS_S: Final = (6.0, 30.0)
-"""Shortest and longest window. Within the longest a bias of the gyroscopes and the zero of a counter do not change."""
+"""Shortest and longest window of totals; within it, the gyroscopes' bias and a counter's zero are constant."""
 _FULL: Final = 0.3
 """A window with a smaller share of the samples of the fullest is left out."""
 _GAP: Final = 5.0
-"""Samples farther apart than so many usual intervals leave a gap between them."""
+"""Samples farther apart than this many usual intervals leave a gap."""
 _APART_S: Final = 2.0
-"""Over this, residuals show how far they walk."""
+"""The random walk of the residuals is estimated over this time."""
 _ANSWER: Final = 0.05
-"""A shift changes what is left by at least this share of what the smoothed motion lets expect."""
+"""Least ratio of the actual effect of a shift to the effect expected from the smoothed motion."""
 _POOR: Final = 30.0
-"""Windows whose σ is so many times that of the better ones say nothing: no motion."""
+"""Windows whose σ exceeds that of the better ones this many times have no motion and are left out."""
 
 
 @dataclass(frozen=True)
 class Lags:
-    """What the windows say."""
+    """Lags of the windows."""
 
     middle_s: Float64
     """(w,) since the motion's origin, by the sensor's clock."""
     lag_s: Float64
-    """(w,) lag that the window asks for, to be added to the sensor's epochs."""
+    """(w,) lag of the window, to be added to the sensor's epochs."""
     sigma_s: Float64
-    """(w,) 1 σ of it; infinite where nothing moved."""
+    """(w,) 1 σ of the lag; infinite where nothing moved."""
     moving: Bool
-    """(w,) False where a window says next to nothing."""
+    """(w,) False where a window has almost no information."""
     explained: float
-    """Share of the variance of what was felt that the motion explains, 0–1."""
+    """Share of the variance that the motion explains, 0–1."""
     gain: float
-    """What was felt is so many times what it should have been."""
+    """Ratio of the measured to the expected motion."""
     keep: float
-    """θ of the filter that made the noise white."""
+    """Parameter θ of the filter that whitens the noise."""
 
 
 @dataclass(frozen=True)
 class Windows:
-    """A recording cut into windows of time."""
+    """A recording divided into windows of time."""
 
     since_s: Float64
     """(n,) since the motion's origin, by the sensor's clock."""
     values: Float64
     """(n, c)"""
     window: Int64
-    """(n,) number of the window, growing."""
+    """(n,) number of the window, ascending."""
     motion: Motion
     is_total: bool
     longest_s: float
@@ -71,7 +71,7 @@ class Windows:
 
     @classmethod
     def of(cls, felt: Felt, motion: Motion) -> Windows:
-        """Some thirty windows, none too short to tell bias from motion, none so long that a bias walks."""
+        """Divide into about thirty windows, long enough to separate bias from motion, with a constant bias in each."""
         since = motion.since_s(felt.epochs_gps_ns)
         shortest, longest = _WINDOW_OF_TOTALS_S if felt.is_total else _WINDOW_OF_RATES_S
         length = float(np.clip((since[-1] - since[0]) / _WINDOWS, shortest, longest))
@@ -79,7 +79,7 @@ class Windows:
         return cls(since, felt.values, window, motion, felt.is_total, longest)
 
     def lags(self, line: Line, keep: float | None) -> Lags | None:
-        """Lag that each window asks for, linearised about a line; None where fewer than three are left.
+        """Return the lag of each window, linearised about a line; None where fewer than three are left.
 
         Parameters
         ----------
@@ -92,7 +92,7 @@ class Windows:
         return _solved(samples.filtered(theta), line, theta)
 
     def _sampled(self, line: Line) -> _Samples | None:
-        """Samples with the motion at their epochs, as the line corrects them."""
+        """Return samples with the motion at their epochs, as the line corrects them."""
         shifted = self.since_s + line.at(self.since_s)
         known = self.motion.known(shifted)
         count = np.bincount(self.window, known, minlength=int(self.window[-1]) + 1)
@@ -108,7 +108,7 @@ class Windows:
 
 @dataclass(frozen=True)
 class _Samples:
-    """What was felt, y, beside the motion F at the corrected epochs."""
+    """Measurements y, with the motion F at the corrected epochs."""
 
     since_s: Float64
     """(n,)"""
@@ -119,14 +119,14 @@ class _Samples:
     f: Float64
     """(n, p) F."""
     df: Float64
-    """(n, p) its change a second."""
+    """(n, p) derivative of F by time."""
     z: Float64
     """(n, p) F smoothed."""
     dz: Float64
     ddz: Float64
 
     def keep(self, memory_s: float) -> float:
-        """θ of the filter that makes the residuals white: from how much they differ at once and after two seconds.
+        """Return θ of the filter that whitens the residuals, from their differences at once and after two seconds.
 
         memory_s : longest memory.
         """
@@ -144,7 +144,7 @@ class _Samples:
         return float(np.clip(1.0 + ratio / 2 - np.sqrt(ratio + ratio * ratio / 4), 0.0, longest))
 
     def filtered(self, keep: float) -> _Samples:
-        """All signals behind the filter that makes noise white which is white noise and a random walk together.
+        """Return all signals after the filter that whitens the sum of white noise and a random walk.
 
         e[k] = θ e[k − 1] + r[k] − r[k − 1], an ARMA(0, 1, 1) process turned round (Box and Jenkins 1976, 4.3.2). Ticks
         of a counter and the noise of gyroscopes are white; errors of positions and biases walk. A constant is taken
@@ -167,10 +167,10 @@ class _Samples:
 
 
 def _solved(s: _Samples, line: Line, keep: float) -> Lags | None:
-    """Lag of each window from white samples.
+    """Return the lag of each window from white samples.
 
-    The lever is what the smoothed motion lets a shift change, less what a wrong A would change as well: noise of F is
-    in the residuals, but not in the lever, so it neither draws the lag nor makes it look better known.
+    The lever is the effect of a shift on the smoothed motion, less what a wrong A would change as well: noise of F is
+    in the residuals, but not in the lever, so it neither biases the lag nor lowers its σ.
     """
     mixing, left, noise, weight = _explained(s)
     shadow = _mixing(s.f, s.z, s.dz @ mixing, weight)
@@ -179,7 +179,7 @@ def _solved(s: _Samples, line: Line, keep: float) -> Lags | None:
     answer = _answer(expected, _sums((lever * (s.df @ mixing) - turn * left) / noise, s.group))
     if answer is None:
         return None
-    # Of a window in which nothing moves nothing is known: σ is infinite, and its middle that of its samples.
+    # A window in which nothing moves has an infinite σ, and the middle of its samples.
     moves = expected > 0.0
     middle = _means(s.since_s[:, None], s.group)[:, 0]
     middle[moves] = (_sums(lever**2 / noise * s.since_s[:, None], s.group)[moves]) / expected[moves]
@@ -193,7 +193,7 @@ def _solved(s: _Samples, line: Line, keep: float) -> Lags | None:
 
 
 def _explained(s: _Samples) -> tuple[Float64, Float64, Float64, Float64]:
-    """A (p, c), what it leaves (n, c), its variance by window (n, c), and the weight of the window (n,).
+    """Return A (p, c), residuals (n, c), their variance by window (n, c), and the weight of the window (n,).
 
     Windows in which something else was felt as well do not shape A.
     """
@@ -208,7 +208,7 @@ def _explained(s: _Samples) -> tuple[Float64, Float64, Float64, Float64]:
 
 
 def _answer(expected: Float64, change: Float64) -> Float64 | None:
-    """How far what is left really changes with a shift, by what the smoothed motion lets expect, a window (w,).
+    """Return the ratio (w,) of the residuals' change with a shift to that expected from the smoothed motion.
 
     Windows that say little take over what all say. None where all is noise.
     """
@@ -221,12 +221,12 @@ def _answer(expected: Float64, change: Float64) -> Float64 | None:
 
 
 def _mixing(instrument: Float64, f: Float64, y: Float64, weight: Float64) -> Float64:
-    """A (p, c) with which f @ A explains y: instrumental variables, so that noise in f does not make A too small.
+    """Return A (p, c) with which f @ A explains y, by instrumental variables, so noise in f does not make A too small.
 
     instrument : (n, p) like f, without its noise.
     """
     weighted = instrument * weight[:, None]
-    size = np.sqrt((f**2).mean(axis=0))  # distances and angles are of different size
+    size = np.sqrt((f**2).mean(axis=0))  # distances and angles differ in size
     size = np.where(size > 0.0, size, 1.0)
     normal = (weighted.T @ f) / np.outer(size, size)
     right = (weighted.T @ y) / size[:, None]
@@ -235,11 +235,11 @@ def _mixing(instrument: Float64, f: Float64, y: Float64, weight: Float64) -> Flo
 
 
 def _means(values: Float64, group: Int64) -> Float64:
-    """(w, c) mean of columns (n, c) a window."""
+    """Return (w, c) mean of columns (n, c) for each window."""
     count = np.maximum(np.bincount(group), 1)
     return np.stack([np.bincount(group, column) / count for column in values.T], axis=-1)
 
 
 def _sums(values: Float64, group: Int64) -> Float64:
-    """(w,) sum over all columns (n, c) a window."""
+    """Return (w,) sum over all columns (n, c) for each window."""
     return np.asarray(np.bincount(group, values.sum(axis=1)), dtype=np.float64)

@@ -1,1 +1,1 @@
-"""A trajectory from GNSS solutions, an IMU and an odometer."""
+"""Computes a trajectory from GNSS solutions, an IMU and an odometer."""

@@ -1,21 +1,21 @@
-"""Noise measured on the run itself, before the smoother relies on it.
+"""Estimates noise from the run itself, before the smoother relies on it.
 
-A constraint of a vehicle does not hold for whatever carries the sensors, receivers state σ of their own, and an IMU
-errs by more than its data sheet says. Stated too small, each of them makes the σ of a trajectory too small, and sound
-measurements outliers. So a run is first solved with stretches of GNSS withheld, and three things are measured there:
+Constraints of a vehicle do not fit every carrier of the sensors equally, receivers state σ by different rules, and an
+IMU errs by more than its data sheet says. Stated too small, each of them makes the σ of a trajectory too small, and
+good measurements outliers. So a run is first solved with stretches of GNSS withheld, where three things are measured:
 
 Constraints
     The innovations of each (velocity to the side and upwards, of the odometer, standing) must not scatter more than
-    stated. Errors that last for a while count more than ones that are new each time: the variance of a mean of n
+    stated. Correlated errors count more than independent ones: the variance of a mean of n
     correlated values is C₀ + 2 Σ Cₖ over n (Geyer 1992, "Practical Markov chain Monte Carlo", section 3.3, whose
-    initial positive sequence ends the sum). A constraint that fails is measured once more while it counts for next to
-    nothing, so that it does not pull at what it is measured by, and holds for what comes out.
+    initial positive sequence ends the sum). A constraint that fails is measured once more with almost no weight, so
+    that it does not affect the solution by which it is measured, and then gets the measured σ.
 GNSS
     The median of the normalised innovations against that of χ²/ν: a robust variance component (compare Mehra 1970, "On
     the identification of variances and adaptive Kalman filtering"). Multipath in a tenth of the time hardly moves it.
 IMU
     Positions that the solution did not see against those that it predicts, over the σ that it states
-    (cross-validation). Innovations of a fifth of a second say nothing of the noise that matters in an outage: that of
+    (cross-validation). Innovations over a fifth of a second do not show the noise that matters in an outage: that of
     biases that vibration shifts within seconds. The ratio, horizontal and vertical, becomes a factor of the IMU's
     noise.
 
@@ -54,50 +54,50 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 WITHHELD_S: Final = 10.0
-"""Length of a stretch of GNSS that is withheld, where the run has no outages of its own."""
+"""Length of a stretch of GNSS that is withheld, where the run has no outages."""
 _LENGTHS_S: Final = (5.0, 20.0)
-"""Shortest and longest."""
+"""Shortest and longest withheld stretch."""
 _BETWEEN_S: Final = 5.0
-"""GNSS is left for at least so long before and behind it."""
+"""GNSS is used for at least this long before and after a stretch."""
 _FIRST_S: Final = 30.0
-"""Nothing is withheld so soon after the first solution: the alignment needs it."""
+"""Nothing is withheld this soon after the first solution, which the alignment needs."""
 _SILENCE_S: Final = 2.0
-"""GNSS is interrupted where it is silent for longer."""
+"""A longer silence of GNSS is an outage."""
 _SETTLED_S: Final = 2.0
-"""Constraints are judged so long after GNSS came back."""
-_MOST_STRETCHES: Final = 60
+"""Constraints are judged from this long after GNSS came back."""
+_MOST_STRETCHES: Final = 60  # Most withheld stretches of a run.
 _CHI2_MEDIAN: Final = 2.365974 / 3.0
-"""Median of χ² of three degrees of freedom, by component."""
+"""Median of χ² of three degrees of freedom, per component."""
 _PRIOR: Final = 2.0
-"""Stretches that the stated noise counts for."""
-_LEAST_STRETCHES: Final = 3
-_LEAST_UPDATES: Final = 20
-_MOST_PASSES: Final = 4
+"""Weight of the stated noise, in stretches."""
+_LEAST_STRETCHES: Final = 3  # With fewer stretches the IMU's noise is not estimated.
+_LEAST_UPDATES: Final = 20  # With fewer updates a kind is not judged.
+_MOST_PASSES: Final = 4  # Most passes that measure noise.
 _FAILS: Final = 2.0
-"""A constraint that scatters by more than so many times its σ fails; errors of springs and tyres last for a while,
-too."""
+"""A constraint that scatters by more than this many times its σ fails; errors of springs and tyres last for a
+while, too."""
 _LOOSE: Final = 10.0
-"""A constraint that failed is measured with so many times its σ."""
+"""The σ of a constraint that failed is multiplied by this while it is measured."""
 _LONGEST_LAG: Final = 10
-"""Updates: two seconds."""
+"""Largest lag of correlated updates: two seconds."""
 _TOLERANCE: Final = 1.35
 """Ratios of errors to σ up to it, and down to its inverse, are taken as right: ten stretches, with about two degrees of
 freedom each, exceed it by chance in 1 % of all cases (square root of χ² over 20)."""
 _GNSS_TOLERANCE: Final = 1.15
-"""The same of innovations, of which there are hundreds."""
+"""The same for innovations, of which there are hundreds."""
 _SOUND: Final = 4.0
-"""A withheld position counts where its stated variance is at most so many times the usual one: σ of solutions that are
-not fixed are of little worth."""
+"""A withheld position counts where its stated variance is at most this many times the usual one: σ of solutions
+that are not fixed are unreliable."""
 _ANSWER: Final = 0.1
-"""Least share of a change of the IMU's noise that the ratio of errors to σ answers with, on logarithmic scales."""
+"""Least ratio of the change in errors over σ to a change of the IMU's noise, on logarithmic scales."""
 _LEAST_FACTOR: Final = 0.5
-"""The share of vibration in the IMU's noise is a rule of thumb: it may be found to be smaller, down to this."""
+"""Least factor on the IMU's noise: the share of vibration is a rule of thumb and may be smaller."""
 _POSES_PER_S: Final = 20.0
-"""Of the passes that measure."""
+"""Poses per second in the passes that measure noise."""
 _FAR_SQUARED: Final = 9.0
-"""A stretch counts no more than this: GNSS may err for a while."""
+"""Largest squared ratio of a stretch that counts: GNSS may err for a while."""
 _LEAST_SQUARED: Final = 1e-6
-"""Simulated positions may be met exactly."""
+"""Least squared ratio: simulated positions may be met exactly."""
 
 
 @dataclass(frozen=True)
@@ -108,12 +108,12 @@ class _Constraint:
     components: tuple[int, ...]
     setting: str
     unit: float
-    """Unit of the residual in units of the setting."""
+    """Factor from the residual's unit to that of the setting."""
     said: str
-    """Of what it is the σ, for the user."""
+    """Name of the quantity, for the user."""
 
 
-_CONSTRAINTS: Final = (
+_CONSTRAINTS: Final = (  # Constraints whose σ is measured; 1.0 is the factor from residual to setting.
     _Constraint("non-holonomic", (1,), "sideways_m_per_s", 1.0, "velocity to the side"),
     _Constraint("non-holonomic", (2,), "upwards_m_per_s", 1.0, "velocity upwards"),
     _Constraint("odometer", (0,), "odometer_sigma_m_per_s", 1.0, "speed of the odometer"),
@@ -124,19 +124,19 @@ _CONSTRAINTS: Final = (
 
 @dataclass(frozen=True)
 class Adapted:
-    """A solution, and the noise that it was made with."""
+    """A solution, and the noise that it was computed with."""
 
     solution: Solution
     config: SmootherConfig
-    """Settings with what was measured in place of what was stated."""
+    """Settings with measured in place of stated noise."""
     measured: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """By setting that was not right: stated, measured."""
+    """Stated and measured value by setting that was wrong."""
     unmeasured: str = ""
     """Why the noise could not be measured."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know of it."""
+        """Return the notes for the user."""
         said = [f"measured noise: {name} = {b:.3g} instead of {a:.3g}" for name, (a, b) in self.measured.items()]
         if self.unmeasured:
             said.append(f"the noise is taken as stated, it could not be measured: {self.unmeasured}")
@@ -150,7 +150,7 @@ def solve_adaptively(
     vehicle: VehicleSensors,
     config: SmootherConfig,
 ) -> Adapted:
-    """Trajectory as of :func:`~roadscan.navigation.inertial.smoother.solve`, with noise measured on the run.
+    """Compute the trajectory as :func:`~roadscan.navigation.inertial.smoother.solve`, with noise measured on the run.
 
     Parameters are those of `solve`; with `measure_noise` off the result is that of `solve`.
 
@@ -177,7 +177,7 @@ def _measured(
     vehicle: VehicleSensors,
     config: SmootherConfig,
 ) -> SmootherConfig:
-    """Settings whose noise agrees with what the run shows."""
+    """Return settings whose noise agrees with the run."""
     gnss = chosen(gnss, usable(gnss))
     stretch = withheld(gnss.epochs_gps_ns)
     kept = chosen(gnss, stretch < 0)
@@ -202,9 +202,9 @@ def _measured(
 
 
 def withheld(epochs: Int64) -> Int64:
-    """Number (m,) of the stretch that a solution is withheld with, −1 for those that are used.
+    """Return the number (m,) of the stretch in which a solution is withheld, −1 for those that are used.
 
-    Stretches are as long as the run's own outages usually are: their noise is the one that has to be right.
+    Stretches have the usual length of the run's outages, for which the noise has to be right.
 
     Parameters
     ----------
@@ -238,7 +238,7 @@ def _with_constraints(
     kept: GnssSolutions,
     failed: frozenset[str],
 ) -> tuple[SmootherConfig, frozenset[str]]:
-    """Settings with the σ that constraints hold for here, and those that fail and are measured by the next pass.
+    """Return settings with the σ of constraints from this run, and those that fail and are measured by the next pass.
 
     Parameters
     ----------
@@ -259,13 +259,13 @@ def _with_constraints(
         values[one.setting] = found if found > _FAILS * stated else stated
     if failed:
         return trial.model_copy(update=values), frozenset()
-    # What pulls at the solution hides in its innovations: with one component, all of its kind are measured.
+    # A constraint pulls the solution and so hides its error: with one component, all of its kind are measured.
     loose = {one.setting: _LOOSE * values[one.setting] for one in _CONSTRAINTS if one.kind in fails}
     return trial.model_copy(update=loose), frozenset(loose)
 
 
 def _settled(epochs: Int64, gnss: Int64) -> Bool:
-    """True (u,) for epochs where GNSS has not been silent for the last seconds."""
+    """Return True (u,) for epochs where GNSS has not been silent for the last seconds."""
     silent = np.diff(gnss) > _SILENCE_S * 1e9
     begins, ends = gnss[:-1][silent], gnss[1:][silent] + round(_SETTLED_S * 1e9)
     if not begins.size:
@@ -275,9 +275,9 @@ def _settled(epochs: Int64, gnss: Int64) -> Bool:
 
 
 def lasting_sigma(residuals: Float64) -> float:
-    """σ of white noise that tells as little over a while as these do: (n, c), evenly spaced, the worst of c columns.
+    """Return the σ of white noise with the same variance of long means as residuals (n, c), of the worst column.
 
-    Values far out are drawn in: half of all may be wrong by chance, not by rule.
+    Outlying values are clipped.
     """
     worst = 0.0
     for column in residuals.T:
@@ -285,7 +285,7 @@ def lasting_sigma(residuals: Float64) -> float:
         values = np.clip(column, -3.0 * scale, 3.0 * scale)
         lags = 2 * max(1, min(_LONGEST_LAG, values.size // 4) // 2)
         covariance = np.array([float((values[k:] * values[: values.size - k]).mean()) for k in range(lags)])
-        # Sums of neighbouring covariances are positive for as long as they are more than noise.
+        # Sums of neighbouring autocovariances are positive as long as they exceed noise.
         pairs = covariance[0::2] + covariance[1::2]
         ends = np.flatnonzero(pairs <= 0.0)
         together = 2.0 * float(pairs[: ends[0] if ends.size else pairs.size].sum()) - covariance[0]
@@ -294,7 +294,7 @@ def lasting_sigma(residuals: Float64) -> float:
 
 
 def _with_gnss(trial: SmootherConfig, innovations: Innovations) -> SmootherConfig:
-    """Settings with the σ of GNSS raised to what its innovations show."""
+    """Return settings with the σ of GNSS raised to what its innovations show."""
     values: dict[str, float] = {}
     for kind, setting in (("gnss position", "gnss_position_factor"), ("gnss velocity", "gnss_velocity_factor")):
         ratio = _typical(innovations, kind)
@@ -304,7 +304,7 @@ def _with_gnss(trial: SmootherConfig, innovations: Innovations) -> SmootherConfi
 
 
 def _typical(innovations: Innovations, kind: str) -> float:
-    """Typical size of the innovations of GNSS in units of their σ."""
+    """Return the typical size of the innovations of GNSS in units of their σ."""
     rows = innovations.kind == kind
     if np.count_nonzero(rows) < _LEAST_UPDATES:
         return 1.0
@@ -313,21 +313,21 @@ def _typical(innovations: Innovations, kind: str) -> float:
 
 @dataclass(frozen=True)
 class _Tried:
-    """A factor of the IMU's noise that was tried."""
+    """A factor on the IMU's noise that was tried."""
 
     factor: float
     ratio: float
-    """Errors of withheld positions over their σ."""
+    """Ratio of the errors of withheld positions to their σ."""
     stretches: int
 
     @property
     def cautious(self) -> float:
-        """The ratio, drawn to 1 where few stretches tell it."""
+        """Return the ratio, shrunk to 1 where few stretches determine it."""
         return float(np.sqrt((_PRIOR + self.stretches * self.ratio**2) / (_PRIOR + self.stretches)))
 
 
 def _try(solution: Solution, gnss: GnssSolutions, stretch: Int64, trial: SmootherConfig) -> dict[str, _Tried]:
-    """What withheld positions say of each factor of the IMU's noise."""
+    """Compare withheld positions with the prediction for each factor on the IMU's noise."""
     squares = _missed(solution, gnss, stretch, trial)
     ratios = np.sqrt(np.maximum(squares.mean(axis=0), _LEAST_SQUARED)) if len(squares) else np.ones(2)
     names = ("imu_factor_horizontal", "imu_factor_vertical")
@@ -335,10 +335,10 @@ def _try(solution: Solution, gnss: GnssSolutions, stretch: Int64, trial: Smoothe
 
 
 def _next_factor(tried: Sequence[_Tried]) -> float:
-    """Factor of the IMU's noise after some that were tried.
+    """Return the next factor on the IMU's noise to try.
 
-    Where the ratio did not answer to the last change, something else than the IMU's noise is the cause: the first
-    factor comes back.
+    Where the ratio did not respond to the last change, the IMU's noise is not the cause, and the first factor is
+    returned.
     """
     for before, after in itertools.pairwise(tried):
         change = np.log(after.factor / before.factor)
@@ -351,7 +351,7 @@ def _next_factor(tried: Sequence[_Tried]) -> float:
 
 
 def _missed(solution: Solution, gnss: GnssSolutions, stretch: Int64, config: SmootherConfig) -> Float64:
-    """Squared error over its variance of withheld positions, (s, 2): horizontal and vertical, mean of each stretch."""
+    """Squared error over variance of withheld positions, (s, 2): horizontal and vertical, mean of each stretch."""
     fixes = fixes_of(gnss, config)
     own = np.einsum("nii->ni", fixes.white) + fixes.coloured**2
     sound = own.sum(axis=1) <= _SOUND * np.median(own.sum(axis=1))
@@ -374,7 +374,7 @@ def _missed(solution: Solution, gnss: GnssSolutions, stretch: Int64, config: Smo
 
 
 def _interpolated(known: Int64, wanted: Int64, values: Float64) -> Float64:
-    """Values (k, c) at epochs `known`, linear between them, at `wanted`."""
+    """Return values (k, c) at epochs `known`, interpolated linearly at `wanted`."""
     since, at = (known - known[0]).astype(np.float64), (wanted - known[0]).astype(np.float64)
     columns: Sequence[Float64] = [np.interp(at, since, column) for column in values.T]
     return np.stack(columns, axis=-1)

@@ -1,4 +1,4 @@
-"""Do IMU, GNSS receiver and odometer feel the same drive? Units, axes, signs and clocks are judged by it.
+"""Checks whether IMU, GNSS receiver and odometer measured the same drive: units, axes, signs and clocks.
 
 A question is answered only where the drive can answer it: without a turn there is no word on the sign of the yaw rate,
 at an even speed none on the forward axis.
@@ -23,33 +23,33 @@ Int64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 TILT_DRIVING_DEG: Final = 10.0
-"""Gravity, with the slope that is driven, lies this near to where the mounting has it."""
+"""Largest angle between gravity, corrected for the road's slope, and its direction by the mounting."""
 TILT_STANDING_DEG: Final = 20.0
 """The same where no slope is known."""
 LAG_S: Final = 0.2
-"""Clocks that differ by less (and by less than five times what the drive can tell) are not judged here."""
+"""Least difference of clocks (and five times its σ) that is judged here."""
 ALIKE: Final = 0.8
-"""Correlation of two signals that are the same motion."""
+"""Least correlation of two signals of the same motion."""
 UNLIKE: Final = 0.5
-"""Below this correlation they are not."""
+"""Below this correlation two signals are not the same motion."""
 SCALES: Final = (0.8, 1.25)
-"""Ratio of two signals that are in the same unit."""
-_LONGEST_LAG_S: Final = 600.0
-_TURNED_RAD: Final = np.radians(60.0)
-_ALONG_M_PER_S2: Final = 0.3
-_ASIDE_M_PER_S2: Final = 0.5
-_LEAST_S: Final = 5.0
-_TIPPED_RAD: Final = np.radians(6.0)
-_TILTED_RAD: Final = np.radians(0.2)
-_TILT_ALIKE: Final = 0.4
-_TILT_BLOCKS: Final = 12
+"""Range of ratios of two signals in the same unit."""
+_LONGEST_LAG_S: Final = 600.0  # Longest lag that is searched.
+_TURNED_RAD: Final = np.radians(60.0)  # Least sum of turns by which axes are judged.
+_ALONG_M_PER_S2: Final = 0.3  # Least acceleration along the way that is judged.
+_ASIDE_M_PER_S2: Final = 0.5  # Least acceleration across the way that is judged.
+_LEAST_S: Final = 5.0  # Least time for a check, and length of the blocks in which tilts are compared.
+_TIPPED_RAD: Final = np.radians(6.0)  # Least tipping by which units are judged.
+_TILTED_RAD: Final = np.radians(0.2)  # Least tilt by which axes are judged.
+_TILT_ALIKE: Final = 0.4  # Least correlation of two tilts.
+_TILT_BLOCKS: Final = 12  # Least number of blocks by which tilts are judged.
 _AXES: Final = ("x", "y", "z")
 _BODY: Final = ("forward", "right", "down")
 
 
 @dataclass(frozen=True)
 class Felt:
-    """What the IMU feels over the windows of a drive, body axes as the mounting has them."""
+    """Measurements of the IMU over the windows of a drive, body axes according to the mounting."""
 
     windows: Windows
     rate: Float64
@@ -57,20 +57,20 @@ class Felt:
     force: Float64
     """(n, 3) m/s²."""
     known: Flags
-    """(n,) the IMU log reaches over the window."""
+    """(n,) True where the IMU log covers the window."""
     sample_s: float
-    """From sample to sample."""
+    """Time between samples."""
 
     @classmethod
     def by(cls, imu: ImuReadings, windows: Windows, vehicle: VehicleSensors) -> Felt:
-        """Means of a log over windows."""
+        """Compute means of a log over windows."""
         rate, force = imu_means(imu, windows.epochs_gps_ns, windows.window_s, vehicle.body_from_imu)
         sample_s = float(np.median(np.diff(imu.epochs_gps_ns))) / NS_PER_S
         return cls(windows, rate, force, np.isfinite(rate[:, 0]), sample_s)
 
 
 def check_gravity(imu: ImuReadings, vehicle: VehicleSensors) -> None:
-    """The force that an IMU feels is gravity's, on the whole.
+    """Check that the mean force of an IMU is that of gravity.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def check_gravity(imu: ImuReadings, vehicle: VehicleSensors) -> None:
 
 
 def check_tipping(imu: ImuReadings, vehicle: VehicleSensors) -> None:
-    """A body that tips as its gyroscopes say would feel gravity move: tells degrees from radians without a turn.
+    """Check that gravity moves as the gyroscopes say the body tips: this tells degrees from radians without a turn.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def check_tipping(imu: ImuReadings, vehicle: VehicleSensors) -> None:
 
 
 def check_axes(felt: Felt, vehicle: VehicleSensors, gnss_name: str = "GNSS") -> None:
-    """The IMU turns, speeds up and leans as the antenna's path says.
+    """Check that the IMU turns, accelerates and leans as the antenna's path does.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def check_axes(felt: Felt, vehicle: VehicleSensors, gnss_name: str = "GNSS") -> 
 
 
 def directions(felt: Felt) -> Float64:
-    """1 where the vehicle drives forward, −1 backwards, 0 where its accelerations cannot tell (n,).
+    """Return 1 (n,) where the vehicle drives forward, −1 backwards, 0 where its accelerations do not show it.
 
     Driving backwards, accelerations along and across the direction of travel change their sign in the body.
     """
@@ -159,7 +159,7 @@ def directions(felt: Felt) -> Float64:
 
 
 def check_direction(felt: Felt, signs: Float64, odometer: Float64 | None, *, drove_backwards: bool) -> None:
-    """The vehicle drives forward for the most part, or something beside the IMU says that it does not.
+    """Check that the vehicle mostly drives forward, unless another sensor confirms that it does not.
 
     odometer : (n,) its speed over the windows.
 
@@ -191,7 +191,7 @@ def check_direction(felt: Felt, signs: Float64, odometer: Float64 | None, *, dro
 
 
 def check_velocity(track: Windows, moved: Float64, stated: Float64) -> None:
-    """The velocities of a GNSS log are those of its positions.
+    """Check that the velocities of a GNSS log are those of its positions.
 
     moved, stated : (n, 3) velocities over windows, from positions and as the log states them.
 
@@ -204,7 +204,7 @@ def check_velocity(track: Windows, moved: Float64, stated: Float64) -> None:
     if ok.sum() * STEP_S < _LEAST_S:
         return
     p, v = moved[ok], stated[ok]
-    # Medians, so that a leap of the positions says nothing about the velocities.
+    # Medians, so that a leap of the positions does not affect the velocities.
     flat = float(np.median((p[:, :2] * v[:, :2]).sum(axis=1) / (v[:, :2] ** 2).sum(axis=1)))
     rest = _left(p, flat * v)
     if rest > 0.4:
@@ -241,7 +241,7 @@ def check_velocity(track: Windows, moved: Float64, stated: Float64) -> None:
 
 
 def check_odometer(speed: Float64, windows: Windows) -> None:
-    """The odometer counts as fast as the antenna moves, and when it moves.
+    """Check that the odometer counts as fast as the antenna moves, and when it moves.
 
     speed : (n,) of the odometer over the windows.
 
@@ -279,7 +279,7 @@ def check_odometer(speed: Float64, windows: Windows) -> None:
 
 
 def _told(force: Float64, motion: Float64, least: float) -> float:
-    """1 or −1 where a motion is felt with this sign, 0 where it is too small or not felt."""
+    """Return 1 or −1 where a motion is measured with this sign, 0 where it is too small or not measured."""
     if np.sqrt(np.mean(motion**2)) < least:
         return 0.0
     alike = float(motion @ force) / np.sqrt(max(float(motion @ motion) * float(force @ force), 1e-12))
@@ -287,7 +287,7 @@ def _told(force: Float64, motion: Float64, least: float) -> float:
 
 
 def _direction(along: float, aside: float) -> float:
-    """Direction of travel by both accelerations; 0 where they contradict each other."""
+    """Return the direction of travel from both accelerations; 0 where they contradict each other."""
     return float(np.sign(along + aside))
 
 
@@ -315,7 +315,7 @@ def _check_slope(felt: Felt, ok: Flags, vehicle: VehicleSensors) -> None:
 
 
 def _check_turn(felt: Felt, ok: Flags, vehicle: VehicleSensors, gnss_name: str) -> None:
-    """The turn of the course against the three rates: which axis, sign, unit and time."""
+    """Compare the turn of the course with the three rates: axis, sign, unit and time."""
     turn, rate = felt.windows.turn, felt.rate
     alike = np.array([_alike(rate[ok, k], turn[ok]) for k in range(3)])
     slope = np.array([_slope(rate[ok, k], turn[ok]) for k in range(3)])
@@ -338,7 +338,7 @@ def _check_turn(felt: Felt, ok: Flags, vehicle: VehicleSensors, gnss_name: str) 
 
 
 def _check_leaning(alike: Float64, slope: Float64) -> None:
-    """Turns are felt about the vertical alone, but for the slope of the road."""
+    """Check that turns are measured about the vertical only, apart from the slope of the road."""
     for axis in range(2):
         lean_deg = float(np.degrees(np.arctan2(slope[axis], slope[2])))
         if abs(alike[axis]) > 0.7 and abs(lean_deg) > TILT_DRIVING_DEG:
@@ -377,7 +377,7 @@ def _check_along(felt: Felt, ok: Flags, vehicle: VehicleSensors) -> None:
 
 
 def _check_lag(felt: Felt, ok: Flags, signs: Float64, vehicle: VehicleSensors) -> None:
-    """Clocks that differ by a part of a second: the lag that takes away the most of the difference."""
+    """Check clocks that differ by a part of a second: find the lag that removes most of the difference."""
     w = felt.windows
     total, weight = 0.0, 0.0
     sense = np.where(signs < 0, -1.0, 1.0)
@@ -399,9 +399,9 @@ def _check_lag(felt: Felt, ok: Flags, signs: Float64, vehicle: VehicleSensors) -
 
 
 def _check_tilt(felt: Felt, signs: Float64, vehicle: VehicleSensors) -> None:
-    """Roll and pitch by the gyroscopes against the tilt that gravity shows: axes and signs that no turn tells.
+    """Compare roll and pitch of the gyroscopes with the tilt from gravity: axes and signs that no turn shows.
 
-    Within blocks of `_LEAST_S`; a road that tilts the vehicle by less than `_TILTED_RAD` says nothing.
+    Within blocks of `_LEAST_S`; a road that tilts the vehicle by less than `_TILTED_RAD` does not count.
     """
     w = felt.windows
     sense = np.where(signs < 0, -1.0, 1.0)
@@ -429,7 +429,7 @@ def _check_tilt(felt: Felt, signs: Float64, vehicle: VehicleSensors) -> None:
 
 
 def _small_lag(motion: Float64, feels: Float64, ok: Flags) -> tuple[float, float]:
-    """How much later (s) a signal is felt, and its σ, from the first-order change with time."""
+    """Return the delay (s) of a signal, and its σ, from the first-order change with time."""
     a, b = motion - motion[ok].mean(), feels - feels[ok].mean()
     lag, sigma = 0.0, np.inf
     at = np.arange(a.size) * STEP_S
@@ -449,7 +449,7 @@ def _small_lag(motion: Float64, feels: Float64, ok: Flags) -> tuple[float, float
 def _wrong_time(
     felt: Felt, ok: Flags, motion: Float64, signals: list[Float64], what: str, alike: float, gnss_name: str
 ) -> None:
-    """Refuse motions that do not agree at the stated times; name the time at which they do, where there is one."""
+    """Reject motions that disagree at the stated times; name the time at which they agree, if any."""
     best = max((_best_lag(s, felt.known, motion, ok) for s in signals), key=lambda found: found[1])
     if best[1] > 0.9 and abs(best[0]) > LAG_S:
         _refuse_lag(best[0], best[1], STEP_S)
@@ -463,7 +463,7 @@ def _wrong_time(
 
 
 def _check_other_time(felt: Felt, ok: Flags, motion: Float64, feels: Float64, alike: float) -> None:
-    """Refuse a motion that is felt much better at another time."""
+    """Reject a motion that agrees much better at another time."""
     lag, there = _best_lag(feels, felt.known, motion, ok)
     if there > 0.97 and there > abs(alike) + 0.1 and abs(lag) > LAG_S:
         _refuse_lag(lag, there, STEP_S)
@@ -547,7 +547,7 @@ def _hint(ratio: float, units: dict[str, float]) -> str:
 
 
 def _best_lag(late: Float64, late_known: Flags, motion: Float64, known: Flags) -> tuple[float, float]:
-    """Lag (s) at which a signal follows a motion best, and the correlation there, up to ten minutes either way."""
+    """Lag (s) with the highest correlation of a signal with a motion, and that correlation, up to ±10 min."""
     a, b = np.where(known, motion, 0.0), np.where(late_known, late, 0.0)
     m, n = known.astype(np.float64), late_known.astype(np.float64)
     a = np.where(known, a - a[known].mean(), 0.0)
@@ -570,7 +570,7 @@ def _best_lag(late: Float64, late_known: Flags, motion: Float64, known: Flags) -
 
 
 def _detrended(values: Float64, size: int) -> Float64:
-    """Values (n, k) less the straight line through each block of `size` rows."""
+    """Subtract from values (n, k) the straight line through each block of `size` rows."""
     blocks = len(values) // size
     cut = values[: blocks * size].reshape(blocks, size, -1)
     line = np.linspace(-1.0, 1.0, size)[None, :, None]
@@ -580,31 +580,31 @@ def _detrended(values: Float64, size: int) -> Float64:
 
 
 def _alike(a: Float64, b: Float64) -> float:
-    """Correlation; 0 where one of the two does not change."""
+    """Return the correlation; 0 where one of the two does not change."""
     x, y = a - a.mean(), b - b.mean()
     power = float(x @ x) * float(y @ y)
     return float(x @ y) / np.sqrt(power) if power > 0 else 0.0
 
 
 def _same_angle(gyro: Float64, gravity: Float64) -> float:
-    """Correlation of two angles; 0 where they are not of the same size."""
+    """Return the correlation of two angles; 0 where their sizes differ."""
     alike = _alike(gyro, gravity)
     size = abs(_slope(gravity, gyro)) if gyro.std() > 0 else 0.0
     return alike if 0.4 < size < 2.5 else 0.0
 
 
 def _slope(a: Float64, b: Float64) -> float:
-    """Factor from b to a, by least squares."""
+    """Return the factor from b to a, by least squares."""
     x, y = a - a.mean(), b - b.mean()
     return float(x @ y) / float(y @ y)
 
 
 def _left(moved: Float64, stated: Float64) -> float:
-    """Median part of horizontal velocities (n, 2 or 3) that others leave over."""
+    """Return the median share of horizontal velocities (n, 2 or 3) that differs from the others."""
     rest = np.linalg.norm(moved[:, :2] - stated[:, :2], axis=1)
     return float(np.median(rest / np.maximum(np.linalg.norm(moved[:, :2], axis=1), 1e-3)))
 
 
 def _rest(a: Float64, b: Float64) -> float:
-    """What is left of b without a, relative to b."""
+    """Return the share of b that remains after subtracting a."""
     return float(np.sqrt(((a - b) ** 2).mean() / max((b**2).mean(), 1e-12)))

@@ -1,4 +1,4 @@
-"""Coarse alignment: the attitude from which the filter starts, found standing, in motion, or both.
+"""Coarse alignment: finds the initial attitude of the filter, standing, in motion, or both.
 
 Specific forces, turned into the IMU's first axes by the gyroscopes, give a change of velocity for each interval; GNSS
 gives the same change, less gravity, in ECEF. The rotation that takes one set of vectors to the other (Wahba's problem,
@@ -30,20 +30,20 @@ Bool = npt.NDArray[np.bool_]
 _SPACING_NS: Final = 500_000_000
 """Least interval over which changes of velocity are compared."""
 _VELOCITY_SIGMA_M_PER_S: Final = 0.1
-"""What a change of velocity is good for, coarsely: GNSS, lever arm, vibration."""
+"""Coarse 1 σ of a change of velocity, from GNSS, lever arm and vibration."""
 _ENOUGH_M_PER_S: Final = 8.0
-"""Changes of horizontal velocity, root of the sum of squares, with which the heading is found."""
+"""Change of horizontal velocity (root of the sum of squares) at which the heading is determined."""
 _LITTLE_M_PER_S: Final = 1.5
-"""With less there is no heading."""
+"""With a smaller change no heading is computed."""
 _WINDOW_S: Final = 90.0
-"""Gyroscopes drift: motion later than this after the first is not used."""
+"""Motion later than this after the first is not used, since gyroscopes drift."""
 _COURSE_M_PER_S: Final = 3.0
-"""Speed from which a course over ground is a heading."""
-_GYROCOMPASS_RAD: Final = np.radians(3.0)
+"""Least speed at which a course over ground is used as heading."""
+_GYROCOMPASS_RAD: Final = np.radians(3.0)  # Largest σ of a heading from standing alone.
 _GYROCOMPASS_S: Final = 30.0
-"""Heading and time from which standing alone tells the heading."""
-_EARLY_NS: Final = 2_000_000_000
-_HOUR_ANGLE: Final = np.radians(15.041)
+"""Least time of standing from which a heading is computed."""
+_EARLY_NS: Final = 2_000_000_000  # Latest start of such a standstill, after the first sample.
+_HOUR_ANGLE: Final = np.radians(15.041)  # Rotation of the Earth in an hour (rad).
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class Alignment:
     sigma_position_m: float
     sigma_velocity_m_per_s: float
     ready_gps_ns: int
-    """Epoch up to which readings were looked at."""
+    """Epoch up to which readings were used."""
 
 
 def align(
     imu: ImuReadings, gnss: GnssSolutions, still: Bool, vehicle: VehicleSensors, *, instant: bool, land_vehicle: bool
 ) -> Alignment:
-    """Attitude, velocity and position at the IMU's first sample.
+    """Return attitude, velocity and position at the IMU's first sample.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def align(
     Raises
     ------
     NavigationError
-        where no motion tells the heading, or there is no GNSS.
+        where no motion determines the heading, or there is no GNSS.
     """
     motion = _Motion.of(imu, gnss, still, vehicle, instant=instant)
     if motion.epochs.size < 3:
@@ -108,25 +108,25 @@ def align(
 
 @dataclass(frozen=True)
 class _Motion:
-    """What IMU and GNSS say at m epochs half a second or more apart."""
+    """Motion of IMU and GNSS at m epochs half a second or more apart."""
 
     epochs: Int64
     """(m,)."""
     attitude: Float64
     """(m, 3, 3) first from present IMU axes."""
     felt: Float64
-    """(m, 3) velocity by specific forces and by the antenna's swing, first IMU axes."""
+    """(m, 3) velocity from specific forces and the antenna's swing, first IMU axes."""
     velocity: Float64
     """(m, 3) of the antenna, ECEF."""
     gained: Float64
-    """(m, 3) the same with gravity and Coriolis taken away: what forces must have given."""
+    """(m, 3) the same less gravity and Coriolis: the part caused by specific forces."""
     level: Float64
     """(3, 3) ECEF from north-east-down."""
     position: Float64
     """(m, 3) of the antenna, ECEF."""
     start_gps_ns: int
     bias: Float64
-    """(3,) mean rate, standing; zero where the vehicle never stands."""
+    """(3,) mean rate while standing; zero where the vehicle never stands."""
 
     @property
     def excitation(self) -> Float64:
@@ -170,7 +170,7 @@ class _Motion:
 
 
 def _velocities(gnss: GnssSolutions) -> tuple[Int64, Float64, Float64]:
-    """Epochs, positions and velocities (ECEF) of solutions; velocities from positions where the log has none."""
+    """Return epochs, positions and velocities (ECEF) of solutions; velocities from positions where the log has none."""
     position = gnss.position_world_m
     stated = np.isfinite(gnss.velocity_ned_m_per_s).all(axis=1)
     if np.count_nonzero(stated) >= 3:
@@ -187,13 +187,13 @@ def _velocities(gnss: GnssSolutions) -> tuple[Int64, Float64, Float64]:
 
 
 def _spaced(epochs: Int64) -> Int64:
-    """Indices of epochs at least half a second apart."""
+    """Return indices of epochs at least half a second apart."""
     slots = (epochs - (epochs[0] if epochs.size else 0)) // _SPACING_NS
     return np.flatnonzero(np.diff(slots, prepend=-1) > 0)
 
 
 def _first_run(still: Bool) -> slice | None:
-    """The first standstill, None where there is none."""
+    """Return the first standstill, None where there is none."""
     where = np.flatnonzero(still)
     if where.size == 0:
         return None
@@ -203,7 +203,7 @@ def _first_run(still: Bool) -> slice | None:
 
 
 def _window(motion: _Motion) -> int:
-    """Epoch up to which motion is used: enough of it, but not too long after the first."""
+    """Return the epoch up to which motion is used: enough of it, but not too long after the first."""
     excitation = motion.excitation
     enough = int(np.searchsorted(excitation, _ENOUGH_M_PER_S))
     moving = int(np.searchsorted(excitation, 1.0))
@@ -212,7 +212,7 @@ def _window(motion: _Motion) -> int:
 
 
 def _fitted(motion: _Motion, last: int) -> tuple[Float64, float | None]:
-    """ECEF from first IMU axes, and 1 σ of its heading, None where there was too little motion."""
+    """Return ECEF from first IMU axes, and 1 σ of its heading, None where there was too little motion."""
     felt = np.diff(motion.felt[: last + 1], axis=0)
     gained = np.diff(motion.gained[: last + 1], axis=0)
     u, _, vt = np.linalg.svd(gained.T @ felt)
@@ -229,7 +229,7 @@ def _fitted(motion: _Motion, last: int) -> tuple[Float64, float | None]:
 def _gyrocompass(
     motion: _Motion, imu: ImuReadings, still: Bool, vehicle: VehicleSensors
 ) -> tuple[Float64, float] | None:
-    """Attitude standing, by gravity and the Earth's rate, where the gyroscopes are good enough for it."""
+    """Return the attitude from gravity and the Earth's rate, where the gyroscopes are good enough for it."""
     run = _first_run(still)
     if run is None or imu.epochs_gps_ns[run.start] - imu.epochs_gps_ns[0] > _EARLY_NS:
         return None
@@ -248,7 +248,7 @@ def _gyrocompass(
 
 
 def _course(motion: _Motion, rotation: Float64, vehicle: VehicleSensors) -> tuple[Float64, float] | None:
-    """`rotation` turned about the vertical so that the body's forward axis points along the course."""
+    """Return `rotation` turned about the vertical so that the body's forward axis points along the course."""
     speed = np.linalg.norm(motion.velocity @ motion.level[:, :2], axis=1)
     fast = np.flatnonzero(speed > _COURSE_M_PER_S)
     if fast.size == 0:
@@ -264,7 +264,7 @@ def _course(motion: _Motion, rotation: Float64, vehicle: VehicleSensors) -> tupl
 def _aligned(
     motion: _Motion, rotation: Float64, heading_sigma: float, vehicle: VehicleSensors, ready: int
 ) -> Alignment:
-    """State at the first sample: the first velocity and position of GNSS carried back."""
+    """Return the state at the first sample, by carrying the first velocity and position of GNSS back."""
     early = (int(motion.epochs[0]) - motion.start_gps_ns) * 1e-9
     arm = rotation @ motion.attitude[0] @ vehicle.body_from_imu.T
     arm = arm @ (vehicle.antenna_lever_arm_body_m - vehicle.imu_lever_arm_body_m)

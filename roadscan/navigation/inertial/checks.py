@@ -1,4 +1,4 @@
-"""Logs fit for the smoother: put in order, repaired where that is sure, refused where it is not.
+"""Checks logs before smoothing: sorts them, repairs them where that is certain, and rejects them otherwise.
 
 - records (records.py): order, repeated and contradicting epochs, no numbers, gaps, saturation;
 - positions (positions.py): frame and unit of GNSS positions, leaps, positions that are repeated;
@@ -54,19 +54,19 @@ Int64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 LEAST_OVERLAP_S: Final = 2.0
-"""IMU and GNSS log have at least this in common."""
+"""Least time that IMU and GNSS log have in common."""
 STUCK_S: Final = 2.0
-"""A sensor that shows one and the same value this long, while the vehicle drives, is stuck."""
+"""A sensor that shows the same value for this long while the vehicle drives is stuck."""
 HANGS_S: Final = 0.5
-"""An odometer that shows standstill in all windows of this long, while the vehicle drives, hangs."""
+"""An odometer that shows standstill for this long while the vehicle drives hangs."""
 STUCK_SHARE: Final = 0.5
-"""Greatest share of the drive that an odometer may be stuck and is only left out there."""
+"""Largest share of the drive for which an odometer may be stuck and still be used elsewhere."""
 SPEED_S: Final = 0.1
-"""Speeds are distances over about this time, where a log cannot be used as distances."""
+"""Where a log cannot be used as distances, speeds are computed over about this time."""
 
 
 class Prepared(NamedTuple):
-    """Logs that the smoother can use, and what was done to them."""
+    """Logs that the smoother can use, and the repairs to them."""
 
     imu: ImuReadings
     gnss: GnssSolutions
@@ -82,7 +82,7 @@ def prepared(
     *,
     drove_backwards: bool = False,
 ) -> Prepared:
-    """Check the logs of a run against themselves and against one another.
+    """Check the logs of a run by themselves and against one another.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def prepared(
 
 
 def _overlap(name: str, epochs: Int64, others: Int64) -> tuple[int, int]:
-    """First and last epoch that a log and the GNSS log have in common.
+    """Return the first and last epoch that a log and the GNSS log have in common.
 
     Raises
     ------
@@ -149,7 +149,7 @@ def _span(epochs: Int64) -> str:
 
 
 def _cause(away_s: float, reach_s: float) -> str:
-    """What a distance in time between two logs looks like; they may be shifted by `reach_s` and still overlap."""
+    """Return the likely cause of an interval between two logs, which may be shifted by `reach_s` and still overlap."""
     if abs(abs(away_s) - GPS_EPOCH_UNIX_S) < 60.0 + reach_s:
         return "the stamps differ by the years from 1970 to 1980: one clock counts Unix time, the other GPS time"
     for name, unit in (("GPS weeks", WEEK_S), ("days", 86_400), ("hours", 3600)):
@@ -160,7 +160,7 @@ def _cause(away_s: float, reach_s: float) -> str:
 
 
 def _check_stuck(kept: Kept[ImuReadings], windows: Windows, vehicle: VehicleSensors) -> None:
-    """Refuse an axis that shows one value while the vehicle drives, unless the sensor is said to have no noise."""
+    """Reject an axis that shows one value while the vehicle drives, unless the sensor is stated to have no noise."""
     imu, errors = kept.log, vehicle.imu_errors
     driving = np.interp(
         (imu.epochs_gps_ns - imu.epochs_gps_ns[0]).astype(np.float64),
@@ -190,7 +190,7 @@ def _check_stuck(kept: Kept[ImuReadings], windows: Windows, vehicle: VehicleSens
 
 
 def _check_velocity(gnss: GnssSolutions) -> None:
-    """Hold the velocities of a GNSS log against its positions."""
+    """Compare the velocities of a GNSS log with its positions."""
     epochs, moved = position_velocity(gnss)
     stated = np.isfinite(gnss.velocity_ned_m_per_s[:, 0])
     if stated.sum() < 3 or epochs.size < 3:
@@ -206,7 +206,7 @@ def _check_velocity(gnss: GnssSolutions) -> None:
 
 
 def _means(epochs: Int64, velocity: Float64, windows: Windows) -> Float64:
-    """Mean velocities (n, 3) over windows."""
+    """Return mean velocities (n, 3) over windows."""
     log = ImuReadings(epochs, velocity, velocity)
     return imu_means(log, windows.epochs_gps_ns, windows.window_s, np.eye(3))[0]
 
@@ -218,7 +218,7 @@ def _compared(
     vehicle: VehicleSensors,
     drove_backwards: bool,
 ) -> Kept[OdometerReadings] | None:
-    """Hold the IMU, then the odometer, against the antenna's motion; the odometer as it can be used."""
+    """Compare the IMU, then the odometer, with the antenna's motion; return the usable part of the odometer."""
     felt = Felt.by(imu, windows, vehicle)
     check_axes(felt, vehicle)
     signs = directions(felt)
@@ -237,7 +237,7 @@ def _compared(
 def _counting_right(
     readings: Kept[OdometerReadings], windows: Windows, speed: Float64, signs: Float64, hangs: Flags
 ) -> Kept[OdometerReadings]:
-    """The odometer forwards positive, without the drives in which it hangs or counts the wrong way."""
+    """Return the odometer with forward positive, without drives in which it hangs or counts the wrong way."""
     told = windows.driving & (signs != 0.0) & (np.abs(speed) > 1e-3)
     wrong = told & (np.sign(speed) != signs)
     right = told & ~wrong
@@ -263,7 +263,7 @@ def _counting_right(
 
 
 def _without(readings: Kept[OdometerReadings], windows: Windows, bad: Flags, what: str) -> Kept[OdometerReadings]:
-    """The odometer as speeds, without the windows in which it is wrong: no distance counts across them."""
+    """Return the odometer as speeds, without the windows in which it is wrong, across which no distance counts."""
     if not bad.any():
         return readings
     log = readings.log
@@ -287,7 +287,7 @@ def _without(readings: Kept[OdometerReadings], windows: Windows, bad: Flags, wha
 
 
 def _speeds(log: OdometerReadings, piece: Int64) -> tuple[Int64, Float64, Int64]:
-    """Epochs, speeds and rows of a piece of an odometer's log: as stated, or from its distances over `SPEED_S`."""
+    """Return epochs, speeds and rows of a piece of an odometer's log: as stated, or from distances over `SPEED_S`."""
     stated = piece[np.isfinite(log.speed_m_per_s[piece])]
     if stated.size:
         return log.epochs_gps_ns[stated], log.speed_m_per_s[stated], stated
@@ -301,7 +301,7 @@ def _speeds(log: OdometerReadings, piece: Int64) -> tuple[Int64, Float64, Int64]
 
 
 def _rows_of(epochs: Int64, windows: Windows, bad: Flags) -> Int64:
-    """Rows whose epochs lie in runs of bad windows, with half a window and a step around."""
+    """Return rows whose epochs lie in runs of bad windows, with half a window and a step around."""
     half = round((windows.window_s / 2 + STEP_S) * NS_PER_S)
     inside = np.zeros(epochs.size, dtype=bool)
     for a, b in runs_of(bad):
@@ -311,7 +311,7 @@ def _rows_of(epochs: Int64, windows: Windows, bad: Flags) -> Int64:
 
 
 def _long(flags: Flags, least_s: float) -> Flags:
-    """Runs of flags of at least so long."""
+    """Return the runs of flags of at least this length."""
     out = np.zeros_like(flags)
     for a, b in runs_of(flags):
         out[a:b] = (b - a) * STEP_S >= least_s
@@ -319,7 +319,7 @@ def _long(flags: Flags, least_s: float) -> Flags:
 
 
 def _whole_stints(windows: Windows, wrong: Flags) -> Flags:
-    """The stints of which the greater part is wrong."""
+    """Return the stints of which the greater part is wrong."""
     out = np.zeros_like(wrong)
     for a, b in windows.stints:
         out[a:b] = wrong[a:b].mean() > 0.5

@@ -1,4 +1,4 @@
-"""The motion of a vehicle as its GNSS receiver, its IMU and its odometer feel it, over the same short windows.
+"""The motion of a vehicle as its GNSS receiver, its IMU and its odometer measure it, over the same short windows.
 
 All are means over a window of `window_s`, so that they can be compared without a model of any sensor:
 
@@ -27,14 +27,14 @@ Int64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 STEP_S: Final = 0.1
-"""Distance of the windows' middles."""
-GRAVITY_M_PER_S2: Final = 9.80665
+"""Interval between the windows' middles."""
+GRAVITY_M_PER_S2: Final = 9.80665  # Standard gravity.
 SLOWEST_M_PER_S: Final = 2.0
-"""Below this speed (and below twenty times its noise) a course says little."""
-_SPIKE_M_PER_S: Final = 0.5
-_USUAL_M_PER_S2: Final = 4.0
-_GAP_S: Final = 0.25
-_LEAST_WINDOW_S: Final = 1.0
+"""Least speed (and least multiple of 20 of its noise) at which a course is used."""
+_SPIKE_M_PER_S: Final = 0.5  # A velocity farther than this from the median of its neighbours is a spike …
+_USUAL_M_PER_S2: Final = 4.0  # … beyond what this acceleration explains.
+_GAP_S: Final = 0.25  # Least gap of an IMU log.
+_LEAST_WINDOW_S: Final = 1.0  # Least length of a window.
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Windows:
     covered: Flags
     """(n,) GNSS solutions without a break over the whole window."""
     driving: Flags
-    """(n,) covered, and fast enough for a course at both ends."""
+    """(n,) covered, and with enough speed for a course at both ends."""
     speed: Float64
     """(n,) m/s."""
     turn: Float64
@@ -67,7 +67,7 @@ class Windows:
     surge: Float64
     """(n,) m/s², change of the speed."""
     along: Float64
-    """(n,) m/s², the same with gravity's part along the slope."""
+    """(n,) m/s², the same plus gravity's component along the slope."""
     turn_noise: Float64
     """(n,) 1 σ of `turn`."""
     along_noise: float
@@ -80,12 +80,12 @@ class Windows:
 
     @property
     def stints(self) -> Int64:
-        """First and one past the last window (s, 2) of each drive without a stop or a break."""
+        """Return the first and one past the last window (s, 2) of each drive without a stop or a break."""
         return runs_of(self.driving)
 
 
 def ned_from_world(world: str, position_world_m: Float64) -> Float64:
-    """Rotation (3, 3) that turns vectors of the world frame to north-east-down at a position (3,)."""
+    """Return the rotation (3, 3) from the world frame to north-east-down at a position (3,)."""
     if world == LOCAL_WORLD:
         return ENU_FROM_NED.T
     lon, lat, _ = geodetic_from_world(world, position_world_m[None])[0]
@@ -93,7 +93,7 @@ def ned_from_world(world: str, position_world_m: Float64) -> Float64:
 
 
 def track_of(gnss: GnssSolutions) -> Track:
-    """Velocities of the log where most positions have one, else those that the positions give."""
+    """Return velocities of the log where most positions have one, else velocities from the positions."""
     placed = np.isfinite(gnss.position_world_m[:, 0])
     moving = np.isfinite(gnss.velocity_ned_m_per_s[:, 0])
     if (placed & moving).sum() >= 0.5 * placed.sum():
@@ -104,7 +104,7 @@ def track_of(gnss: GnssSolutions) -> Track:
 
 
 def position_velocity(gnss: GnssSolutions) -> tuple[Int64, Float64]:
-    """Middles (k,) and velocities (k, 3), north-east-down, between one position and the next."""
+    """Return middles (k,) and velocities (k, 3), north-east-down, between one position and the next."""
     placed = np.flatnonzero(np.isfinite(gnss.position_world_m[:, 0]))
     epochs, position = gnss.epochs_gps_ns[placed], gnss.position_world_m[placed]
     if placed.size < 2:
@@ -115,7 +115,7 @@ def position_velocity(gnss: GnssSolutions) -> tuple[Int64, Float64]:
 
 
 def windows_of(track: Track, span_gps_ns: tuple[int, int]) -> Windows:
-    """Windows over the track inside a span, on whole tenths of a second."""
+    """Return windows over the track inside a span, at whole tenths of a second."""
     step = np.median(np.diff(track.epochs_gps_ns)) / NS_PER_S if track.epochs_gps_ns.size > 1 else 1.0
     window = max(_LEAST_WINDOW_S, 2.0 * float(step))
     grid_ns, half_ns = round(STEP_S * NS_PER_S), round(window * NS_PER_S / 2)
@@ -150,7 +150,7 @@ def windows_of(track: Track, span_gps_ns: tuple[int, int]) -> Windows:
 
 
 def imu_means(imu: ImuReadings, middles: Int64, window_s: float, body_from_imu: Float64) -> tuple[Float64, Float64]:
-    """Mean angular rate and specific force (n, 3) over windows, body axes; NaN where the log does not reach or
+    """Return mean angular rate and specific force (n, 3) over windows, body axes; NaN where the log ends or
     has a gap.
     """
     half = round(window_s * NS_PER_S / 2)
@@ -171,7 +171,7 @@ def imu_means(imu: ImuReadings, middles: Int64, window_s: float, body_from_imu: 
 
 
 def odometer_means(odometer: OdometerReadings, middles: Int64, window_s: float) -> Float64:
-    """Mean speed (n,) over windows; NaN where the log does not reach."""
+    """Return mean speed (n,) over windows; NaN outside the log."""
     half = round(window_s * NS_PER_S / 2)
     known = ~np.isnan(odometer.distance_m)
     if known.sum() >= 2:
@@ -186,14 +186,14 @@ def odometer_means(odometer: OdometerReadings, middles: Int64, window_s: float) 
 
 
 def _at(epochs: Int64, values: Float64, wanted: Int64) -> Float64:
-    """Values (n, k) at wanted epochs (m,), linear between."""
+    """Return values (n, k) at wanted epochs (m,), interpolated linearly."""
     since = (epochs - epochs[0]).astype(np.float64)
     x = (wanted - epochs[0]).astype(np.float64)
     return np.stack([np.interp(x, since, values[:, k]) for k in range(values.shape[1])], axis=1)
 
 
 def _without_spikes(epochs: Int64, velocity: Float64) -> tuple[Int64, Float64]:
-    """Velocities from positions, without those that a leap of a position has spoilt."""
+    """Return velocities from positions, without those spoilt by a leap of a position."""
     if epochs.size < 5:
         return epochs, velocity
     padded = np.pad(velocity, ((2, 2), (0, 0)), mode="edge")
@@ -204,7 +204,7 @@ def _without_spikes(epochs: Int64, velocity: Float64) -> tuple[Int64, Float64]:
 
 
 def _noise(values: Float64) -> float:
-    """1 σ of the noise of values (n, k), from the median of their second differences."""
+    """Return 1 σ of the noise of values (n, k), from the median of their second differences."""
     if len(values) < 3:
         return 0.0
     bends = values[2:] - 2 * values[1:-1] + values[:-2]

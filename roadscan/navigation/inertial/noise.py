@@ -1,9 +1,9 @@
-"""How far readings are believed. GNSS: by what the log states, and by their quality where it states nothing.
+"""Noise of readings. GNSS: as the log states it, or by quality where it states none.
 
-A position's error has a part that is new at each epoch and a part that changes slowly. Taken as new at each epoch, the
-slow part would let a standing receiver know its place to a millimetre after a minute. It is a state of the filter
+A position's error has a part that is independent between epochs and a part that changes slowly. If the slow part were
+taken as independent too, a standing receiver's σ would fall to a millimetre after a minute. It is a state of the filter
 instead: a Gauss–Markov process of the stated σ (Bar-Shalom, Li and Kirubarajan 2001, section 8.2, "coloured measurement
-noise"). It starts anew when the quality of the solution changes.
+noise"). It restarts when the quality of the solution changes.
 
 IMU: the noise of its data sheet, and a share of what it trembles at the upper end of its band. Vibration of engine and
 road lies largely above half the rate of the samples and folds back into what is integrated; where samples are polled
@@ -43,19 +43,19 @@ QUALITIES: Final[dict[str, _Quality]] = {
     "single": _Quality(2.0, 4.0, 0.2),
     "simulated": _Quality(2.0, 4.0, 0.2),
 }
-"""1 σ where the log states none. Solutions of other qualities are not measured, and not used."""
+"""1 σ by quality where the log states none. Solutions of other qualities are not measured, and not used."""
 _SLOW_SHARE: Final = 0.9
-"""Share of the variance that changes slowly, of all solutions that are not fixed."""
+"""Share of the variance that changes slowly, for all solutions that are not fixed."""
 
 
 def usable(gnss: GnssSolutions) -> npt.NDArray[np.bool_]:
-    """True (m,) for measured solutions with a position."""
+    """Return True (m,) for measured solutions with a position."""
     measured = np.isin(gnss.quality, list(QUALITIES))
     return np.asarray(measured & np.isfinite(gnss.position_world_m).all(axis=1))
 
 
 def fixes_of(gnss: GnssSolutions, config: SmootherConfig) -> Fixes:
-    """Solutions with their noise as the filter takes it; all of them :func:`usable`."""
+    """Return solutions with their noise in the filter's form; all of them :func:`usable`."""
     covariance = _covariance(gnss, config) * config.gnss_position_factor**2
     slow = np.where(gnss.quality == "fixed", config.gnss_correlated_share, _SLOW_SHARE)
     default = np.array([QUALITIES[str(q)].velocity_m_per_s for q in gnss.quality])
@@ -72,7 +72,7 @@ def fixes_of(gnss: GnssSolutions, config: SmootherConfig) -> Fixes:
 
 
 def _covariance(gnss: GnssSolutions, config: SmootherConfig) -> Float64:
-    """Covariances (m, 3, 3), north-east-down, of the positions: stated or by quality, not below the floor."""
+    """Return covariances (m, 3, 3), north-east-down, of the positions: stated or by quality, not below the floor."""
     found = np.array(gnss.covariance_ned_m2, dtype=np.float64) * config.gnss_sigma_factor**2
     diagonal = np.einsum("nii->ni", found)
     unknown = ~(np.isfinite(found).all(axis=(1, 2)) & (diagonal > 0.0).all(axis=1))
@@ -82,26 +82,26 @@ def _covariance(gnss: GnssSolutions, config: SmootherConfig) -> Float64:
     floor = np.array([config.gnss_floor_horizontal_m] * 2 + [config.gnss_floor_vertical_m])
     raised = np.maximum(floor**2 - np.einsum("nii->ni", found), 0.0)
     found += raised[:, :, None] * np.eye(3)
-    # A log that rounds its covariances may state a correlation of one: the least eigenvalue is kept off zero.
+    # Rounded covariances may have a correlation of one: the least eigenvalue is kept above zero.
     kept: Float64 = found + 0.01 * np.einsum("nii->ni", found)[:, :, None] * np.eye(3)
     return kept
 
 
 def colour_restarts(gnss: GnssSolutions) -> npt.NDArray[np.bool_]:
-    """True (m,) where a solution is of another quality than the one before it."""
+    """Return True (m,) where a solution has another quality than the one before it."""
     return np.append(False, gnss.quality[1:] != gnss.quality[:-1])
 
 
-_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
+_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # Unit of the stated noise.
 _LEAST_DENSITY: Final = 1e-8
-"""Noise of a perfect IMU, rad/√s and m/s/√s: rounding."""
-_TREMBLING_S: Final = 1.0
+"""Noise of a perfect IMU, rad/√s and m/s/√s, from rounding."""
+_TREMBLING_S: Final = 1.0  # Time over which vibration is measured.
 
 
 def imu_noise(
     imu: ImuReadings, vehicle: VehicleSensors, config: SmootherConfig, epochs: npt.NDArray[np.int64]
 ) -> tuple[Float64, Float64]:
-    """Noise of gyroscopes (rad²/s) and accelerometers (m²/s³), (k, 3) in the IMU's axes, about epochs (k,)."""
+    """Return noise of gyroscopes (rad²/s) and accelerometers (m²/s³), (k, 3) in the IMU's axes, around epochs (k,)."""
     errors = vehicle.imu_errors
     gyro = max(float(np.radians(errors.gyro_noise_deg_per_sqrt_h)) / 60.0, _LEAST_DENSITY)
     accel = max(errors.accel_noise_ug_per_sqrt_hz * 1e-6 * _STANDARD_GRAVITY_M_PER_S2, _LEAST_DENSITY)
@@ -112,7 +112,7 @@ def imu_noise(
     level, down = config.imu_factor_horizontal**2, config.imu_factor_vertical**2
     along_down = vehicle.body_from_imu[2] ** 2
     factor = level * (1.0 - along_down) + down * along_down
-    # Vibration may be found to fold back less than it is taken to; a data sheet is no upper limit.
+    # Vibration may fold back less than assumed; a data sheet is no upper limit.
     return (
         gyro**2 * max(level, 1.0) + share * _trembling(imu.angular_rate_rad_per_s, size)[at] * level,
         accel**2 * np.maximum(factor, 1.0) + share * _trembling(imu.specific_force_m_per_s2, size)[at] * factor,
@@ -120,7 +120,7 @@ def imu_noise(
 
 
 def _trembling(vectors: Float64, size: int) -> Float64:
-    """Variance (n, 3) of white noise with these second differences, which pass only the upper half of the band."""
+    """Variance (n, 3) of white noise with these second differences, which pass the upper half of the band."""
     bend = np.zeros_like(vectors)
     bend[1:-1] = vectors[1:-1] - 0.5 * (vectors[:-2] + vectors[2:])
     return np.asarray(uniform_filter1d(bend**2, max(size, 1), axis=0) / 1.5)

@@ -1,7 +1,7 @@
-"""Whether a smoothed trajectory follows the measurements that it was made of.
+"""Checks whether a smoothed trajectory follows the measurements that it was computed from.
 
-Some wrong inputs no comparison of motions can tell beforehand (a horizontal gyroscope with the wrong sign on an even
-road). They leave their mark on the result: the smoother has to trust either the IMU or GNSS, and they disagree.
+Some wrong inputs cannot be detected by comparing motions beforehand (a horizontal gyroscope with the wrong sign on an
+even road). They show in the result: the smoother has to trust either the IMU or GNSS, and they disagree.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 FAR_SIGMAS: Final = 6.0
-"""A position so many σ from the trajectory disagrees with it."""
+"""A position this many σ from the trajectory disagrees with it."""
 LEAST_SIGMA_M: Final = 0.02
-"""σ of a GNSS position counts at least so much: what receivers state is often too good."""
+"""Least σ of a GNSS position in this check: receivers often state too small ones."""
 FAR_SHARE: Final = 0.05
-"""Greatest share of positions that may disagree."""
+"""Largest share of positions that may disagree."""
 CONTRADICTED: Final = 1 / 3
-"""Greatest share of another kind of measurement that may be outliers where positions disagree."""
+"""Largest share of another kind of measurement that may be outliers where positions disagree."""
 _DOUBTFUL: Final = 0.1
-"""Share of outliers above which a kind of measurement doubts the trajectory."""
+"""Share of outliers above which a kind of measurement contradicts the trajectory."""
 _LARGE: Final = 3.0
 """RMS of innovations over their σ above which it does."""
-_LEAST: Final = 20
+_LEAST: Final = 20  # With fewer measurements of a kind nothing is reported.
 _CAUSE: Final = (
     "check axes, signs and units of the IMU (its horizontal axes above all), its errors in the rig file, clocks, the "
     "antenna's lever arm and the σ of the GNSS log"
@@ -42,18 +42,18 @@ _CAUSE: Final = (
 
 @dataclass(frozen=True)
 class Residuals:
-    """Antenna by the trajectory less antenna by GNSS."""
+    """Antenna position of the trajectory less that of GNSS."""
 
     records: Int64
     """(k,) rows of the GNSS log."""
     ned_m: Float64
     """(k, 3)."""
     sigmas: Float64
-    """(k,) size by its σ."""
+    """(k,) length over its σ."""
 
 
 def residuals_of(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSensors) -> Residuals:
-    """Residuals of the GNSS positions within the trajectory's pieces that state a covariance."""
+    """Return residuals of the GNSS positions within the trajectory's pieces that state a covariance."""
     epochs = gnss.epochs_gps_ns
     first, last = int(solution.epochs_gps_ns[0]), int(solution.epochs_gps_ns[-1])
     pieces = solution.pieces or ((first, last),)
@@ -75,7 +75,7 @@ def residuals_of(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSensor
 
 
 def check_outcome(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSensors) -> list[str]:
-    """Refuse a trajectory that its own measurements contradict; note one that they doubt.
+    """Reject a trajectory that its measurements contradict; return notes on one that is suspect.
 
     Multipath makes GNSS positions disagree, and them alone. Where an IMU is wrong, velocities, odometer and the
     constraints of a vehicle disagree, too.
@@ -116,18 +116,18 @@ def check_outcome(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSenso
 
 @dataclass(frozen=True)
 class KindFigures:
-    """What became of the updates of a kind."""
+    """Statistics of the updates of a kind."""
 
     kind: str
     updates: int
     outliers: float
-    """Share that counts less than stated."""
+    """Share that is down-weighted."""
     innovation: float
     """RMS of the innovations over their predicted σ."""
 
 
 def figures_of(solution: Solution) -> list[KindFigures]:
-    """Figures of the updates by kind, those of GNSS also together as 'gnss'."""
+    """Return statistics of the updates by kind, those of GNSS also together as 'gnss'."""
     found = solution.innovations
     if found is None:
         return []
@@ -146,9 +146,9 @@ def figures_of(solution: Solution) -> list[KindFigures]:
 
 
 def warnings_of(solution: Solution) -> list[str]:
-    """In words, the kinds of measurement of which many are outliers, or whose innovations are large.
+    """Describe the kinds of measurement with many outliers, or with large innovations.
 
-    A receiver that errs often does that as well as a trajectory that is wrong: :func:`check_outcome` tells which.
+    Both a poor receiver and a wrong trajectory cause this: :func:`check_outcome` distinguishes them.
     """
     said = []
     for one in figures_of(solution):
@@ -165,7 +165,7 @@ def warnings_of(solution: Solution) -> list[str]:
 
 
 def _doubted(solution: Solution) -> dict[str, float]:
-    """Share of the measurements of each kind that count less than stated; kinds with too few are left out."""
+    """Return the share of down-weighted measurements of each kind; kinds with too few are left out."""
     found = solution.innovations
     if found is None:
         return {}

@@ -1,4 +1,4 @@
-"""Positions of a GNSS log: in the frame that they are said to be in, and where the antenna can have been."""
+"""Checks positions of a GNSS log: whether they lie in the stated frame, and whether the antenna can have been there."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ Int64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 HEIGHTS_M: Final = (-1000.0, 20_000.0)
-"""Ellipsoidal heights at which vehicles and their trials are found."""
+"""Range of ellipsoidal heights of vehicles."""
 LEAP_M: Final = 5.0
-"""A change of position that no motion explains, beyond ten σ."""
+"""Least change of position, beyond ten σ, that counts as a leap if no motion explains it."""
 HARDEST_M_PER_S2: Final = 8.0
-"""No road vehicle speeds up, brakes or turns harder."""
+"""Largest acceleration of a road vehicle."""
 LONGEST_AWAY_S: Final = 30.0
-"""Positions may stay away this long and are left out; what stays away longer may be the truth."""
+"""Positions that leap away for up to this long are left out; what stays away longer may be right."""
 AWAY_SHARE: Final = 0.2
-"""Greatest share of positions that may be left out."""
-_CHECKED_GAP_S: Final = 5.0
-_USUAL_SIGMA_M: Final = {"fixed": 0.05, "float": 1.0, "ppp": 1.0, "dgps": 2.0, "sbas": 3.0, "pps": 5.0}
-_OTHER_SIGMA_M: Final = 10.0
-_EARTH_M: Final = 6_371_000.0
+"""Largest share of positions that may be left out."""
+_CHECKED_GAP_S: Final = 5.0  # Over longer gaps positions are not compared.
+_USUAL_SIGMA_M: Final = {"fixed": 0.05, "float": 1.0, "ppp": 1.0, "dgps": 2.0, "sbas": 3.0, "pps": 5.0}  # 1 σ.
+_OTHER_SIGMA_M: Final = 10.0  # 1 σ of other qualities.
+_EARTH_M: Final = 6_371_000.0  # Mean radius of the Earth.
 
 
 def check_frame(gnss: GnssSolutions, records: Int64) -> None:
-    """Positions of a geocentric frame lie near the Earth's surface.
+    """Check that positions of a geocentric frame lie near the Earth's surface.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def check_frame(gnss: GnssSolutions, records: Int64) -> None:
 
 
 def without_leaps(kept: Kept[GnssSolutions]) -> Kept[GnssSolutions]:
-    """The log without the positions that leap away and come back, and without those that a receiver repeats.
+    """Return the log without positions that leap away and back, and without those that a receiver repeats.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def _blanked(gnss: GnssSolutions, bad: Flags) -> GnssSolutions:
 
 
 def _repeated(gnss: GnssSolutions) -> Flags:
-    """Positions (m,) that are, to the bit, those of the epoch before, while the antenna moves.
+    """Return positions (m,) identical to those of the epoch before, while the antenna moves.
 
     It moves where its velocity says so, or where it is afterwards farther away than a vehicle comes from rest.
     """
@@ -135,7 +135,7 @@ def _repeated(gnss: GnssSolutions) -> Flags:
 
 
 def _away(gnss: GnssSolutions, records: Int64) -> Flags:
-    """Positions (m,) between a leap away and a leap back."""
+    """Return positions (m,) between a leap away and a leap back."""
     placed = np.flatnonzero(np.isfinite(gnss.position_world_m[:, 0]))
     out: Flags = np.zeros(gnss.epochs_gps_ns.size, dtype=bool)
     if placed.size < 3:
@@ -167,13 +167,13 @@ def _away(gnss: GnssSolutions, records: Int64) -> Flags:
 
 
 def _leaps(gnss: GnssSolutions, placed: Int64) -> Float64:
-    """Changes of position (p − 1, 3), north-east-down, that no motion explains; 0 where one does."""
+    """Return changes of position (p − 1, 3), north-east-down, that no motion explains; 0 where one does."""
     epochs, position = gnss.epochs_gps_ns[placed], gnss.position_world_m[placed]
     seconds = np.diff(epochs) / NS_PER_S
     step = np.diff(position, axis=0) @ _ned(gnss, position).T
     velocity = gnss.velocity_ned_m_per_s[placed]
     mean = (velocity[1:] + velocity[:-1]) / 2
-    # Where the log has no velocity, the steps before and after stand for it.
+    # Where the log has no velocity, that of the steps before and after is used.
     usual = _neighbours(step / seconds[:, None])
     guess = np.where(np.isfinite(mean), mean, usual)
     sigma = _sigma(gnss)[placed]
@@ -186,14 +186,14 @@ def _leaps(gnss: GnssSolutions, placed: Int64) -> Float64:
 
 
 def _neighbours(speeds: Float64) -> Float64:
-    """For each of (n, 3) the median of the nine around it."""
+    """Return for each of (n, 3) the median of the nine around it."""
     padded = np.pad(speeds, ((4, 4), (0, 0)), mode="edge")
     around: Float64 = np.median(np.lib.stride_tricks.sliding_window_view(padded, 9, axis=0), axis=-1)
     return around
 
 
 def _sigma(gnss: GnssSolutions) -> Float64:
-    """1 σ (m,) of a position; of its quality where the log states none."""
+    """Return 1 σ (m,) of a position; that of its quality where the log states none."""
     trace = np.trace(gnss.covariance_ned_m2, axis1=1, axis2=2)
     usual = np.array([_USUAL_SIGMA_M.get(str(q), _OTHER_SIGMA_M) for q in gnss.quality])
     sigma: Float64 = np.where(np.isfinite(trace), np.sqrt(np.maximum(trace, 0.0)), usual)
@@ -205,7 +205,7 @@ def _ned(gnss: GnssSolutions, position: Float64) -> Float64:
 
 
 def _heights(world: str, position: Float64) -> Float64:
-    """Ellipsoidal heights (n,); NaN far from the Earth's surface, where the projection has none to give."""
+    """Return ellipsoidal heights (n,); NaN far from the Earth's surface, where the projection is undefined."""
     out = np.full(len(position), np.nan)
     near = np.abs(np.linalg.norm(position, axis=1) - _EARTH_M) < 60_000.0
     if near.any():

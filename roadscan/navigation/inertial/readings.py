@@ -1,4 +1,4 @@
-"""What the smoother takes and gives: readings, how their sensors sit on the vehicle, and the solution."""
+"""Input and output of the smoother: readings, mounting of the sensors, and the solution."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Int64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class ImuReadings:
-    """Samples of an IMU in its own axes, as the table ``imu`` holds them."""
+    """Samples of an IMU in its axes, as in the table ``imu``."""
 
     epochs_gps_ns: Int64
     """(n,) strictly ascending; a sample is the mean over the interval that ends there, or the value at that instant
@@ -28,7 +28,7 @@ class ImuReadings:
 
 @dataclass(frozen=True)
 class GnssSolutions:
-    """Positions and velocities of an antenna, as the table ``gnss`` holds them."""
+    """Positions and velocities of an antenna, as in the table ``gnss``."""
 
     world: str
     """Geocentric frame of the positions (as in the log record)."""
@@ -60,7 +60,7 @@ class OdometerReadings:
 
 @dataclass(frozen=True)
 class VehicleSensors:
-    """How the sensors sit on the vehicle, body axes forward, right, down from the IMU reference point (m)."""
+    """Mounting of the sensors on the vehicle, body axes forward, right, down from the IMU reference point (m)."""
 
     body_from_imu: Float64
     """(3, 3) rotation from the IMU's axes to the body's."""
@@ -77,7 +77,7 @@ class VehicleSensors:
 
 @dataclass(frozen=True)
 class Solution:
-    """A smoothed trajectory of the IMU reference point, with what was estimated beside it."""
+    """A smoothed trajectory of the IMU reference point, with the other estimated states."""
 
     world: str
     epochs_gps_ns: Int64
@@ -97,27 +97,27 @@ class Solution:
     sigma_rph_rad: Float64
     """(n, 3) 1 σ of roll, pitch, heading."""
     states: dict[str, tuple[Float64, Float64]] = field(default_factory=dict)
-    """What else was estimated, by name with frame and unit (``…_imu``: the IMU's axes, ``…_body``: the body's): value
+    """Other estimated states, by name with frame and unit (``…_imu``: the IMU's axes, ``…_body``: the body's): value
     (j,) or (j, k) and its 1 σ, at `state_epochs_gps_ns`."""
     state_epochs_gps_ns: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
     innovations: Innovations | None = None
     pieces: tuple[tuple[int, int], ...] = ()
     """First and last epoch (GPS ns) of each unbroken piece; the IMU was silent for too long between them."""
     notes: tuple[str, ...] = ()
-    """What the user should know: where the solution is divided, and which part could not be solved."""
+    """Notes for the user: where the solution is divided, and which part could not be solved."""
 
 
 @dataclass(frozen=True)
 class Innovations:
-    """Every update that the filter was offered: what was measured against what was predicted."""
+    """Every update that the filter was offered: measured less predicted."""
 
     epochs_gps_ns: Int64
     """(u,)."""
     kind: npt.NDArray[np.str_]
     """(u,) 'gnss position', 'gnss velocity', 'odometer', 'non-holonomic', 'zero velocity', 'zero rotation' …"""
     residual: Float64
-    """(u, 3) observed − predicted, in the update's own unit and axes; NaN where it has fewer components."""
+    """(u, 3) observed − predicted, in unit and axes of the update; NaN where it has fewer components."""
     normalised: Float64
     """(u,) squared, normalised by the predicted covariance, and divided by the components."""
     weight: Float64
-    """(u,) 1 as stated, below 1 down-weighted as an outlier, 0 refused."""
+    """(u,) 1 for full weight, below 1 for down-weighted outliers, 0 for rejected ones."""

@@ -1,4 +1,4 @@
-"""Records of the smoother's logs put in order: what cannot be used is left out and named, or the log is refused.
+"""Sorts and filters the records of the smoother's logs: unusable ones are left out and reported, or a log is rejected.
 
 A record is counted from 0 in the order in which it arrived.
 """
@@ -21,39 +21,39 @@ Int64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 LOST_SHARE: Final = 0.05
-"""Greatest share of samples that an IMU log may lack in gaps up to `SHORT_GAP_S`."""
+"""Largest share of samples that an IMU log may lack in gaps up to `SHORT_GAP_S`."""
 SHORT_GAP_S: Final = 1.0
 """A longer gap is a pause."""
 DAMAGED_SHARE: Final = 0.05
-"""Greatest share of a log's records that may be left out for what they hold."""
+"""Largest share of a log's records that may be left out for invalid values."""
 CONFLICT_SHARE: Final = 0.01
-"""Greatest share of records that may contradict another one of the same epoch."""
+"""Largest share of records that may contradict another one of the same epoch."""
 FEWEST_SPOILT: Final = 5
-"""Up to so many spoilt records never spoil a log by their share."""
+"""Up to this many damaged records never cause a log to be rejected by their share."""
 FASTEST_M_PER_S: Final = 100.0
-"""No road vehicle drives faster."""
+"""Largest speed of a road vehicle."""
 CLIPPED_S: Final = 0.1
-"""A sensor may stand at the end of its scale this long at a time."""
+"""Longest time that a sensor may stay at the end of its scale."""
 CLIPPED_SHARE: Final = 0.001
-"""Greatest share of samples at the end of the scale."""
-_CLIPPED_SAMPLES: Final = 3
+"""Largest share of samples at the end of the scale."""
+_CLIPPED_SAMPLES: Final = 3  # Least number of equal samples in a row that are the end of a scale.
 _LEAST_SCALE: Final = (1.0, 14.0)
-"""No gyroscope ends below this rate (rad/s), no accelerometer below this force (m/s²)."""
-_LISTED: Final = 3
+"""Least end of scale of a gyroscope (rad/s) and of an accelerometer (m/s²)."""
+_LISTED: Final = 3  # Most records that a message lists.
 
 Log = TypeVar("Log")
 
 
 @dataclass(frozen=True)
 class Repair:
-    """What was done to some records of a log, so that the rest can be used."""
+    """A repair of some records of a log, so that the rest can be used."""
 
     sensor: str
     """'IMU', 'GNSS' or 'odometer'."""
     what: str
-    """What was wrong with them, and what was done."""
+    """What was wrong with them, and the repair."""
     records: Int64
-    """(n,) the records, from 0 as they arrived; of a gap the record before it."""
+    """(n,) records counted from 0 in order of arrival; for a gap the record before it."""
     epochs_gps_ns: Int64
     """(n,) their epochs."""
 
@@ -63,11 +63,11 @@ class Repair:
 
 @dataclass(frozen=True)
 class Kept(Generic[Log]):
-    """A log in order."""
+    """A log sorted by time."""
 
     log: Log
     records: Int64
-    """(n,) where each of its rows stood as they arrived."""
+    """(n,) record of each row in order of arrival."""
     repairs: list[Repair]
 
 
@@ -79,7 +79,7 @@ def listed(records: Int64, epochs_gps_ns: Int64) -> str:
 
 
 def imu_in_order(imu: ImuReadings) -> Kept[ImuReadings]:
-    """Samples sorted, each epoch once, all of them numbers; gaps are named, and stay.
+    """Return samples sorted, each epoch once, all of them numbers; gaps are reported and stay.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def imu_in_order(imu: ImuReadings) -> Kept[ImuReadings]:
 
 
 def gnss_in_order(gnss: GnssSolutions) -> Kept[GnssSolutions]:
-    """Solutions sorted, each epoch once; half a position, and covariances that are none, are set to NaN.
+    """Return solutions sorted, each epoch once; incomplete positions and invalid covariances become NaN.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def gnss_in_order(gnss: GnssSolutions) -> Kept[GnssSolutions]:
 
 
 def odometer_in_order(odometer: OdometerReadings) -> Kept[OdometerReadings]:
-    """Readings sorted, each epoch once; a counter that started anew goes on where it was.
+    """Return readings sorted, each epoch once; a counter that restarted continues where it was.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def odometer_in_order(odometer: OdometerReadings) -> Kept[OdometerReadings]:
 
 
 def _each_epoch_once(sensor: str, epochs: Int64, values: Float64) -> tuple[Int64, list[Repair]]:
-    """Rows in the order of their epochs, each epoch once, and what had to be done for it."""
+    """Return rows in the order of their epochs, each epoch once, and the repairs for it."""
     if epochs.size == 0:
         raise NavigationError(f"the {sensor} log is empty", expected="at least two records")
     repairs = []
@@ -191,7 +191,7 @@ def _each_epoch_once(sensor: str, epochs: Int64, values: Float64) -> tuple[Int64
 
 
 def _check_not_interleaved(sensor: str, epochs: Int64, order: Int64, late: Int64) -> None:
-    """Refuse records that, sorted, run in between others: the clock went back over a time that it had shown."""
+    """Reject records that interleave with others once sorted: the clock went back over a time that it had shown."""
     steps = np.diff(epochs[order])
     if not (steps > 0).any():
         return
@@ -240,7 +240,7 @@ def _left_out(sensor: str, what: str, rows: Int64, epochs: Int64, of: int) -> Re
 
 
 def _gaps(epochs: Int64, rows: Int64) -> list[Repair]:
-    """What an IMU log lacks: the smoother crosses short gaps with a wider σ, and divides the run at long ones."""
+    """Return the gaps of an IMU log: short ones are crossed with a wider σ, long ones divide the run."""
     steps = np.diff(epochs)
     usual = float(np.median(steps))
     gaps = np.flatnonzero(steps > 2.5 * usual)
@@ -256,7 +256,7 @@ def _gaps(epochs: Int64, rows: Int64) -> list[Repair]:
 
 
 def _check_share(counts: Int64, epochs: Int64, rows: Int64, gaps: Int64) -> None:
-    """Refuse a log that loses samples all the time; a pause is one gap, whatever its length."""
+    """Reject a log that loses samples throughout; a pause is one gap, whatever its length."""
     short = counts * float(np.median(np.diff(epochs))) < SHORT_GAP_S * NS_PER_S
     counts, gaps = counts[short], gaps[short]
     if counts.sum() > max(FEWEST_SPOILT, LOST_SHARE * epochs.size):
@@ -270,7 +270,7 @@ def _check_share(counts: Int64, epochs: Int64, rows: Int64, gaps: Int64) -> None
 
 
 def _saturation(epochs: Int64, values: Float64, rows: Int64) -> tuple[Flags, list[Repair]]:
-    """Samples at the end of a sensor's scale: left out where they are few, refused where they are many."""
+    """Find samples at the end of a sensor's scale: few are left out, many cause rejection."""
     repairs = []
     out = np.zeros(epochs.size, dtype=bool)
     step_s = float(np.median(np.diff(epochs))) / NS_PER_S
@@ -305,7 +305,7 @@ def _is_constant(column: Float64) -> bool:
 
 
 def _whole(vectors: Float64) -> tuple[Float64, Flags]:
-    """Vectors (n, 3), all NaN where a part is not finite; flags where that was not so."""
+    """Return vectors (n, 3), all NaN where a part is not finite; flags where that was not so."""
     finite = np.isfinite(vectors)
     whole: Flags = np.asarray(finite.all(axis=1))
     missing: Flags = np.asarray(np.isnan(vectors).all(axis=1))
@@ -313,7 +313,7 @@ def _whole(vectors: Float64) -> tuple[Float64, Flags]:
 
 
 def _covariances(covariance: Float64) -> tuple[Float64, Flags]:
-    """Covariances (n, 3, 3), NaN where they are none; flags where one was stated that is none."""
+    """Return covariances (n, 3, 3), NaN where invalid; flags of stated ones that are invalid."""
     stated = ~np.isnan(covariance).all(axis=(1, 2))
     finite = np.isfinite(covariance).all(axis=(1, 2))
     smallest = np.full(len(covariance), -1.0)
@@ -324,7 +324,7 @@ def _covariances(covariance: Float64) -> tuple[Float64, Flags]:
 
 
 def _going_on(epochs: Int64, distance: Float64, rows: Int64) -> tuple[Float64, list[Repair]]:
-    """Distances (n,) where a counter that leaps goes on as before its leap."""
+    """Return distances (n,) in which a counter that leaps continues as before its leap."""
     known = np.flatnonzero(~np.isnan(distance))
     steps, seconds = np.diff(distance[known]), np.diff(epochs[known]) / NS_PER_S
     leaps = np.flatnonzero(np.abs(steps) > FASTEST_M_PER_S * seconds + 1.0)

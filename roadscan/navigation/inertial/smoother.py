@@ -1,4 +1,4 @@
-"""The smoother: a trajectory from IMU, GNSS and odometer.
+"""The smoother computes a trajectory from IMU, GNSS and odometer.
 
 A loosely coupled error-state Kalman filter (:mod:`roadscan.navigation.inertial.kernels.kalman`) runs forwards over a
 run, a smoother (:mod:`roadscan.navigation.inertial.kernels.kalman_smoother`) back. The order of things is
@@ -54,11 +54,11 @@ Bool = npt.NDArray[np.bool_]
 KINDS: Final = np.array(
     ["gnss position", "gnss velocity", "odometer", "non-holonomic", "zero velocity", "zero rotation"]
 )
-_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
-_SHORTEST_PIECE_S: Final = 5.0
+_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # Unit of the stated bias.
+_SHORTEST_PIECE_S: Final = 5.0  # Least time of GNSS in a piece that is solved.
 _FINE_S: Final = 60.0
-"""The first pass over the beginning goes on for this long behind the coarse alignment."""
-_UNKNOWN_AXLE_SIGMA_M: Final = (1.5, 0.5, 1.0)
+"""The first pass over the beginning continues for this long after the coarse alignment."""
+_UNKNOWN_AXLE_SIGMA_M: Final = (1.5, 0.5, 1.0)  # 1 σ of the axle (forward, right, down) where no wheel is stated.
 
 
 def solve(
@@ -70,7 +70,7 @@ def solve(
     *,
     smooth: bool = True,
 ) -> Solution:
-    """Trajectory of the IMU reference point over all samples of an IMU.
+    """Compute the trajectory of the IMU reference point over all samples of an IMU.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def _span(of: ImuReadings | Solution) -> str:
 
 
 def _pieces(imu: ImuReadings, config: SmootherConfig) -> list[ImuReadings]:
-    """Unbroken pieces of the IMU's samples."""
+    """Return unbroken pieces of the IMU's samples."""
     cuts = np.flatnonzero(np.diff(imu.epochs_gps_ns) > config.max_imu_gap_s * 1e9) + 1
     edges = [0, *cuts.tolist(), imu.epochs_gps_ns.size]
     return [_part(imu, slice(a, b)) for a, b in itertools.pairwise(edges)]
@@ -158,7 +158,7 @@ def _solve_piece(
 
 
 def _layout(odometer: OdometerReadings | None, vehicle: VehicleSensors, config: SmootherConfig) -> Layout:
-    """Columns of the states that this solution has."""
+    """Return the columns of the states that this solution has."""
     errors = vehicle.imu_errors
     size = inertial = 21 if errors.gyro_scale_ppm > 0.0 or errors.accel_scale_ppm > 0.0 else 15
     columns = {}
@@ -215,7 +215,7 @@ def _start(
     layout: Layout,
     odometer: OdometerReadings | None,
 ) -> Start:
-    """Nominal state and covariance at the first sample."""
+    """Return nominal state and covariance at the first sample."""
     values, sigma = np.zeros(layout.size), np.zeros(layout.size)
     sigma[0:3], sigma[3:6] = alignment.sigma_position_m, alignment.sigma_velocity_m_per_s
     sigma[9:12], sigma[12:15] = _gyro_bias_sigma(vehicle), _accel_bias_sigma(vehicle)
@@ -253,7 +253,7 @@ def _start(
 def _axle(
     vehicle: VehicleSensors, config: SmootherConfig, odometer: OdometerReadings | None
 ) -> tuple[Float64, Float64]:
-    """The point that moves only forwards, from the IMU reference point, and its σ, body axes (m)."""
+    """Return the point that moves only forwards, from the IMU reference point, and its σ, body axes (m)."""
     if config.axle_body_m is not None:
         return np.array(config.axle_body_m), np.array(config.axle_sigma_m)
     if odometer is not None and vehicle.wheel_lever_arm_body_m is not None:
@@ -264,7 +264,7 @@ def _axle(
 def _refined(
     start: Start, alignment: Alignment, whole: Timeline, model: Model, layout: Layout, vehicle: VehicleSensors
 ) -> Start:
-    """Start from where a first pass over the beginning, smoothed, says that it was: small errors are linear ones."""
+    """Return the start from a smoothed first pass over the beginning, so that errors are small enough to be linear."""
     last = int(np.searchsorted(whole.node_epochs, alignment.ready_gps_ns + _FINE_S * 1e9))
     first = _Run.of(_until(whole, min(last, whole.nodes.bound.size - 1)), model, layout, start, smooth=True)
     poses = first.poses(np.zeros(1, np.int64), vehicle, at_imu=True)
@@ -275,7 +275,7 @@ def _refined(
 
 
 def _until(whole: Timeline, last: int) -> Timeline:
-    """The beginning of a timeline, up to a node."""
+    """Return the beginning of a timeline, up to a node."""
     columns: list[Any] = [column[: last + 1] for column in whole.nodes]
     nodes = Nodes(*columns)
     return Timeline(whole.bounds[: int(nodes.bound[-1]) + 1], whole.steps, nodes, whole.fixes, whole.samples)
@@ -349,7 +349,7 @@ class _Run:
         return cls(whole, layout, track, record, updates, correction, covariance, values, sigmas, smooth)
 
     def poses(self, wanted: Int64, vehicle: VehicleSensors, *, at_imu: bool = False) -> Poses:
-        """Poses of the reference point, or of the IMU in its own axes, at bounds (e,)."""
+        """Return poses of the reference point, or of the IMU in its axes, at bounds (e,)."""
         count = wanted.size
         poses = Poses(
             *(np.empty(shape) for shape in ((count, 3), (count, 4), (count, 3), (3, count, 3, 3), (count, 3)))
@@ -371,7 +371,7 @@ class _Run:
         return poses
 
     def solution(self, world: str, vehicle: VehicleSensors, config: SmootherConfig, *, smooth: bool) -> Solution:
-        """Poses at the IMU's epochs, states and innovations."""
+        """Return poses at the IMU's epochs, states and innovations."""
         wanted = _thinned(self.timeline, config)
         poses = self.poses(wanted, vehicle)
         return Solution(
@@ -390,7 +390,7 @@ class _Run:
         )
 
     def _on_gnss_time(self, epochs: Int64) -> Int64:
-        """Stamps of the IMU (ascending, ns) as GNSS time, by the delay that was found."""
+        """Convert stamps of the IMU (ascending, ns) to GNSS time, by the estimated delay."""
         if self.layout.delay < 0:
             return epochs
         known = self.timeline.reported
@@ -436,7 +436,7 @@ class _Run:
 
 
 def _definite(covariance: Float64) -> bool:
-    """Whether all of them (k, n, n) are positive definite; Cholesky's factors do not depend on the states' units."""
+    """Return whether all of them (k, n, n) are positive definite, by Cholesky factors, which are free of units."""
     try:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
@@ -445,7 +445,7 @@ def _definite(covariance: Float64) -> bool:
 
 
 def _thinned(whole: Timeline, config: SmootherConfig) -> Int64:
-    """Bounds of the samples that become poses: the first of each interval of `poses_per_s`, and the last."""
+    """Return bounds of the samples that become poses: the first of each interval of `poses_per_s`, and the last."""
     epochs = whole.bounds[whole.samples]
     slots = epochs // round(1e9 / config.poses_per_s)
     keep = np.diff(slots, prepend=slots[0] - 1) > 0
@@ -454,7 +454,7 @@ def _thinned(whole: Timeline, config: SmootherConfig) -> Int64:
 
 
 def _joined(parts: list[Solution], notes: tuple[str, ...]) -> Solution:
-    """One solution of several pieces in a row."""
+    """Join the solutions of several successive pieces."""
     first = parts[0]
     arrays = {
         name: np.concatenate([getattr(p, name) for p in parts])

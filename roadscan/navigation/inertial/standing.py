@@ -1,4 +1,4 @@
-"""When the vehicle stands: from its odometer, and from how much the IMU trembles."""
+"""Detects standstill from the odometer and from the vibration of the IMU."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 WINDOW_S: Final = 1.0
-"""Trembling is judged over this."""
+"""Length of the window over which vibration is measured."""
 _STILL_M_PER_S: Final = 0.15
 """GNSS speed below which a vehicle may stand."""
-_MOVING_M_PER_S: Final = 0.5
+_MOVING_M_PER_S: Final = 0.5  # GNSS speed above which a vehicle moves.
 _STILL_M: Final = 0.02
-"""Distance that an odometer may count in a window, standing (play, rounding)."""
+"""Distance that an odometer may count in a window while standing (play, rounding)."""
 _LEARNING_S: Final = 4.0
-"""Least standing time, by GNSS, from which the trembling of a standing vehicle is learnt."""
+"""Least standing time, by GNSS, from which the vibration of a standing vehicle is estimated."""
 
 
 def standing(imu: ImuReadings, gnss: GnssSolutions, odometer: OdometerReadings | None, vehicle: VehicleSensors) -> Bool:
-    """True (n,) at samples of an IMU within a standstill.
+    """Return True (n,) at samples of an IMU within a standstill.
 
     How much a standing vehicle trembles, engine on, is learnt from the times when GNSS or odometer say that it stands;
     a sample stands when rate and force tremble no more than there, and nothing says that it moves. Where nothing ever
@@ -54,12 +54,12 @@ def standing(imu: ImuReadings, gnss: GnssSolutions, odometer: OdometerReadings |
     found = ~moves
     for trembles, noise in zip((rate, force), density, strict=True):
         found &= trembles <= _limit(trembles, whole, moves, noise**2 / step * 3.0, step)
-    # Only what has stood for a whole window, and away from its ends.
+    # Only samples that stand for a whole window, and away from its ends.
     return np.asarray(minimum_filter1d(found.astype(np.uint8), size) > 0)
 
 
 def _limit(trembles: Float64, stands: Bool, moves: Bool, noise: float, step_s: float) -> float:
-    """Variance up to which a window may stand."""
+    """Return the largest variance of a standing window."""
     if np.count_nonzero(stands) * step_s < _LEARNING_S:
         return 4.0 * noise
     limit = 3.0 * float(np.quantile(trembles[stands], 0.9))
@@ -69,7 +69,7 @@ def _limit(trembles: Float64, stands: Bool, moves: Bool, noise: float, step_s: f
 
 
 def _trembling(vectors: Float64, size: int) -> Float64:
-    """Variance (n,) within windows of `size`, summed over axes."""
+    """Return the variance (n,) within windows of `size`, summed over axes."""
     centred = vectors - vectors.mean(axis=0)
     mean = uniform_filter1d(centred, size, axis=0)
     square = uniform_filter1d(centred**2, size, axis=0)
@@ -77,7 +77,7 @@ def _trembling(vectors: Float64, size: int) -> Float64:
 
 
 def _speed(epochs: Int64, gnss: GnssSolutions) -> Float64:
-    """GNSS speed (m/s) at epochs, NaN where no solution with a velocity is within a second."""
+    """Return GNSS speed (m/s) at epochs, NaN where no solution with a velocity is within a second."""
     known = np.isfinite(gnss.velocity_ned_m_per_s).all(axis=1)
     at = gnss.epochs_gps_ns[known]
     if at.size < 2:
@@ -90,7 +90,7 @@ def _speed(epochs: Int64, gnss: GnssSolutions) -> Float64:
 
 
 def _counted(epochs: Int64, odometer: OdometerReadings) -> Float64:
-    """Distance (m) that the odometer counted within half a window to both sides, NaN where it has none."""
+    """Return the distance (m) that the odometer counted within half a window on both sides, NaN where it has none."""
     at, distance = odometer_distance(odometer)
     if at.size < 2:
         return np.full(epochs.size, np.nan)
@@ -104,7 +104,7 @@ def _counted(epochs: Int64, odometer: OdometerReadings) -> Float64:
 
 
 def odometer_distance(odometer: OdometerReadings) -> tuple[Int64, Float64]:
-    """Epochs (k,) and distance (k,) of an odometer that states a distance or a speed; damaged records left out."""
+    """Epochs (k,) and distance (k,) of an odometer that states a distance or a speed, without damaged records."""
     if np.isfinite(odometer.distance_m).any():
         sound = np.isfinite(odometer.distance_m)
         return odometer.epochs_gps_ns[sound], odometer.distance_m[sound]

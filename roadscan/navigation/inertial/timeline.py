@@ -1,4 +1,4 @@
-"""The order of a solution: steps of the mechanisation, and nodes at which covariances and updates are worked out."""
+"""The timeline of a solution: steps of the mechanisation, and nodes at which covariances and updates are computed."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-_REPORT_NS = 1_000_000_000
-_ODOMETER_GAP_NS = 500_000_000
+_REPORT_NS = 1_000_000_000  # Interval of reported states.
+_ODOMETER_GAP_NS = 500_000_000  # Longest gap over which the odometer's distance is used.
 _SHORTEST_NS = 20_000_000
-"""Intervals shorter than this carry no constraint: their end's one does."""
+"""Shorter intervals get no constraint; the next interval does."""
 
 
 @dataclass(frozen=True)
@@ -38,17 +38,17 @@ class Timeline:
 
     @property
     def node_epochs(self) -> Int64:
-        """(k,)."""
+        """(k,) epochs of the nodes."""
         return self.bounds[self.nodes.bound]
 
     @property
     def reported(self) -> Int64:
-        """(j,) epochs at which all states are kept."""
+        """(j,) epochs at which all states are stored."""
         return self.node_epochs[self.nodes.report >= 0]
 
     @property
     def most_updates(self) -> int:
-        """No more than these can come."""
+        """Upper bound on the number of updates."""
         nodes = self.nodes
         with_gnss = np.count_nonzero(nodes.gnss >= 0)
         return int(
@@ -67,7 +67,7 @@ def timeline(
     vehicle: VehicleSensors,
     config: SmootherConfig,
 ) -> Timeline:
-    """Lay out the piece between the first and the last IMU sample.
+    """Build the timeline between the first and the last IMU sample of a piece.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def _within(gnss: GnssSolutions, first: int, last: int) -> GnssSolutions:
 
 
 def chosen(gnss: GnssSolutions, rows: Bool) -> GnssSolutions:
-    """Some of the solutions."""
+    """Return some of the solutions."""
     return GnssSolutions(
         gnss.world,
         gnss.epochs_gps_ns[rows],
@@ -106,13 +106,13 @@ def chosen(gnss: GnssSolutions, rows: Bool) -> GnssSolutions:
 
 
 def merged(*epochs: Int64) -> Int64:
-    """Epochs of ascending lists in one, each once."""
+    """Merge epochs of ascending lists, each once."""
     together = np.sort(np.concatenate(epochs), kind="stable")
     return together[np.diff(together, prepend=together[0] - 1) > 0]
 
 
 def _filled(epochs: Int64, config: SmootherConfig) -> Int64:
-    """Epochs with others between them, evenly, where they lie further apart than one and a half constraints."""
+    """Return epochs with evenly spaced others added where they lie more than one and a half constraints apart."""
     interval = 1e9 / config.constraints_per_s
     gaps = np.diff(epochs)
     parts = np.where(gaps > 1.5 * interval, np.ceil(gaps / interval), 1).astype(np.int64)
@@ -180,7 +180,7 @@ def _nodes(
 
 
 def _whole(samples: Int64, still: Bool, epochs: Int64) -> Bool:
-    """True (k,) where all samples of the interval before a node are standing ones."""
+    """Return True (k,) where all samples of the interval before a node are standing ones."""
     total = np.append(0, np.cumsum(~still))
     at = np.searchsorted(samples, epochs, side="right")
     before = np.append(at[:1], at[:-1])
@@ -189,7 +189,7 @@ def _whole(samples: Int64, still: Bool, epochs: Int64) -> Bool:
 
 
 def _travel(odometer: OdometerReadings | None, epochs: Int64) -> Float64:
-    """Distance (m) counted over the interval before each node (k,), NaN where the odometer was silent."""
+    """Return the distance (m) counted over the interval before each node (k,), NaN where the odometer was silent."""
     unknown = np.full(epochs.size, np.nan)
     if odometer is None:
         return unknown
@@ -206,7 +206,7 @@ def _travel(odometer: OdometerReadings | None, epochs: Int64) -> Float64:
 
 
 def _reports(epochs: Int64) -> Int64:
-    """Row of the reported states for the first node of each second and the last node, −1 for all others."""
+    """Return the row of the reported states for the first node of each second and the last node, −1 for others."""
     slots = epochs // _REPORT_NS
     first = np.diff(slots, prepend=slots[0] - 1) > 0
     first[-1] = True

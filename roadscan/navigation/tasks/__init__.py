@@ -1,1 +1,1 @@
-"""Trajectories and clocks that are computed from logs, their records and pictures."""
+"""Tasks that compute trajectories and clocks from logs, and their records and pictures."""

@@ -1,4 +1,4 @@
-"""The tables ``clocks`` and ``clock_residuals``: what is known of the clocks of sensors."""
+"""The tables ``clocks`` and ``clock_residuals``, which contain the estimated clocks of sensors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ClockEstimate:
     """'epochs' or 'ingest', as in ``schemas/clocks.toml``."""
     correction: ClockCorrection
     residuals: Residuals | None
-    """None for a sensor that shares the clock of another."""
+    """Residuals; None for a sensor that shares the clock of another."""
     used: int
     refused: int
     rms_s: float
@@ -34,17 +34,17 @@ class ClockEstimate:
 
 
 def clock_unit(run: str, sensor: str, applied: str) -> str:
-    """Name of the picture of a clock's residuals, without its ending."""
+    """Return the name of the picture of a clock's residuals, without suffix."""
     return f"{run}_{sensor}{'_pairs' if applied == 'ingest' else ''}"
 
 
 def clock_picture_path(unit: str) -> str:
-    """Where it lies, relative to the survey's root."""
+    """Return its path, relative to the survey's root."""
     return f"products/clocks/{unit}.png"
 
 
 def load_clocks(store: Store) -> dict[tuple[str, str], ClockCorrection]:
-    """Corrections of ingested epochs by run ('*' for all) and sensor; none where nothing was estimated."""
+    """Read corrections of ingested epochs by run ('*' for all) and sensor; empty where nothing was estimated."""
     return {
         (e.run, e.sensor): e.correction
         for e in kept_estimates(store, with_residuals=False)
@@ -53,7 +53,7 @@ def load_clocks(store: Store) -> dict[tuple[str, str], ClockCorrection]:
 
 
 def kept_estimates(store: Store, *, with_residuals: bool = True) -> list[ClockEstimate]:
-    """What the tables hold."""
+    """Read the estimates of the tables."""
     rows = _read(store, "clocks")
     left = _read(store, "clock_residuals") if with_residuals else []
     return [
@@ -104,7 +104,7 @@ def _read(store: Store, name: str) -> list[dict[str, Any]]:
 
 
 def set_damaged_clocks_aside(store: Store) -> list[str]:
-    """Move tables that cannot be read out of the way, so that the clocks are estimated anew; returns what was done."""
+    """Move unreadable tables aside, so that the clocks are estimated again; return what was done."""
     done: list[str] = []
     for name in ("clocks", "clock_residuals"):
         try:
@@ -116,7 +116,7 @@ def set_damaged_clocks_aside(store: Store) -> list[str]:
 
 
 def keep_estimates(store: Store, estimates: Sequence[ClockEstimate]) -> None:
-    """Replace both tables: the residuals first, so that no clock is seen without its own."""
+    """Replace both tables: residuals first, so that no clock is visible without its residuals."""
     residuals = [
         {
             "run": e.run,

@@ -1,4 +1,4 @@
-"""Clocks of sensors: estimate them, keep them in the tables ``clocks`` and ``clock_residuals``, load them."""
+"""Estimates clocks of sensors, stores them in the tables ``clocks`` and ``clock_residuals``, and loads them."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ from roadscan.store.store import Store
 __all__ = ["ClockEstimate", "estimate_clocks", "load_clocks"]
 
 _POSES: Final = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz"]
-_MAX_GAP_S: Final = 1.0
+_MAX_GAP_S: Final = 1.0  # Poses farther apart are not interpolated.
 
 Report = Callable[[str], None]
 
@@ -65,7 +65,7 @@ def estimate_clocks(
     before_navigation: bool = False,
     logs: Logs | None = None,
 ) -> list[ClockEstimate]:
-    """Estimate the clocks that the survey file asks for, and keep them; what did not change is not estimated again.
+    """Estimate the clocks that the survey file requests, and store them; unchanged ones are not estimated again.
 
     Clocks from motion (``[[clocks]]``) become corrections of ingested epochs. Pairs of stamps in a log's `clock` were
     applied when it was ingested; they are listed with their residuals. A picture of the residuals lies in
@@ -129,19 +129,19 @@ class _Task:
 
     run: str
     sensors: tuple[str, ...]
-    """The sensor, then those that share its clock."""
+    """The sensor, followed by those that share its clock."""
     applied: str
     key: str
     solve: Callable[[Store, Report], list[ClockEstimate]]
 
     @property
     def unit(self) -> str:
-        """Of its picture's record: the name of the file without its ending."""
+        """Name of its picture's record: the file's name without suffix."""
         return clock_unit(self.run, self.sensors[0], self.applied)
 
 
 def _pair_tasks(survey: Survey, records: Sequence[LogRecord]) -> Iterator[_Task]:
-    """Logs whose clock comes from pairs of stamps, one a run and sensor."""
+    """Return logs whose clock comes from pairs of stamps, one for each run and sensor."""
     code = code_digest("roadscan.navigation.tasks.clocks:_of_pairs")
     seen: set[tuple[str, str]] = set()
     for run in survey.config.runs:
@@ -151,7 +151,7 @@ def _pair_tasks(survey: Survey, records: Sequence[LogRecord]) -> Iterator[_Task]
                 continue
             sensor = log.sensor or next((r.sensor for r in records if r.path == str(log.path)), "trajectory")
             if (run.id, sensor) in seen:
-                continue  # further logs of a sensor share its row: the first is listed
+                continue  # further logs of a sensor share its row
             seen.add((run.id, sensor))
             key = key_of("pairs", code, run.id, sensor, log.clock.model_dump(mode="json"), found.fit)
 
@@ -185,7 +185,7 @@ def _of_pairs(survey: Survey, report: Report, run: str, sensor: str, log: LogCon
 def _motion_tasks(
     survey: Survey, store: Store, records: Sequence[LogRecord], before_navigation: bool
 ) -> Iterator[_Task]:
-    """Clocks from motion, one a run; runs without the sensor's log have none."""
+    """Return clocks from motion, one for each run with the sensor's log."""
     runs = [run.id for run in survey.config.runs]
     for evidence in survey.config.clocks:
         _check(survey, evidence, runs)
@@ -213,13 +213,13 @@ def _motion_tasks(
 
 
 def check_clocks(survey: Survey) -> None:
-    """Raise :class:`ConfigError` where ``[[clocks]]`` names what rig or survey file do not know; reads no log."""
+    """Raise :class:`ConfigError` where ``[[clocks]]`` names a sensor or run that does not exist; reads no log."""
     for evidence in survey.config.clocks:
         _check(survey, evidence, [run.id for run in survey.config.runs])
 
 
 def _check(survey: Survey, evidence: MotionEvidence, runs: Sequence[str]) -> None:
-    """Refuse names that the rig and the survey file do not know."""
+    """Reject names that the rig or the survey file does not contain."""
     sensors = survey.rig.sensors
     for name in (evidence.sensor, *evidence.also, *([] if evidence.against == "trajectory" else [evidence.against])):
         if name not in sensors:
@@ -243,7 +243,7 @@ def _check(survey: Survey, evidence: MotionEvidence, runs: Sequence[str]) -> Non
 
 
 def _against(store: Store, records: Sequence[LogRecord], run: str, evidence: MotionEvidence) -> tuple[LogRecord, ...]:
-    """Logs that hold the same motion on GPS time: a trajectory, stated or computed, or those of an IMU."""
+    """Return logs with the same motion on GPS time: a trajectory, recorded or computed, or those of an IMU."""
     if evidence.against == "trajectory":
         found = [r for r in records if r.run == run and r.tables.get("trajectory")]
         found = found or [r for r in read_log_records(store) if (r.run, r.sensor) == (run, NAVIGATION)]
@@ -263,7 +263,7 @@ def _against(store: Store, records: Sequence[LogRecord], run: str, evidence: Mot
 def _check_independence(
     evidence: MotionEvidence, run: str, felt: Sequence[LogRecord], against: Sequence[LogRecord]
 ) -> None:
-    """Refuse a computed trajectory that has the sensor's own clock in it."""
+    """Reject a computed trajectory that depends on the sensor's clock itself."""
     own = {r.key for r in felt}
     if any(own & set(r.attributes.get("logs", ())) for r in against):
         raise ConfigError(
@@ -276,7 +276,7 @@ def _check_independence(
 
 @dataclass(frozen=True)
 class _MotionTask:
-    """The clock of one sensor in one run, from motion."""
+    """The estimation of one sensor's clock in one run from motion."""
 
     survey: Survey
     run: str
@@ -286,7 +286,7 @@ class _MotionTask:
     key: str
 
     def solve(self, store: Store, _report: Report) -> list[ClockEstimate]:
-        """Load, estimate."""
+        """Load the logs and estimate the clock."""
         e = self.evidence
         felt, motion = self._signals(store)
         what = f"run '{self.run}', sensor '{e.sensor}'"
@@ -298,7 +298,7 @@ class _MotionTask:
         return [first, *shared]
 
     def _signals(self, store: Store) -> tuple[Felt, Motion]:
-        """What was felt, and what should have been."""
+        """Return measured and expected motion."""
         if self.survey.rig.sensors[self.evidence.sensor].kind == "encoder":
             odometer = odometer_readings(store, self.felt, self.survey.rig.sensors[self.evidence.sensor])
             if odometer is None:
@@ -313,13 +313,13 @@ class _MotionTask:
 
 
 def _counts_down(odometer: OdometerReadings) -> bool:
-    """True where a counter has fallen, or a speed was negative: it knows backwards."""
+    """Return True where a counter has fallen, or a speed was negative: it has a direction."""
     distance, speed = odometer.distance_m, odometer.speed_m_per_s
     return bool((distance[1:] < distance[:-1]).any() or (speed < 0.0).any())
 
 
 def _poses(store: Store, records: Sequence[LogRecord]) -> Trajectory:
-    """Poses as they were recorded: an adjustment's corrections do not move clocks."""
+    """Return poses as recorded: an adjustment's corrections do not change clocks."""
     files = [f for r in records for f in r.tables["trajectory"]]
     rows = pa.concat_tables([read_groups(store, f.path, range(len(f.group_rows)), _POSES) for f in files])
     column = {name: rows.column(name).to_numpy() for name in _POSES}
@@ -358,7 +358,7 @@ def _draw(survey: Survey, store: Store, manifest: Manifest, task: _Task, estimat
 
 
 def _line(estimate: ClockEstimate) -> str:
-    """One line for whoever watches."""
+    """Return one line of progress."""
     c = estimate.correction
     left = f", {estimate.refused} left out" if estimate.refused else ""
     return (

@@ -16,17 +16,17 @@ Float64 = npt.NDArray[np.float64]
 Rows = tuple[str, pa.RecordBatch]
 
 
-_ROWS: Final = 1 << 18
+_ROWS: Final = 1 << 18  # Rows that are written at a time.
 
 
 @dataclass(frozen=True)
 class Computed:
-    """What came of computing a trajectory."""
+    """A computed trajectory."""
 
     rows: Iterator[Rows]
     """Tables and rows."""
     attributes: dict[str, Any]
-    """Of its record: the world frame, the logs it was made from, figures."""
+    """Attributes of its record: the world frame, the logs it was computed from, statistics."""
 
 
 class PlannedTrajectory(Protocol):
@@ -38,18 +38,18 @@ class PlannedTrajectory(Protocol):
 
     @property
     def format(self) -> str:
-        """What computes it: `smoother` or `spline`."""
+        """Name of the method: `smoother` or `spline`."""
 
     @property
     def key(self) -> str:
-        """Hash of the logs, settings and code that it is made from."""
+        """Hash of the logs, settings and code that determine it."""
 
     def compute(self, report: Callable[[str], None]) -> Computed:
         """Compute it."""
 
 
 def sigma_figures(sigma_ned_m: Float64) -> dict[str, float]:
-    """Median and largest σ (m) of a trajectory, horizontal and down, for its record; none where nothing states them.
+    """Return median and largest σ (m) of a trajectory, horizontal and down, for its record; empty where not stated.
 
     sigma_ned_m : (n, 3), NaN where unknown.
     """
@@ -69,7 +69,7 @@ def trajectory_rows(
     sigma_ned_m: Float64,
     sigma_rph_rad: Float64,
 ) -> Iterator[Rows]:
-    """Rows of the table ``trajectory``; σ that are NaN become nulls."""
+    """Yield rows of the table ``trajectory``; σ that are NaN become nulls."""
     columns: dict[str, npt.NDArray[Any]] = {"epoch_gps_ns": epochs_gps_ns}
     columns |= {f"{a}_world_m": position_world_m[:, i] for i, a in enumerate("xyz")}
     columns |= {q: quaternion_world_from_body[:, i] for i, q in enumerate(("qw", "qx", "qy", "qz"))}
@@ -79,7 +79,7 @@ def trajectory_rows(
 
 
 def table_rows(table: str, columns: dict[str, npt.NDArray[Any]]) -> Iterator[Rows]:
-    """Rows of a table in pieces; NaN become nulls."""
+    """Yield rows of a table in pieces; NaN become nulls."""
     schema = table_schema(table).arrow()
     for start in range(0, columns["epoch_gps_ns"].size, _ROWS):
         part = slice(start, start + _ROWS)

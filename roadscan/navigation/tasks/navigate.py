@@ -1,6 +1,6 @@
-"""Navigate: the trajectories that a survey's own logs give, beside the logs they came from.
+"""Computes the trajectories of a survey from its logs, and stores them beside these.
 
-A computed trajectory is held like a log of its own (sensor ``navigation``): its key names the logs, the rig, the
+A computed trajectory is stored like a separate log (sensor ``navigation``): its key names the logs, the rig, the
 settings and the code that it was made from, and it is replaced when one of them changes.
 """
 
@@ -23,7 +23,7 @@ from roadscan.store.writer import LogWriter
 
 
 def plan_trajectories(survey: Survey, store: Store, records: Sequence[LogRecord]) -> list[PlannedTrajectory]:
-    """Trajectories that the survey file and its logs ask for, at most one a run.
+    """Return trajectories that the survey file and its logs request, at most one for each run.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def navigate(
 def records_with_trajectories(
     survey: Survey, store: Store, ingested: Sequence[LogRecord] | None = None
 ) -> list[LogRecord]:
-    """Records of the survey file's logs (`ingested`, where they are known) and of the trajectories computed from them.
+    """Records of the survey file's logs (`ingested`, where known) and of the trajectories computed from them.
 
     Raises
     ------
@@ -96,18 +96,18 @@ def records_with_trajectories(
 
 
 def known_keys(survey: Survey, store: Store, logs: Logs | None = None) -> list[str]:
-    """Keys of the survey file's logs that the store holds, and of the trajectories computed from them."""
+    """Return keys of the survey file's logs in the store, and of the trajectories computed from them."""
     planned, _ = plan_logs(survey, store) if logs is None else logs
     keys = [log.key for log in planned if has_log(store, log.key)]
     try:
         solutions = plan_trajectories(survey, store, read_log_records(store, keys, damaged=[]))
-    except (ConfigError, DamagedError):  # the run, and `verify`, say so
+    except (ConfigError, DamagedError):  # the run and `verify` report it
         return keys
     return keys + [p.key for p in solutions if has_log(store, p.key)]
 
 
 def keep_trajectory(store: Store, planned: PlannedTrajectory, report: Callable[[str], None]) -> None:
-    """Compute a trajectory and make it part of the store, in place of an older one of its run."""
+    """Compute a trajectory and store it, in place of an older one of its run."""
     computed = planned.compute(report)
     with store.scratch() as folder:
         writer = LogWriter(folder, None)
@@ -149,7 +149,7 @@ def _figures(record: LogRecord) -> str:
 
 @found_once
 def records_of(session: Session) -> tuple[LogRecord, ...]:
-    """Records of the survey file's logs and of the trajectories computed from them.
+    """Return records of the survey file's logs and of the trajectories computed from them.
 
     Raises
     ------

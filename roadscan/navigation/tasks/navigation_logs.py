@@ -1,4 +1,4 @@
-"""Tables of a run's GNSS, IMU and odometer as the smoother takes them."""
+"""Converts tables of a run's GNSS, IMU and odometer into the smoother's input."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from roadscan.store.store import Store
 Float64 = npt.NDArray[np.float64]
 
 ANTENNA_SIGMA_M = 0.01
-"""1 σ of an antenna's lever arm whose rig file states none: a tape measure."""
+"""1 σ of an antenna's lever arm where the rig file states none: that of a tape measure."""
 
 
 NO_SENSOR = "none"
-"""Stands for a sensor that shall not navigate."""
+"""Stands for no sensor: a kind that is not to be used in navigation."""
 
 
 @dataclass(frozen=True)
 class RunLogs:
-    """Logs of one run that its trajectory is computed from."""
+    """Logs of one run from which its trajectory is computed."""
 
     run: str
     imu: tuple[LogRecord, ...]
@@ -43,7 +43,7 @@ class RunLogs:
 
 
 def chosen(records: Sequence[LogRecord], run: str, table: str, stated: str | None) -> tuple[LogRecord, ...]:
-    """Logs of one sensor of a run with rows in `table`: the stated sensor's, or those of the only one.
+    """Return logs of one sensor of a run with rows in `table`: the stated sensor's, or those of the only one.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def chosen(records: Sequence[LogRecord], run: str, table: str, stated: str | Non
 
 
 def imu_readings(store: Store, records: Sequence[LogRecord]) -> ImuReadings:
-    """Samples of an IMU, in the order the store holds them."""
+    """Return samples of an IMU, in the order of the store."""
     rows = _rows(store, records, "imu")
     return ImuReadings(
         rows["epoch_gps_ns"],
@@ -77,7 +77,7 @@ def imu_readings(store: Store, records: Sequence[LogRecord]) -> ImuReadings:
 
 
 def gnss_solutions(store: Store, records: Sequence[LogRecord]) -> GnssSolutions:
-    """Solutions of a receiver; those without a position are left out.
+    """Return solutions of a receiver; those without a position are left out.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def gnss_solutions(store: Store, records: Sequence[LogRecord]) -> GnssSolutions:
 
 
 def odometer_readings(store: Store, records: Sequence[LogRecord], sensor: Sensor | None) -> OdometerReadings | None:
-    """Distance driven: ticks by the rig's way of a tick, or the log's own distance or speed; wheels are averaged.
+    """Distance driven: ticks times the rig's length of a tick, or the log's distance or speed; wheels averaged.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def odometer_readings(store: Store, records: Sequence[LogRecord], sensor: Sensor
 
 
 def vehicle_sensors(rig: Rig, logs: RunLogs) -> VehicleSensors:
-    """How the sensors of a run's logs sit on the vehicle.
+    """Return the mounting of the sensors of a run's logs.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def _sensor(rig: Rig, record: LogRecord, kind: str) -> Sensor:
 
 
 def _rows(store: Store, records: Sequence[LogRecord], table: str) -> dict[str, npt.NDArray[Any]]:
-    """Columns of all rows, in order of time; nulls of numbers become NaN."""
+    """Return columns of all rows, in order of time; nulls of numbers become NaN."""
     files = [f for record in records for f in record.tables.get(table, ())]
     parts = [read_groups(store, f.path, range(len(f.group_rows))) for f in files]
     rows = pa.concat_tables(parts).sort_by("epoch_gps_ns") if parts else None
@@ -189,7 +189,7 @@ def _rows(store: Store, records: Sequence[LogRecord], table: str) -> dict[str, n
 def _mean_wheel(
     epochs: npt.NDArray[np.int64], wheel: npt.NDArray[Any], distance: Float64, speed: Float64
 ) -> OdometerReadings:
-    """One wheel, or the mean of several at the epochs of the first: the path of the middle between them."""
+    """Return one wheel, or the mean of several at the epochs of the first: the path of the middle between them."""
     names = np.unique(wheel.astype(np.str_))
     wheels = [wheel == name for name in names]
     first = wheels[0]

@@ -1,4 +1,4 @@
-"""The pictures of computed trajectories, drawn from what the store holds of them: nothing is solved for a picture."""
+"""Draws pictures of computed trajectories from the store, without solving again."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _VALUE: Final = ("value", "sigma")
 
 
 def picture_path(run: str) -> str:
-    """Where the picture of a run's trajectory lies, relative to the survey's root."""
+    """Return the path of the picture of a run's trajectory, relative to the survey's root."""
     return f"{_FOLDER}/{run}.png"
 
 
@@ -44,7 +44,7 @@ def draw_trajectories(
     runs: Collection[str],
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Draw the pictures of computed trajectories that are missing, damaged or out of date; remove those of no run.
+    """Draw pictures of computed trajectories that are missing, damaged or stale; remove those without a run.
 
     Without Matplotlib there are none.
 
@@ -84,7 +84,7 @@ def _picture(survey: Survey, store: Store, record: LogRecord, title: str) -> Nav
 
 
 def stored_solution(store: Store, record: LogRecord) -> Solution:
-    """A computed trajectory as its tables hold it.
+    """Return a computed trajectory from its tables.
 
     Covariances are those of their diagonals, velocities differences of positions; attitude and velocity have no
     covariance.
@@ -116,14 +116,14 @@ def stored_solution(store: Store, record: LogRecord) -> Solution:
 
 
 def _columns(store: Store, record: LogRecord, table: str) -> dict[str, npt.NDArray[Any]]:
-    """Columns of a record's rows in a table; none where it has none."""
+    """Return columns of a record's rows in a table; empty where it has none."""
     parts = [read_groups(store, f.path, range(len(f.group_rows))) for f in record.tables.get(table, ())]
     rows = pa.concat_tables(parts) if parts else pa.table({})
     return {name: rows.column(name).to_numpy() for name in rows.column_names}
 
 
 def _states(rows: dict[str, npt.NDArray[Any]]) -> tuple[npt.NDArray[np.int64], dict[str, tuple[Float64, Float64]]]:
-    """Epochs (j,) and states by name, (j,) or (j, axes) with their σ."""
+    """Return epochs (j,) and states by name, (j,) or (j, axes) with their σ."""
     if not rows:
         return np.zeros(0, np.int64), {}
     found: dict[str, tuple[Float64, Float64]] = {}

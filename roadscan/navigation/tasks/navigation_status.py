@@ -1,4 +1,4 @@
-"""What the store holds of computed trajectories, estimated clocks and calibrated mountings, for `roadscan status`."""
+"""Status of computed trajectories, estimated clocks and calibrated mountings, for `roadscan status`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from roadscan.store.store import Store
 
 @dataclass
 class NavigationStatus:
-    """State of what is computed of poses, clocks and mountings; tables that are damaged are left out."""
+    """Status of computed trajectories, clocks and mountings; damaged tables are left out."""
 
     trajectories: list[dict[str, Any]] = field(default_factory=list)
     """A computed trajectory of each run that has or awaits one: run, state, poses, epochs, σ, outliers, doubts,
@@ -38,7 +38,7 @@ class NavigationStatus:
         return all(one["state"] == "computed" for one in self.trajectories)
 
     def lines(self) -> Iterator[str]:
-        """A line for each of them."""
+        """Return a line for each of them."""
         for one in self.trajectories:
             yield f"trajectory of run '{one['run']}': {_trajectory_words(one)}"
         for one in self.clocks:
@@ -66,7 +66,7 @@ COMPUTED_POSES: Final = Witness(
 
 
 def trajectory_findings(records: Iterable[LogRecord]) -> list[Finding]:
-    """Computed trajectories that their own measurements doubt, each doubt by itself."""
+    """Return computed trajectories that their measurements contradict, a finding for each reason."""
     return [
         COMPUTED_POSES.finds(f"trajectory of run '{r.run}'", f"doubtful: {doubt}")
         for r in records
@@ -78,7 +78,7 @@ def trajectory_findings(records: Iterable[LogRecord]) -> list[Finding]:
 def navigation_status(
     survey: Survey, store: Store, logs: Sequence[LogRecord], records: Mapping[str, LogRecord]
 ) -> NavigationStatus:
-    """Look at records and small tables; reads no poses.
+    """Read records and small tables; reads no poses.
 
     Parameters
     ----------
@@ -90,12 +90,12 @@ def navigation_status(
         planned = plan_trajectories(survey, store, logs)
         found.trajectories = [_trajectory(store, one, records.get(one.key)) for one in planned]
     except ConfigError:
-        pass  # the run says so
+        pass  # the run reports it
     try:
         found.clocks = list(_clocks(store))
         found.mountings = list(_mountings(store))
     except DamagedError:
-        pass  # `roadscan verify` says so
+        pass  # `roadscan verify` reports it
     return found
 
 

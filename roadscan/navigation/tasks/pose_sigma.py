@@ -1,4 +1,4 @@
-"""σ of poses, as a run's logs state them: beside the poses, or in an accuracy log of their own."""
+"""σ of poses as stated in a run's logs: beside the poses, or in a separate accuracy log."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SIGMAS: Final = (
 
 
 _STEP_NS: Final = 100_000_000
-"""σ of poses that are closer say the same: they change over seconds."""
+"""Interval at which σ of poses are kept: they change over seconds."""
 
 
 def pose_sigma(
@@ -35,7 +35,7 @@ def pose_sigma(
     epochs: Int64,
     settings: CalibrationSettings,
 ) -> Float64:
-    """1 σ (n, 6) of poses at epochs (n,): north, east, down (m), roll, pitch, heading (rad).
+    """Return 1 σ (n, 6) of poses at epochs (n,): north, east, down (m), roll, pitch, heading (rad).
 
     Where the run's logs state none, that of the settings.
     """
@@ -53,14 +53,14 @@ def pose_sigma(
 def usual_pose_sigma(
     store: Store, records: Sequence[LogRecord], source: TrajectorySource, settings: CalibrationSettings
 ) -> Float64:
-    """1 σ (6,) of a run's poses, the median over the run."""
+    """Return 1 σ (6,) of a run's poses, the median over the run."""
     usual = median_pose_sigma(store, records, source)
     assumed = np.array([*settings.traverse_sigma_m, *settings.traverse_sigma_deg])
     return _in_radians(np.where(np.isnan(usual), assumed, usual))
 
 
 def median_pose_sigma(store: Store, records: Sequence[LogRecord], source: TrajectorySource) -> Float64:
-    """1 σ (6,) of a run's poses as its logs state it, the median over the run (m, degrees); NaN where they do not."""
+    """Return 1 σ (6,) of a run's poses as stated in its logs, the median over the run (m, degrees); NaN where not."""
     usual = np.full(6, np.nan)
     for _, values in _stated(store, records, source):
         for k in range(6):
@@ -72,7 +72,7 @@ def median_pose_sigma(store: Store, records: Sequence[LogRecord], source: Trajec
 def stated_pose_sigma(
     store: Store, records: Sequence[LogRecord], source: TrajectorySource
 ) -> tuple[Int64, Float64]:  # fmt: skip
-    """Epochs (k,) and 1 σ (k, 6) of a run's poses as its logs state it (m, radians), each tenth of a second at most.
+    """Return epochs (k,) and 1 σ (k, 6; m, radians) of a run's poses as stated, at most one each tenth of a second.
 
     Of each component those of the poses themselves, else those of an accuracy log; NaN of components that neither
     states. What is not above 0 is no σ.
@@ -94,7 +94,7 @@ def stated_pose_sigma(
 
 
 def _thinned(epochs_gps_ns: Int64, sigma: Float64) -> tuple[Int64, Float64]:
-    """The largest σ of each tenth of a second, at its own epoch."""
+    """Return the largest σ of each tenth of a second, with its epoch."""
     steps, of_row = np.unique(epochs_gps_ns // _STEP_NS, return_inverse=True)
     order = np.lexsort((epochs_gps_ns, -sigma, of_row))
     first = order[np.searchsorted(of_row[order], np.arange(steps.size))]
@@ -102,7 +102,7 @@ def _thinned(epochs_gps_ns: Int64, sigma: Float64) -> tuple[Int64, Float64]:
 
 
 def _stated(store: Store, records: Sequence[LogRecord], source: TrajectorySource) -> list[tuple[Int64, Float64]]:
-    """Epochs and σ (n, 6; m and degrees) of the poses themselves, then of the run's accuracy logs."""
+    """Yield epochs and σ (n, 6; m and degrees) of the poses themselves, then of the run's accuracy logs."""
     accuracy = [f for r in records if r.run == source.run for f in r.tables.get("trajectory_accuracy", ())]
     found: list[tuple[Int64, Float64]] = []
     for files in (source.files, accuracy):
@@ -115,7 +115,7 @@ def _stated(store: Store, records: Sequence[LogRecord], source: TrajectorySource
 
 
 def _in_radians(sigma: Float64) -> Float64:
-    """σ of m and degrees as m and radians; none is smaller than what makes the estimate regular."""
+    """Convert σ of m and degrees to m and radians; none is smaller than what makes the estimate regular."""
     out = np.asarray(sigma, dtype=np.float64).copy()
     out[..., 3:] = np.radians(out[..., 3:])
     return out

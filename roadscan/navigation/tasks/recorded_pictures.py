@@ -1,4 +1,4 @@
-"""Pictures that no stage of tiles makes: of navigation, clocks and calibration. Recorded like all other outputs.
+"""Records of pictures of navigation, clocks and calibration, like those of all other outputs.
 
 Each has a record in the manifest with its digest and a key of what it shows, so that `roadscan verify` sees damage and
 the next run draws what is missing, damaged or out of date, and nothing else.
@@ -25,7 +25,7 @@ _DRAWN_BY: Final = ("roadscan.calibrate.picture", "roadscan.navigation.clocks.pi
 
 
 def picture_key(*shown: object) -> str:
-    """Key of a picture: hash of what it shows and of the code that draws it."""
+    """Return the key of a picture: hash of its content and of the code that draws it."""
     return key_of(code_digest(*_DRAWN_BY), *shown)
 
 
@@ -55,5 +55,5 @@ def keep_file(
 
 
 def remove_others(manifest: Manifest, product: str, units: Collection[str]) -> None:
-    """Remove the files of all units of a product but these."""
+    """Remove the files of all units of a product except these."""
     manifest.remove(manifest.beside([product], units))

@@ -1,4 +1,4 @@
-"""The trajectory of a run from its GNSS, IMU and odometer: load, check, smooth, hand over the rows."""
+"""Computes the trajectory of a run from its GNSS, IMU and odometer: load, check, smooth, yield rows."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SMOOTHER: Final = "smoother"
 
 @dataclass(frozen=True)
 class PlannedSolution:
-    """A trajectory to compute from a run's own sensors."""
+    """A trajectory to compute from a run's sensors."""
 
     survey: Survey
     store: Store
@@ -53,7 +53,7 @@ class PlannedSolution:
         return self.logs.run
 
     def compute(self, report: Callable[[str], None]) -> Computed:
-        """Smooth what the logs hold.
+        """Smooth the logs.
 
         Raises
         ------
@@ -94,7 +94,7 @@ class PlannedSolution:
 
 
 def plan_solutions(survey: Survey, store: Store, records: Sequence[LogRecord]) -> list[PlannedSolution]:
-    """Trajectories that the survey's logs ask for.
+    """Return trajectories that the survey's logs request.
 
     Raises
     ------
@@ -129,14 +129,14 @@ def plan_solutions(survey: Survey, store: Store, records: Sequence[LogRecord]) -
 
 
 def on_time(readings: Any, clock: ClockCorrection | None) -> Any:
-    """Readings with their clock's estimated correction applied."""
+    """Return readings with their clock's estimated correction applied."""
     if readings is None or clock is None:
         return readings
     return type(readings)(**{**readings.__dict__, "epochs_gps_ns": clock.applied(readings.epochs_gps_ns)})
 
 
 def _batches(solution: Solution) -> Iterator[Rows]:
-    """Rows of the solution's tables."""
+    """Yield rows of the solution's tables."""
     sigma_ned = np.sqrt(np.einsum("nii->ni", solution.covariance_position_ned_m2))
     yield from trajectory_rows(
         solution.epochs_gps_ns,
@@ -175,7 +175,7 @@ def _innovation_columns(found: Innovations) -> dict[str, npt.NDArray[Any]]:
 
 
 def _summary(solution: Solution, gnss: GnssSolutions) -> dict[str, Any]:
-    """Figures of a solution for its record and for whoever looks at the run."""
+    """Return statistics of a solution for its record."""
     sigma = np.sqrt(np.einsum("nii->ni", solution.covariance_position_ned_m2))
     found = solution.innovations
     figures: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""The trajectory log of a run, smoothed by cubics where GNSS dropped out."""
+"""Smooths the trajectory log of a run by cubics in GNSS outages."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PlannedSpline:
     format: str = SPLINE
 
     def compute(self, report: Callable[[str], None]) -> Computed:
-        """Smooth what the logs hold.
+        """Smooth the logs.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class PlannedSpline:
         return Computed(rows, attributes)
 
     def _load(self, world: str) -> tuple[Trajectory, Float64]:
-        """Poses of all logs, and σ (n, 3) of roll, pitch, heading (degrees)."""
+        """Return poses of all logs, and σ (n, 3) of roll, pitch, heading (degrees)."""
         files = [f for r in self.records for f in r.tables["trajectory"]]
         parts = [
             read_groups(self.store, f.path, range(len(f.group_rows)), [*_POSE, *_SIGMA, *_ANGLE_SIGMA]) for f in files
@@ -99,7 +99,7 @@ class PlannedSpline:
 def plan_splines(
     survey: Survey, store: Store, records: Sequence[LogRecord], runs: Sequence[str]
 ) -> list[PlannedSpline]:
-    """Trajectory logs of `runs` that the survey file wants smoothed."""
+    """Return trajectory logs of `runs` for which the survey file requests smoothing."""
     config = survey.config.navigation
     if not config.spline.on:
         return []
@@ -117,6 +117,6 @@ def plan_splines(
 
 
 def _at(epochs: npt.NDArray[np.int64], knots: npt.NDArray[np.int64], values: Float64) -> Float64:
-    """Values (k, 3) at knots (k,), linear between them, at epochs (n,)."""
+    """Return values (k, 3) at knots (k,), interpolated linearly at epochs (n,)."""
     since, at = (epochs - knots[0]).astype(np.float64), (knots - knots[0]).astype(np.float64)
     return np.stack([np.interp(since, at, values[:, a]) for a in range(values.shape[1])], axis=-1)

@@ -1,4 +1,4 @@
-"""Pictures of cameras as the tables list them: when each was taken, and where its file lies."""
+"""Pictures of cameras as listed in the tables: epoch and file of each."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ class TakenPictures:
 
     record: LogRecord
     epochs_gps_ns: npt.NDArray[np.int64]
-    """(n,) as the camera's clock was found."""
+    """(n,) epochs with the camera's clock corrected."""
     files: tuple[str, ...]
-    """(n,) relative to the log's folder; of a video's frames its name."""
+    """(n,) path relative to the log's folder; for frames of a video its name."""
     size_px: npt.NDArray[np.int64]
-    """(n, 2) width and height, 0 where not known."""
+    """(n, 2) width and height, 0 where unknown."""
 
 
 def taken_pictures(store: Store, records: Sequence[LogRecord], sensor: str) -> list[TakenPictures]:
-    """Pictures of a camera, log by log."""
+    """Yield pictures of a camera, log by log."""
     clocks = load_clocks(store)
     found = []
     for record in records:

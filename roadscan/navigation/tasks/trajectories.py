@@ -1,4 +1,4 @@
-"""Trajectories of runs and their corrections, as the store holds them."""
+"""Loads trajectories of runs and their corrections from the store."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _POSE_COLUMNS = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m", "qw", "q
 
 @dataclass(frozen=True)
 class TrajectorySource:
-    """Where the poses of a run lie."""
+    """Location of the poses of a run."""
 
     run: str
     world: str
@@ -40,9 +40,9 @@ class TrajectorySource:
 def load_trajectory(
     store: Store, source: TrajectorySource, spans: Sequence[tuple[int, int]], max_gap_s: float
 ) -> Trajectory:
-    """Poses of a run around spans of time, corrected.
+    """Load poses of a run around spans of time, with corrections.
 
-    As much is read beyond each span as interpolation looks at, so poses do not depend on what was asked for.
+    Poses beyond each span are read as far as interpolation uses them, so the result does not depend on the spans.
     """
     return load_recorded(store, source, spans, max_gap_s).corrected(load_corrections(store, source.run))
 
@@ -50,7 +50,7 @@ def load_trajectory(
 def load_recorded(
     store: Store, source: TrajectorySource, spans: Sequence[tuple[int, int]], max_gap_s: float
 ) -> Trajectory:
-    """The same as they were recorded."""
+    """Load the same poses as recorded."""
     pad = round(STENCIL_KNOTS * max_gap_s * NS_PER_S)
     wanted = np.array(spans, dtype=np.int64).reshape(-1, 2) + np.array([-pad, pad])
     parts: list[pa.Table] = []
@@ -78,13 +78,13 @@ def load_recorded(
 
 
 def load_corrections(store: Store, run: str) -> Corrections | None:
-    """Corrections of a run's trajectory, None where no adjustment wrote any."""
+    """Load corrections of a run's trajectory, None where no adjustment wrote any."""
     rows = read_small(store, "corrections")
     return None if rows is None else _corrections(rows, run)
 
 
 def load_all_corrections(store: Store) -> dict[str, Corrections]:
-    """Corrections of the trajectories of all runs that have any."""
+    """Load corrections of the trajectories of all runs that have any."""
     rows = read_small(store, "corrections")
     runs = [] if rows is None else sorted(pc.unique(rows.column("run")).to_pylist())
     return {run: found for run in runs if (found := _corrections(rows, run)) is not None}
@@ -103,7 +103,7 @@ def _corrections(rows: pa.Table, run: str) -> Corrections | None:
 
 
 def _sigma(rows: pa.Table) -> npt.NDArray[np.float64] | None:
-    """1 σ (k, 6) of corrected poses; None in tables that state none."""
+    """Return 1 σ (k, 6) of corrected poses; None in tables that state none."""
     if any(name not in rows.column_names for name in CORRECTION_SIGMAS):
         return None
     return np.stack([pc.fill_null(rows.column(c), np.nan).to_numpy() for c in CORRECTION_SIGMAS], axis=-1)

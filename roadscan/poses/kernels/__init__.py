@@ -1,1 +1,1 @@
-"""Loops of navigation: poses at any epoch."""
+"""Kernels that interpolate poses."""

@@ -28,11 +28,11 @@ ROTATION = slice(12, 21)
 """d1, d2, d3 of the rotation vector's x, then y, then z."""
 QUATERNION = slice(21, 25)
 """w, x, y, z of the attitude at the interval's start (world from body)."""
-COEFFICIENTS = 25
+COEFFICIENTS = 25  # Length of a row of coefficients: 12 of position, 9 of rotation, 4 of the quaternion.
 
 
 class PoseIntervals(NamedTuple):
-    """A trajectory: intervals between knots, of which poses are interpolated."""
+    """A trajectory as intervals between knots, in which poses are interpolated."""
 
     knots: npt.NDArray[np.int64]
     """(n,) GPS ns, strictly ascending."""
@@ -44,7 +44,7 @@ class PoseIntervals(NamedTuple):
 
 @inlined
 def rotation_vector(w, x, y, z):
-    """Logarithm of a unit quaternion: the rotation vector (rad), the shorter way round."""
+    """Return the logarithm of a unit quaternion: the rotation vector (rad) of the shorter way round."""
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
     sine = math.sqrt(x * x + y * y + z * z)
@@ -54,7 +54,7 @@ def rotation_vector(w, x, y, z):
 
 @inlined
 def relative(a, b):
-    """Quaternion conj(a) ⊗ b: attitude b seen from attitude a."""
+    """Return the quaternion conj(a) ⊗ b: attitude b relative to attitude a."""
     return (
         a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3],
         a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2],
@@ -92,7 +92,7 @@ def slope_weights(times, at, weights):
 
 @kernel
 def interval_coefficients(epochs, positions, quaternions, max_gap_ns, coefficients, valid):
-    """Coefficients of every interval between knots.
+    """Compute the coefficients of every interval between knots.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def _interval(dt, k, positions, quaternions, velocity, rate, out):
 
 @inlined
 def find_interval(epoch, epochs, k):
-    """Interval that holds `epoch`, searched from interval `k` on; −1 outside the knots.
+    """Return the interval that contains `epoch`, searched from interval `k` on; −1 outside the knots.
 
     An interval holds its first knot, the last one both of its knots, whatever `k` is.
     """
@@ -198,12 +198,12 @@ def find_interval(epoch, epochs, k):
     return found
 
 
-NO_INTERVAL = (0.0,) * COEFFICIENTS
+NO_INTERVAL = (0.0,) * COEFFICIENTS  # The interval that a loop starts from before it has found one.
 
 
 @inlined
 def interval(coefficients, k):
-    """Coefficients of interval `k` as a tuple.
+    """Return the coefficients of interval `k` as a tuple.
 
     Loops keep the tuple of the current interval: handing an array to a function costs two atomic
     operations for its reference count, more than the arithmetic of a reading.
@@ -218,7 +218,7 @@ def interval(coefficients, k):
 
 @inlined
 def attitude_at(c, u):
-    """World-from-body matrix, row by row, at part `u` of an interval with coefficients `c`, a tuple."""
+    """Return the world-from-body matrix, row by row, at fraction `u` of an interval with coefficients `c` (a tuple)."""
     vx = u * (c[12] + u * (c[13] + u * c[14]))
     vy = u * (c[15] + u * (c[16] + u * c[17]))
     vz = u * (c[18] + u * (c[19] + u * c[20]))
@@ -244,7 +244,7 @@ def attitude_at(c, u):
 
 @inlined
 def position_at(c, u):
-    """World position (m) at part `u` of an interval with coefficients `c`, a tuple."""
+    """Return the world position (m) at fraction `u` of an interval with coefficients `c` (a tuple)."""
     return (
         c[0] + u * (c[1] + u * (c[2] + u * c[3])),
         c[4] + u * (c[5] + u * (c[6] + u * c[7])),
@@ -254,7 +254,7 @@ def position_at(c, u):
 
 @kernel
 def interpolate(queries, poses, positions, rotations, found):
-    """Write the poses at many epochs.
+    """Interpolate the poses at many epochs.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Readings counted into cells, the cells' statistics, and what is made of cells."""
+"""Kernels that count readings into cells, compute the cells' statistics, and reduce cells."""

@@ -1,9 +1,9 @@
-"""Readings counted into cells in one pass: each reading's height is kept until its tile is finished, nothing else.
+"""Counts readings into cells in one pass, keeping only each reading's height until its tile is finished.
 
-What is kept, and where, depends on the order of the readings only until it is sorted (``cells.cell_statistics``).
+The order of the readings affects the layout in memory, but not the statistics (``tiles.kernels.cell_statistics``).
 
-Neighbouring readings of a profile mostly lie in one cell, so readings are counted in *streaks*: what has to be looked
-up is looked up once a streak, and the heights of a streak are stored as one vector.
+Neighbouring readings of a profile mostly lie in one cell, so readings are counted in *streaks*: the cell is looked up
+once per streak, and the heights of a streak are stored as one vector.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from roadscan.tiles.kernels.pool import header_of_pass, longer_chain, new_group,
 from roadscan.tiles.kernels.selection import bounds_of
 
 NOWHERE = -(1 << 30)
-"""Column of a reading that is not to be counted: outside every tile."""
+"""Column of a reading that does not count: outside every tile."""
 AHEAD = 12
-"""Streaks whose slots are fetched before their turn comes."""
+"""Number of streaks whose slots are prefetched."""
 PIECE = 1024
-"""Readings worked on together: their working arrays stay in the first cache."""
+"""Readings per pass of the loops: their working arrays fit the first-level cache."""
 
 
 class Heights(NamedTuple):
@@ -55,7 +55,7 @@ class Heights(NamedTuple):
 
 
 class Streaks(NamedTuple):
-    """Streaks of up to n readings in one cell each."""
+    """Up to n streaks, each of readings in one cell."""
 
     starts: npt.NDArray[np.uint32]
     """(n + 1,) first reading of each streak, and the end."""
@@ -70,16 +70,16 @@ class Streaks(NamedTuple):
 
 
 class CountingWork(NamedTuple):
-    """Arrays that readings are worked on in, a piece at a time."""
+    """Working arrays for one piece of readings at a time."""
 
     readings: Heights
     streaks: Streaks
     touched: npt.NDArray[np.uint8]
-    """(a,) 1 for each active tile that got a reading."""
+    """(a,) 1 for each active tile with a reading."""
 
 
 def work_arrays(tiles: int) -> CountingWork:
-    """Arrays to count in, for so many active tiles."""
+    """Return working arrays for so many active tiles."""
     streaks = Streaks(
         starts=np.empty(PIECE + 1, np.uint32),
         sums=np.empty(PIECE + 1, np.uint32),
@@ -93,7 +93,7 @@ def work_arrays(tiles: int) -> CountingWork:
 
 @bare_inner
 def count_slowly(own, heights, intensity, gain, first, end, mark, pool):
-    """Count readings `first` to `end` − 1 into the cell that begins with the slot `own`, one by one."""
+    """Count readings `first` to `end` − 1 one by one into the cell that begins with slot `own`."""
     headers, bases = pool.headers, pool.bases
     for j in range(first, end):
         height = np.int64(heights[j])
@@ -109,7 +109,7 @@ def count_slowly(own, heights, intensity, gain, first, end, mark, pool):
 
 @bare_inlined
 def slot_of_streak(own, heights, first, end, word, pool):
-    """Slot of the cell that begins with `own` with room for a streak; −1 where its heights are too far apart."""
+    """Return the slot with room for a streak in the cell that begins with `own`; −1 where heights are too far apart."""
     low, high = np.int64(heights[first]), np.int64(heights[first])
     for j in range(first, end):
         low, high = min(low, np.int64(heights[j])), max(high, np.int64(heights[j]))
@@ -121,7 +121,7 @@ def slot_of_streak(own, heights, first, end, word, pool):
 
 @bare_inlined
 def store_streak(heights, first, size, base, slots, slot, used):
-    """Write the heights of a streak behind the `used` ones of the slot that begins at `slot`.
+    """Write the heights of a streak after the `used` ones of the slot that begins at `slot`.
 
     A whole vector is written, not the part of one, which takes AMD's Zen 4 twenty cycles: what lies beyond the streak's
     heights is overwritten by the next streak, or by the header, which is written last.
@@ -135,7 +135,7 @@ def store_streak(heights, first, size, base, slots, slot, used):
 
 @bare_inlined
 def tile_at(x, y, edge, tile_rows):
-    """South-west cell of the tile that holds cell (x, y), and its row in `groups`, −1 where it is not active."""
+    """Return the south-west cell of the tile that contains cell (x, y), and its row in `groups`, −1 where inactive."""
     across, along = x // edge, y // edge
     inside = (along >= 0) & (along < tile_rows.shape[0]) & (across >= 0) & (across < tile_rows.shape[1])
     return across * edge, along * edge, np.int64(tile_rows[along, across]) if inside else np.int64(-1)
@@ -143,7 +143,7 @@ def tile_at(x, y, edge, tile_rows):
 
 @bare_inner
 def find_slots(heights, streaks, count, active, pool, touched):
-    """First slot of each streak's cell, −1 outside the active tiles, into `streaks`. Takes new groups.
+    """Write the first slot of each streak's cell, −1 outside the active tiles, into `streaks`. Takes new groups.
 
     heights : (n,) int32, of the readings; count : uint64, streaks.
     """
@@ -236,7 +236,7 @@ def accumulate(readings, bounds, intensity, gain, number, work, active, pool):
 
 @bare_inlined
 def end_of_pass(passes, start, most):
-    """End of the readings from `start` on of one pass, at most so many."""
+    """Return the end of the readings of one pass from `start` on, at most so many."""
     end, last = start, min(start + most, passes.size)
     while end < last and passes[end] == passes[start]:
         end += 1
@@ -245,7 +245,7 @@ def end_of_pass(passes, start, most):
 
 @bare
 def accumulate_cells(readings, passes, intensity, active, pool, work, fates, first):
-    """Count readings that know their cells, best in the order of cells.
+    """Count readings whose cells are known, best in the order of cells.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ def accumulate_points(x, y, height, passes, intensity, active, pool, work, first
 
 @bare
 def find_cells(x, y, per_cell, column, row):
-    """Cells (≥ n,) int32, out, of points; x, y : (n,) int32, quanta from the tile's south-west corner."""
+    """Write the cells (≥ n,) int32, out, of points; x, y: (n,) int32, quanta from the tile's south-west corner."""
     for j in range(x.size):
         column[j] = np.int32(np.floor((x[j] + 0.5) * per_cell))
         row[j] = np.int32(np.floor((y[j] + 0.5) * per_cell))

@@ -1,4 +1,4 @@
-"""Tiles that readings are counted into, and what is known of readings besides their place."""
+"""The tiles that readings are counted into, and the attributes of readings besides their position."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 
 class ActiveTiles(NamedTuple):
-    """Tiles that are begun and not finished, in a box of tiles; each has a row in the arrays of (a, …)."""
+    """Active tiles in a box of tiles; each has a row in the arrays of (a, …)."""
 
     rows: npt.NDArray[np.int32]
     """(rows, columns) of the box: the row of each tile, −1 for tiles that are not active."""
@@ -20,9 +20,9 @@ class ActiveTiles(NamedTuple):
     edge: int
     """Cells along a tile's edge."""
     groups: npt.NDArray[np.int32]
-    """(a, edge · ⌈edge / 16⌉) element of the pool that each group of sixteen cells has, −1 where it has none."""
+    """(a, edge · ⌈edge / 16⌉) pool element of each group of sixteen cells, −1 where it has none."""
     ends: npt.NDArray[np.int32]
-    """(a, edge) where the next reading of each row's bucket goes (``row_buckets.Buckets``)."""
+    """(a, edge) position for the next reading in each row's bucket (``row_buckets.Buckets``)."""
     spans: npt.NDArray[np.int64]
     """(a, 2) first and last epoch of the readings, GPS ns; in/out."""
     sigmas: npt.NDArray[np.float64]
@@ -30,15 +30,15 @@ class ActiveTiles(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What is known of readings, or of profiles, besides their place."""
+    """Attributes of readings, or of profiles, besides their position."""
 
     epochs: npt.NDArray[np.int64]
-    """(n,) GPS ns at which each was measured."""
+    """(n,) GPS ns of the measurement."""
     passes: npt.NDArray[np.int32]
-    """(n,) number of the pass among the accumulator's, −1 for none."""
+    """(n,) index of the pass among the accumulator's, −1 for none."""
     intensity: npt.NDArray[np.unsignedinteger]
-    """(n,), of profiles (n, m)."""
+    """(n,), for profiles (n, m)."""
     gain: np.uint32
-    """What the intensity is multiplied by; the product takes at most 16 bits."""
+    """Factor on the intensity; the product takes at most 16 bits."""
     interval_sigmas_m: npt.NDArray[np.float64]
     """(intervals of the trajectory, 2) largest horizontal and vertical 1 σ of the poses."""

@@ -1,4 +1,4 @@
-"""Spans of adjacent cells in a row, which loops can take many at a time."""
+"""Runs of adjacent cells in a row, which loops can process many at a time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from roadscan.compute.kernel_options import bare
 
 @bare
 def run_end(column, row, start, end):
-    """First place behind the run that begins at `start`: cells of one row, each beside the one before.
+    """Return the end of the run that begins at `start`: cells of one row, each beside the one before.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Readings with an epoch each, or points of a tile, put into the buckets of their tiles' rows."""
+"""Puts readings with an epoch each, or points of a tile, into the buckets of their tiles' rows."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from roadscan.tiles.kernels.row_buckets import TAKEN, Places, fill_buckets, put_
 
 @inlined
 def places_in_tiles(n, tiles):
-    """Arrays for the cells of n readings, and what is known of so many active tiles."""
+    """Return arrays for the cells of n readings and for the σ of so many active tiles."""
     return Places(np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32), np.full(tiles, -1, np.int32))
 
 
 @inlined
 def part_of(measured, first, end):
-    """Readings `first` to `end` − 1 of :class:`Measured`."""
+    """Return readings `first` to `end` − 1 of :class:`Measured`."""
     return Measured(
         measured.epochs[first:end], measured.passes[first:end], measured.intensity[first:end], measured.gain,
         measured.interval_sigmas_m,
@@ -29,7 +29,7 @@ def part_of(measured, first, end):
 
 @kernel
 def bucket_returns(returns, measured, georeference, active, buckets, fates, first):
-    """Place returns and put those in active tiles into their buckets.
+    """Georeference returns and put those in active tiles into their buckets.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def bucket_returns(returns, measured, georeference, active, buckets, fates, firs
 
 @kernel
 def bucket_mirror(profiles, measured, georeference, active, buckets, fates, first):
-    """Place the readings of a mirror's profiles and put those in active tiles into their buckets.
+    """Georeference the readings of a mirror's profiles and put those in active tiles into their buckets.
 
     Parameters
     ----------

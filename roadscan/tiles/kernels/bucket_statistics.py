@@ -1,7 +1,7 @@
-"""Statistics of a tile's cells from its buckets, equal to the bit with those of ``cells.cell_statistics``.
+"""Computes statistics of a tile's cells from its buckets, bit-identical to ``tiles.kernels.cell_statistics``.
 
-Cells of about as many readings are put side by side, wherever they lie: sixteen of up to 8, of up to 32 and of up to 64
-readings go through ``simd.column_statistics`` together. Fuller ones are taken one by one.
+Cells with similar numbers of readings are grouped wherever they lie: sixteen of up to 8, of up to 32 and of up to 64
+readings go through ``compute.kernels.column_statistics`` together. Fuller ones are processed one by one.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from roadscan.tiles.kernels.row_buckets import (
     size_of,
 )
 
-statistics_of_8, statistics_of_32 = statistics_of(8), statistics_of(32)
+statistics_of_8, statistics_of_32 = statistics_of(8), statistics_of(32)  # Of up to 8 and up to 32 readings a cell.
 
 SHORT, MEDIUM, LONG = 8, 32, 64
-"""Readings of the fullest cells that are taken side by side, by table."""
+"""Most readings of a cell in each of the tables for sixteen cells."""
 WORD = 64
-"""Passes that a word of marks names."""
+"""Passes in a word of marks."""
 COUNT_SHIFT = np.int64(40)
-"""A cell's readings and the sum of their intensities are one number, the intensities in so many bits …"""
+"""Number of bits of a cell's sum of intensities, above which the same number has the count of readings …"""
 MOST = 1 << 23
-"""… which does for rows of fewer readings."""
-_LIGHTS = np.int64((1 << 40) - 1)
-_NUMBERS = 4
+"""… which suffices for rows of fewer readings."""
+_LIGHTS = np.int64((1 << 40) - 1)  # Mask of the sum of intensities.
+_NUMBERS = 4  # Rows of numbers of a table.
 _COUNT, _LIGHT, _BASE, _TARGET = range(_NUMBERS)
 
 
 def row_arrays(edge: int, passes: int, most: int) -> tuple[Any, ...]:
-    """Arrays that a row of `edge` cells with up to `most` readings of so many passes is worked on in."""
+    """Return working arrays for a row of `edge` cells with up to `most` readings of so many passes."""
     table, own = np.zeros((SHORT + MEDIUM + LONG, LANES), np.int32), np.zeros((3 * _NUMBERS, LANES), np.int32)
     row = (
         np.zeros(edge, np.int64), np.zeros((edge, -(-passes // WORD)), np.uint64), np.empty(edge, np.int32),
@@ -53,7 +53,7 @@ def row_arrays(edge: int, passes: int, most: int) -> tuple[Any, ...]:
 
 @bare_inner
 def mark_row(end, buckets, marks):
-    """Note the passes of a row's cells; marks : (edge, w) uint64, in/out, zeros. See :func:`sort_row`."""
+    """Mark the passes of a row's cells; marks: (edge, w) uint64, in/out, zeros. See :func:`sort_row`."""
     records, before, sizes, owners, _, _ = buckets
     block = last_block(end)
     while block >= 0:
@@ -65,7 +65,7 @@ def mark_row(end, buckets, marks):
 
 @bare_inner
 def sort_row(end, buckets, sums, ends, used, heights):
-    """Heights of a row cell by cell, in the order of the cells; returns how many cells have one.
+    """Sort the heights of a row by cell; return the number of cells that have one.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def sort_row(end, buckets, sums, ends, used, heights):
 
 @bare_inlined
 def put_aside(heights, first, n, light, target, kind, table, own, lane):
-    """Put the n heights of a cell from `first` on into a lane of the part of the table for its kind."""
+    """Put the n heights of a cell from `first` on into a lane of the part of the table for its size."""
     base, at = heights[np.uint64(first)], np.uint64(0 if kind == 0 else (SHORT if kind == 1 else SHORT + MEDIUM))
     numbers = np.uint64(_NUMBERS * kind)
     own[numbers + np.uint64(_COUNT), lane], own[numbers + np.uint64(_LIGHT), lane] = n, np.int32(light)
@@ -115,7 +115,7 @@ def put_aside(heights, first, n, light, target, kind, table, own, lane):
 
 @bare_inner
 def finish_table(kind, table, owns, lanes, floor, quantum_m, out, columns):
-    """Write the statistics of the cells in a part of the table to their places; it is empty then."""
+    """Write the statistics of the cells in a part of the table to their places, and empty it."""
     own = owns[_NUMBERS * kind : _NUMBERS * (kind + 1)]
     for lane in range(lanes[kind], LANES):
         own[_COUNT, lane] = 0
@@ -133,7 +133,7 @@ def finish_table(kind, table, owns, lanes, floor, quantum_m, out, columns):
 
 @bare_inlined
 def write_marked(marks, numbers, written, pass_ids):
-    """Ids of the passes of a cell, ascending; marks : (w,) uint64. Returns the end of what is written."""
+    """Write the ids of a cell's passes, ascending; marks: (w,) uint64. Return the end of what is written."""
     for p in range(numbers.size):
         if (marks[p // WORD] >> np.uint64(p % WORD)) & np.uint64(1):
             pass_ids[written] = numbers[p]
@@ -143,7 +143,7 @@ def write_marked(marks, numbers, written, pass_ids):
 
 @bare
 def finish_buckets(bucket_ends, buckets, floor, quantum_m, numbers, work, columns):
-    """Write the statistics of all cells of a tile that hold a reading; its blocks are given back.
+    """Write the statistics of all cells of a tile with a reading, and free its blocks.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Statistics of the cells of a tile as columns, which kernels write."""
+"""The statistics of a tile's cells as columns, which kernels write."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from roadscan.compute.kernel_options import bare_inlined
 
 
 class CellColumns(NamedTuple):
-    """Room for c cells that hold a reading, in order of row and column, of up to p passes each."""
+    """Columns for c cells with a reading, in order of row and column, of up to p passes each."""
 
     column: npt.NDArray[np.uint16]
     """(c,) in the tile."""
@@ -32,14 +32,14 @@ class CellColumns(NamedTuple):
     intensity_mean: npt.NDArray[np.float32]
     """(c,)"""
     pass_offsets: npt.NDArray[np.int32]
-    """(c + 1,) where the passes of each cell begin, and the end."""
+    """(c + 1,) first pass of each cell, and the end."""
     pass_ids: npt.NDArray[np.uint16]
-    """(c · p,) ids of the passes of each cell, ascending."""
+    """(c · p,) ids of each cell's passes, ascending."""
 
 
 @bare_inlined
 def write_statistics(out, lane, cell, columns):
-    """Write the statistics of a lane of `out`, see ``simd.column_statistics.statistics_of``, as those of a cell."""
+    """Write a lane of `out`, see ``column_statistics.statistics_of``, as the statistics of a cell."""
     columns.height_mean_m[cell], columns.height_robust_m[cell] = out[0, lane], out[1, lane]
     columns.height_min_m[cell], columns.height_max_m[cell] = out[2, lane], out[3, lane]
     columns.height_std_m[cell], columns.intensity_mean[cell] = np.float32(out[4, lane]), np.float32(out[5, lane])

@@ -1,4 +1,4 @@
-"""Sums and medians over a tile's cells, in few passes over them."""
+"""Sums and medians over a tile's cells."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy.typing as npt
 
 from roadscan.compute.kernel_options import kernel
 
-_BINS = 1 << 15
+_BINS = 1 << 15  # Bins of the highest bits of a 32-bit number of 0 and above.
 
 
 @kernel
 def totals(count, intensity, height):
-    """Sums over cells, one after another: points, intensities of the points, heights.
+    """Return sums over cells: points, intensities of the points, heights.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def _within(bits, first, last, found):
 
 
 def median(values: npt.NDArray[np.float32]) -> float:
-    """Median of (n,) float32 of 0 and above, one or more: their bits are in their order, so bins are counted."""
+    """Return the median of (n ≥ 1,) float32 of 0 and above; their bits sort like the numbers, so bins are counted."""
     bits = (values + np.float32(0.0)).view(np.uint32)
     counts = np.zeros(_BINS, np.int64)
     _bins(bits, counts)

@@ -1,4 +1,4 @@
-"""Statistics of a tile's cells from their heights, in whole numbers: equal to the bit whatever the readings' order."""
+"""Statistics of a tile's cells from their heights as integers, to the bit independent of the readings' order."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from roadscan.tiles.kernels.large_cells import select_arrays, statistics_of_full
 from roadscan.tiles.kernels.pool import header_of, release
 
 AHEAD = 2
-"""Groups whose slots are fetched before their turn comes."""
+"""Number of groups whose slots are prefetched."""
 STATISTICS = 6
-"""Mean, robust, lowest and highest height, standard deviation, mean intensity."""
+"""Number of statistics: mean, robust, lowest and highest height, standard deviation, mean intensity."""
 AT_ONCE = 64
-"""Heights a cell of which sixteen cells are worked on together; fuller cells are taken one by one."""
+"""Most heights of a cell for which sixteen cells are processed together; fuller cells are processed singly."""
 
 
 def work_arrays(most: int) -> tuple[Any, ...]:
-    """Arrays that `finish_cells` works in; `most` : heights that a cell may have."""
+    """Return the working arrays of `finish_cells`; `most`: heights that a cell may have."""
     pairs, table = np.zeros((SLOT_HEIGHTS // 2, LANES), np.int32), np.zeros((AT_ONCE, LANES), np.int32)
     rows, out = np.zeros((4, LANES), np.int32), np.zeros((STATISTICS, LANES))
     return pairs, table, *rows, out, np.empty(most, np.int32), select_arrays(most)
@@ -46,7 +46,7 @@ def work_arrays(most: int) -> tuple[Any, ...]:
 
 @bare
 def find_groups(groups, chain, found):
-    """Groups of a tile that have an element, in order, and the largest number of slots that a cell has.
+    """Find the groups of a tile that have an element, in order, and the largest number of slots of a cell.
 
     groups : (g,) int32; found : (g + AHEAD,) int32, out, the numbers of these groups.
 
@@ -75,7 +75,7 @@ def find_groups(groups, chain, found):
 
 @bare_inlined
 def add_chains(first_slot, longer, pool, heights, counts, light, marks):
-    """Heights of the further slots of a group's cells, relative to the base of the cell's first slot.
+    """Add the heights of further slots of a group's cells, relative to the base of the cell's first slot.
 
     longer : uint64, a bit for each cell that has further slots.
     heights : (AT_ONCE, LANES) int32, in/out, as far as it reaches; counts, light, marks : (LANES,) int32, in/out; light
@@ -105,7 +105,7 @@ def add_chains(first_slot, longer, pool, heights, counts, light, marks):
 
 @bare_inner
 def gather_many(first_slot, pool, heights):
-    """All heights (quanta) of a cell → heights, int32. Returns their number and the sum of their intensities."""
+    """Collect all heights (quanta) of a cell as int32; return their number and the sum of their intensities."""
     n, light, slot = 0, np.int64(0), first_slot
     while slot >= 0:
         header = header_of(slot, pool)
@@ -119,7 +119,7 @@ def gather_many(first_slot, pool, heights):
 
 @bare_inlined
 def write_passes(first_slot, marks, numbers, pool, written, pass_ids):
-    """Ids of the passes of a cell, ascending. Returns the end of what is written."""
+    """Write the ids of a cell's passes, ascending. Return the end of what is written."""
     if numbers.size <= PASSES:
         for p in range(numbers.size):
             if (marks >> p) & 1:
@@ -142,7 +142,7 @@ def write_passes(first_slot, marks, numbers, pool, written, pass_ids):
 
 @bare
 def finish_cells(groups, found, taken, edge, pool, floor, quantum_m, numbers, work, columns):
-    """Write the statistics of all cells of a tile that hold a reading; its groups are given back.
+    """Write the statistics of all cells of a tile with a reading, and free its groups.
 
     Parameters
     ----------

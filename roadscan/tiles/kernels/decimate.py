@@ -1,4 +1,4 @@
-"""One point a square of cells, without what lies on the pavement or gapes in it. Whole micrometres throughout.
+"""Reduces cells to one point per square, without stones on the pavement and cracks in it, in whole micrometres.
 
 Places without a cell hold `ABSENT`, above every height, so that loops run over whole squares and need no branch.
 """
@@ -16,15 +16,15 @@ from roadscan.compute.kernels.copies import copy_values
 from roadscan.tiles.kernels.adjacent_cells import run_end
 
 ABSENT = np.int32(2**31 - 1)
-"""Height of a place without a cell."""
+"""Height of a position without a cell."""
 FARTHEST_UM = 2.0**28
 """Heights are cut off here, 268 m above and below the base, so that no difference overflows."""
 LIGHT_STEPS = 64.0
-"""Intensities are summed in sixty-fourths of a digital number."""
+"""Intensities are summed in units of 1/64 of a digital number."""
 
 
 class Cells(NamedTuple):
-    """Cells of a tile that hold a reading, sorted by row and column."""
+    """Cells of a tile with a reading, sorted by row and column."""
 
     column: npt.NDArray[np.uint16]
     """(n,) from the tile's west edge."""
@@ -39,10 +39,10 @@ class Cells(NamedTuple):
 
 
 class Squares(NamedTuple):
-    """Room for s squares of cells, which kernels write in order of row and column."""
+    """Columns for s squares of cells, which kernels write in order of row and column."""
 
     column: npt.NDArray[np.uint16]
-    """(s,) of the square in its tile, from the west edge."""
+    """(s,) column of the square in its tile, from the west edge."""
     row: npt.NDArray[np.uint16]
     """(s,) from the south edge."""
     height_m: npt.NDArray[np.float64]
@@ -59,7 +59,7 @@ class Squares(NamedTuple):
 
 @bare_inlined
 def count_upto(values, n, limit):
-    """How many of the first `n` values (int32) are `limit` or less."""
+    """Return how many of the first `n` values (int32) are `limit` or less."""
     below = np.int32(0)
     for i in range(n):
         below = np.int32(below + np.int32(values[i] <= limit))
@@ -68,7 +68,7 @@ def count_upto(values, n, limit):
 
 @bare_inlined
 def value_of_rank(values, n, rank):
-    """Value of `rank` (from 0) among the first `n` (int32): the least that more than `rank` of them do not exceed.
+    """Return the value of `rank` (from 0) among the first `n` (int32): the least that more than `rank` do not exceed.
 
     Halves the interval of values, so that each pass is a count that the processor does many at a time.
     """
@@ -87,7 +87,7 @@ def value_of_rank(values, n, rank):
 
 @bare_inlined
 def median_step(heights, corner, edge, side, east_lag, north_lag, steps):
-    """Lower median of the height differences of a patch's cells that lie so far apart, and how many there are."""
+    """Return the lower median of height differences between a patch's cells at a distance, and their number."""
     width = side - east_lag
     k = 0
     for i in range(side - north_lag):
@@ -103,13 +103,13 @@ def median_step(heights, corner, edge, side, east_lag, north_lag, steps):
 
 @bare_inlined
 def slopes_of(heights, corner, edge, side, steps):
-    """Slopes (µm a cell) of a patch towards east and north, each the median over pairs of cells half its side apart.
+    """Return a patch's slopes (µm a cell) to east and north: medians over pairs of cells half its side apart.
 
     Where an eighth of the patch is not paired like that, the pairs lie a quarter of its side apart, and so on.
 
     Returns
     -------
-    east, north, and whether both could be told.
+    east, north, and whether both are determined.
     """
     east, north = 0.0, 0.0
     east_known, north_known = False, False
@@ -129,7 +129,7 @@ def slopes_of(heights, corner, edge, side, steps):
 
 @bare_inlined
 def micrometres(height, base):
-    """A height (m) as whole micrometres above `base` (int32), cut off at `FARTHEST_UM`."""
+    """Return a height (m) as whole micrometres above `base` (int32), cut off at `FARTHEST_UM`."""
     above = np.floor((height - base) * 1e6 + 0.5)
     return np.int32(min(max(above, -FARTHEST_UM), FARTHEST_UM))
 
@@ -148,7 +148,7 @@ def _light_steps(intensity, out):
 
 @bare_inner
 def fill_strip(cells, start, base, first_row, rows, strip, listed):
-    """Lay the cells from `start` on out in a strip, as far as its rows reach.
+    """Write the cells from `start` on into a strip, as far as its rows reach.
 
     Parameters
     ----------
@@ -191,19 +191,19 @@ def fill_strip(cells, start, base, first_row, rows, strip, listed):
 
 @bare_inlined
 def reach_of(mad, floor_um):
-    """µm from the median within which a cell counts."""
+    """Return the distance (µm) from the median within which a cell counts."""
     return np.int32(max(OUTLIER_SIGMAS * MAD_TO_SIGMA * mad, floor_um))
 
 
 @bare_inlined
 def large_squares(strip, patches, south, per_patch, side, slopes, base, floor_um, scratch, out, written):
-    """Squares of one row of some patches, one after another; returns how many are written by now."""
+    """Write the squares of one row of some patches, one by one; return how many are written so far."""
     heights, lights, counts, edge = strip
     residual, distance = scratch[0], scratch[1]
     out_column, _, out_height, out_intensity, out_cells, out_points, out_sloped = out
     size = -(-side * side // LANES) * LANES
     middle = 0.5 * (side - 1)
-    plain = np.int32(floor_um / (OUTLIER_SIGMAS * MAD_TO_SIGMA))  # a MAD up to this leaves the reach at its floor
+    plain = np.int32(floor_um / (OUTLIER_SIGMAS * MAD_TO_SIGMA))  # up to this MAD the reach is the floor
     residual[:] = ABSENT
     for own in range(patches.size * per_patch):
         p = own // per_patch
@@ -245,7 +245,7 @@ def large_squares(strip, patches, south, per_patch, side, slopes, base, floor_um
 
 @bare_inlined
 def small_squares(strip, patches, south, per_patch, side, slopes, base, floor_um, table, out, written):
-    """As `large_squares` for squares of up to 16 cells, sixteen of them side by side."""
+    """Do the same as `large_squares` for squares of up to 16 cells, sixteen squares at once."""
     heights, lights, counts, edge = strip
     residual, place, found, median, mad, square_of = table
     out_column, _, out_height, out_intensity, out_cells, out_points, out_sloped = out
@@ -293,7 +293,7 @@ def small_squares(strip, patches, south, per_patch, side, slopes, base, floor_um
 
 @bare_inner
 def decimate_strip(strip, patches, patch, side, base, floor_um, scratch, table, slopes, out, first_row, written):
-    """Squares of those patches of a strip that hold a cell; returns how many are written by now.
+    """Write the squares of the patches of a strip with a cell; return how many are written so far.
 
     strip : as from :func:`fill_strip`; patches : (p,) int32; slopes : (p, 3)
     float64, scratch; first_row : int, row of the strip's first squares. Others as in :func:`decimate_cells`.
@@ -318,7 +318,7 @@ def decimate_strip(strip, patches, patch, side, base, floor_um, scratch, table, 
 
 @kernel
 def decimate_cells(cells, base, edge, patch, side, floor_um, out):
-    """Robust height at the centre of every square of a tile that holds a cell, in order of row and column.
+    """Write the robust height at the centre of every square of a tile with a cell, in order of row and column.
 
     Parameters
     ----------

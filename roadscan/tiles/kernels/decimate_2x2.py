@@ -1,4 +1,4 @@
-"""One point a square of two by two cells that is its own patch: as `decimate_cells`, to the bit.
+"""Reduces squares of two by two cells, each its own patch, to one point; bit-identical to `decimate_cells`.
 
 A square has four places, so its slopes and medians are written out. Squares that hold a cell are gathered and go
 through registers side by side, whatever lies between them.
@@ -12,15 +12,15 @@ from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner, kern
 from roadscan.tiles.kernels.decimate import ABSENT, LIGHT_STEPS, micrometres, reach_of
 
 AT_ONCE = 512
-"""Squares that are gathered before they are computed."""
-_BEYOND = np.uint16(65_535)
+"""Number of squares that are collected before they are computed."""
+_BEYOND = np.uint16(65_535)  # Column beyond that of any cell.
 SCRATCH_ROWS, SUMS = 20, 4
 """Rows of scratch: heights, lights, counts of the four places, slopes, median, reach, distances; sums."""
 
 
 @bare_inlined
 def _gather(cells, i, end, square, base, found, south, at):
-    """Take the cells of a square that lie in one of its rows; returns the first cell behind them."""
+    """Collect the cells of a square in one of its rows; return the first cell after them."""
     column, _, height, intensity, count = cells
     while i < end and column[i] >> 1 == square:
         place = south + np.uint64(column[i] & 1)
@@ -33,7 +33,7 @@ def _gather(cells, i, end, square, base, found, south, at):
 
 @bare
 def _steps(near, far, other_near, other_far, out):
-    """Lower median of the two differences of each square in one direction, `ABSENT` where there is none."""
+    """Compute the lower median of two differences of each square in one direction, `ABSENT` where there is none."""
     for k in range(out.size):
         first = np.int32(far[k] - near[k]) if (near[k] != ABSENT) & (far[k] != ABSENT) else ABSENT
         other = np.int32(other_far[k] - other_near[k])
@@ -43,7 +43,7 @@ def _steps(near, far, other_near, other_far, out):
 
 @bare
 def _known(east, north, out):
-    """Whether both slopes could be told; those that could not are 0."""
+    """Write whether both slopes are determined, and set the others to 0."""
     for k in range(out.size):
         out[k] = (east[k] != ABSENT) & (north[k] != ABSENT)
     for k in range(out.size):
@@ -54,7 +54,7 @@ def _known(east, north, out):
 
 @bare_inner
 def _flatten(heights, east, north, up, right):
-    """Take the slopes off the cells of one place; `up` and `right` are its row and column, 0.0 or 1.0."""
+    """Subtract the slopes from the cells at one position; `up` and `right` are its row and column, 0.0 or 1.0."""
     for k in range(heights.size):
         slope = np.float64(east[k])
         slant = np.float64(north[k]) * (up - 0.5) - slope * 0.5
@@ -64,7 +64,7 @@ def _flatten(heights, east, north, up, right):
 
 @bare
 def _medians(a, b, c, d, out):
-    """Lower median of those of four that are there."""
+    """Compute the lower median of those of four values that exist."""
     for k in range(out.size):
         low, high = min(a[k], b[k]), max(a[k], b[k])
         less, more = min(c[k], d[k]), max(c[k], d[k])
@@ -86,7 +86,7 @@ def _reaches(mad, floor_um):
 
 @bare
 def _add(heights, lights, counts, median, reach, total, used, points, light):
-    """Add the cells of one place that count."""
+    """Add the cells at one position that count."""
     for k in range(total.size):
         off = np.int64(heights[k]) - np.int64(median[k])
         counted = np.int64(abs(off) <= np.int64(reach[k]))
@@ -112,7 +112,7 @@ def _write(sums, median, base, out_height, out_intensity, out_cells, out_points)
 
 @bare
 def _compute(found, sums, base, floor_um, own, out):
-    """Points of the squares that were gathered, to the rows `own` of the output."""
+    """Compute the points of the collected squares, into the rows `own` of the output."""
     n = out.height_m[own].size
     a, b, c, d = found[0, :n], found[1, :n], found[2, :n], found[3, :n]
     east, north, median, reach = found[12, :n], found[13, :n], found[14, :n], found[15, :n]
@@ -144,7 +144,7 @@ def _clear(values):
 
 @kernel
 def decimate_2x2(cells, starts, base, floor_um, out):
-    """Robust height at the centre of every square of two by two cells that holds a cell.
+    """Write the robust height at the centre of every square of two by two cells with a cell.
 
     Parameters
     ----------

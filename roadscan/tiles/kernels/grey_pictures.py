@@ -1,4 +1,4 @@
-"""Grey pictures of a tile's cells; 0 is empty, 1 to 255 is what was seen."""
+"""Draws grey pictures of a tile's cells; 0 is empty, 1 to 255 are values."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import numpy as np
 
 from roadscan.compute.kernel_options import inlined, kernel
 
-EMPTY = np.uint8(0)
+EMPTY = np.uint8(0)  # Grey of a pixel without a cell.
 
-ONE, TWO = np.float32(1.0), np.float32(2.0)
+ONE, TWO = np.float32(1.0), np.float32(2.0)  # In the type of the heights, so that arithmetic stays in 32 bits.
 DARKEST, STEPS = np.float32(1.5), np.float32(254.0)
-"""Grey is 1 plus so many steps, rounded."""
+"""Grey is DARKEST plus this many steps, rounded down."""
 
 
 @kernel
 def grey_intensity(column, row, intensity, black, white, west, north, picture):
-    """Grey of each cell: 1 at `black` and below, 255 at `white` and above, even steps between.
+    """Draw each cell's intensity: 1 at `black` and below, 255 at `white` and above, even steps between.
 
     Parameters
     ----------
@@ -31,14 +31,14 @@ def grey_intensity(column, row, intensity, black, white, west, north, picture):
 
 @inlined
 def continued(near, opposite, centre):
-    """A neighbour's height; where it is missing, the surface continues what lies opposite, or is level."""
+    """Return a neighbour's height; if missing, the surface continues from the opposite one, or is level."""
     other = centre if np.isnan(opposite) else TWO * centre - opposite
     return other if np.isnan(near) else near
 
 
 @inlined
 def shade_line(south, here, north, slope_scale, light_east, light_north, light_up, line):
-    """Shade of one line of cells; all three have a place more on either side, NaN where nothing is known."""
+    """Shade one line of cells; all three lines have one more cell on either side, NaN where unknown."""
     for k in range(line.size):
         centre = here[k + 1]
         sw = continued(south[k], north[k + 2], centre)
@@ -60,7 +60,7 @@ def shade_line(south, here, north, slope_scale, light_east, light_north, light_u
 def shade_cells(
     column, row, height, base, slope_scale, light_east, light_north, light_up, west, north, heights, picture
 ):
-    """Shaded relief of a tile's cells (Horn 1981, weights 1, 2, 1), three lines in memory at a time.
+    """Draw shaded relief of a tile's cells (Horn 1981, weights 1, 2, 1), with three lines in memory at a time.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def shade_cells(
     rows = picture.shape[0]
     heights[:] = np.nan
     at = 0
-    for line in range(-1, rows):  # from the south; the line above it is filled, then it is shaded
+    for line in range(-1, rows):  # from the south; a line is shaded once the line above it is filled
         above = heights[(line + 1) % 3]
         above[:] = np.nan
         wanted = north - rows + 2 + line

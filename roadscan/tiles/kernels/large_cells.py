@@ -1,4 +1,4 @@
-"""Statistics of a cell of more heights than stand side by side: one cell at a time."""
+"""Computes statistics of a single cell with more heights than the tables for sixteen cells take."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from roadscan.compute.kernel_options import bare, bare_inner
 from roadscan.compute.kernels.column_statistics import REACH
 from roadscan.tiles.kernels.selection import BINS, bounds_of, smallest
 
-_MEAN, _ROBUST, _LOW, _HIGH, _DEVIATION, _BRIGHT = range(6)
+_MEAN, _ROBUST, _LOW, _HIGH, _DEVIATION, _BRIGHT = range(6)  # Rows of the statistics.
 
 
 def select_arrays(most: int) -> tuple[Any, ...]:
-    """Arrays that `statistics_of_full` works in; `most` : heights that a cell may have."""
+    """Return the working arrays of `statistics_of_full`; `most`: heights that a cell may have."""
     return np.empty(most, np.int32), np.empty(BINS, np.int32), np.empty(most + 1, np.int32)
 
 
 @bare
 def differences(heights, base, out):
-    """Heights (n,) int32 above a base → out (≥ n,) int32."""
+    """Write heights (n,) int32 relative to a base into out (≥ n,) int32."""
     for k in range(heights.size):
         out[k] = heights[k] - base
 
 
 @bare
 def distances(heights, middle, out):
-    """Distances of heights (n,) int32 from another → out (≥ n,) int32."""
+    """Write distances of heights (n,) int32 from another into out (≥ n,) int32."""
     for k in range(heights.size):
         out[k] = abs(heights[k] - middle)
 
 
 @bare_inner
 def sums_of(heights, middle, reach):
-    """Of (n,) int32 less another: sum, sum of squares, number within reach, and their sum."""
+    """Return sum and sum of squares of (n,) int32 less a middle, number within reach, and their sum."""
     total, squares, used, near = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for k in range(heights.size):
         d = np.int64(heights[k]) - middle
@@ -49,7 +49,7 @@ def sums_of(heights, middle, reach):
 
 @bare
 def statistics_of_full(heights, light, floor, quantum_m, select, out, lane):
-    """Statistics of one cell of n readings, as ``simd.column_statistics.statistics_of``, into out[:, lane].
+    """Write the statistics of one cell of n readings, as ``column_statistics.statistics_of``, into out[:, lane].
 
     heights : (n,) int32; light : int64, sum of intensities; select : work, see :func:`select_arrays`.
     """

@@ -1,4 +1,4 @@
-"""Points of a cube as nodes of an octree: a node holds one point a voxel, its children hold the others."""
+"""Cuts the points of a cube into nodes of an octree: a node has one point a voxel, its children have the others."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy.typing as npt
 from roadscan.compute.kernel_options import inlined, kernel
 
 BITS = 30
-"""Places along an edge of the cube are told in 2³⁰ parts of it."""
+"""Positions along an edge of the cube are counted in 2⁻³⁰ of it."""
 
 SPAN_BITS = 7
 """A node has 2⁷ voxels along an edge."""
 
 NODE_COLUMNS = 6
-"""Level, place of the node along x, y and z, first position of its points, their number."""
+"""Columns of a node: level, place along x, y and z, first position of its points, their number."""
 
 
 class Steps(NamedTuple):
-    """Places of n points in 2^-BITS of the cube's edge, from its corner (:func:`parts_of_edge`)."""
+    """Positions of n points in 2^-BITS of the cube's edge, from its corner (:func:`parts_of_edge`)."""
 
     x: npt.NDArray[np.int32]
     y: npt.NDArray[np.int32]
@@ -28,28 +28,28 @@ class Steps(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """How the cube is cut."""
+    """Parameters of the octree."""
 
     top: int
-    """Level of the cell that holds all points that are given; its nodes above are shared with other cells."""
+    """Level of the cell that contains all given points; nodes above it are shared with other cells."""
     leaf_points: int
-    """A node from `top` downward with no more points than these is not cut."""
+    """A node from `top` downward with at most this many points is not cut."""
 
 
 class Tables(NamedTuple):
-    """Memory of the kernel; -1 throughout in `best` before and after."""
+    """Working memory; `best` is -1 throughout before and after."""
 
     best: npt.NDArray[np.int32]
     """(2^21,) position of the point nearest to the centre of each voxel."""
     distance: npt.NDArray[np.int64]
-    """(2^21,) square of twice its distance (parts²)."""
+    """(2^21,) square of twice the distance to that point (parts²)."""
     moved: npt.NDArray[np.int32]
-    """(n,) order of the points of a node while they are moved."""
+    """(n,) order of the points of a node during sorting."""
 
 
 @kernel
 def parts_of_edge(values, corner, edge):
-    """Stored coordinates (n,) as parts of a cube's edge, rounded down: its last bits tell nothing of coarser levels.
+    """Return stored coordinates (n,) as parts of a cube's edge, rounded down.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def parts_of_edge(values, corner, edge):
 
 @inlined
 def _voxel(steps, point, shift, bits):
-    """Number of a point's voxel of 2^shift parts among 2^bits along an edge, and twice its distance squared."""
+    """Return a point's voxel of 2^shift parts among 2^bits an edge, and its distance² from the centre, times 4."""
     size, mask = np.int64(1) << shift, (np.int64(1) << bits) - 1
     number, square = np.int64(0), np.int64(0)
     for place in (np.int64(steps.x[point]), np.int64(steps.y[point]), np.int64(steps.z[point])):
@@ -76,7 +76,7 @@ def _voxel(steps, point, shift, bits):
 
 @inlined
 def _choose(steps, order, first, end, shift, bits, tables):
-    """Note the point nearest to the centre of each voxel; of several that are as near the first."""
+    """Find the point nearest to the centre of each voxel, of equally near ones the first."""
     for at in range(first, end):
         point = order[at]
         voxel, square = _voxel(steps, point, shift, bits)
@@ -88,7 +88,7 @@ def _choose(steps, order, first, end, shift, bits, tables):
 
 @inlined
 def _chosen_first(steps, order, first, end, shift, bits, tables):
-    """Put the chosen points before the others, both in the order that they had; returns where the others begin."""
+    """Put the chosen points before the others, both in their former order; return where the others begin."""
     chosen, others = first, 0
     for at in range(first, end):
         point = order[at]
@@ -109,14 +109,14 @@ def _chosen_first(steps, order, first, end, shift, bits, tables):
 
 @inlined
 def _octant(steps, point, shift):
-    """Number 0 to 7 of the half of an edge along x (1), y (2) and z (4) that a point lies in."""
+    """Return the octant 0 to 7 of a point: sum of 1, 2 and 4 for the upper half along x, y and z."""
     x, y, z = (steps.x[point] >> shift) & 1, (steps.y[point] >> shift) & 1, (steps.z[point] >> shift) & 1
     return x + 2 * y + 4 * z
 
 
 @kernel
 def cut_cell(steps, order, first, end, shape, tables, nodes):
-    """Cut the points of one cell into nodes of the octree; returns how many nodes were written.
+    """Cut the points of one cell into nodes of the octree; return the number of nodes.
 
     Above the level `top` the cell adds one point a voxel to each node that it is a part of. From there downward a node
     with more than `leaf_points` keeps the point nearest to the centre of each of its voxels and hands on the others.

@@ -1,9 +1,9 @@
-"""Memory for the heights of cells: slots of 64 bytes, handed out sixteen at a time and taken back.
+"""Pool of memory for the heights of cells: slots of 64 bytes, allocated sixteen at a time.
 
-The heights of a cell stand in a *slot* (``simd.height_slots``). The cells of a tile are taken sixteen at a time, side
-by side along a row: a *group*. When the first reading falls into a group, it gets an *element* of the pool: a slot for
-each of its cells. A cell with more readings, or with heights too far from the base for 16 bits, or of more passes than
-a header has bits for, chains spare slots behind its own.
+The heights of a cell are stored in a *slot* (``compute.kernels.height_slots``). Sixteen adjacent cells along a row of a
+tile form a *group*. With its first reading, a group gets an *element* of the pool: a slot for each of its cells. A cell
+with more readings, or with heights too far from the base for 16 bits, or of more passes than a header has bits for,
+chains spare slots behind its first one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Pool(NamedTuple):
     headers: npt.NDArray[np.uint64]
     """(c · LANES · SLOT_HEADERS,) the same memory; of each slot the last is its header."""
     bases: npt.NDArray[np.int32]
-    """(c · LANES,) height (quanta) that those of each slot are counted from."""
+    """(c · LANES,) height (quanta) from which those of each slot are counted."""
     chain: npt.NDArray[np.int32]
     """(c · LANES,) next slot of the cell, −1 for none."""
     free: npt.NDArray[np.int32]
@@ -49,20 +49,20 @@ class Pool(NamedTuple):
 
 @bare_inlined
 def header_of(slot, pool):
-    """The header of a slot."""
+    """Return the header of a slot."""
     return pool.headers[slot * SLOT_HEADERS + SLOT_HEADERS - 1]
 
 
 @bare_inlined
 def header_of_pass(number):
-    """What a pass sets in a header, its bit and its word (uint64)."""
+    """Return what a pass sets in a header, its bit and its word (uint64)."""
     word, bit = np.uint64(number // PASSES), np.uint64(number % PASSES)
     return (word << np.uint64(WORD_SHIFT)) | (np.uint64(1) << (bit + np.uint64(MARK_SHIFT)))
 
 
 @bare_inlined
 def new_group(height, pool):
-    """Take an element from the stack of free ones, its slots empty and based on a height (quanta)."""
+    """Take an element from the free list, with empty slots based on a height (quanta)."""
     e = pool.free[pool.held[0]]
     pool.held[0] += 1
     for slot in range(np.uint64(e) * np.uint64(LANES), np.uint64(e + 1) * np.uint64(LANES)):
@@ -74,7 +74,7 @@ def new_group(height, pool):
 
 @bare_inlined
 def new_slot(height, pool):
-    """Take an empty slot from the spare ones; where there is none, an element becomes spare slots."""
+    """Take an empty slot from the spare ones; if there is none, turn an element into spare slots."""
     held, spare = pool.held, pool.spare
     if held[1] == 0:
         e = new_group(height, pool)
@@ -91,7 +91,7 @@ def new_slot(height, pool):
 
 @bare_inlined
 def slot_with_room(own, size, low, high, word, pool):
-    """Slot of the chain from `own` that takes `size` more heights from `low` to `high`; −1 where none does."""
+    """Return a slot of the chain from `own` that takes `size` more heights from `low` to `high`; −1 where none does."""
     slot = np.int64(own)
     while slot >= 0:
         header = header_of(slot, pool)
@@ -106,7 +106,7 @@ def slot_with_room(own, size, low, high, word, pool):
 
 @bare_inlined
 def longer_chain(own, height, pool):
-    """A new slot behind `own`: before the older ones, which are full."""
+    """Insert a new slot after `own`, before the older ones, which are full."""
     slot = np.int64(new_slot(height, pool))
     pool.chain[slot] = pool.chain[own]
     pool.chain[own] = slot
@@ -115,7 +115,7 @@ def longer_chain(own, height, pool):
 
 @bare_inlined
 def release(element, longer, pool):
-    """Give a group's element back, and the further slots of its cells; longer : uint64, a bit for each such cell."""
+    """Free a group's element and the further slots of its cells; longer: uint64, a bit for each such cell."""
     held, chain = pool.held, pool.chain
     while longer:
         slot = np.int64(chain[element * LANES + np.int64(lowest_bit(longer))])

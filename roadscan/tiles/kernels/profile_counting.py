@@ -1,4 +1,4 @@
-"""Profiles that are measured at once, near the sensor, counted into cells without a point in between."""
+"""Counts flat profiles, whose readings are taken at one instant near the sensor, into cells without writing points."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from roadscan.tiles.kernels.accumulate import NOWHERE, PIECE, Heights, accumulat
 
 
 class Plane(NamedTuple):
-    """Where the readings of a profile lie on the map, to 32 bits about its anchor."""
+    """Map positions of a profile's readings in 32 bits, relative to its anchor."""
 
     maps: tuple[tuple[float, ...], ...]
-    """Planes (p, q, r) of easting, northing and height, see ``georeferencing.flat_profiles``."""
+    """Planes (p, q, r) of easting, northing and height, see ``georeference.kernels.flat_profiles``."""
     rests: tuple[float, float]
-    """Easting and northing left over from :func:`whole_cells`."""
+    """Remainders of easting and northing from :func:`whole_cells`."""
     first: tuple[int, int, int]
     """Cells to the anchor, east and north, and the height of the anchor (quanta)."""
     per_cell: float
-    """Cells a quantum."""
+    """Cells per quantum."""
     heights: tuple[float, float]
-    """Lowest and highest height that is kept, above the anchor."""
+    """Lowest and highest height that is kept, relative to the anchor."""
 
 
 @bare_inlined
 def whole_cells(anchor, cell_quanta):
-    """Cells up to an anchor (int32), and half a quantum more than what is left of it (float32, exact)."""
+    """Return the cells up to an anchor (int32), and the remainder plus half a quantum (float32, exact)."""
     cells = math.floor((anchor + 0.5) / cell_quanta)
     return np.int32(cells), np.float32(anchor - np.int64(cells) * cell_quanta + 0.5)
 
 
 @bare_inlined
 def plane_of(anchors, maps, heights, active):
-    """The :class:`Plane` of what ``planes_of`` returns."""
+    """Return the :class:`Plane` of what ``planes_of`` returns."""
     first_column, east_rest = whole_cells(anchors[0] - active.corner_quanta[0], active.cell_quanta)
     first_row, north_rest = whole_cells(anchors[1] - active.corner_quanta[1], active.cell_quanta)
     first = (first_column, first_row, np.int32(anchors[2]))
@@ -47,7 +47,7 @@ def plane_of(anchors, maps, heights, active):
 
 @bare_inner
 def place_profile(raw, rays, scale, raw_limits, plane, out):
-    """Cells and heights of readings of a profile. A function of its own: inside a larger one it stays scalar.
+    """Compute cells and heights of a profile's readings. A separate function: inside a larger one it stays scalar.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def place_profile(raw, rays, scale, raw_limits, plane, out):
 
 @bare_inner
 def count_out_of_range(raw, raw_limits):
-    """How many readings have no return, and how many have one that is too near or too far."""
+    """Return how many readings have no return, and how many have one that is too near or too far."""
     silent, within = np.uint32(0), np.uint32(0)
     for j in range(raw.size):
         silent = np.uint32(silent + np.uint32(raw[j] == 0))
@@ -83,7 +83,7 @@ def count_out_of_range(raw, raw_limits):
 
 @bare_inner
 def reach_of_kept(column, height):
-    """How many readings are kept, and their lowest and highest height (int64)."""
+    """Return the number of kept readings, and their lowest and highest height (int64)."""
     good, low, high = 0, np.int32(2**31 - 1), np.int32(-(2**31))
     for j in range(column.size):
         keep = column[j] != NOWHERE
@@ -95,7 +95,7 @@ def reach_of_kept(column, height):
 
 @bare_inlined
 def note_pose(epoch, sigmas, active, touched):
-    """Note the epoch and σ of a profile with the tiles that it touched, which are forgotten then."""
+    """Record the epoch and σ of a profile with the tiles that it touched; clear `touched`."""
     for tile in range(touched.size):
         if touched[tile]:
             touched[tile] = 0

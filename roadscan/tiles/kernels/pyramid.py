@@ -1,4 +1,4 @@
-"""Pixels of overviews from cells. Sums are of whole units, hence exact: a pixel does not depend on the way to it."""
+"""Computes pixels of overviews from cells. Sums are of whole units, hence exact, whatever the order."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from roadscan.compute.kernel_options import bare, bare_inner, kernel
 from roadscan.tiles.kernels.adjacent_cells import run_end
 
 TO_HEIGHT_UNIT = 1.5 * 2.0**20
-"""Added and taken away again, it rounds a number below 2¹⁹ to a multiple of 2⁻³² (heights, m: 0.23 nm)."""
+"""Adding and subtracting it rounds a number below 2¹⁹ to a multiple of 2⁻³² (heights, m: 0.23 nm)."""
 
-_SAMPLE = 4096
+_SAMPLE = 4096  # About this many cells are sampled for runs.
 
 TO_WHOLE = 1.5 * 2.0**52
-"""Added and taken away again, it rounds a number below 2⁵¹ to a whole one (intensities)."""
+"""Adding and subtracting it rounds a number below 2⁵¹ to an integer (intensities)."""
 
 
 class Levels(NamedTuple):
-    """Overviews of a tile: how coarse each is, and where its pixels go."""
+    """Overviews of a tile: the factor of each, and the place of its pixels."""
 
     factors: npt.NDArray[np.int64]
     """(levels,) cells along an edge of a pixel, ascending, each a multiple of the one before."""
@@ -33,7 +33,7 @@ class Levels(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """Pixels of all levels that hold a cell, in order of row and column; written by kernels."""
+    """Pixels of all levels with at least one cell, in order of row and column; written by kernels."""
 
     column: npt.NDArray[np.uint16]
     """(n,) from the tile's west edge."""
@@ -42,7 +42,7 @@ class Pixels(NamedTuple):
     readings: npt.NDArray[np.uint32]
     """(n,)"""
     cells: npt.NDArray[np.uint32]
-    """(n,) that hold a reading."""
+    """(n,) number of cells with a reading."""
     height_m: npt.NDArray[np.float64]
     """(n,) mean of the cells' heights."""
     intensity: npt.NDArray[np.float32]
@@ -51,7 +51,7 @@ class Pixels(NamedTuple):
 
 @bare_inner
 def _add_pairs(count, height, intensity, base, cells, points, above, light):
-    """Add two cells side by side to each pixel."""
+    """Add two adjacent cells to each pixel."""
     for p in range(cells.size):
         cells[p] += 2.0
     for p in range(cells.size):
@@ -67,7 +67,7 @@ def _add_pairs(count, height, intensity, base, cells, points, above, light):
 
 @bare_inner
 def _add_run(first, factor, count, height, intensity, base, sums):
-    """Add cells side by side, from column `first` on, to the sums (4, …) of their pixels."""
+    """Add adjacent cells from column `first` on to the sums (4, …) of their pixels."""
     end, pairs = count.size, 0
     if factor == 2:
         start = first & 1
@@ -98,7 +98,7 @@ def _add_run(first, factor, count, height, intensity, base, sums):
 
 @bare
 def _fold(line, factor, pixels):
-    """Add `factor` pixels to each of the next level, and leave zeros. The usual four are spelled out."""
+    """Add `factor` pixels to each of the next level, and reset them to 0. The usual four are written out."""
     if factor == 4:
         for p in range(pixels.size):
             pixels[p] += (line[4 * p] + line[4 * p + 1]) + (line[4 * p + 2] + line[4 * p + 3])
@@ -111,7 +111,7 @@ def _fold(line, factor, pixels):
 
 @bare
 def _means(cells, points, above, light, base, out_count, out_cells, out_height, out_intensity):
-    """Write pixels side by side that all hold a cell."""
+    """Write adjacent pixels, each with a cell."""
     for p in range(cells.size):
         out_cells[p] = np.uint32(cells[p])
     for p in range(cells.size):
@@ -124,7 +124,7 @@ def _means(cells, points, above, light, base, out_count, out_cells, out_height, 
 
 @bare_inner
 def _is_scattered(column, row):
-    """True where fewer than half of the cells have one beside them, by a sample: it does not pay to look for runs."""
+    """Return True where fewer than half of the sampled cells have a neighbour, so that searching runs does not pay."""
     beside, looked = 0, 0
     for k in range(1, row.size, 1 + row.size // _SAMPLE):
         looked += 1
@@ -134,7 +134,7 @@ def _is_scattered(column, row):
 
 @bare_inner
 def _add_cells(column, factor, count, height, intensity, base, cells, above, points, light):
-    """Add cells one by one to the sums of their pixels; returns the first pixel and the one behind the last."""
+    """Add cells one by one to the sums of their pixels; return the first pixel and the one after the last."""
     west, east = cells.size, 0
     for i in range(column.size):
         pixel = np.int64(column[i] >> 1) if factor == 2 else np.int64(column[i]) // factor
@@ -149,7 +149,7 @@ def _add_cells(column, factor, count, height, intensity, base, cells, above, poi
 
 @bare_inner
 def _write_pixels(sums, west, east, base, line, at, out):
-    """Write pixels one by one; returns where the next one goes."""
+    """Write pixels one by one; return where the next one goes."""
     for pixel in range(west, east):
         cells = sums[0, pixel]
         if cells > 0.0:
@@ -163,7 +163,7 @@ def _write_pixels(sums, west, east, base, line, at, out):
 
 @bare_inner
 def _reduce(cells, base, levels, sums, pixels, west, east):
-    """:func:`reduce_cells`; west, east : (levels,) int64, edges[0] and 0, pixels of a strip that have sums."""
+    """Compute :func:`reduce_cells`; west, east: (levels,) int64, edges[0] and 0, pixels of a strip that have sums."""
     column, row, height, intensity, count = cells
     factors, edges, starts, written = levels
     n = row.size
@@ -225,12 +225,12 @@ def _reduce(cells, base, levels, sums, pixels, west, east):
             line //= ratio
             following //= ratio
             if following == line:
-                break  # more of this line of pixels is to come
+                break  # more cells of this line of pixels follow
 
 
 @kernel
 def reduce_cells(cells, base, levels, sums, pixels):
-    """Pixels of all levels in one pass over the cells, strip by strip; the sums of a strip feed the next level.
+    """Compute the pixels of all levels in one pass over the cells; the sums of a strip feed the next level.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""Buckets of readings by row of cells, until their tile is finished.
+"""Buckets collect readings by row of cells until their tile is finished.
 
-A turning mirror or a lidar looks elsewhere with every reading: counted into cells as they come, each reading would wait
+Successive readings of a rotating mirror or a lidar fall into distant cells: counted one by one, each reading would wait
 for its cell's memory. So readings are first put into the bucket of their row of cells in their tile: buckets grow at
-their ends only, and the ends of all rows stay in the second cache. A finished tile is taken row by row
-(``cells.bucket_statistics``).
+their ends only, and the ends of all rows stay in the second-level cache. A finished tile is processed row by row
+(``tiles.kernels.bucket_statistics``).
 
 A bucket is a chain of *blocks* of `BLOCK` readings of one pass. A reading is a number of 64 bits, from the lowest: its
 column in the tile (16), its intensity (16), its height in quanta (32).
@@ -21,14 +21,14 @@ from roadscan.compute.kernels.height_slots import prefetch
 from roadscan.georeference.kernels.readings import CLASS_KEPT, KEPT, OUTSIDE
 
 BLOCK = 64
-"""Readings of a block."""
-_BITS = 6
+"""Readings in a block."""
+_BITS = 6  # Binary logarithm of BLOCK.
 _LINE = 8
-"""Readings of a line of the cache, which is fetched while the one before it is filled."""
-COLUMN, LIGHT_SHIFT, LIGHT, HEIGHT_SHIFT = np.uint64(0xFFFF), np.uint64(16), np.uint64(0xFFFF), np.uint64(32)
+"""Readings in a cache line; the next line is fetched while one is filled."""
+COLUMN, LIGHT_SHIFT, LIGHT, HEIGHT_SHIFT = np.uint64(0xFFFF), np.uint64(16), np.uint64(0xFFFF), np.uint64(32)  # Fields.
 
 TAKEN, PASS = 0, 1
-"""What `held` counts: blocks in use, and the pass of the readings that came last."""
+"""Indices of `held`: number of blocks in use, and the pass of the latest readings."""
 
 
 class Buckets(NamedTuple):
@@ -41,9 +41,9 @@ class Buckets(NamedTuple):
     records: npt.NDArray[np.uint64]
     """(b · BLOCK,) readings."""
     before: npt.NDArray[np.int32]
-    """(b,) block before it in its bucket, −1 for none."""
+    """(b,) previous block of the bucket, −1 for none."""
     sizes: npt.NDArray[np.int32]
-    """(b,) readings of a block that is not the last one of its bucket."""
+    """(b,) number of readings in a block that is not the last one of its bucket."""
     owners: npt.NDArray[np.int32]
     """(b,) number of the readings' pass."""
     free: npt.NDArray[np.int32]
@@ -53,21 +53,21 @@ class Buckets(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Cells of readings in their tiles; work."""
+    """Cells of readings in their tiles; working memory."""
 
     column: npt.NDArray[np.int32]
     """(n,)"""
     row: npt.NDArray[np.int32]
     """(n,)"""
     tile: npt.NDArray[np.int32]
-    """(n,) place of the tile in the box of all tiles, row by row; −1 outside it."""
+    """(n,) index of the tile in the box of all tiles, row by row; −1 outside it."""
     known: npt.NDArray[np.int32]
-    """(a,) interval of the trajectory whose σ each active tile has already, −1 for none."""
+    """(a,) trajectory interval whose σ each active tile has already, −1 for none."""
 
 
 @bare_inner
 def find_places(placed, n, active, places):
-    """Cells of the first n placed readings in their tiles, into `places`; one loop without branches.
+    """Write the cells of the first n georeferenced readings into `places`, in one loop without branches.
 
     placed : Placed, of which what is not CLASS_KEPT has no place; active : ActiveTiles.
     """
@@ -88,7 +88,7 @@ def find_places(placed, n, active, places):
 
 @bare_inlined
 def new_block(end, number, buckets):
-    """Take a block for a bucket that ends at `end`; returns where its readings begin."""
+    """Take a block for a bucket that ends at `end`; return where its readings begin."""
     held = buckets.held
     block = np.int64(buckets.free[held[TAKEN]])
     held[TAKEN] += 1
@@ -100,7 +100,7 @@ def new_block(end, number, buckets):
 
 @bare_inner
 def close_buckets(ends, sizes):
-    """End the last block of every bucket: what comes next begins a new one."""
+    """Close the last block of every bucket, so that the next reading begins a new one."""
     flat = ends.reshape(-1)
     for k in range(flat.size):
         used = flat[k] & (BLOCK - 1)
@@ -159,7 +159,7 @@ def put_in_buckets(placed, measured, first, end, places, active, buckets):
 
 @bare
 def put_in_own_buckets(column, row, height, intensity, number, ends, buckets):
-    """Put readings of one pass into the buckets of the tile that all of them lie in.
+    """Put readings of one pass into the buckets of the tile that contains all of them.
 
     column, row, height : (n,) int32; intensity : (n,) uint16; number : int, of the pass; ends : (edge,) int32, in/out,
     of the tile's buckets; buckets : Buckets.
@@ -181,7 +181,7 @@ def put_in_own_buckets(column, row, height, intensity, number, ends, buckets):
 
 @bare
 def fill_buckets(placed, measured, places, active, buckets, fates):
-    """Put placed readings into the buckets of the active tiles.
+    """Put georeferenced readings into the buckets of the active tiles.
 
     Parameters
     ----------
@@ -207,13 +207,13 @@ def fill_buckets(placed, measured, places, active, buckets, fates):
 
 @bare_inlined
 def height_of(record):
-    """Height of a reading (quanta)."""
+    """Return the height of a reading (quanta)."""
     return np.int32(np.int64(record) >> np.int64(HEIGHT_SHIFT))
 
 
 @bare_inlined
 def fetch_block(block, records):
-    """A block's readings are wanted soon; −1 for none."""
+    """Prefetch the readings of a block; −1 for none."""
     first = np.uint64(max(block, 0)) * np.uint64(BLOCK)
     for k in range(np.uint64(0), np.uint64(BLOCK), np.uint64(_LINE)):
         prefetch(records, first + k)
@@ -221,20 +221,20 @@ def fetch_block(block, records):
 
 @bare_inlined
 def last_block(end):
-    """Number of the last block of a bucket that ends at `end`, −1 without readings."""
+    """Return the last block of a bucket that ends at `end`, −1 without readings."""
     return (np.int64(end) - 1) >> _BITS
 
 
 @bare_inlined
 def size_of(block, end, sizes):
-    """Readings in a block of a bucket that ends at `end`."""
+    """Return the number of readings in a block of a bucket that ends at `end`."""
     used = np.int64(end) & (BLOCK - 1)
     return used if used and block == np.int64(end) >> _BITS else np.int64(sizes[block])
 
 
 @bare
 def sizes_of_rows(ends, before, sizes):
-    """Readings of a tile, and of its fullest row; ends : (edge,) int32, of its buckets."""
+    """Return the number of readings of a tile, and of its fullest row; ends: (edge,) int32, of its buckets."""
     total, most = np.int64(0), np.int64(0)
     for y in range(ends.size):
         own, block = np.int64(0), last_block(ends[y])
@@ -248,7 +248,7 @@ def sizes_of_rows(ends, before, sizes):
 
 @bare
 def free_row(end, buckets):
-    """Give the blocks of a bucket back."""
+    """Free the blocks of a bucket."""
     before, free, held = buckets.before, buckets.free, buckets.held
     block = last_block(end)
     while block >= 0:
@@ -259,7 +259,7 @@ def free_row(end, buckets):
 
 @bare
 def take_readings(ends, buckets, west, south, readings, passes, intensity):
-    """Take the readings of a tile out of its buckets, row by row.
+    """Move the readings of a tile out of its buckets, row by row.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The k-th smallest of many whole numbers, by bins."""
+"""Finds the k-th smallest of many whole numbers, by bins."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import numpy as np
 
 from roadscan.compute.kernel_options import bare, bare_inner
 
-BINS = 256
-_BITS = 8
+BINS = 256  # Bins of one pass over the numbers.
+_BITS = 8  # Binary logarithm of BINS.
 _FEW = 48
-"""So many numbers are put in order one by one."""
+"""Up to this many numbers are sorted directly."""
 
 
 @bare
 def bounds_of(values):
-    """Least and greatest of (n,) int32, n > 0."""
+    """Return the least and greatest of (n,) int32, n > 0."""
     low, high = values[0], values[0]
     for i in range(values.size):
         low, high = min(low, values[i]), max(high, values[i])
@@ -39,7 +39,7 @@ def _of_bin(values, low, shift, wanted, found):
 
 @bare
 def sort_few(values):
-    """Put few numbers (n,) in order, one by one."""
+    """Sort few numbers (n,) by insertion."""
     for i in range(1, values.size):
         own, j = values[i], i
         while j > 0 and values[j - 1] > own:
@@ -50,7 +50,7 @@ def sort_few(values):
 
 @bare
 def smallest(values, k, bins, found):
-    """The k-th smallest (from 0) of numbers.
+    """Return the k-th smallest (from 0) of numbers.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Products over many tiles, made from the tiles' cells. One task some files that draw the same tiles."""
+"""Makes products over many tiles from the tiles' cells. One task makes several files that draw the same tiles."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from roadscan.tiles.tasks.tiles import summary_of
 from roadscan.tiles.tasks.wanted_products import product_context, product_key, wanted_products
 
 _TILES_DRAWN = 2000
-"""Tiles that one task draws, each as often as it draws it: `kilometre`, with its six rasters, over two kilometres."""
-_NOWHERE = TileId(0, 0)
+"""Tiles that one task draws, counted as often as they are drawn: six rasters of `kilometre` over two kilometres."""
+_NOWHERE = TileId(0, 0)  # Sorts before other tiles, for an output without tiles.
 
 
 @dataclass(frozen=True)
 class OutputTask:
-    """One file of a survey product."""
+    """One file of a survey product, as a task gets it."""
 
     store: Store
     product: SurveyProduct
@@ -51,13 +51,13 @@ class OutputTask:
     overviews: tuple[OutputRecord, ...] = ()
     """Records of the overviews of the same tiles, where there are any."""
     files: tuple[OutputRecord, ...] = ()
-    """Records of the files of surface products that the output is made from."""
+    """Records of the files of surface products from which the output is made."""
     drives: Drives | None = None
-    """Where the vehicles drove, for a product that asks."""
+    """Trajectories of the vehicles, for a product that needs them."""
 
     @property
     def target(self) -> str:
-        """Where the file goes, relative to the survey's root."""
+        """Path of the file, relative to the survey's root."""
         return f"products/{self.product.name}/{self.output.name}"
 
 
@@ -101,10 +101,10 @@ def make_products(
     compute: Compute,
     report: Callable[[int, int], None] = lambda _a, _b: None,
 ) -> list[tuple[str, str]]:
-    """Make the survey products that are missing or stale; remove those no longer due. Returns the failures."""
+    """Make the survey products that are missing or stale, and remove those no longer due; return the failures."""
     stale, gone = plan_outputs(plan, manifest)
     manifest.remove(gone)
-    stale.sort(key=lambda t: (t.product.name, min(t.output.tiles, default=_NOWHERE)))  # what draws the same tiles
+    stale.sort(key=lambda t: (t.product.name, min(t.output.tiles, default=_NOWHERE)))  # by tiles drawn
     failed = run_bundles(write_output, stale, lambda t: len(t.output.tiles), _TILES_DRAWN, manifest, compute, report)
     return [(f"{task.product.name}/{task.output.name}", reason) for task, reason in failed]
 
@@ -124,7 +124,7 @@ def write_output(task: OutputTask) -> OutputRecord:
 
 
 class StoredTiles:
-    """Finished tiles of the store, as survey products ask for them."""
+    """Finished tiles of the store, for survey products."""
 
     def __init__(
         self,
@@ -143,21 +143,21 @@ class StoredTiles:
         self._edge = context.grid.cells_per_edge
 
     def __call__(self, tile: TileId) -> TileCells | None:
-        """Cells of a tile; None where the survey has no such tile."""
+        """Return the cells of a tile; None where the survey has no such tile."""
         record = self._cells.get(str(tile))
         return None if record is None else read_cells(self._store, record, self._edge)
 
     def file(self, product: str, tile: TileId) -> bytes | None:
-        """Content of a tile's file of a surface product; None where there is none."""
+        """Return the content of a tile's file of a surface product; None where there is none."""
         record = self._files.get((product, str(tile)))
         return None if record is None else read_recorded(self._store, record)
 
     def lanes(self) -> LaneDirections:
-        """Which way the lanes run; nowhere known for a product that does not need it."""
+        """Return the directions of the lanes; empty for a product that does not need them."""
         return LaneDirections.of_path([]) if self._drives is None else self._drives.lanes(self._store)
 
     def overview(self, tile: TileId, factor: int) -> Level | None:
-        """Overview of a tile; made from its cells where none was stored with them."""
+        """Return an overview of a tile, made from its cells where none was stored."""
         record = self._overviews.get(str(tile))
         if record is not None:
             return read_overview(self._store, record, factor)
@@ -179,7 +179,7 @@ def _tasks(
     drives = Drives.of(plan) if product.needs_lanes else None
     own_key = product_key(product, options, context)
     driven = [] if drives is None else [drives.key()]
-    bridged = {TileId.parse(r.unit) for r in files} - summaries.keys()  # they have a surface, and no reading
+    bridged = {TileId.parse(r.unit) for r in files} - summaries.keys()  # tiles with a surface and no reading
     known = [*summaries.values(), *map(TileSummary.without_readings, sorted(bridged))]
     for output in product.outputs(known, options, context) if summaries else []:
         own = tuple(by_tile[t] for t in output.tiles if t in by_tile)
@@ -205,6 +205,6 @@ def _tasks(
 
 
 def _read(product: SurveyProduct, files: Sequence[OutputRecord], output: Output) -> tuple[OutputRecord, ...]:
-    """Files of surface products that an output is made from, in the order of tiles."""
+    """Return the files of surface products that an output is made from, in the order of tiles."""
     units = {str(t) for t in output.tiles} if product.reads else set()
     return tuple(sorted((r for r in files if r.unit in units), key=lambda r: (r.product, TileId.parse(r.unit))))

@@ -1,1 +1,1 @@
-"""Files out: one file a product, found by itself."""
+"""Products of tiles: one module for each product, found by itself."""

@@ -19,20 +19,20 @@ SCALE_M: Final = 1e-4
 """Step of the stored coordinates (m)."""
 PRODUCT: Final = "publish"
 
-_PLAIN, _COLOURED = 6, 7
+_PLAIN, _COLOURED = 6, 7  # LAS point formats without and with colours.
 
 
 class Lattice(NamedTuple):
-    """What the records of a cloud share."""
+    """Parameters that all records of a cloud share."""
 
     map: MapFrame
     grid: TileGrid
     offsets: tuple[float, float, float]
-    """Whole units of the CRS that the stored coordinates count from."""
+    """Origin of the stored coordinates, in whole units of the CRS."""
 
 
 def layout_of(frame: MapFrame, *, coloured: bool) -> Layout:
-    """Layout of the records: point format 6, or 7 where the points have colours; no further dimensions."""
+    """Return the layout of the records: point format 6, or 7 with colours; no further dimensions."""
     empty = np.zeros(0, np.int32)
     units = (frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m)
     scales = tuple(axis(empty, 0, SCALE_M, unit_m, PRODUCT).scale for unit_m in units)
@@ -40,7 +40,7 @@ def layout_of(frame: MapFrame, *, coloured: bool) -> Layout:
 
 
 def records_of(points: TilePoints, lattice: Lattice) -> npt.NDArray[np.void]:
-    """(n,) records of format 7 of a tile's points; without colours these are black."""
+    """Return (n,) records of format 7 of a tile's points; without colours these are black."""
     size, frame = lattice.grid.size_quanta, lattice.map
     units = (frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m)
     corners = (points.tile.column * size, points.tile.row * size, 0)
@@ -56,12 +56,12 @@ def records_of(points: TilePoints, lattice: Lattice) -> npt.NDArray[np.void]:
 
 
 def picked(records: npt.NDArray[np.void], numbers: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.void]:
-    """Some records (n,) by their numbers; as rows of bytes they are copied six times as fast as field by field."""
+    """Return some records (n,) by number; as rows of bytes they are copied six times as fast as field by field."""
     rows = np.ascontiguousarray(records).view(np.uint8).reshape(records.size, -1)
     return np.take(rows, numbers, axis=0).view(records.dtype).ravel()
 
 
 def without_colours(records: npt.NDArray[np.void], plain: np.dtype[np.void]) -> npt.NDArray[np.void]:
-    """Records of format 7 as format 6, which begins alike."""
+    """Return records of format 7 as format 6, which has the same first fields."""
     kept = np.ascontiguousarray(records).view(np.uint8).reshape(records.size, -1)[:, : plain.itemsize]
     return np.ascontiguousarray(kept).view(plain).ravel()

@@ -16,7 +16,7 @@ from roadscan.core.crs import crs_from_text
 from roadscan.core.errors import StoreError
 from roadscan.tiles.product import ProductContext
 
-_ROW_GROUP_ROWS: Final = 65_536
+_ROW_GROUP_ROWS: Final = 65_536  # Rows in a row group.
 
 
 def write_geo_table(
@@ -29,7 +29,7 @@ def write_geo_table(
     *,
     counterclockwise: bool = False,
 ) -> None:
-    """Write rows with their geometry, in the CRS's own unit.
+    """Write rows with their geometry, in the CRS's unit.
 
     Parameters
     ----------
@@ -53,15 +53,15 @@ def write_geo_table(
 
 
 def read_geo_table(content: bytes, context: ProductContext) -> tuple[pa.Table, npt.NDArray[Any]]:
-    """Plain columns, and geometries on the map (m)."""
-    table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)  # by this thread: see Store.read_table
+    """Return plain columns, and geometries on the map (m)."""
+    table = pq.ParquetFile(pa.BufferReader(content)).read(use_threads=False)  # in this thread: see Store.read_table
     name = json.loads(table.schema.metadata[b"geo"])["primary_column"]
     shapes = shapely.from_wkb(table[name].to_numpy())
     return table.drop_columns([name]), _changed(shapes, context, np.multiply)
 
 
 def in_crs_unit(shapes_m: npt.NDArray[Any], context: ProductContext) -> npt.NDArray[Any]:
-    """Geometries (n,) on the map (m), in the CRS's own unit; heights, where they have any, in that of its heights."""
+    """Return geometries (n,), given on the map (m), in the CRS's unit; heights in that of its heights."""
     return _changed(shapes_m, context, np.divide)
 
 

@@ -28,7 +28,7 @@ STEPS: Final[dict[Quantity, float]] = {
 """Pixels are whole multiples of this. Bits below it are noise that takes time and room; float32 itself has no finer
 heights from 256 m on."""
 
-_SMALLEST_OVERVIEW: Final = 32
+_SMALLEST_OVERVIEW: Final = 32  # Fewest pixels along an edge of an overview.
 
 
 class GeoTiffOptions(Strict):
@@ -75,7 +75,7 @@ class GeoTiff(TileProduct):
 
 
 def _sigmas(tile: Tile) -> list[tuple[str, str]]:
-    """Metadata items of the σ that are known."""
+    """Return metadata items of the σ that are known."""
     known = (("HEIGHT", tile.sigma_height_m), ("HORIZONTAL", tile.sigma_horizontal_m))
     return [(f"ROADSCAN_SIGMA_{name}_M", f"{sigma_m:.6f}") for name, sigma_m in known if sigma_m is not None]
 

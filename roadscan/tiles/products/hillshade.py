@@ -39,8 +39,8 @@ Float64 = npt.NDArray[np.float64]
 
 _STEM: Final = "hillshade"
 _PICTURE: Final = "hillshade.png"
-_EMPTY: Final = 0
-_STRIP_ROWS: Final = 128
+_EMPTY: Final = 0  # Grey of a pixel without a height.
+_STRIP_ROWS: Final = 128  # Rows that are shaded at a time, to save memory.
 SHADE_BAND: Final = Band("hillshade", "")
 
 
@@ -120,14 +120,14 @@ class Hillshade(SurveyProduct):
 
 @dataclass(frozen=True)
 class Surface:
-    """Tiles whose heights are drawn, counted from a base near them to keep float arithmetic fine."""
+    """Tiles whose heights are drawn, relative to a base near them to keep float arithmetic precise."""
 
     tiles: Sequence[TileId]
     base_m: float
     load_cells: LoadCells
 
     def images(self) -> Iterator[tuple[TileId, Float64]]:
-        """Tile and its (rows, columns) heights above the base (m), NaN where no point lies; row by row."""
+        """Yield tiles and their (rows, columns) heights above the base (m), NaN where no point lies; row by row."""
         for tile in sorted(self.tiles, key=lambda t: (-t.row, t.column)):
             cells = cells_of(tile, self.load_cells)
             yield tile, cell_image(cells, cells.height_robust_m - self.base_m, "float64")
@@ -138,7 +138,7 @@ class Light(Protocol):
 
     @property
     def azimuth_deg(self) -> float:
-        """Where the light comes from, clockwise from map north (degrees)."""
+        """Direction of the light, clockwise from map north (degrees)."""
 
     @property
     def altitude_deg(self) -> float:
@@ -150,7 +150,7 @@ class Light(Protocol):
 
 
 def horn_slopes(heights_m: Float64, cell_m: float, cell_north_m: float | None = None) -> tuple[Float64, Float64]:
-    """Slopes towards east and north of the inner cells of a north-up raster.
+    """Return slopes towards east and north of the inner cells of a north-up raster.
 
     The weighted differences of Horn, *Hill shading and the reflectance map* (Proc. IEEE 69, 1981), eq. for
     the third-order finite difference with weights 1, 2, 1. A missing neighbour is the continuation of the
@@ -171,7 +171,7 @@ def horn_slopes(heights_m: Float64, cell_m: float, cell_north_m: float | None = 
     to_east = (north_east + 2 * east + south_east) - (north_west + 2 * west + south_west)
     to_north = (north_west + 2 * north + north_east) - (south_west + 2 * south + south_east)
     unknown = np.isnan(heights_m[1:-1, 1:-1])
-    to_east[unknown] = to_north[unknown] = np.nan  # eight neighbours would give the empty cell between them a slope
+    to_east[unknown] = to_north[unknown] = np.nan  # its eight neighbours would give an empty cell a slope
     return to_east / (8 * cell_m), to_north / (8 * (cell_north_m or cell_m))
 
 
@@ -190,7 +190,7 @@ def _neighbour(heights_m: Float64, down: int, right: int) -> Float64:
 def shade(
     heights_m: Float64, cell_m: float, options: Light, cell_north_m: float | None = None
 ) -> npt.NDArray[np.uint8]:
-    """Shade of the inner cells of (rows + 2, columns + 2) heights: 1 to 255, 0 where the height is unknown.
+    """Return the shade of the inner cells of (rows + 2, columns + 2) heights: 1 to 255, 0 where unknown.
 
     The brightness of a matt surface: the cosine between its normal and the direction of the light. Cells whose edges
     differ have that towards north stated, too.
@@ -207,14 +207,14 @@ def shade(
 
 
 def with_empty_rim(heights_m: Float64) -> Float64:
-    """(rows + 2, columns + 2) heights with unknown ones around them."""
+    """Return (rows + 2, columns + 2) heights with unknown ones around them."""
     return np.pad(heights_m, 1, constant_values=np.nan)
 
 
 def shade_in_strips(
     around_m: Float64, cell_m: float, options: Light, cell_north_m: float | None = None
 ) -> npt.NDArray[np.uint8]:
-    """As :func:`shade`, few rows at a time to save memory."""
+    """Compute :func:`shade` a few rows at a time to save memory."""
     rows = around_m.shape[0] - 2
     strips = [
         shade(around_m[top : top + _STRIP_ROWS + 2], cell_m, options, cell_north_m)
@@ -224,13 +224,13 @@ def shade_in_strips(
 
 
 def with_neighbours(sheet: Sheet, everything: frozenset[TileId]) -> tuple[TileId, ...]:
-    """Tiles of a sheet and those of the survey that touch one of them, in order."""
+    """Return the tiles of a sheet and those of the survey that touch one of them, in order."""
     around = {TileId(t.column + right, t.row + up) for t in sheet.tiles for right in (-1, 0, 1) for up in (-1, 0, 1)}
     return tuple(sorted(around & everything))
 
 
 def base_below(tiles: Sequence[TileSummary], output: Output) -> float:
-    """Whole metres at or below the lowest height of the tiles of `output`."""
+    """Return whole metres at or below the lowest height of the tiles of `output`."""
     members = set(output.tiles)
     return float(math.floor(min(one.height_min_m for one in tiles if one.tile in members)))
 
@@ -248,7 +248,7 @@ def _write_sheet(
 
 @contextmanager
 def _heights(surface: Surface, box: CellBox, context: ProductContext, path: Path) -> Iterator[Any]:
-    """Heights over `box` and one cell around it, in a scratch raster."""
+    """Write heights over `box` and one cell around it into a scratch raster."""
     around = SparseRaster(box.grown(1), Band("height", "metre"), "float64", np.nan, context)
     with around.scratch(path.with_name(path.name + ".heights.scratch")) as raster:
         for tile, image in surface.images():
@@ -267,7 +267,7 @@ def _write_picture(
 
 
 def _mean_heights(tiles: Sequence[TileId], load_cells: LoadCells, box: CellBox, step: int) -> MeanPixels:
-    """Means of the heights in pixels of `step` squared cells, north up."""
+    """Return means of the heights in pixels of `step` squared cells, north up."""
     pixels = MeanPixels.over(box.height, box.width, (step, step))
     for tile in tiles:
         cells = cells_of(tile, load_cells)

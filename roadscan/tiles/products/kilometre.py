@@ -78,7 +78,7 @@ class Kilometre(SurveyProduct):
         """Sheets of each view and pixel, followed by the index that joins them."""
         settings = cast(KilometreOptions, options)
         everything = frozenset(one.tile for one in tiles)
-        sheets = cut_sheets("", everything, settings.sheet_m, context.grid)  # the same for all, names without stem
+        sheets = cut_sheets("", everything, settings.sheet_m, context.grid)  # the same for all, as names without stem
         index = index_output("", sheets)
         plain = [Output(s.name, s.tiles) for s in sheets] + index
         wanted = sheets if "shaded" in settings.views else ()
@@ -122,7 +122,7 @@ class Kilometre(SurveyProduct):
 
 @dataclass(frozen=True)
 class _Raster:
-    """One view in pixels of one size; the context's grid has those pixels for cells."""
+    """One view in pixels of one size; the cells of the context's grid are these pixels."""
 
     view: View
     factor: int
@@ -130,7 +130,7 @@ class _Raster:
 
     @property
     def stem(self) -> str:
-        """Name of its files without sheet and suffix."""
+        """File name without sheet and suffix."""
         return f"{self.view}_{round(self.context.grid.cell_m * 1000)}mm"
 
     @property
@@ -140,7 +140,7 @@ class _Raster:
 
 
 def _rasters(options: KilometreOptions, context: ProductContext) -> Iterator[_Raster]:
-    """What the settings ask for; two pixel sizes that have the same nearest overview are one."""
+    """Return the requested rasters; two pixel sizes with the same nearest overview become one."""
     grid = context.grid
     known = overview_factors(grid.cells_per_edge) or (1,)
     factors = {min(known, key=lambda f: (max(f / r, r / f), f)) for r in (m / grid.cell_m for m in options.pixels_m)}
@@ -151,7 +151,7 @@ def _rasters(options: KilometreOptions, context: ProductContext) -> Iterator[_Ra
 
 
 class _Overviews:
-    """Overviews of the tiles of a sheet, asked for row by row from the north; each is loaded once."""
+    """Overviews of the tiles of a sheet, read row by row from the north; each is loaded once."""
 
     def __init__(self, output: Output, base_m: float, raster: _Raster, load_cells: LoadCells) -> None:
         self._tiles = frozenset(output.tiles)
@@ -161,7 +161,7 @@ class _Overviews:
         self._near: dict[TileId, Level] = {}
 
     def image(self, tile: TileId, light: Light) -> npt.NDArray[Any]:
-        """(rows, columns) of a tile, north up, in the unit of the band."""
+        """Return the (rows, columns) image of a tile, north up, in the unit of the band."""
         raster, level = self._raster, self._level(tile)
         unit_m = raster.context.map.vertical_unit_m
         edge = raster.context.grid.cells_per_edge
@@ -173,7 +173,7 @@ class _Overviews:
         return image
 
     def _heights_around(self, tile: TileId, edge: int) -> npt.NDArray[np.float64]:
-        """(edge + 2, edge + 2) heights above the base (m) of a tile and the pixels around it."""
+        """Return (edge + 2, edge + 2) heights above the base (m) of a tile and the pixels around it."""
         heights_m = np.full((edge + 2, edge + 2), np.nan)
         for right in (-1, 0, 1):
             for up in (-1, 0, 1):

@@ -24,7 +24,7 @@ from roadscan.tiles.products.las_axes import Axes, axis, rounding_errors, set_co
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_SCAN_ANGLE_STEP_DEG: Final = 0.006
+_SCAN_ANGLE_STEP_DEG: Final = 0.006  # Step of the scan angle in LAS 1.4.
 
 _FLAG_BITS: Final = {
     "scan_direction_flag": 1,
@@ -82,7 +82,7 @@ class Las(TileProduct):
         return ".laz" if cast(LasOptions, options).compress else ".las"
 
     def check_options(self, options: Strict, context: ProductContext) -> None:
-        """Refuse a spacing that does not divide the tile."""
+        """Raise an error for a spacing that does not divide the tile."""
         spacing_m = cast(LasOptions, options).spacing_m
         if spacing_m is not None:
             _squares_per_edge(spacing_m, context.grid)
@@ -127,7 +127,7 @@ def write_las(
 
 
 def _points_of(tile: Tile, options: LasOptions, context: ProductContext) -> TilePoints:
-    """Points to write: thinned out, or all, and behind them those that filters leave out, where they are kept."""
+    """Return the points to write: thinned, or all followed by filtered points, where they are kept."""
     if tile.points is None:
         raise StoreError(f"tile {tile.cells.tile} came without its points", expected="points, which the product needs")
     if options.spacing_m is not None:
@@ -136,7 +136,7 @@ def _points_of(tile: Tile, options: LasOptions, context: ProductContext) -> Tile
 
 
 def thin_out(points: TilePoints, spacing_m: float, grid: TileGrid) -> TilePoints:
-    """One point in each square of `spacing_m`: the one at the lower median of the square's heights.
+    """Return one point in each square of `spacing_m`: the one at the lower median of the square's heights.
 
     The squares are counted from the tile's south-west corner. Of several points at the median height the
     first in canonical order is kept; the kept points stay in canonical order.
@@ -144,7 +144,7 @@ def thin_out(points: TilePoints, spacing_m: float, grid: TileGrid) -> TilePoints
     per_edge = _squares_per_edge(spacing_m, grid)
     edge = grid.size_quanta // per_edge
     square = (points.y_quanta // edge).astype(np.int64) * per_edge + points.x_quanta // edge
-    order = np.lexsort((points.height_quanta, square))  # stable: equal heights stay in canonical order
+    order = np.lexsort((points.height_quanta, square))  # stable, so equal heights stay in canonical order
     square, height = square[order], points.height_quanta[order]
     new_square = np.diff(square, prepend=-1) != 0
     first_of_height = np.flatnonzero(new_square | (np.diff(height, prepend=0) != 0))
@@ -202,7 +202,7 @@ def _layout(points: TilePoints, axes: Axes, context: ProductContext) -> Layout:
 
 
 def _further(points: TilePoints) -> list[str]:
-    """Recorded columns that LAS has no dimension for."""
+    """Return recorded columns that LAS has no dimension for."""
     return sorted(name for name in points.extra if name not in _HANDLED)
 
 
@@ -216,7 +216,7 @@ def _record(points: TilePoints, axes: Axes, header: laspy.LasHeader) -> Any:
 
 
 def fill_record(record: Any, points: TilePoints) -> None:
-    """Fill the dimensions of LAS, but for coordinates: those that all points have, and what a vendor recorded."""
+    """Fill the dimensions of LAS except coordinates: those that all points have, and those that a vendor recorded."""
     record["intensity"] = points.intensity
     record["classification"] = points.classification
     record["point_source_id"] = points.pass_id
@@ -235,15 +235,15 @@ def fill_record(record: Any, points: TilePoints) -> None:
 
 
 def adjusted_gps_s(epoch_gps_ns: Int64) -> Float64:
-    """Adjusted standard GPS time (s): the double nearest to GPS seconds minus 1e9 (LAS 1.4 R15, 2.4)."""
+    """Return adjusted standard GPS time (s): the double nearest to GPS seconds minus 1e9 (LAS 1.4 R15, 2.4)."""
     since_ns = epoch_gps_ns - ADJUSTED_OFFSET_S * NS_PER_S
-    whole = np.sign(since_ns) * (np.abs(since_ns) // NS_PER_S)  # towards zero: the parts never cancel
+    whole = np.sign(since_ns) * (np.abs(since_ns) // NS_PER_S)  # towards zero, so that the parts have the same sign
     time_s: Float64 = whole + (since_ns - whole * NS_PER_S) / NS_PER_S
     return time_s
 
 
 def _gps_time_step_ns(points: TilePoints) -> float:
-    """Distance of the doubles that hold the last epoch (ns): twice the largest rounding error of time."""
+    """Return the spacing of doubles at the last epoch (ns): twice the largest rounding error of time."""
     last = adjusted_gps_s(points.epoch_gps_ns.max(keepdims=True))
     return round(float(np.spacing(np.abs(last))[0]) * NS_PER_S, 3)
 

@@ -1,4 +1,4 @@
-"""Coordinates as a point file stores them: whole numbers, a scale and an offset, in the CRS's own unit."""
+"""Coordinates as a point file stores them: integers, a scale and an offset, in the CRS's unit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from roadscan.core.errors import ConfigError
 from roadscan.core.grid import QUANTA_PER_M
 
-_INT32_MAX: Final = 2**31 - 1
+_INT32_MAX: Final = 2**31 - 1  # Largest stored coordinate.
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ Axes = tuple[Axis, Axis, Axis]
 
 
 def axis(quanta: npt.NDArray[Any], corner_quanta: int, scale_m: float, unit_m: float, product: str) -> Axis:
-    """Store `quanta` (n,) from `corner_quanta`; offsets are whole units, so that all tiles share one lattice.
+    """Return an axis that stores `quanta` (n,) from `corner_quanta`; offsets are whole units, shared by all tiles.
 
     Raises :class:`ConfigError` where the scale is too fine for 32 bits.
     """
@@ -46,7 +46,7 @@ def axis(quanta: npt.NDArray[Any], corner_quanta: int, scale_m: float, unit_m: f
 
 
 def rounding_errors(axes: Axes) -> dict[str, float]:
-    """Largest rounding error of each coordinate (m), to the nanometre."""
+    """Return the largest rounding error of each coordinate (m), rounded to nanometres."""
     return {name: round(one.error_max_m, 9) for name, one in zip("xyz", axes, strict=True)}
 
 

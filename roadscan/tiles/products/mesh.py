@@ -13,7 +13,7 @@ Float64 = npt.NDArray[np.float64]
 
 
 def mesh_of(easting_m: Float64, northing_m: Float64, height_m: Float64, colour: npt.NDArray[np.uint8]) -> Mesh:
-    """Two triangles between four nodes that hold a height, one between three.
+    """Return two triangles between four nodes with a height, one between three.
 
     Of a square's diagonals the one whose ends differ less in height is taken: edges and cracks keep their lines.
 
@@ -44,7 +44,7 @@ def mesh_of(easting_m: Float64, northing_m: Float64, height_m: Float64, colour: 
     return Mesh(places.astype(np.float32), colour[row, column], triangles.reshape(-1, 3).astype(np.uint32))
 
 
-_LOW, _HIGH = slice(None, -1), slice(1, None)
+_LOW, _HIGH = slice(None, -1), slice(1, None)  # First and second node of an edge, along an axis.
 _CORNERS: Final = ((_LOW, _LOW), (_LOW, _HIGH), (_HIGH, _LOW), (_HIGH, _HIGH))
 
 

@@ -16,11 +16,11 @@ from roadscan.tiles.decimate import Squares, cells_per_square, decimate
 from roadscan.tiles.product import Cells, ProductContext, Tile, TileProduct
 from roadscan.tiles.products.las_axes import Axes, axis, rounding_errors, set_coordinates
 
-_UNCLASSIFIED = 1
+_UNCLASSIFIED = 1  # ASPRS class.
 _WITHHELD = np.uint8(4)
-"""Among the flags of a point."""
+"""Flag of a withheld point."""
 _FURTHER = (("cells", "u2", "cells that count"), ("points", "u2", "readings in them"))
-_MOST = 65_535
+_MOST = 65_535  # Largest number of the dimensions ``cells`` and ``points``.
 
 
 class ModelLasOptions(Strict):
@@ -72,7 +72,7 @@ class ModelLas(TileProduct):
         return ".laz" if cast(ModelLasOptions, options).compress else ".las"
 
     def check_options(self, options: Strict, context: ProductContext) -> None:
-        """Refuse a spacing that is no whole number of cells."""
+        """Raise an error for a spacing that is no whole number of cells."""
         self._side(cast(ModelLasOptions, options), context)
 
     def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:

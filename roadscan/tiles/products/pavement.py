@@ -57,7 +57,7 @@ class ShadedOptions(PictureOptions):
 
 
 class _Picture(TileProduct):
-    """A picture of the part of a tile that holds cells, with a world file beside it."""
+    """A picture of the part of a tile with cells, and a world file beside it."""
 
     suffix: ClassVar[str] = ".png"
     version: ClassVar[int] = 3
@@ -70,7 +70,7 @@ class _Picture(TileProduct):
         return f".{cast(PictureOptions, options).format}"
 
     def companions(self, options: Strict) -> dict[str, str]:
-        """The world file, by which GIS places the picture."""
+        """Return the world file, with which a GIS georeferences the picture."""
         return {"place": _WORLD_FILES[cast(PictureOptions, options).format]}
 
     def write(self, tile: Tile, options: Strict, context: ProductContext, path: Path) -> None:
@@ -123,7 +123,7 @@ class PavementIntensity(_Picture):
     def draw(
         self, cells: TileCells, box: CellBox, options: Strict, context: ProductContext, picture: npt.NDArray[np.uint8]
     ) -> None:
-        """Grey of each cell's intensity."""
+        """Draw the grey of each cell's intensity."""
         settings = cast(IntensityOptions, options)
         grey_intensity(
             cells.column, cells.row, cells.intensity_mean, settings.black, settings.white,
@@ -147,7 +147,7 @@ class PavementShaded(_Picture):
     def draw(
         self, cells: TileCells, box: CellBox, options: Strict, context: ProductContext, picture: npt.NDArray[np.uint8]
     ) -> None:
-        """Shade of each cell."""
+        """Draw the shade of each cell."""
         settings = cast(ShadedOptions, options)
         azimuth, altitude = math.radians(settings.azimuth_deg), math.radians(settings.altitude_deg)
         level = math.cos(altitude)
@@ -160,7 +160,7 @@ class PavementShaded(_Picture):
 
 
 def _seen(cells: TileCells) -> CellBox:
-    """Smallest box around a tile's cells, counted from its own corner; one cell where there are none."""
+    """Return the smallest box around a tile's cells, relative to its corner; one cell where there are none."""
     if not len(cells):
         return CellBox(0, 0, 1, 1)
     west, south = int(cells.column.min()), int(cells.row[0])

@@ -1,4 +1,4 @@
-"""What the rasters show of a cell: four quantities, with their bands and units."""
+"""Quantities of a cell that rasters show, with their bands and units."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUANTITIES: Final[tuple[Quantity, ...]] = get_args(Quantity)
 
 
 def band_of(quantity: Quantity, context: ProductContext) -> Band:
-    """Band that shows a quantity; heights are in the unit of the map's heights."""
+    """Return the band that shows a quantity; heights are in the unit of the map's heights."""
     unit = height_unit(context.map)
     return {
         "height": Band("height", unit),
@@ -29,7 +29,7 @@ def band_of(quantity: Quantity, context: ProductContext) -> Band:
 
 
 def values_of(quantity: Quantity, cells: TileCells, context: ProductContext) -> npt.NDArray[Any]:
-    """(n,) values of a quantity, one a cell, in the unit of its band."""
+    """Return (n,) values of a quantity, one a cell, in the unit of its band."""
     unit_m = context.map.vertical_unit_m
     match quantity:
         case "height":

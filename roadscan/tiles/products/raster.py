@@ -1,4 +1,4 @@
-"""How every raster product lies in its file: north up, in the CRS's own units, as a cloud-optimised GeoTIFF."""
+"""Common layout of raster products: north up, in the CRS's units, as a cloud-optimised GeoTIFF."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class CellBox:
     width: int
     height: int
     edges_m: tuple[float, float] | None = None
-    """Edges of a cell (m), east and north, of a grid that is not the map's own; None for the context's cells."""
+    """Edges of a cell (m), east and north, of a grid other than the map's; None for the context's cells."""
 
     @classmethod
     def around(cls, tiles: Iterable[TileId], grid: TileGrid) -> Self:
-        """Smallest box that holds all cells of `tiles` (at least one)."""
+        """Return the smallest box that contains all cells of `tiles` (at least one)."""
         columns, rows = zip(*((t.column, t.row) for t in tiles), strict=True)
         n, west, south = grid.cells_per_edge, min(columns), min(rows)
         return cls(west * n, south * n, (max(columns) + 1 - west) * n, (max(rows) + 1 - south) * n)
@@ -49,13 +49,13 @@ class CellBox:
         return self.south + self.height
 
     def grown(self, cells: int) -> CellBox:
-        """The box with `cells` more on every side."""
+        """Return the box with `cells` more on every side."""
         return CellBox(
             self.west - cells, self.south - cells, self.width + 2 * cells, self.height + 2 * cells, self.edges_m
         )
 
     def transform(self, context: ProductContext) -> Affine:
-        """Map position, in the CRS's own unit, of a (column, row) counted from the north-west corner."""
+        """Return the transform from (column, row) from the north-west corner to the map, in the CRS's unit."""
         if self.edges_m is not None:
             unit_m, (east, north) = context.map.horizontal_unit_m, self.edges_m
             return Affine(
@@ -67,24 +67,24 @@ class CellBox:
         return Affine(pixel, 0.0, self.west * cell / unit_quanta, 0.0, -pixel, self.north * cell / unit_quanta)
 
     def tile_window(self, tile: TileId, edge: int) -> tuple[int, int, int, int]:
-        """Columns and rows (first, end, first, end) of a tile of `edge` squared cells, cut off at the box."""
+        """Return columns and rows (first, end, first, end) of a tile of `edge` squared cells, cut off at the box."""
         left = tile.column * edge - self.west
         top = self.north - (tile.row + 1) * edge
         return max(left, 0), min(left + edge, self.width), max(top, 0), min(top + edge, self.height)
 
     def block(self, column: int, row: int) -> Window:
-        """Window of the block of that number, counted from the north-west."""
+        """Return the window of a block by its column and row, counted from the north-west."""
         left, top = column * BLOCK, row * BLOCK
         return Window(left, top, min(BLOCK, self.width - left), min(BLOCK, self.height - top))
 
     def blocks(self) -> Iterator[Window]:
-        """Windows of the blocks that cover the raster, row by row."""
+        """Yield the windows of the blocks that cover the raster, row by row."""
         for row in range(-(-self.height // BLOCK)):
             for column in range(-(-self.width // BLOCK)):
                 yield self.block(column, row)
 
     def blocks_under(self, tiles: Iterable[TileId], edge: int) -> list[Window]:
-        """Windows of the blocks that share a cell with one of `tiles`, row by row."""
+        """Yield the windows of the blocks that share a cell with one of `tiles`, row by row."""
         found: set[tuple[int, int]] = set()
         for tile in tiles:
             x0, x1, y0, y1 = self.tile_window(tile, edge)
@@ -94,12 +94,12 @@ class CellBox:
 
 @functools.lru_cache(maxsize=16)
 def height_unit(frame: MapFrame) -> str:
-    """Name of the unit that heights are written in."""
+    """Return the name of the unit in which heights are written."""
     return frame.vertical_unit
 
 
 def cell_image(cells: TileCells, values: npt.NDArray[Any], dtype: str) -> npt.NDArray[Any]:
-    """(rows, columns) image of one value (n,) a cell, north up, NaN where no point lies."""
+    """Return a (rows, columns) image of one value (n,) a cell, north up, NaN where no point lies."""
     edge = cells.cells_per_edge
     image = np.full((edge, edge), np.nan, dtype=dtype)
     image[edge - 1 - cells.row.astype(np.int64), cells.column] = values
@@ -117,7 +117,7 @@ def paste_tile(raster: Any, box: CellBox, tile: TileId, image: npt.NDArray[Any])
 
 @dataclass(frozen=True)
 class SparseRaster:
-    """What a one-band raster is to be, before it has pixels."""
+    """Properties of a one-band raster whose pixels are written later."""
 
     box: CellBox
     band: Band
@@ -127,7 +127,7 @@ class SparseRaster:
 
     @contextlib.contextmanager
     def scratch(self, path: Path) -> Iterator[Any]:
-        """The raster in the file `path`, removed at the end; blocks never written take no room."""
+        """Yield a raster in the file `path`, removed at the end; blocks never written take no room."""
         try:
             with self._create(path) as raster:
                 yield raster
@@ -136,7 +136,7 @@ class SparseRaster:
 
     @contextlib.contextmanager
     def cog(self, path: Path) -> Iterator[Any]:
-        """The raster to be filled; it becomes a cloud-optimised GeoTIFF at `path` when it is left.
+        """Yield a raster to be filled; at the end it becomes a cloud-optimised GeoTIFF at `path`.
 
         Overviews halve the raster until it is small; each of their pixels is the mean of those below it that hold a
         value. The same pixels give the same bytes.
@@ -176,7 +176,7 @@ class SparseRaster:
             yield raster
 
     def _stored_blocks(self, raster: Any) -> Iterator[Window]:
-        """Windows of the blocks that were written."""
+        """Return the windows of the blocks that were written."""
         for block in self.box.blocks():
             place = f"BLOCK_OFFSET_{block.col_off // BLOCK}_{block.row_off // BLOCK}"
             if raster.get_tag_item(place, "TIFF", bidx=1) is not None:
@@ -190,7 +190,7 @@ def about(
     tile: TileId | None = None,
     more: Sequence[tuple[str, str]] = (),
 ) -> About:
-    """What a raster says of itself; `more` : names and values of further metadata."""
+    """Return the metadata of a raster; `more`: names and values of further metadata."""
     height = "local" if context.map.is_local else context.map.height
     items = [("ROADSCAN_SURVEY", context.survey_id), ("ROADSCAN_HEIGHT", height)]
     if tile is not None:

@@ -20,12 +20,12 @@ Int64 = npt.NDArray[np.int64]
 
 PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 
-_EMPTY: Final = 0
+_EMPTY: Final = 0  # Grey of a pixel without a height.
 
 
 @dataclass(frozen=True)
 class MeanPixels:
-    """Heights gathered in pixels of several cells, north up."""
+    """Mean heights in pixels of several cells, north up."""
 
     steps: tuple[int, int]
     """Cells along the edges of a pixel: down, and to the right."""
@@ -35,7 +35,7 @@ class MeanPixels:
 
     @classmethod
     def over(cls, rows: int, columns: int, steps: tuple[int, int]) -> Self:
-        """Empty pixels over so many rows and columns of cells."""
+        """Create empty pixels over so many rows and columns of cells."""
         shape = -(-rows // steps[0]), -(-columns // steps[1])
         return cls(steps, np.zeros(shape), np.zeros(shape))
 
@@ -48,7 +48,7 @@ class MeanPixels:
         self.count.reshape(-1)[pixel] += np.bincount(inverse)
 
     def trimmed(self) -> Float64:
-        """(rows, columns) mean heights, NaN where empty, without empty rows and columns at the edges."""
+        """Return (rows, columns) mean heights, NaN where empty, without empty rows and columns at the edges."""
         with np.errstate(invalid="ignore"):
             heights_m = self.total / self.count
         known = self.count > 0

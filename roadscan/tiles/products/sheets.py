@@ -1,4 +1,4 @@
-"""How rasters over a whole survey are cut into sheets, and the index (VRT) that joins them again."""
+"""Cuts rasters over a whole survey into sheets, and writes the index (VRT) that joins them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from roadscan.tiles.products.raster import CellBox
 _VRT_TYPES: Final = {"float32": ("Float32", "nan"), "uint8": ("Byte", "0")}
 """GDAL's name and the value of empty cells, by type of the sheets."""
 
-_SHEET_CELLS: Final = 20_000
+_SHEET_CELLS: Final = 20_000  # Cells along the edge of a sheet, by default.
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Sheet:
 
 
 def cut_sheets(stem: str, tiles: Iterable[TileId], sheet_m: float | None, grid: TileGrid) -> list[Sheet]:
-    """Sheets of the raster `stem` over `tiles`.
+    """Return the sheets of the raster `stem` over `tiles`.
 
     A survey no wider and no higher than one sheet is one file, ``stem.tif``. A larger one is cut along
     multiples of the sheet's edge, counted from the map's origin, into ``stem_COLUMN_ROW.tif``. A
@@ -55,7 +55,7 @@ def cut_sheets(stem: str, tiles: Iterable[TileId], sheet_m: float | None, grid: 
 
 
 def sheet_of(stem: str, output: Output, sheet_m: float | None, grid: TileGrid) -> Sheet | None:
-    """Sheet of the raster `stem` that `output` is, if it is one, without tiles that are only its neighbours."""
+    """Return the sheet of the raster `stem` that `output` is, if any, without tiles that are only its neighbours."""
     found = re.fullmatch(rf"{re.escape(stem)}(?:_(-?\d+)_(-?\d+))?\.tif", output.name)
     if found is None:
         return None
@@ -76,12 +76,12 @@ def _tiles_per_edge(sheet_m: float | None, grid: TileGrid) -> int:
 
 
 def index_name(stem: str) -> str:
-    """Name of the file that joins the sheets of `stem`."""
+    """Return the name of the file that joins the sheets of `stem`."""
     return f"{stem}.vrt"
 
 
 def index_output(stem: str, sheets: Sequence[Sheet]) -> list[Output]:
-    """The index over `sheets`, where there is more than one.
+    """Return the index over `sheets`, where there is more than one.
 
     It depends on where the sheets lie, and so names the outermost tiles of each alone: a network has millions.
     """
@@ -91,25 +91,25 @@ def index_output(stem: str, sheets: Sequence[Sheet]) -> list[Output]:
 
 
 def _outermost(tiles: Sequence[TileId]) -> set[TileId]:
-    """Up to four tiles that span the same box as all."""
+    """Return up to four tiles that span the same box as all."""
     by_column, by_row = [sorted(tiles, key=key) for key in (lambda t: (t.column, t.row), lambda t: (t.row, t.column))]
     return {by_column[0], by_column[-1], by_row[0], by_row[-1]}
 
 
 def unknown_output(output: Output) -> StoreError:
-    """The error for a file that the product does not make."""
+    """Return the error for a file that the product does not make."""
     return StoreError(f"'{output.name}' is no file of this product", expected="one of those it lists")
 
 
 def dated(context: ProductContext, tiles: Iterable[TileSummary], drawn: Iterable[TileId]) -> ProductContext:
-    """The context with the UTC date of the first epoch of the tiles `drawn`, so that a file depends on them alone."""
+    """Return the context with the UTC date of the first epoch of the tiles `drawn`, so a file depends on them alone."""
     members = set(drawn)
     first_gps_ns = min((one.first_epoch_gps_ns for one in tiles if one.tile in members), default=None)
     return context if first_gps_ns is None else replace(context, date=utc_from_gps_ns(first_gps_ns).date())
 
 
 def cells_of(tile: TileId, load_cells: LoadCells) -> TileCells:
-    """Cells of a tile that the survey lists, or :class:`StoreError` where they are missing."""
+    """Return the cells of a tile of the survey; raises :class:`StoreError` where they are missing."""
     cells = load_cells(tile)
     if cells is None:
         raise StoreError(f"tile {tile} is listed and has no cells", change="run the survey again")
@@ -186,6 +186,6 @@ def _add_source(band: ET.Element, name: str, own: CellBox, box: CellBox, nodata:
 
 
 def _axis_mapping(frame: MapFrame) -> str:
-    """Which axis of the CRS the raster's columns and rows run along (some CRSs state northing first)."""
+    """Return which axis of the CRS the raster's columns and rows run along (some CRSs state northing first)."""
     east_first = frame.crs is None or crs_from_text(frame.crs).axis_info[0].direction == "east"
     return ("1,2" if east_first else "2,1") + ("" if frame.vertical_crs is None else ",3")

@@ -53,7 +53,7 @@ class TileTable(SurveyProduct):
     title: ClassVar[str] = "table of the tiles with their outlines (GeoParquet), for DuckDB, pandas and GIS"
 
     def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
-        """One file."""
+        """Return one file."""
         return [Output(_FILE, tuple(sorted(t.tile for t in tiles)))]
 
     def write(
@@ -100,7 +100,7 @@ def _row(one: TileSummary, context: ProductContext) -> dict[str, Any]:
 
 
 def _outlines_m(rows: Sequence[TileSummary], context: ProductContext) -> Any:
-    """(n,) polygons on the map (m), counter-clockwise."""
+    """Return (n,) polygons on the map (m), counter-clockwise."""
     boxes = [context.grid.bounds(one.tile) for one in rows]
     edges = np.array([[b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m] for b in boxes])
     return shapely.box(*edges.reshape(-1, 4).T, ccw=True)

@@ -1,1 +1,1 @@
-"""Footprints, keys and tasks of tiles; what workers do with them; files of tiles."""
+"""Tasks of tiles: keys, plans, the work on workers, and files."""

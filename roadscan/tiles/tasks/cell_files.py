@@ -1,4 +1,4 @@
-"""Files of a tile's cells and of their overviews: Parquet, in the encodings that measured best.
+"""Files of a tile's cells and of their overviews: Parquet, in the encodings that were fastest and smallest.
 
 Surfaces and overviews go through `roadscan/store/plane_table.py`: byte planes under LZ4 take 17 ns of one core and
 5.8 bytes a cell of the line-rate pair (Parquet's general writer and ZSTD: 42 ns, 5.2 bytes). Of full tables, measured
@@ -32,10 +32,10 @@ from roadscan.tiles.cells import TileCells
 from roadscan.tiles.pyramid import Level
 
 HEIGHT_STEP_M: Final = 2.0**-20
-"""Heights of surfaces and overviews are whole multiples of this (0.95 µm)."""
+"""Heights of surfaces and overviews are rounded to multiples of this (0.95 µm)."""
 
 INTENSITY_STEP: Final = 2.0**-6
-"""Intensities of surfaces and overviews are whole multiples of this."""
+"""Intensities of surfaces and overviews are rounded to multiples of this."""
 
 _ROUNDED: Final = {
     "height_robust_m": HEIGHT_STEP_M,
@@ -45,11 +45,11 @@ _ROUNDED: Final = {
 }
 _PLACES: Final = ("factor", "row", "column")
 _LISTS: Final = "passes.list.element"
-_GROUP_ROWS: Final = 1 << 20
+_GROUP_ROWS: Final = 1 << 20  # Rows in a row group.
 
 
 def cells_table(cells: TileCells, columns: CellColumns = "full") -> pa.Table:
-    """Cells as rows of ``schemas/cells.toml``; a ``surface`` has the columns that are always there, rounded."""
+    """Return cells as rows of ``schemas/cells.toml``; a ``surface`` has only the mandatory columns, rounded."""
     schema = _stored("cells", columns)
     if columns == "surface":
         return pa.table([_rounded(n, getattr(cells, n)) for n in schema.names], schema=schema)
@@ -58,7 +58,7 @@ def cells_table(cells: TileCells, columns: CellColumns = "full") -> pa.Table:
 
 
 def overviews_table(levels: Sequence[Level]) -> pa.Table:
-    """Overviews as rows of ``schemas/overviews.toml``, heights and intensities rounded."""
+    """Return overviews as rows of ``schemas/overviews.toml``, heights and intensities rounded."""
     schema = _stored("overviews", "full")
     parts = [
         pa.table(
@@ -86,7 +86,7 @@ def write_cells(path: Path, cells: TileCells, columns: CellColumns = "full") -> 
 
 
 def write_overviews(path: Path, levels: Sequence[Level]) -> None:
-    """Write a tile's overviews, a row group a level, so that one is read without the others."""
+    """Write a tile's overviews with a row group per level, so that one can be read without the others."""
     schema = _stored("overviews", "full")
     groups = (
         {n: getattr(one, n) for n in schema.names[1:]} | {"factor": np.full(len(one), one.factor, np.uint16)}
@@ -96,7 +96,7 @@ def write_overviews(path: Path, levels: Sequence[Level]) -> None:
 
 
 def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileCells:
-    """Cells of a finished tile; what a ``surface`` leaves out is NaN, and it names no passes."""
+    """Return the cells of a finished tile; columns missing in a ``surface`` are NaN, and it names no passes."""
     rows = store.parse_table(read_recorded(store, record), record.path)
     n = rows.num_rows
     known: dict[str, Any] = {name: rows.column(name).to_numpy() for name in rows.column_names if name != "passes"}
@@ -115,7 +115,7 @@ def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileC
 
 
 def read_overview(store: Store, record: OutputRecord, factor: int) -> Level:
-    """One overview of a finished tile; nothing else of its file is read, so its size and checksums tell if it is whole.
+    """Return one overview of a finished tile; only its part of the file is read and checked, by size and checksums.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def read_overview(store: Store, record: OutputRecord, factor: int) -> Level:
 @functools.cache
 def _stored(table: str, columns: CellColumns) -> pa.Schema:
     schema = table_schema(table).arrow()
-    if columns == "full":  # all columns are there, and none has a null: levels of nulls take time
+    if columns == "full":  # all columns are present without nulls: levels of nulls would take time
         return pa.schema([f.with_nullable(False) for f in schema])
     return pa.schema([f for f in schema if not f.nullable])
 
@@ -161,7 +161,7 @@ def _rounded(name: str, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _settings(schema: pa.Schema) -> dict[str, Any]:
-    """Encodings by column: places repeat from row to row, all else is split into byte planes, lists by dictionary."""
+    """Return encodings by column: plain for places, which repeat; byte planes for all else; dictionaries for lists."""
     planes = {f.name: "BYTE_STREAM_SPLIT" for f in schema if f.name not in (*_PLACES, "pass_count", "passes")}
     return {
         "compression": "zstd",

@@ -1,9 +1,9 @@
-"""Whether the survey's cells hold enough readings, and which cells would: from the tiles that are there.
+"""Checks whether the survey's cells have enough readings, and which cell size would, from the finished tiles.
 
-The rule: a cell of the road that holds a reading should hold :data:`ENOUGH` of them, so that its robust height is a
-median and not the reading itself. What counts is the median over the cells of the fullest tiles, those that together
-hold half of all readings: a lidar sees far beside the road, too. Larger cells are put together from the cells that are
-there, so the numbers are counted and not modelled; no reading is read again.
+The rule: a cell of the road with a reading should have :data:`ENOUGH` of them, so that its robust height is a median
+and not the reading itself. The criterion is the median over the cells of the fullest tiles, which together have half of
+all readings: a lidar also sees far beside the road. Larger cells are joined from the existing cells, so the numbers are
+counted and not modelled; no reading is read again.
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 
 _SAMPLED: Final = 4
-"""Tiles that are looked at: their cells are read from their files."""
+"""Number of tiles that are examined by reading the files of their cells."""
 _PLENTY: Final = 3 * ENOUGH
-"""Where the cells of a tile hold so many readings on average, they are not looked at."""
+"""Where cells have at least this many readings on average, they are not examined."""
 
 
 @dataclass(frozen=True)
 class CellDensity:
-    """Median readings of a cell that holds one, by the cell's edge (m), from the survey's own edge upwards."""
+    """Median number of readings of a cell with a reading, by the cell's edge (m), from the survey's edge upwards."""
 
     readings: dict[float, float]
 
     @property
     def now(self) -> float:
-        """Those of the survey's own cells."""
+        """Median of the survey's cells."""
         return next(iter(self.readings.values()))
 
     @property
     def proposed_m(self) -> float | None:
-        """Smallest edge (m) of a cell that holds enough; None where none up to a metre does."""
+        """Smallest edge (m) of a cell with enough readings; None where none up to a metre has."""
         return next((edge for edge, held in self.readings.items() if held >= ENOUGH), None)
 
 
 def density_notes(survey: Survey, store: Store, manifest: Manifest) -> list[str]:
-    """What to say of the cells' size, if anything: where cells hold one reading each, or a default size too few."""
+    """Return remarks on the cells' size: where cells have one reading each, or a default size too few."""
     config = survey.config.tiles
     try:
         found = _density(TileGrid(config.size_m, config.cell_m), store, manifest)
     except RoadscanError:
-        return []  # a damaged file of cells is told, and made again, elsewhere
+        return []  # damage is reported and repaired elsewhere
     if found is None or found.now >= ENOUGH:
         return []
     stated = "cell_m" in config.model_fields_set
@@ -71,7 +71,7 @@ def _readings(number: float) -> str:
 
 
 def _density(grid: TileGrid, store: Store, manifest: Manifest) -> CellDensity | None:
-    """What the fullest tiles hold; None where there are none, or they hold plenty."""
+    """Return the density of the fullest tiles; None where there are none, or cells have plenty."""
     chosen = _fullest([r for r in manifest.of(TILE).values() if r.path])
     figures = [record.figures() for record in chosen]
     if not chosen or sum(f["points"] for f in figures) >= _PLENTY * sum(f["cells"] for f in figures):
@@ -81,7 +81,7 @@ def _density(grid: TileGrid, store: Store, manifest: Manifest) -> CellDensity | 
 
 
 def _fullest(records: Sequence[OutputRecord]) -> list[OutputRecord]:
-    """Some of the tiles that together hold half of all readings, from the fullest to the least full of them."""
+    """Return some of the tiles that together have half of all readings, from the fullest to the least full."""
     points = [(int(r.figures().get("points", 0)), r) for r in records]
     ordered = sorted((one for one in points if one[0]), key=lambda one: (-one[0], one[1].unit))
     if not ordered:
@@ -93,7 +93,7 @@ def _fullest(records: Sequence[OutputRecord]) -> list[OutputRecord]:
 
 
 def cell_density(tiles: Sequence[TileCells], grid: TileGrid) -> CellDensity:
-    """Readings of the cells of some tiles, and of larger cells that a tile could be cut into."""
+    """Return the readings of the cells of some tiles, and of larger cells that divide a tile."""
     edge = grid.cells_per_edge
     found: dict[float, float] = {}
     for factor in range(1, edge + 1):
@@ -107,7 +107,7 @@ def cell_density(tiles: Sequence[TileCells], grid: TileGrid) -> CellDensity:
 
 
 def _counts(cells: TileCells, factor: int) -> npt.NDArray[np.float64]:
-    """Readings of each cell of `factor` squared ones that holds one."""
+    """Return the readings of each cell of `factor` squared ones with a reading."""
     across = -(-cells.cells_per_edge // factor)
     number = (cells.row.astype(np.int64) // factor) * across + cells.column.astype(np.int64) // factor
     counts = np.bincount(number, weights=cells.count)

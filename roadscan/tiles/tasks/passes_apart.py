@@ -1,4 +1,4 @@
-"""Whether the passes that saw a place agree on its height: asked of points, also where no pose can be adjusted."""
+"""Checks whether passes over one place agree on its height, from points, also where no pose can be adjusted."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ PASSES_APART: Final = Witness(
 FIGURE: Final = "passes_apart"
 """Name of the figure in a tile's record."""
 _MOST_PASSES: Final = 6
-"""Of a tile of more passes, those with the most points are compared."""
-_LEAST_CELLS: Final = 20
+"""Most passes of a tile that are compared, those with the most points."""
+_LEAST_CELLS: Final = 20  # Least number of cells that both passes saw.
 _LEAST_M: Final = 0.02
-"""Two passes of a good mapping system, in one datum, are nearer together."""
-_SCATTERS: Final = 5.0
-_MOST_TOLD: Final = 8
+"""Least reported difference: passes of a good mapping system in one datum agree better."""
+_SCATTERS: Final = 5.0  # A reported difference exceeds the scatter this many times.
+_MOST_TOLD: Final = 8  # Most differences that are reported.
 
 
 def apart_in_tile(points: TilePoints, grid: TileGrid, passes: Sequence[LanePass]) -> list[list[Any]]:
-    """Of each two passes of a tile: both in words, cells that both saw, median difference of their mean heights (m) and
-    its scatter (m, 1 σ of a cell).
+    """Return for each two passes of a tile: both in words, number of common cells, median difference of their mean
+    heights (m) and its scatter (m, 1 σ of a cell).
     """
     ids, counts = np.unique(points.pass_id, return_counts=True)
     if ids.size < 2:
@@ -69,7 +69,7 @@ def apart_in_tile(points: TilePoints, grid: TileGrid, passes: Sequence[LanePass]
 
 
 def apart_findings(tiles: Iterable[OutputRecord]) -> list[Finding]:
-    """Passes that differ by far more than their noise, from the records of tiles; the largest differences first."""
+    """Return passes that differ by far more than their noise, from the records of tiles; the largest first."""
     pairs: dict[tuple[str, str], list[tuple[int, float, float]]] = defaultdict(list)
     for record in tiles:
         for one, other, *figures in record.figures().get(FIGURE, ()):

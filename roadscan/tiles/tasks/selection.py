@@ -1,4 +1,4 @@
-"""Tiles that a selection holds, among those that a reading touches."""
+"""Selects tiles among those that a reading touches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from roadscan.run.selection import Selection, SelectionError
 def chosen_tiles(
     selection: Selection, known: Iterable[TileId], footprints: FootprintRanges, grid: TileGrid
 ) -> list[TileId]:
-    """Chosen tiles among those with readings, by row and column."""
+    """Return the chosen tiles among those with readings, by row and column."""
     with_readings = set(known)
     unknown = [t for t in selection.named if t not in with_readings]
     if unknown:

@@ -1,4 +1,4 @@
-"""Tiles in stretches of road, each of which is a task: two kilometres, or less where there are few for the workers."""
+"""Divides tiles into stretches of road, each of which is a task: two kilometres, or less for many workers."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy.typing as npt
 from roadscan.footprints.row_groups import GroupsByTile
 
 _SQUARE_M = 100.0
-"""Edge of the squares whose tiles stay together."""
+"""Edge of the squares whose tiles stay in one task."""
 
 _SQUARES = 29
-"""Squares that one task computes at most: two kilometres of road oblique to the grid, three along it."""
+"""Most squares of a task: two kilometres of road oblique to the grid, three along it."""
 
 _SQUARES_A_TASK = 4
-"""Squares of a task at least, of less than 100 m where there are few: tasks have about as many readings each."""
+"""Least number of squares of a task; where there are few, squares are smaller than 100 m, to balance the tasks."""
 
 _SHARES = (8, 4, 2, 1)
-"""Tasks a worker, where there are few squares: several, so that no worker waits long for the last one …"""
+"""Tasks per worker where there are few squares: several, so that no worker waits long for the last one …"""
 
 _MOST_READ = 1.15
-"""… unless tasks would read so many times as many row groups as there are: a lidar sees far beyond its own stretch."""
+"""… unless tasks would read more than this many times the row groups: a lidar sees far beyond a stretch."""
 
 Int64 = npt.NDArray[np.int64]
 
@@ -34,14 +34,14 @@ class DrivenTiles:
     column: npt.NDArray[np.int32]
     row: npt.NDArray[np.int32]
     readings: Int64
-    """About how many."""
+    """Approximate number of readings."""
     first_epoch_gps_ns: Int64
     groups: GroupsByTile
     """Row groups that may touch them."""
 
 
 def cut_stretches(tiles: DrivenTiles, numbers: Int64, size_m: float, workers: int) -> list[Int64]:
-    """Tiles (numbers into `tiles`, at least one) in the order in which they were driven over, cut into stretches."""
+    """Divide tiles (numbers into `tiles`, at least one) in driving order into stretches."""
     numbers = np.sort(numbers)
     edge = max(1, round(_SQUARE_M / size_m))
     square = _squares(tiles, numbers, edge)
@@ -64,14 +64,14 @@ def cut_stretches(tiles: DrivenTiles, numbers: Int64, size_m: float, workers: in
 
 
 def _squares(tiles: DrivenTiles, numbers: Int64, edge: int) -> npt.NDArray[np.intp]:
-    """Number of the square of `edge` by `edge` tiles in which each tile lies."""
+    """Return the number of the square of `edge` by `edge` tiles that contains each tile."""
     east, north = (part[numbers].astype(np.int64) // edge for part in (tiles.column, tiles.row))
     square: npt.NDArray[np.intp] = np.unique((north << 32) + east, return_inverse=True)[1]
     return square
 
 
 def _stretch_by_turn(readings: Int64, parts: int) -> Int64:
-    """Stretch of each square, in the order of the drive: of 29 squares, or `parts` of about as many readings each."""
+    """Return the stretch of each square in driving order: of 29 squares, or `parts` of about as many readings each."""
     if readings.size >= _SQUARES * parts:
         return np.arange(readings.size, dtype=np.int64) // _SQUARES
     upto = np.cumsum(readings)
@@ -80,7 +80,7 @@ def _stretch_by_turn(readings: Int64, parts: int) -> Int64:
 
 
 def _times_read(groups: GroupsByTile, stretches: list[Int64], numbers: Int64) -> float:
-    """Row groups that the stretches read, to those that there are."""
+    """Return the ratio of the row groups that the stretches read to those that there are."""
     read = [int((runs.end - runs.begin).sum()) for runs in map(groups.runs, [numbers, *stretches])]
     return sum(read[1:]) / max(read[0], 1)
 

@@ -1,8 +1,8 @@
-"""Cells of a task's tiles straight from the raw readings: each row group is read once, and no point is made.
+"""Counts raw readings into the cells of a task's tiles: each row group is read once, and no point is written.
 
-Tiles are finished one after another, in the order of the drive. For the next one, the row groups that may touch it
-and have not been read yet are counted, into all tiles of the task that they touch. So a row group is read once, and
-what memory holds at any time are the cells of the few tiles that are begun and not finished.
+Tiles are finished one after another, in driving order. For the next tile, the row groups that may touch it and have not
+been read yet are counted into all tiles of the task that they touch. So a row group is read once, and memory contains
+only the cells of the few tiles that are started and not finished.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from roadscan.tiles.cells import TileCells
 from roadscan.tiles.counting import Counting
 from roadscan.tiles.tasks.tile_plan import TileTask
 
-_RETURNS_AT_ONCE = 1 << 18
-_READINGS_AT_ONCE = 1 << 20
+_RETURNS_AT_ONCE = 1 << 18  # Returns that are read together, at most.
+_READINGS_AT_ONCE = 1 << 20  # Readings of profiles that are read together, at most.
 _PIECES_AHEAD = 4
-"""Pieces of 2 to 3 MB that are on their way while one is counted; several, because requests wait for a network."""
+"""Number of pieces of 2 to 3 MB that are prefetched; several, because requests wait for a network."""
 _KEPT = threading.local()
 
 
@@ -41,18 +41,18 @@ class CountedTile:
 
     tile: TileId
     cells: TileCells | None
-    """None where no reading fell into it."""
+    """Cells of the tile; None where no reading fell into it."""
     evidence: TileEvidence | None
     failure: str = ""
 
 
 def count_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[CountedTile]:
-    """Cells of all tiles of a task that needs no points, in the task's order."""
+    """Yield the cells of all tiles of a task that needs no points, in the task's order."""
     yield from _Stretch(task, fates).tiles(range(len(task.block.tiles)))
 
 
 class _Stretch:
-    """A task at work."""
+    """Computes one task."""
 
     def __init__(self, task: TileTask, fates: ReadingCounts) -> None:
         self._task, self._fates = task, fates
@@ -64,7 +64,7 @@ class _Stretch:
         self._owners = {(s, k): tile for s, k, tile in task.owned}
 
     def tiles(self, numbers: Sequence[int]) -> Iterator[CountedTile]:
-        """Finish tiles by their numbers in the task; half of them at a time where memory is too small."""
+        """Yield finished tiles by their numbers in the task; half of them at a time where memory is too small."""
         left = list(numbers)
         try:
             for finished in self._finished(numbers):
@@ -108,7 +108,7 @@ class _Stretch:
                 yield CountedTile(tile, *(finished or (None, None)))
 
     def _announced(self, numbers: Sequence[int]) -> Iterator[None]:
-        """Goes on once a piece that is counted, and lets those that follow be on their way."""
+        """Yields once per counted piece, after prefetching the next four."""
         done: set[tuple[int, int]] = set()
         pieces = (
             (touch.slice_index, *piece)
@@ -123,7 +123,7 @@ class _Stretch:
                 yield
 
     def _tiles_by_group(self, wanted: set[int]) -> dict[tuple[int, int], list[TileId]]:
-        """Wanted tiles that each group of a slice may touch."""
+        """Return the wanted tiles that each group of a slice may touch."""
         found: dict[tuple[int, int], list[TileId]] = defaultdict(list)
         for number in sorted(wanted):
             for touch in self._task.touches[number]:
@@ -151,7 +151,7 @@ class _Stretch:
 
 
 def _unread(index: int, first: int, end: int, done: set[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Runs of positions from `first` to `end` − 1 that have not been read; they count as read from now on."""
+    """Yield runs of positions from `first` to `end` − 1 that have not been read, and mark them as read."""
     start = first
     while start < end:
         if (index, start) in done:
@@ -172,10 +172,10 @@ class _Source:
     task: TileTask
     slice: RawSlice
     passes: tuple[LanePass, ...]
-    """Those of its run."""
+    """Passes of its run."""
     reader: ProfileReader | ReturnsReader
     at_once: int
-    """Row groups that are read together."""
+    """Number of row groups that are read together."""
 
     @classmethod
     def of(cls, task: TileTask, number: int) -> _Source:
@@ -187,12 +187,12 @@ class _Source:
         return cls(task, one, tuple(p for p in task.passes if p.run == one.source.run), reader, max(1, most))
 
     def pieces(self, first: int, end: int) -> Iterator[tuple[int, int]]:
-        """Positions `first` to `end` − 1 in pieces that are read together."""
+        """Yield positions `first` to `end` − 1 in pieces that are read together."""
         for start in range(first, end, self.at_once):
             yield start, min(start + self.at_once, end)
 
     def expect(self, groups: Sequence[int]) -> None:
-        """Let row groups be on their way that will be counted soon."""
+        """Prefetch row groups that will be counted soon."""
         self.reader.expect(groups)
 
     def count(self, counting: Counting, accumulator: Accumulator, groups: Sequence[int]) -> None:
@@ -223,12 +223,12 @@ class _Source:
         counting.returns(epochs, pose_epochs, xyz, rows.intensity, self._passes(epochs, accumulator))
 
     def _passes(self, epochs: npt.NDArray[np.int64], accumulator: Accumulator) -> npt.NDArray[np.int32]:
-        """Index of each epoch's pass among the accumulator's, −1 for none."""
+        """Return the index of each epoch's pass among the accumulator's, −1 for none."""
         return pass_numbers(epochs, self.passes, accumulator.passes)
 
 
 def _pool() -> Pool:
-    """The worker's memory for cells: fresh memory is dear, so it serves one task after another."""
+    """Return the worker's memory for cells, which serves one task after another: fresh memory is slow."""
     pool: Pool | None = getattr(_KEPT, "pool", None)
     if pool is None:
         pool = _KEPT.pool = Pool()

@@ -1,4 +1,4 @@
-"""Files of a tile: written to a scratch folder, published by rename, listed with their key."""
+"""Writes the files of a tile to a scratch folder, publishes them by renaming, and records them with their key."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from roadscan.tiles.product import ProductContext, SurfaceProduct, Tile, TileFil
 
 @dataclass(frozen=True)
 class WantedFiles:
-    """A product of one file a tile, with its settings and the key of its inputs beside the tile's own."""
+    """A product of one file per tile, with its settings and the key of its inputs besides the tile's."""
 
     product: TileFiles
     options: Strict
@@ -24,7 +24,7 @@ class WantedFiles:
 
     @functools.cached_property
     def files(self) -> dict[str, str]:
-        """Suffix of each file by its name in the manifest; the product's own file is the last."""
+        """Suffix of each file by its name in the manifest; that of the product itself is the last."""
         beside = self.product.companions(self.options)
         named = {f"{self.product.name}.{name}": suffix for name, suffix in beside.items()}
         return {**named, self.product.name: self.product.suffix_for(self.options)}
@@ -32,14 +32,14 @@ class WantedFiles:
 
 @dataclass(frozen=True)
 class WantedProduct(WantedFiles):
-    """One of the tiles' readings."""
+    """A product made from the tiles' readings."""
 
     product: TileProduct
 
 
 @dataclass(frozen=True)
 class WantedSurface(WantedFiles):
-    """One of the reconstructed surface."""
+    """A product made from the reconstructed surface."""
 
     product: SurfaceProduct
 
@@ -55,7 +55,7 @@ def write_product(
 def publish_product(
     wanted: WantedFiles, unit: str, write: Callable[[Path], None], key: str, store: Store, folder: Path
 ) -> list[OutputRecord]:
-    """Let `write` make a tile's file in `folder`, and publish it with those beside it; `key` is the tile's."""
+    """Let `write` make a tile's file in `folder`, and publish it with its companions; `key` is the tile's."""
     product = wanted.product
     path = folder / f"tile{product.suffix_for(wanted.options)}"
     write(path)
@@ -69,19 +69,19 @@ def publish_product(
 def publish_file(
     store: Store, path: Path, target: str, product: str, unit: str, key: str, detail: str = ""
 ) -> OutputRecord:
-    """Move a finished file into the store; returns its record for the manifest."""
+    """Move a finished file into the store; return its record for the manifest."""
     size, digest = path.stat().st_size, file_digest(path)
     store.publish(path, target)
     return OutputRecord(product, unit, key, target, size, digest, detail)
 
 
 def tile_file_names(names: Collection[str] | None = None) -> set[str]:
-    """Names in the manifest of the files of tile products: of all there are, or of those named."""
+    """Return the names in the manifest of the files of tile products: of all products, or of those named."""
     return _file_names([p for p in products().values() if isinstance(p, TileProduct)], names)
 
 
 def surface_file_names(names: Collection[str] | None = None) -> set[str]:
-    """The same, of products of the surface."""
+    """Return the names of the files of surface products likewise."""
     return _file_names([p for p in products().values() if isinstance(p, SurfaceProduct)], names)
 
 

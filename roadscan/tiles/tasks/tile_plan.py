@@ -1,4 +1,4 @@
-"""What the tiles stage has to do: keys of tiles, which are stale, and the tasks that compute them."""
+"""Plans the tiles stage: keys of tiles, stale tiles, and the tasks that compute them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TILE = "tile"
 """Manifest name of a tile as a whole; its file holds the cells."""
 
 OVERVIEWS = "overviews"
-"""Manifest name of a tile's overviews; their record has the key of the tile's own."""
+"""Manifest name of a tile's overviews; their record has the tile's key."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class PlannedTiles(DrivenTiles):
 
     @cached_property
     def number(self) -> dict[TileId, int]:
-        """Place of each tile in the arrays."""
+        """Index of each tile in the arrays."""
         return {tile: number for number, tile in enumerate(self.ids)}
 
     def numbers(self, tiles: Iterable[TileId]) -> npt.NDArray[np.int64]:
-        """Places of some tiles; a `KeyError` where one is none of these."""
+        """Return the indices of some tiles; raises `KeyError` for an unknown one."""
         wanted = np.array([(tile.row, tile.column) for tile in tiles], dtype=np.int64).reshape(-1, 2)
         place = _places(*wanted.T)
         found = np.searchsorted(self._place, place)
@@ -77,7 +77,7 @@ class PlannedTiles(DrivenTiles):
 
 
 def _places(row: npt.NDArray[Any], column: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    """Numbers that order tiles by row and column."""
+    """Return numbers that order tiles by row and column."""
     return (row.astype(np.int64) << 32) + column.astype(np.int64)
 
 
@@ -103,11 +103,11 @@ class TileTask:
     slices: tuple[RawSlice, ...]
     """Raw blocks that may touch the tiles, sorted by run, sensor and time."""
     touched: npt.NDArray[np.int32]
-    """(n, 4) core tile by its place in the block, slice, first position and end in its groups."""
+    """(n, 4) core tile by its index in the block, slice, first position and end in its groups."""
     owned_runs: npt.NDArray[np.int32]
-    """(n, 4) slice, first position, end, core tile: groups whose readings are told by fate with that tile."""
+    """(n, 4) slice, first position, end, core tile: groups on whose readings that tile reports."""
     readings: int
-    """Readings expected."""
+    """Expected number of readings."""
     passes: tuple[LanePass, ...]
     centre_lines: CentreLines | None
     products: tuple[WantedProduct, ...]
@@ -116,7 +116,7 @@ class TileTask:
 
     @cached_property
     def touches(self) -> tuple[tuple[TileTouch, ...], ...]:
-        """What may touch each core tile."""
+        """Row groups that may touch each core tile."""
         found: list[list[TileTouch]] = [[] for _ in self.block.tiles]
         for place, index, first, end in self.touched.tolist():
             found[place].append(TileTouch(index, first, end))
@@ -130,12 +130,12 @@ class TileTask:
 
     @property
     def raw_bytes(self) -> int:
-        """Compressed bytes to read, about."""
+        """Approximate compressed bytes to read."""
         return sum(s.bytes for s in self.slices)
 
     @property
     def needs_points(self) -> bool:
-        """True where single points have to be placed: for a product, for a filter, or because they are given."""
+        """True where points are needed: for a product, for a filter, or because the data are points."""
         return (
             any(w.product.needs_points for w in self.products)
             or self.centre_lines is not None
@@ -145,7 +145,7 @@ class TileTask:
 
 
 def plan_tiles(footprints: FootprintRanges, plan: SurveyPlan) -> PlannedTiles:
-    """Every tile that a raw block may touch."""
+    """Return every tile that raw data may touch."""
     f = footprints
     order = np.lexsort((f.first_group, f.slice_index, f.tile_column, f.tile_row))
     column, row = f.tile_column[order], f.tile_row[order]
@@ -174,7 +174,7 @@ def plan_tiles(footprints: FootprintRanges, plan: SurveyPlan) -> PlannedTiles:
 
 
 def _correction_digests(f: FootprintRanges, plan: SurveyPlan) -> npt.NDArray[np.uint64]:
-    """Digest (n,) of the corrections that place the readings of each run of row groups."""
+    """Return a digest (n,) of the corrections that affect the readings of each run of row groups."""
     found = np.zeros(f.slice_index.size, np.uint64)
     order = np.argsort(f.slice_index, kind="stable")
     ends = np.searchsorted(f.slice_index[order], np.arange(len(f.slices)), side="right").tolist()
@@ -195,7 +195,7 @@ def stale_tiles(tiles: PlannedTiles, products: Sequence[WantedProduct], manifest
 
 @dataclass(frozen=True)
 class TilePlan:
-    """Tiles of a survey and what is to be made of them."""
+    """Tiles of a survey and the products to be made of them."""
 
     plan: SurveyPlan
     footprints: FootprintRanges
@@ -204,7 +204,7 @@ class TilePlan:
     context: ProductContext
 
     def tasks(self, chosen: Sequence[TileId], workers: int = 1) -> Sequence[TileTask]:
-        """Tasks over the chosen tiles: two kilometres each, or less where there are few for that many workers.
+        """Return tasks over the chosen tiles: two kilometres each, or less to occupy so many workers.
 
         Where products need points, a task is a block that fits into memory.
         """
@@ -218,23 +218,23 @@ class TilePlan:
         return LazyTasks(cut_stretches(self.tiles, numbers, config.size_m, workers), self._stretch)
 
     def _stretch(self, own: npt.NDArray[np.int64]) -> TileTask:
-        """A task over tiles by their numbers, without halo."""
+        """Return a task over tiles by number, without halo."""
         return self._task(Block(tuple(map(self.tiles.ids.__getitem__, own.tolist()))), own, own)
 
     def singly(self, chosen: Sequence[TileId]) -> list[TileTask]:
-        """A task for each tile."""
+        """Return a task for each tile."""
         return [self.task(Block((tile,))) for tile in chosen]
 
     def _points_of(self, task: TileTask) -> bool:
         return task.needs_points or any(s.source.table == "cloud" for s in self.footprints.slices)
 
     def task(self, block: Block) -> TileTask:
-        """A task over a block."""
+        """Return a task over a block."""
         near = self.tiles.numbers(t for t in block.with_halo() if t in self.tiles)
         return self._task(block, self.tiles.numbers(block.tiles), near)
 
     def _task(self, block: Block, core: npt.NDArray[np.int64], near: npt.NDArray[np.int64]) -> TileTask:
-        """A task over the tiles numbered `core`, with the row groups of those numbered `near`."""
+        """Return a task over the tiles numbered `core`, with the row groups of those numbered `near`."""
         tiles = self.tiles
         runs = tiles.groups.runs(near)
         cuts = np.flatnonzero(np.diff(runs.slice, prepend=-1))
@@ -275,5 +275,5 @@ def _why_due(unit: str, key: str, products: Sequence[WantedProduct], manifest: M
 
 @found_once
 def tiles_of(session: Session) -> PlannedTiles:
-    """Tiles that a reading may touch, with their keys."""
+    """Return the tiles that a reading may touch, with their keys."""
     return plan_tiles(footprints_of(session), plan_of(session))

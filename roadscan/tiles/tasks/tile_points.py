@@ -1,4 +1,4 @@
-"""Points of a task's tiles: for products, filters and clouds that need them one by one."""
+"""Loads the points of a task's tiles, for products, filters and clouds that need single points."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from roadscan.tiles.tasks.tile_plan import TileTask
 
 @dataclass(frozen=True)
 class LoadedTile:
-    """What a tile holds."""
+    """Points of a tile."""
 
     tile: TileId
     points: TilePoints | None
@@ -34,18 +34,18 @@ class LoadedTile:
     marked: TilePoints | None
     """Points that a filter leaves out; None without any, or where the survey does not keep them."""
     evidence: TileEvidence | None
-    """Of the poses that placed the points; None without any."""
+    """Evidence of the poses that georeferenced the points; None without any."""
 
 
 def load_points(task: TileTask) -> Iterator[tuple[TileId, TilePoints]]:
-    """Points of every tile of the block and its halo that holds any: filtered, in canonical order, tile by tile."""
+    """Yield the points of every tile of block and halo that has any: filtered, in canonical order, tile by tile."""
     for loaded in load_tiles(task, ReadingCounts()):
         if loaded.points is not None:
             yield loaded.tile, loaded.points
 
 
 def load_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[LoadedTile]:
-    """As :func:`load_points`, with the points that filters leave out, where the survey keeps them marked."""
+    """Yield the same as :func:`load_points`, with filtered points where the survey keeps them marked."""
     box = task.block.box()
     buffer = None if task.centre_lines is None else load_buffer(task.centre_lines, task.ground.map)
     parts = _Parts()
@@ -66,7 +66,7 @@ def load_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[LoadedTile]:
     width = box[2] - box[0]
     local = (joined.tiles[:, 1] - box[1]) * width + (joined.tiles[:, 0] - box[0])
     ends = np.cumsum(np.bincount(local, minlength=width * (box[3] - box[1])))
-    kind = np.uint16 if ends.size <= 1 << 16 else np.uint32  # 16 bits: a radix sort
+    kind = np.uint16 if ends.size <= 1 << 16 else np.uint32  # 16 bits, for a radix sort
     order = np.argsort(local.astype(kind), kind="stable").astype(np.int32)
     del local
     for tile in sorted(task.block.with_halo(), key=lambda t: (t.row, t.column)):
@@ -78,7 +78,7 @@ def load_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[LoadedTile]:
 
 
 def _by_owner(one: RawSlice, owners: Sequence[TileId | None]) -> Iterator[tuple[TileId | None, RawSlice]]:
-    """Pieces of a slice whose groups' fates are told with the same tile, or with none of the task."""
+    """Yield pieces of a slice whose groups are reported by the same tile, or by none of the task."""
     start = 0
     for end in range(1, len(owners) + 1):
         if end == len(owners) or owners[end] != owners[start]:
@@ -94,7 +94,7 @@ def _loaded(
     buffer: CentreLineBuffer | None,
     ground: MapSettings,
 ) -> LoadedTile:
-    """Points of a tile at `rows` of the block, those that filters leave out apart."""
+    """Return the points of a tile at `rows` of the block, filtered points separately."""
     near = None if buffer is None else near_lines(tile, joined.quanta[rows], buffer, ground)
     if joined.classes is None:
         rows = rows if near is None else rows[near]
@@ -108,7 +108,7 @@ def _loaded(
 
 
 class _Parts:
-    """Placed readings of a block as they come, with their pass and source."""
+    """Collects the georeferenced readings of a block, with their pass and source."""
 
     def __init__(self) -> None:
         self.placed: list[Placed] = []
@@ -125,7 +125,7 @@ class _Parts:
         passes: npt.NDArray[np.uint16],
         trajectory: Trajectory | None,
     ) -> None:
-        """Take a chunk of one source; sources are numbered as they come."""
+        """Add a chunk of one source; sources are numbered as they come."""
         number = self._numbers.setdefault(source.key, len(self._numbers))
         if number == len(self._profiles):
             self._profiles.append(source.table == "scans")
@@ -135,7 +135,7 @@ class _Parts:
         self._sources.append(np.full(passes.size, number, np.uint16))
 
     def join(self) -> _Joined:
-        """All chunks as one set of arrays; the chunks are given up, so that memory holds each point once."""
+        """Join all chunks into one set of arrays; the chunks are freed, so that memory has each point once."""
         placed, self.placed = self.placed, []
         extra = {c: v for c in EXTRA_COLUMNS if (v := _joined_extra(placed, c)) is not None}
         lacking = {c: _lacks(placed, c) for c in extra if any(c not in p.extra for p in placed)}
@@ -159,7 +159,7 @@ class _Parts:
 
 @dataclass(frozen=True)
 class _Joined:
-    """Placed readings of a block, in the order they were loaded."""
+    """Georeferenced readings of a block, in the order they were loaded."""
 
     tiles: npt.NDArray[np.int32]
     quanta: npt.NDArray[np.int32]
@@ -171,15 +171,15 @@ class _Joined:
     profiles: npt.NDArray[np.bool_]
     """(sources,) True for scans."""
     trajectories: Sequence[Trajectory | None]
-    """Of each source; None for clouds."""
+    """Trajectory of each source; None for clouds."""
     extra: dict[str, npt.NDArray[Any]]
     lacking: dict[str, npt.NDArray[np.bool_]]
     """(n,) True for points without a recorded value, for columns that some points lack."""
     classes: npt.NDArray[np.uint8] | None
-    """(n,) class of each reading, where those that a filter leaves out were placed too."""
+    """(n,) class of each reading, where filtered readings are included."""
 
     def evidence(self, rows: npt.NDArray[np.integer[Any]]) -> TileEvidence | None:
-        """When, and by how good poses, the points at `rows` were placed; None without any."""
+        """Return the epochs of the points at `rows`, and the σ of their poses; None without any."""
         if rows.size == 0:
             return None
         sources, epochs = self.sources[rows], self.epoch_gps_ns[rows]
@@ -201,9 +201,9 @@ class _Joined:
         rows: npt.NDArray[np.integer[Any]],
         marks: npt.NDArray[np.uint8] | None = None,
     ) -> TilePoints:
-        """Points of one tile, in canonical order; with `marks` (n,), the classes they get, they are withheld."""
+        """Return the points of one tile, in canonical order; with `marks` (n,), their classes, they are withheld."""
         sources = self.sources[rows]
-        # A tile has the columns that its own points have, whatever else was loaded with it.
+        # A tile has the columns of its points, whatever else was loaded with it.
         extra = {c: v for c, v in self.extra.items() if c not in self.lacking or not self.lacking[c][rows].all()}
         content = [*extra.values(), self.quanta, self.intensity, self.classification]
         order = canonical_order(
@@ -244,7 +244,7 @@ def _lacks(parts: list[Placed], column: str) -> npt.NDArray[np.bool_]:
 def near_lines(
     tile: TileId, quanta: npt.NDArray[np.int32], buffer: CentreLineBuffer, ground: MapSettings
 ) -> npt.NDArray[np.bool_]:
-    """Which points (n, …) of a tile lie in the buffer about the centre lines; `quanta` from the tile's corner."""
+    """Return which points (n, …) of a tile lie near the centre lines; `quanta` from the tile's corner."""
     b = ground.grid.bounds(tile)
     easting = b.easting_min_m + quanta[:, 0].astype(np.float64) * QUANTUM_M
     northing = b.northing_min_m + quanta[:, 1].astype(np.float64) * QUANTUM_M

@@ -1,4 +1,4 @@
-"""What the stage `tiles` has to do: the tiles there are against those there should be."""
+"""Compares existing with required tiles, to find the work of the stage `tiles`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from roadscan.tiles.tasks.wanted_products import product_context, wanted_tile_pr
 
 @dataclass(frozen=True)
 class TileWork:
-    """What the stage has to do."""
+    """Work of the stage."""
 
     planned: TilePlan
     chosen: list[TileId]
@@ -33,10 +33,10 @@ class TileWork:
 
 
 def plan_tile_work(session: Session) -> TileWork:
-    """Compare what there is with what there should be."""
+    """Compare existing tiles with required ones."""
     plan, manifest, survey = plan_of(session), session.manifest, session.survey
     context = product_context(plan)
-    check_surface_ahead(plan)  # before the tiles are computed for it
+    check_surface_ahead(plan)  # before tiles are computed for it
     wanted = tuple(wanted_tile_products(survey, context))
     tiles, footprints = tiles_of(session), footprints_of(session)
     why = {} if session.selection is not None else stale_tiles(tiles, wanted, manifest)
@@ -51,6 +51,6 @@ def plan_tile_work(session: Session) -> TileWork:
 
 
 def memory_of(tasks: Sequence[TileTask]) -> int:
-    """Memory (bytes) that a worker needs for the largest of some tasks, about."""
+    """Return the approximate memory (bytes) that a worker needs for the largest of some tasks."""
     largest = max((t.readings * BYTES_PER_READING if t.needs_points else MOST_BYTES for t in tasks), default=0)
     return WORKER_BASE_BYTES + largest if tasks else 0

@@ -1,4 +1,4 @@
-"""Tiles: raw readings → cells and tile products, by way of points where a product needs them. One task a stretch."""
+"""Computes tiles: raw readings become cells and tile products, with points where needed. One task per stretch."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from roadscan.tiles.tasks.tile_points import load_tiles
 
 @dataclass(frozen=True)
 class TaskResult:
-    """What a worker did."""
+    """Result of a task."""
 
     records: Packed
     failures: tuple[tuple[str, str], ...]
@@ -47,17 +47,17 @@ class TaskResult:
     def of(
         cls, records: Sequence[Row], failures: Sequence[tuple[str, str]] = (), damaged: Collection[str] = ()
     ) -> TaskResult:
-        """Finished outputs as the manifest will keep them, so that the run has only to write them."""
+        """Pack finished outputs in the manifest's form, so that the run only has to write them."""
         return cls(Packed.of(table_of(records)), tuple(failures), frozenset(damaged) - {""})
 
 
 @dataclass(frozen=True)
 class ComputedTile:
-    """A tile on its way into files."""
+    """A computed tile whose files are not written yet."""
 
     tile: TileId
     content: Tile | None
-    """None where no reading fell into it."""
+    """Content of the tile; None where no reading fell into it."""
     evidence: TileEvidence | None
     failure: str = ""
 
@@ -67,7 +67,7 @@ class OfTiles(Protocol):
 
     @property
     def block(self) -> Block:
-        """The tiles."""
+        """Block of the task's tiles."""
 
 
 T = TypeVar("T", bound=OfTiles)
@@ -82,7 +82,7 @@ def run_tasks(
     compute: Compute,
     report: Callable[[int, int], None] = lambda _a, _b: None,
 ) -> list[tuple[str, str]]:
-    """Compute tasks over `total` tiles by `function`; returns the failures.
+    """Compute tasks over `total` tiles by `function`; return the failures.
 
     A task that fails as a whole (a worker out of memory, a damaged raw block where points are made) is tried again
     tile by tile, with the tasks that `singly` makes of its tiles, so that only the tiles at fault are lost.
@@ -144,7 +144,7 @@ def compute_tiles(task: TileTask) -> TaskResult:
 
 
 def computed_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[ComputedTile]:
-    """Tiles of a task: counted from the readings, or from points where these are needed."""
+    """Yield the tiles of a task, counted from the readings, or from points where these are needed."""
     if not task.needs_points:
         for counted in count_tiles(task, fates):
             content = None if counted.cells is None else Tile(None, counted.cells)
@@ -157,7 +157,7 @@ def computed_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[ComputedTil
 
 
 def summary_of(record: OutputRecord) -> TileSummary | None:
-    """Figures of a finished tile; None where it holds no point."""
+    """Return figures of a finished tile; None where it has no point."""
     figures = record.figures()
     if not figures.get("points"):
         return None
@@ -187,7 +187,7 @@ def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence,
     detail = json.dumps(figures)
     records.append(
         publish_file(task.store, path, f"tiles/cells/{unit}.parquet", TILE, unit, key, detail)
-    )  # last: a tile is current only with all its files
+    )  # last, since a tile is current only with all its files
     return records
 
 
@@ -216,7 +216,7 @@ def _known(sigma_m: float) -> float | None:
 
 
 def _with_fates(record: OutputRecord, fates: ReadingCounts) -> OutputRecord:
-    """A tile's record, with what became of the readings that it tells of."""
+    """Return a tile's record, with the counts of the readings that it reports."""
     told = fates.of(TileId.parse(record.unit)) if record.product == TILE else {}
     if not told:
         return record

@@ -1,4 +1,4 @@
-"""Products that a survey file asks for, with their checked settings, and what they are told of the survey."""
+"""Products that a survey file requests, with their checked settings, and their context."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from roadscan.tiles.product import (
 from roadscan.tiles.tasks.tile_files import WantedProduct, WantedSurface
 
 _OF_SURVEY = ("roadscan.tiles.drives:Drives", "roadscan.tiles.mosaics.products:StoredTiles")
-"""Code by which survey products get what they draw."""
+"""Code that supplies survey products with their data."""
 
 
 def wanted_products(survey: Survey) -> list[tuple[Product, Strict]]:
-    """Products that the survey file asks for, with their checked settings."""
+    """Return the products that the survey file requests, with their checked settings."""
     config = survey.config.products
     cell_m = survey.config.tiles.cell_m
     with_surface = survey.has("surface")
@@ -51,8 +51,8 @@ def wanted_products(survey: Survey) -> list[tuple[Product, Strict]]:
 
 
 def check_product(survey: Survey, name: str) -> None:
-    """Raise :class:`ConfigError` where a product that the survey file names does not exist, has other settings than
-    those stated, or needs a surface that is not made; reads nothing.
+    """Raise :class:`ConfigError` where a product in the survey file does not exist, has other settings than those
+    stated, or needs a surface that is not made; reads nothing.
     """
     product, config = product_named(name), survey.config.products
     if name in (config.make or ()):
@@ -84,7 +84,7 @@ def _default_names(cell_m: float, with_surface: bool) -> list[str]:
 
 
 def product_context(plan: SurveyPlan) -> ProductContext:
-    """What products know of the survey."""
+    """Return the context of products for a survey."""
     config, grid = plan.survey.config, plan.ground.grid
     surface = SurfaceConfig.stated(plan.survey)
     cell_m = None if surface is None else SurfaceGrid(grid, surface).cell_m
@@ -92,7 +92,7 @@ def product_context(plan: SurveyPlan) -> ProductContext:
 
 
 def wanted_tile_products(survey: Survey, context: ProductContext) -> list[WantedProduct]:
-    """Tile products of the survey, their settings checked, with the keys of what shapes them beside the tile."""
+    """Return the survey's tile products with checked settings, and keys of what changes them besides the tile."""
     wanted: list[WantedProduct] = []
     for product, options in wanted_products(survey):
         if isinstance(product, TileProduct):
@@ -102,7 +102,7 @@ def wanted_tile_products(survey: Survey, context: ProductContext) -> list[Wanted
 
 
 def wanted_surface_products(survey: Survey, context: ProductContext) -> list[WantedSurface]:
-    """The same, of products of the reconstructed surface."""
+    """Return the survey's products of the reconstructed surface likewise."""
     config = SurfaceConfig.stated(survey)
     grid = None if config is None else SurfaceGrid(context.grid, config)
     wanted: list[WantedSurface] = []
@@ -115,7 +115,7 @@ def wanted_surface_products(survey: Survey, context: ProductContext) -> list[Wan
 
 
 def product_key(product: Product, options: Strict, context: ProductContext) -> str:
-    """Key of a product with its settings and what it is told of the survey."""
+    """Return the key of a product with its settings and its context."""
     stated = [asdict(p) for p in context.passes] if isinstance(product, SurveyProduct) else []
     around = _OF_SURVEY if isinstance(product, SurveyProduct) else ()
     return key_of(

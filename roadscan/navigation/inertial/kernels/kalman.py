@@ -84,7 +84,7 @@ def filter_forwards(steps, nodes, fixes, model, layout, start, track, record, up
 
 @inlined
 def _keep(k, report, present, record):
-    """What the way back needs of a node, and all states where they are reported."""
+    """Record what the smoother needs of a node, and all states where they are reported."""
     p = present.covariance
     n = p.shape[0]
     for i in range(NAVIGATION):
@@ -100,7 +100,7 @@ def _keep(k, report, present, record):
 
 @inlined
 def _report(kind, k, size, offer, at, updates):
-    """Residual in the axes that the table states: level for GNSS, the update's own for the others."""
+    """Return the residual in the axes of the table: level for GNSS, those of the update for the others."""
     y, level = offer.innovation, offer.level
     updates.kind[at], updates.node[at] = kind, k
     first = 1 if kind == NON_HOLONOMIC else 0

@@ -1,4 +1,4 @@
-"""Rauch–Tung–Striebel smoother, backwards over the filter's record, and poses between its nodes.
+"""Rauch–Tung–Striebel smoother, which runs backwards over the filter's record, and poses between its nodes.
 
 In the form of Bryson and Frazier (Bierman 1973, "Fixed interval smoothing with discrete measurements") an adjoint
 vector λ and matrix Λ run backwards, and no covariance is inverted:
@@ -29,7 +29,7 @@ Float64 = npt.NDArray[np.float64]
 
 @kernel
 def smooth_backwards(nodes, layout, record, updates, correction, covariance, values, sigmas):
-    """Run the adjoint back over all nodes.
+    """Run the adjoint backwards over all nodes.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def smooth_backwards(nodes, layout, record, updates, correction, covariance, val
 
 @kernel
 def _smoothed(rows, adjoint, information, work, correction, covariance):
-    """Correction (9,) and covariance (9, 9) of the navigation states of a node with rows (9, n) of P."""
+    """Compute correction (9,) and covariance (9, 9) of the navigation states of a node with rows (9, n) of P."""
     n = adjoint.size
     for i in range(NAVIGATION):
         total = 0.0
@@ -96,7 +96,7 @@ def _smoothed_values(p, nominal, adjoint, information, values, sigmas):
 
 @inner
 def _adjoint_update(row, gain, innovation, size, adjoint, information, z):
-    """λ and Λ before a whitened update; z : (n, n) scratch, of which `size` rows are used."""
+    """Update λ and Λ to those before a whitened update; z: (n, n) scratch, of which `size` rows are used."""
     n = adjoint.size
     inner, factor = np.zeros((3, 3)), np.zeros(3)
     for c in range(size):
@@ -126,7 +126,7 @@ def _adjoint_update(row, gain, innovation, size, adjoint, information, z):
 
 @inner
 def _downdate(row, z, size, information):
-    """Λ ← Λ − rowᵀ z − zᵀ row; a symmetric Λ stays symmetric to the last bit."""
+    """Subtract: Λ ← Λ − rowᵀ z − zᵀ row; a symmetric Λ stays symmetric to the last bit."""
     n = information.shape[0]
     for c in range(size):
         for i in range(n):
@@ -137,7 +137,7 @@ def _downdate(row, z, size, information):
 
 @inner
 def _adjoint_step(phi, decay, adjoint, information, work):
-    """λ ← Φᵀλ and Λ ← ΦᵀΛΦ; phi : (9, inertial) rows of navigation, decay : (n,) diagonal of the others.
+    """Apply λ ← Φᵀλ and Λ ← ΦᵀΛΦ; phi: (9, inertial) rows of navigation, decay: (n,) diagonal of the others.
 
     One triangle is worked out and copied to the other.
     """
@@ -166,7 +166,7 @@ def _adjoint_step(phi, decay, adjoint, information, work):
 
 @inner
 def _times_transition(information, phi, decay, out):
-    """(n, n) Λ Φ."""
+    """Compute (n, n) Λ Φ."""
     n = decay.size
     for i in range(n):
         for j in range(n):
@@ -178,7 +178,7 @@ def _times_transition(information, phi, decay, out):
 
 
 class Poses(NamedTuple):
-    """Poses of the IMU reference point at chosen bounds, e of them."""
+    """Poses of the IMU reference point at e selected bounds."""
 
     position: Float64
     """(e, 3) ECEF."""
@@ -194,7 +194,7 @@ class Poses(NamedTuple):
 
 @kernel
 def spread(wanted, bound, track, applied, correction, covariance, smooth, arm_imu, imu_from_body, poses):
-    """Corrections and covariances of the nodes, spread over the bounds between them.
+    """Distribute corrections and covariances of the nodes over the bounds between them.
 
     The correction of a smoothed state changes linearly from a node, after its updates, to the next, before them.
     Covariances change linearly too.
@@ -230,7 +230,7 @@ def spread(wanted, bound, track, applied, correction, covariance, smooth, arm_im
         q = (track.quaternion[b, 0], track.quaternion[b, 1], track.quaternion[b, 2], track.quaternion[b, 3])
         q = unit(product(exponential(dx[6], dx[7], dx[8]), q))
         c = matrix(q)
-        # From the IMU to the reference point, and what it moves in a turn.
+        # From the IMU to the reference point, and its movement in a turn.
         w0 = track.rate[b, 0] - c[6] * EARTH_RATE_RAD_PER_S
         w1 = track.rate[b, 1] - c[7] * EARTH_RATE_RAD_PER_S
         w2 = track.rate[b, 2] - c[8] * EARTH_RATE_RAD_PER_S
@@ -267,7 +267,7 @@ def spread(wanted, bound, track, applied, correction, covariance, smooth, arm_im
 
 @inlined
 def _note_sigma_rph(poses, e, c, level):
-    """σ of roll, pitch, heading from the covariance of a small rotation about north, east, down.
+    """Write σ of roll, pitch, heading from the covariance of a small rotation about north, east, down.
 
     c : ECEF from body, row by row; level : ECEF from north-east-down.
     """

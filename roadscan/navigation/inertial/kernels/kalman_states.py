@@ -17,19 +17,19 @@ from roadscan.navigation.inertial.kernels.strapdown import geodetic
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS = 0, 3, 6, 9, 12
+POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS = 0, 3, 6, 9, 12  # First columns of these states, three each.
 GYRO_SCALE, ACCEL_SCALE = 15, 18
-"""Columns of the states that all solutions have; scales only where the layout says 21 inertial states."""
+"""First columns of the scale states, which exist only where the layout has 21 inertial states."""
 NAVIGATION = 9
-"""States that a mechanisation carries: position, velocity, attitude."""
-WITHOUT_SCALES = 15
+"""Number of states that a mechanisation carries: position, velocity, attitude."""
+WITHOUT_SCALES = 15  # Inertial states of a layout without scales.
 
-GNSS_POSITION, GNSS_VELOCITY, ODOMETER, NON_HOLONOMIC, ZERO_VELOCITY, ZERO_ROTATION = 0, 1, 2, 3, 4, 5
-KINDS = 6
+GNSS_POSITION, GNSS_VELOCITY, ODOMETER, NON_HOLONOMIC, ZERO_VELOCITY, ZERO_ROTATION = 0, 1, 2, 3, 4, 5  # Kinds.
+KINDS = 6  # Number of these kinds.
 
 
 class Layout(NamedTuple):
-    """Columns of the states that not every solution has, −1 where it has not."""
+    """Columns of the optional states, −1 for missing ones."""
 
     size: int
     """Number of states."""
@@ -46,13 +46,13 @@ class Layout(NamedTuple):
     colour: int
     """Time-correlated error of the GNSS position, north, east, down, in units of its σ (3)."""
     delay: int
-    """How far the IMU's stamps are ahead of GNSS time (1, s)."""
+    """Lead of the IMU's stamps over GNSS time (1, s)."""
     lag: int
-    """How far the velocities of GNSS lag behind its positions (1, s)."""
+    """Delay of the velocities of GNSS relative to its positions (1, s)."""
 
 
 class Steps(NamedTuple):
-    """Steps of the mechanisation, s of them."""
+    """The s steps of the mechanisation."""
 
     seconds: Float64
     turn: Float64
@@ -60,24 +60,24 @@ class Steps(NamedTuple):
     push: Float64
     """(s, 3) m/s."""
     loose: Float64
-    """(s,) seconds for which no sample was there."""
+    """(s,) seconds without a sample."""
 
 
 class Nodes(NamedTuple):
-    """Where covariances are worked out, k of them; the first is the start."""
+    """The k nodes at which covariances are computed; the first is the start."""
 
     bound: Int64
-    """(k,) steps before it."""
+    """(k,) number of steps before it."""
     colour_keep: Float64
-    """(k,) how much of the coloured GNSS error stays over the interval that ends there, 0 to 1."""
+    """(k,) share of the coloured GNSS error that remains over the interval that ends there, 0 to 1."""
     gnss: Int64
     """(k,) row of `Fixes`, −1 for none."""
     still: npt.NDArray[np.bool_]
-    """(k,) the vehicle stood over the interval that ends there."""
+    """(k,) True where the vehicle stood over the interval that ends there."""
     travel: Float64
     """(k,) metres that the odometer counted over the interval, NaN where there is none."""
     constrained: npt.NDArray[np.bool_]
-    """(k,) non-holonomic constraint over the interval."""
+    """(k,) True where the non-holonomic constraint applies to the interval."""
     report: Int64
     """(k,) row of the reported states, −1 for none."""
     rate_noise: Float64
@@ -92,7 +92,7 @@ class Fixes(NamedTuple):
     position: Float64
     """(m, 3) ECEF, m; NaN for none."""
     white: Float64
-    """(m, 3, 3) covariance of the part that is independent from epoch to epoch, north-east-down, m²."""
+    """(m, 3, 3) covariance of the part that is independent between epochs, north-east-down, m²."""
     coloured: Float64
     """(m, 3) σ of the part that is correlated in time, m."""
     velocity: Float64
@@ -105,39 +105,39 @@ class Model(NamedTuple):
     """Noise and geometry."""
 
     gyro_bias: float
-    """σ, rad/s."""
+    """1 σ, rad/s."""
     accel_bias: float
-    """σ, m/s²."""
+    """1 σ, m/s²."""
     bias_seconds: float
-    """Time constant of both."""
+    """Time constant of both biases."""
     body_from_imu: Float64
     """(3, 3)."""
     travel_sigma: float
-    """Of the odometer's speed, m/s."""
+    """1 σ of the odometer's speed, m/s."""
     travel_share: float
-    """And the part that grows with speed (slip)."""
+    """Part of it that grows with speed (slip)."""
     side_sigma: float
-    """Of the non-holonomic constraint to the side, m/s."""
+    """1 σ of the non-holonomic constraint to the side, m/s."""
     side_slip: float
     """Side-slip angle of the axle for each m/s² of acceleration to the side, rad."""
     up_sigma: float
-    """Upwards, m/s."""
+    """1 σ of the non-holonomic constraint upwards, m/s."""
     zero_sigma: float
-    """Of a standing vehicle's velocity, m/s."""
+    """1 σ of a standing vehicle's velocity, m/s."""
     zero_rate_sigma: float
-    """Of its rotation, rad/s."""
+    """1 σ of its rotation, rad/s."""
     loose_rate: float
-    """Rotation that nobody measured in a gap of the IMU, rad/s."""
+    """Unmeasured rotation in a gap of the IMU, rad/s."""
     loose_force: float
-    """Acceleration in it, m/s²."""
+    """Unmeasured acceleration in it, m/s²."""
     outlier: Float64
-    """(4,) squared normalised innovation by component from which an update of 1, 2, 3 components counts less."""
+    """(4,) squared normalised innovation by component above which an update of 1, 2, 3 components is down-weighted."""
     patience_s: float
-    """After that long of positions that count less in a row they count in full again: then the filter errs."""
+    """After positions were down-weighted for this long in a row, they get full weight: then the filter errs."""
     delay_wander: float
-    """How the IMU's clock wanders: random walk, s/√s."""
+    """Random walk of the IMU's clock, s/√s."""
     interval_s: float
-    """Length of interval that the σ of constraints hold for; their noise is white, so longer ones weigh more."""
+    """Interval for which the σ of constraints are stated; their noise is white, so longer intervals weigh more."""
 
 
 class Start(NamedTuple):
@@ -148,7 +148,7 @@ class Start(NamedTuple):
     velocity: Float64
     position: Float64
     values: Float64
-    """(n − 9,) nominal values of the states behind attitude."""
+    """(n − 9,) nominal values of the states after attitude."""
     covariance: Float64
     """(n, n)."""
 
@@ -167,7 +167,7 @@ class Track(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What the way back needs."""
+    """The filter's record for the smoother."""
 
     transition: Float64
     """(k, 9, inertial) of the interval that ends at a node."""
@@ -176,7 +176,7 @@ class Record(NamedTuple):
     rows: Float64
     """(k, 9, n) covariance of navigation states with all states, after the node's updates."""
     applied: Float64
-    """(k, 9) what the node's updates added to the nominal state."""
+    """(k, 9) correction of the nominal state by the node's updates."""
     first_update: Int64
     """(k + 1,)."""
     values: Float64
@@ -186,7 +186,7 @@ class Record(NamedTuple):
 
 
 class Updates(NamedTuple):
-    """All updates in their order, u of them."""
+    """All u updates in their order."""
 
     row: Float64
     """(u, 3, n) whitened L⁻¹ H."""
@@ -195,11 +195,11 @@ class Updates(NamedTuple):
     innovation: Float64
     """(u, 3) whitened L⁻¹ y."""
     size: Int64
-    """(u,) components."""
+    """(u,) number of components."""
     kind: Int64
     node: Int64
     residual: Float64
-    """(u, 3) as reported."""
+    """(u, 3) residual that is reported."""
     normalised: Float64
     weight: Float64
 
@@ -228,13 +228,13 @@ class Interval(NamedTuple):
     ways: Float64
     """(4, 3): 0 ∫f, 1 ∫∫f (ECEF), 2 ∫ω, 3 ∫Cᵀv (IMU axes)."""
     acceleration: Float64
-    """(3,) mean, ECEF, m/s²."""
+    """(3,) mean acceleration, ECEF, m/s²."""
     length: Float64
     """(2,) its length and the longest silence of the IMU within, s."""
 
 
 class Offer(NamedTuple):
-    """One update: innovation = row · errors + noise."""
+    """A measurement offered to the filter: innovation = row · errors + noise."""
 
     row: Float64
     """(3, n)."""
@@ -247,12 +247,12 @@ class Offer(NamedTuple):
     level: Float64
     """(3, 3) ECEF from north-east-down."""
     shift: Float64
-    """(n,) what it adds to the states."""
+    """(n,) correction of the states."""
 
 
 @inlined
 def cross_rows(x, y, z, out, top, left, sign):
-    """out[top:, left:] = sign · [x y z]×."""
+    """Write out[top:, left:] = sign · [x y z]×."""
     out[top, left], out[top, left + 1], out[top, left + 2] = 0.0, -sign * z, sign * y
     out[top + 1, left], out[top + 1, left + 1], out[top + 1, left + 2] = sign * z, 0.0, -sign * x
     out[top + 2, left], out[top + 2, left + 1], out[top + 2, left + 2] = -sign * y, sign * x, 0.0
@@ -260,7 +260,7 @@ def cross_rows(x, y, z, out, top, left, sign):
 
 @inlined
 def decays(bias_keep, colour_keep, layout, out):
-    """(n,) how much of each state behind attitude stays over an interval."""
+    """Write (n,) the share of each state after attitude that remains over an interval."""
     for i in range(out.size):
         out[i] = bias_keep if GYRO_BIAS <= i < WITHOUT_SCALES else 1.0
     if layout.colour >= 0:
@@ -270,7 +270,7 @@ def decays(bias_keep, colour_keep, layout, out):
 
 @inlined
 def level_axes(x, y, z, out):
-    """ECEF from north-east-down at a position (Groves 2013, eq. 2.150)."""
+    """Write ECEF from north-east-down at a position (Groves 2013, eq. 2.150)."""
     s_lat, c_lat, s_lon, c_lon, _ = geodetic(x, y, z)
     out[0, 0], out[0, 1], out[0, 2] = -s_lat * c_lon, -s_lon, -c_lat * c_lon
     out[1, 0], out[1, 1], out[1, 2] = -s_lat * s_lon, c_lon, -c_lat * s_lon

@@ -33,7 +33,7 @@ from roadscan.navigation.inertial.kernels.strapdown import (
 
 @kernel
 def advance(k, steps, nodes, model, layout, present, interval, track, record):
-    """Mechanise the steps between nodes k − 1 and k, and sum up what their transition is made of.
+    """Mechanise the steps between nodes k − 1 and k, and sum up the integrals of their transition.
 
     Changes `present` (all but its covariance), `interval`, rows of `track` and `record.transition`, `record.keep`.
     """
@@ -71,7 +71,7 @@ def advance(k, steps, nodes, model, layout, present, interval, track, record):
 
 @inlined
 def note(track, at, q, v, r):
-    """Write a nominal state."""
+    """Record a nominal state."""
     for j in range(4):
         track.quaternion[at, j] = q[j]
     for j in range(3):
@@ -81,7 +81,7 @@ def note(track, at, q, v, r):
 
 @inlined
 def _corrected(stated, s, values, bias, scale, scaled, dt):
-    """Increment without bias and scale error: stated = (1 + scale) · true + bias."""
+    """Return an increment without bias and scale error: stated = (1 + scale) · true + bias."""
     x = stated[s, 0] - values[bias] * dt
     y = stated[s, 1] - values[bias + 1] * dt
     z = stated[s, 2] - values[bias + 2] * dt
@@ -100,7 +100,7 @@ def _accumulate(sums, ways, c0, c1, v0, v1, turn, push, gain, dt, scaled):
     wz = 0.5 * (v0[2] + v1[2])
     for j in range(3):
         m0, m1, m2 = 0.5 * (c0[j] + c1[j]), 0.5 * (c0[3 + j] + c1[3 + j]), 0.5 * (c0[6 + j] + c1[6 + j])
-        # Position's integrals first: they take velocity's at the begin, plus half of the step.
+        # Integrals of position first: they use those of velocity at the beginning, plus half of the step.
         a0, a1, a2 = sums[0, 0, j], sums[0, 1, j], sums[0, 2, j]
         h0, h1, h2 = a0 + 0.5 * m0 * dt, a1 + 0.5 * m1 * dt, a2 + 0.5 * m2 * dt
         b0, b1, b2 = fy * h2 - fz * h1, fz * h0 - fx * h2, fx * h1 - fy * h0
@@ -151,7 +151,7 @@ def _accumulate(sums, ways, c0, c1, v0, v1, turn, push, gain, dt, scaled):
 
 @inner
 def _transition(sums, ways, seconds, field, scaled, phi):
-    """Rows of position, velocity and attitude of the transition (9, inertial) over an interval."""
+    """Compute rows of position, velocity and attitude of the transition (9, inertial) over an interval."""
     phi[:] = 0.0
     size, ux, uy, uz = field[0], field[1], field[2], field[3]
     up = (ux, uy, uz)
@@ -178,7 +178,7 @@ def _transition(sums, ways, seconds, field, scaled, phi):
                 phi[3 + i, ACCEL_SCALE + j] = -sums[2, i, j]
     cross_rows(ways[1, 0], ways[1, 1], ways[1, 2], phi, 0, 6, -1.0)
     cross_rows(ways[0, 0], ways[0, 1], ways[0, 2], phi, 3, 6, -1.0)
-    # The Earth turns: ψ and δv against ECEF axes.
+    # Rotation of the Earth: ψ and δv relative to ECEF axes.
     turn = EARTH_RATE_RAD_PER_S * seconds
     phi[6, 7] += turn
     phi[7, 6] -= turn
@@ -190,7 +190,7 @@ def _transition(sums, ways, seconds, field, scaled, phi):
 
 @kernel
 def predict(k, nodes, model, layout, present, interval, record, work):
-    """P ← Φ P Φᵀ + Q over the interval that ends at node k; the other states decay."""
+    """Apply P ← Φ P Φᵀ + Q over the interval that ends at node k; the other states decay."""
     p, phi, values = present.covariance, record.transition[k], present.values
     n = layout.size
     decay = np.empty(n)
@@ -215,7 +215,7 @@ def predict(k, nodes, model, layout, present, interval, record, work):
 
 @inner
 def _moved_rows(p, phi, work):
-    """Rows of navigation: work (9, n) ← Φ P, and the block Φ P Φᵀ of them in `p`."""
+    """Compute rows of navigation: work (9, n) ← Φ P, and the block Φ P Φᵀ of them in `p`."""
     n, mixed = p.shape[0], phi.shape[1]
     for i in range(9):
         for j in range(n):
@@ -236,7 +236,7 @@ def _moved_rows(p, phi, work):
 
 @inner
 def _add_noise(k, nodes, model, present, interval, phi):
-    """Noise of gyroscopes and accelerometers, and of motion in a silence of the IMU.
+    """Add noise of gyroscopes and accelerometers, and of motion in a silence of the IMU.
 
     Noise early in the interval reaches the states behind: integrals of white noise (Groves 2013, 14.2.6).
     """

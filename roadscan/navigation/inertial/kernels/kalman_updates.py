@@ -1,4 +1,4 @@
-"""Measurement updates of the filter: innovation, row and variance of each kind of measurement.
+"""Measurement updates of the filter: innovation, row and variance of each kind.
 
 All functions fill an :class:`~roadscan.navigation.inertial.kernels.kalman_states.Offer`: innovation = row · errors +
 noise.
@@ -29,7 +29,7 @@ from roadscan.navigation.inertial.kernels.strapdown import EARTH_RATE_RAD_PER_S,
 
 @kernel
 def prepare(nodes, k, model, present, offer):
-    """Axes at node k: body, and level where there is a GNSS solution."""
+    """Compute the axes at node k: body, and level where there is a GNSS solution."""
     c = matrix((present.quaternion[0], present.quaternion[1], present.quaternion[2], present.quaternion[3]))
     for i in range(3):
         for j in range(3):
@@ -42,7 +42,7 @@ def prepare(nodes, k, model, present, offer):
 
 @kernel
 def offered(kind, k, nodes, fixes, model, layout, track, present, interval, offer):
-    """Fill `offer` with the measurement of a kind at node k; its number of components, 0 where there is none."""
+    """Fill `offer` with the measurement of a kind at node k; return its number of components, 0 where there is none."""
     g = nodes.gnss[k]
     size = 0
     offer.row[:] = 0.0
@@ -64,7 +64,7 @@ def offered(kind, k, nodes, fixes, model, layout, track, present, interval, offe
 
 @inner
 def _gnss_position(fixes, g, layout, present, offer):
-    """Antenna's position against the predicted one, ECEF."""
+    """Offer the antenna's position less the predicted one, ECEF."""
     h, y, noise, values = offer.row, offer.innovation, offer.noise, present.values
     v, r, body, level = present.velocity, present.position, offer.body, offer.level
     a = layout.antenna - 9
@@ -94,7 +94,7 @@ def _gnss_position(fixes, g, layout, present, offer):
 
 @inner
 def _gnss_velocity(fixes, g, rate, model, layout, present, interval, offer):
-    """Antenna's velocity against the predicted one, ECEF; `rate` (3,) of the IMU in its own axes."""
+    """Offer the antenna's velocity less the predicted one, ECEF; `rate` (3,) of the IMU in its axes."""
     h, y, noise, values = offer.row, offer.innovation, offer.noise, present.values
     v, gained, body, level = present.velocity, interval.acceleration, offer.body, offer.level
     a = layout.antenna - 9
@@ -103,7 +103,7 @@ def _gnss_velocity(fixes, g, rate, model, layout, present, interval, offer):
     for i in range(3):
         for j in range(3):
             w[i] += b[i, j] * rate[j]
-    # The Earth's own rate, in body axes, is not over ground.
+    # Velocity over ground excludes the Earth's rotation, given in body axes.
     for i in range(3):
         w[i] -= body[2, i] * EARTH_RATE_RAD_PER_S
     l0, l1, l2 = values[a], values[a + 1], values[a + 2]
@@ -140,7 +140,7 @@ def _gnss_velocity(fixes, g, rate, model, layout, present, interval, offer):
 
 @kernel
 def _travel(kind, counted_m, constrained, model, layout, present, interval, offer):
-    """Mean velocity of the axle over the interval, in the axes of travel: forwards, or to the side and down.
+    """Offer the axle's mean velocity over the interval in the axes of travel: forwards, or to the side and down.
 
     u = R Cᵀ v + ω × l, turned by the heading and the pitch of the direction of travel against the body. Only the
     components of a kind are offered: ODOMETER the first, NON_HOLONOMIC the two others.
@@ -165,7 +165,7 @@ def _travel(kind, counted_m, constrained, model, layout, present, interval, offe
     share = model.interval_s / seconds
     if kind == ODOMETER:
         counted = counted_m / seconds
-        # A counter that does not know its direction counts up on the way back.
+        # A counter without direction counts up when reversing.
         if forward < -0.5 and counted > 0.0:
             counted = -counted
         for j in range(h.shape[1]):
@@ -184,7 +184,7 @@ def _travel(kind, counted_m, constrained, model, layout, present, interval, offe
 
 @inlined
 def _axle_velocity(model, layout, present, interval, rows):
-    """Mean velocity of the axle in body axes (three numbers), its rows, and the rate of turn (rad/s)."""
+    """Return the axle's mean velocity in body axes (three numbers), its rows, and the rate of turn (rad/s)."""
     b, values = model.body_from_imu, present.values
     seconds = interval.length[0]
     x = layout.axle - 9
@@ -211,7 +211,7 @@ def _axle_velocity(model, layout, present, interval, rows):
 
 @kernel
 def _standing(kind, rate_noise, model, present, interval, offer):
-    """The vehicle neither moves nor turns against the Earth; what the gyroscopes feel is the Earth's rate."""
+    """Offer that the vehicle neither moves nor turns relative to the Earth: gyroscopes measure the Earth's rate."""
     h, y, noise = offer.row, offer.innovation, offer.noise
     seconds, rate = interval.length[0], EARTH_RATE_RAD_PER_S
     if kind in (ODOMETER, NON_HOLONOMIC):
@@ -235,7 +235,7 @@ def _standing(kind, rate_noise, model, present, interval, offer):
 
 @kernel
 def apply(present, offer, size, limit, at, updates):
-    """One update of `size` components; too large an innovation has its noise raised.
+    """Apply one update of `size` components; the noise of an outlying innovation is raised.
 
     The weight w of an outlier divides its noise: w = limit / normalised innovation, whose influence falls off again
     (compare Chang 2014, "Robust Kalman filtering based on Mahalanobis distance").
@@ -274,7 +274,7 @@ def apply(present, offer, size, limit, at, updates):
 
 @inner
 def _whitened_rows(h, ph, factor, size, row, gain):
-    """L⁻¹ H and (P Hᵀ L⁻ᵀ)ᵀ by forward substitution."""
+    """Compute L⁻¹ H and (P Hᵀ L⁻ᵀ)ᵀ by forward substitution."""
     for c in range(size):
         for j in range(h.shape[1]):
             a, b = h[c, j], ph[c, j]
@@ -301,7 +301,7 @@ def _shifted(present, shift):
 
 @inner
 def _whiten(predicted, noise, weight, size, y, factor, white):
-    """Cholesky factor of the innovation's covariance, L⁻¹y, and its squared length by component."""
+    """Compute the Cholesky factor of the innovation's covariance, L⁻¹y, and its squared length by component."""
     total = 0.0
     for i in range(size):
         for j in range(i + 1):

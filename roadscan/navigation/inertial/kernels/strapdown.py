@@ -1,4 +1,4 @@
-"""Strapdown mechanisation in ECEF axes, and the increments it takes.
+"""Strapdown mechanisation in ECEF axes, and the increments that it uses.
 
 Attitude is a quaternion (scalar first) that turns vectors of the IMU into ECEF; velocity is over ground. One step
 takes a rotation vector and a velocity increment (Groves 2013, section 5.3; coning and sculling: Savage 1998,
@@ -12,20 +12,20 @@ import math
 
 from roadscan.compute.kernel_options import inlined, kernel
 
-EARTH_RATE_RAD_PER_S = 7.292115e-5
-SEMI_MAJOR_M = 6378137.0
-FLATTENING = 1.0 / 298.257223563
-ECCENTRICITY2 = FLATTENING * (2.0 - FLATTENING)
-SEMI_MINOR_M = SEMI_MAJOR_M * (1.0 - FLATTENING)
-GRAVITY_EQUATOR_M_PER_S2 = 9.7803253359
-SOMIGLIANA = 0.001931853
+EARTH_RATE_RAD_PER_S = 7.292115e-5  # WGS 84.
+SEMI_MAJOR_M = 6378137.0  # Semi-major axis of WGS 84.
+FLATTENING = 1.0 / 298.257223563  # Flattening of WGS 84.
+ECCENTRICITY2 = FLATTENING * (2.0 - FLATTENING)  # First eccentricity squared.
+SEMI_MINOR_M = SEMI_MAJOR_M * (1.0 - FLATTENING)  # Semi-minor axis.
+GRAVITY_EQUATOR_M_PER_S2 = 9.7803253359  # Normal gravity at the equator, WGS 84.
+SOMIGLIANA = 0.001931853  # Constant of Somigliana's formula, WGS 84.
 CENTRIFUGAL = 0.00344978650684
 """ω² a² b / GM of WGS 84."""
 
 
 @inlined
 def product(q, p):
-    """Quaternion product q ⊗ p."""
+    """Return the quaternion product q ⊗ p."""
     return (
         q[0] * p[0] - q[1] * p[1] - q[2] * p[2] - q[3] * p[3],
         q[0] * p[1] + q[1] * p[0] + q[2] * p[3] - q[3] * p[2],
@@ -36,7 +36,7 @@ def product(q, p):
 
 @inlined
 def exponential(x, y, z):
-    """Unit quaternion of a rotation vector (rad)."""
+    """Return the unit quaternion of a rotation vector (rad)."""
     a = x * x + y * y + z * z
     if a < 1e-3:
         w = 1.0 - a * (0.125 - a / 384.0)
@@ -49,14 +49,14 @@ def exponential(x, y, z):
 
 @inlined
 def unit(q):
-    """Quaternion of length one."""
+    """Return the quaternion normalised to length one."""
     scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale
 
 
 @inlined
 def matrix(q):
-    """Rotation matrix of a unit quaternion, row by row."""
+    """Return the rotation matrix of a unit quaternion, row by row."""
     w, x, y, z = q
     return (
         1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
@@ -67,7 +67,7 @@ def matrix(q):
 
 @inlined
 def geodetic(x, y, z):
-    """Sine and cosine of latitude, sine and cosine of longitude, ellipsoidal height (m) of an ECEF position.
+    """Return sine and cosine of latitude, sine and cosine of longitude, ellipsoidal height (m) of an ECEF position.
 
     Bowring (1985), one step: below 1 nm near the Earth's surface.
     """
@@ -89,7 +89,7 @@ def geodetic(x, y, z):
 
 @kernel
 def gravity_at(x, y, z):
-    """Normal gravity (m/s², downwards positive) and the upward unit vector, ECEF.
+    """Return normal gravity (m/s², downwards positive) and the upward unit vector, ECEF.
 
     Somigliana on the ellipsoid, second order in height (Groves 2013, eq. 2.134, 2.139).
     """
@@ -105,7 +105,7 @@ def gravity_at(x, y, z):
 
 @inlined
 def gravity_near(field, x, y, z):
-    """Gravity vector (m/s², ECEF) close to where `field` = (size, up, x, y, z) was worked out.
+    """Return the gravity vector (m/s², ECEF) close to the place where `field` = (size, up, x, y, z) was computed.
 
     It turns with the vertical and falls with height: Δg = −g/r (Δx − 3 up (up · Δx)).
     """
@@ -118,14 +118,14 @@ def gravity_near(field, x, y, z):
 
 @inlined
 def gravity_field(x, y, z):
-    """What :func:`gravity_near` starts from."""
+    """Return the field from which :func:`gravity_near` starts."""
     size, ux, uy, uz = gravity_at(x, y, z)
     return size, ux, uy, uz, x, y, z
 
 
 @inlined
 def strapdown_step(q, v, r, turn, push, dt, field):
-    """One step of the mechanisation.
+    """Compute one step of the mechanisation.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def strapdown_step(q, v, r, turn, push, dt, field):
     half = 0.5 * EARTH_RATE_RAD_PER_S * dt
     fx, fy = fx + half * fy, fy - half * fx
     gx, gy, gz = gravity_near(field, r[0] + 0.5 * dt * v[0], r[1] + 0.5 * dt * v[1], r[2] + 0.5 * dt * v[2])
-    # Coriolis at the middle of the step.
+    # Coriolis with the velocity at the middle of the step.
     mx, my = v[0] + 0.5 * (fx + gx * dt), v[1] + 0.5 * (fy + gy * dt)
     vx = v[0] + fx + (gx + 2.0 * EARTH_RATE_RAD_PER_S * my) * dt
     vy = v[1] + fy + (gy - 2.0 * EARTH_RATE_RAD_PER_S * mx) * dt
@@ -161,7 +161,7 @@ def strapdown_step(q, v, r, turn, push, dt, field):
 
 @kernel
 def increments(epochs, rate, force, instant, bounds, steps, turn, push):
-    """Rotation and velocity increments of the steps between `bounds`, coning and sculling included.
+    """Compute rotation and velocity increments of the steps between `bounds`, coning and sculling included.
 
     Rates and forces change linearly within a sample: what two samples in a row say (Savage 1998, part 1, eq. 41;
     part 2, eq. 39). A sample that a bound divides gives each part its share.
@@ -207,7 +207,7 @@ def increments(epochs, rate, force, instant, bounds, steps, turn, push):
 
 @kernel
 def strapdown(steps, turn, push, quaternions, velocities, positions):
-    """Free-running mechanisation from the first row of the outputs on.
+    """Run the free mechanisation from the first row of the outputs on.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def strapdown(steps, turn, push, quaternions, velocities, positions):
 
 @kernel
 def geodetic_of(positions, out):
-    """Sine and cosine of latitude and longitude, and height: (n, 5) out, of ECEF positions (n, 3)."""
+    """Compute (n, 5) sine and cosine of latitude and longitude, and height, of ECEF positions (n, 3)."""
     for i in range(positions.shape[0]):
         found = geodetic(positions[i, 0], positions[i, 1], positions[i, 2])
         for j in range(5):
@@ -239,7 +239,7 @@ def geodetic_of(positions, out):
 
 @kernel
 def turned_frame(turn, push, quaternions, velocities):
-    """Attitudes against the first, and the velocity that specific forces alone give, in its axes.
+    """Compute attitudes relative to the first, and the velocity from specific forces alone, in its axes.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from roadscan.core.strict import Strict
 
 
 class Interior(Strict):
-    """Interior orientation: u = cx + fx · x', v = cy + fy · y' of a pixel, where x', y' are the distorted tangents.
+    """Interior orientation: a pixel has u = cx + fx · x', v = cy + fy · y', where x', y' are the distorted tangents.
 
     Tangents are taken in OpenCV's camera axes, x right, y down, z along the optical axis; the sensor frame of the
     rig has x along the optical axis, y right, z down (`axes = "frd"`). In a picture of 360° x' and y' are angles

@@ -50,7 +50,7 @@ class RoadscanError(Exception):
     expected : what should have been there.
     change : what the user can do about it.
     file, record : where it was found (record number or byte offset).
-    missing : settings of the log that would mend it: one, or alternatives, each a setting or several together.
+    missing : settings of the log that would resolve it: one, or alternatives, each a setting or several together.
         `expected` and `change` follow from them where they are not given.
     """
 

@@ -36,7 +36,7 @@ def check_private(folder: Path, code: Code = KERNELS) -> None:
     """Refuse a folder that others may write to, as OpenSSH does with keys.
 
     The folder, all above it and the files in it have to belong to this user or to root, and nobody else may write to
-    them. Above it, a folder like /tmp will do, where everyone may write and nobody may move what is another's.
+    them. Above it, a folder like /tmp will do, where everyone may write and nobody may move another user's files.
 
     Raises
     ------

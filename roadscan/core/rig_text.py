@@ -1,6 +1,6 @@
 """Edits a rig file and leaves every other byte as it is: comments, order, spaces.
 
-Only what can be changed safely is: the file has to hold ``[sensors.NAME]`` as a table of its own. The text that comes
+Only what can be changed safely is: the file has to contain ``[sensors.NAME]`` as a separate table. The text that comes
 out is parsed again and has to mean the old file with just these changes, or nothing is written.
 """
 

@@ -1,7 +1,7 @@
 """Remembers a request to end the program (Ctrl-C, or a system signal) until the program ends.
 
-It is raised as :class:`Stopped`, but a library that was just calling back may hand on an error of its own instead
-(lazrs does). So whoever catches any error asks :func:`stop_if_asked` before it goes on.
+It is raised as :class:`Stopped`, but a library that was just calling back may raise its own error instead
+(lazrs does). So code that catches every error calls :func:`stop_if_asked` before it continues.
 """
 
 from __future__ import annotations

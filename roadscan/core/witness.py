@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import Any, Final, Literal
 
 Told = Literal["error", "rejects", "findings"]
-"""Where a fault is told: ``error`` ends the command or the log with a message; ``rejects`` counts the records in the
-summary and lists each in the table `rejects`; ``findings`` is a line of the summary, of `status` and of the report."""
+"""Where a fault is reported: ``error`` ends the command or the log with a message; ``rejects`` counts the records in
+the summary and lists each in the table `rejects`; ``findings`` is a line of summary, `status` and report."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Finds when logs were recorded before any is read completely, so that times that never meet show at once.
 
-A small log is read. Of a large one the first chunk is, and what its format finds at its end without reading it through
+A small log is read completely. Of a large one, the first chunk is read, and what its format finds at its end directly
 (`LogFormat.ending`). Where that end is not known, a log counts as one that lasts two days.
 """
 

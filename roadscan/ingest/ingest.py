@@ -77,7 +77,7 @@ def ingest(
 
     Parameters
     ----------
-    report : hears of each log, in the order of :func:`plan_logs` whichever ends first.
+    report : receives each log, in the order of :func:`plan_logs` whichever ends first.
     compute : where logs are read; this process by default.
     logs : what :func:`plan_logs` says, where that is known.
 

@@ -90,9 +90,7 @@ class LaserRanges(LogCheck):
             self._compare(ranges, azimuths, known[three].tolist(), level[three])
 
     def _compare(self, ranges: Float64, azimuths: Float64, lasers: Sequence[int], level: Float64) -> None:
-        """Add the residuals of the first of three lasers against the other two, by firing; `level` (3,) elevations
-        (rad).
-        """
+        """Add one laser's residuals against two others, by firing; `level` (3,) holds their elevations (rad)."""
         mid, one, other = (ranges[:, k] for k in lasers)
         span = float(np.sin(level[2] - level[1]))
         if span <= 0:

@@ -18,7 +18,7 @@ from roadscan.ingest.reading.format import Rows
 from roadscan.store.logs import LogRecord
 
 STAMPED: Final = ("scans", "imu", "encoder", "gnss")
-"""Tables whose rows each have a time of their own. Returns of one sweep may share theirs."""
+"""Tables in which each row has a time. Returns of one sweep may share theirs."""
 
 
 ONE_STAMP: Final = Witness(

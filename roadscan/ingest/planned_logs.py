@@ -203,7 +203,7 @@ def _earlier_checks(format_: LogFormat) -> list[list[list[object]]]:
 def log_source(
     survey: Survey, config: LogConfig | ControlConfig, path: Path, format_: LogFormat, options: Strict
 ) -> LogSource:
-    """Return what a reader is told of a log; nothing of the log is read.
+    """Return the description of a log for its reader; nothing of the log is read.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Leaves out poses and GNSS positions that no vehicle can have taken, and reports steps of them.
 
-It is done when all rows of the log are read and lie in order of time: readers stream, and a pose shows to be wrong by
+This needs all rows of the log in order of time: readers stream, and a pose is only seen to be wrong by
 those that follow it. No row is changed; one that is left out is a reject of its record. Velocities that a log states
-are held until then, and kept in no table.
+are kept until then, and stored in no table.
 """
 
 from __future__ import annotations

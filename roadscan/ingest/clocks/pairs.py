@@ -46,7 +46,7 @@ class PairFit:
     drift: float
     """s/s"""
     reference_s: float
-    """Stamp at which the offset holds (s of the log's own count)."""
+    """Stamp at which the offset holds (s of the log's count)."""
     correction: ClockCorrection
     """The same as a correction of epochs that the time system alone gives for the stamps."""
     residuals: Residuals

@@ -1,6 +1,6 @@
 """Builds a first survey from a folder of logs: which logs there are, which form a drive, which sensors wrote them.
 
-Every file is told by its content and looked into as `roadscan inspect` does. What the logs say is filled in; what
+Every file is identified by its content and inspected as `roadscan inspect` does. What the logs say is filled in; what
 they do not say becomes a question of the written file (:mod:`roadscan.ingest.inspect.first_survey_text`), never a
 guess.
 """
@@ -76,7 +76,7 @@ class FoundLog:
 
     @property
     def is_assumed(self) -> bool:
-        """Return True if settings other than its time were assumed: what the log says of itself may change."""
+        """Return True if settings other than its time were assumed: what is known of the log may change."""
         return any(need.key.startswith("options.") and not need.is_of_time for need in self.report.opened.needs)
 
     @property
@@ -166,7 +166,7 @@ def find_logs(folder: Path, progress: Progress = lambda rows, share: None) -> Fo
 
     Parameters
     ----------
-    progress : hears of each log how far it is read.
+    progress : receives how far each log is read.
 
     Raises
     ------
@@ -251,7 +251,7 @@ def _is_store(folder: Path) -> bool:
 def _taken_by_folder_log(folder: Path) -> frozenset[Path]:
     """Return the files of the folder log that the folder is; empty if it is none.
 
-    A folder is a log if a format claims it and its files are no logs by themselves, or are parts of one: of the
+    A folder is a log if a format claims it and its files are no separate logs, or are parts of one: of the
     same format, in one folder, with names that differ in digits only.
     """
     for log_format in formats_of(folder):
@@ -308,7 +308,7 @@ def _sort_in(path: Path, found: FoundFolder, logs: list[FoundLog], progress: Pro
 def _runs(logs: list[FoundLog], folder: Path) -> list[FoundRun]:
     """Return the runs: one for each trajectory, or else for each folder; every other log joins the run it fits best.
 
-    A log that has neither time, folder nor a word of its name in common with any trajectory makes a run of its own.
+    A log that has neither time, folder nor a word of its name in common with any trajectory makes a separate run.
     """
     seeds = [log for log in logs if log.is_trajectory]
     if not seeds:

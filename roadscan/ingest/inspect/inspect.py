@@ -2,7 +2,7 @@
 
 A file that a raw format claims is read through that format's reader, as ingest would, and its figures are taken
 while it streams by. What the file does not say and nobody stated (a GPS week, a CRS) is assumed for looking only,
-and listed. Other files are told by their first bytes. Hostile files end in a message, never in a crash.
+and listed. Other files are identified by their first bytes. Hostile files end in a message, never in a crash.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Reads record batches of mapped Arrow IPC files (Feather), and checks them against the list in the file's footer.
 
-Arrow reads what the footer lists. A damaged or truncated list would leave out readings without a word.
+Arrow reads what the footer lists. A damaged or truncated list would silently leave out readings.
 """
 
 from __future__ import annotations

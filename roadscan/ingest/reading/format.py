@@ -1,9 +1,9 @@
-"""The contract of a raw format, and the registry that finds formats by themselves.
+"""The interface of a raw format, and the registry that finds all formats.
 
 A format is one file of `roadscan/formats/` (or one entry point of the group ``roadscan.formats``) with one
 subclass of :class:`LogFormat`. It streams :class:`Rows`, :class:`Reject` for each damaged record, and a
 :class:`~roadscan.core.witness.Finding` for what is doubtful of the log; everything else (schemas, partitions,
-fingerprints, rejects table, where findings are told) is done for it.
+fingerprints, rejects table, where findings are reported) is done for it.
 """
 
 from __future__ import annotations

@@ -289,7 +289,7 @@ class UnorderedStamps:
         scale_ns = UNIT_NS[self.clock.unit]
         with np.errstate(invalid="ignore", over="ignore"):
             elapsed_ns = (stamps - self.anchor) * scale_ns
-            # A day's margin: leap seconds and drift are left to the clock's own exact rule. Seconds of the week have
+            # A day's margin: leap seconds and drift are left to the clock's exact rule. Seconds of the week have
             # no leap seconds, and those of week 0, which inspect assumes, may be of its first day.
             first_day_ns = 0 if self.clock.system is TimeSystem.GPS_WEEK and not self.clock.drift_ppm else _DAY_NS
             earliest = EARLIEST_GPS_NS - self.anchor_gps_ns + first_day_ns

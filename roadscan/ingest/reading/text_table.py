@@ -436,8 +436,8 @@ def text_blocks(
 ) -> Iterator[TextBlock | Reject]:
     """Read the columns `kinds` in blocks of whole lines; faulty lines become rejects.
 
-    A compressed stream that breaks off costs what lies behind the break. Memory is bounded by
-    a block of some 1 MB of text. Behind a header that differs from the first no line is read.
+    A truncated compressed stream costs what follows the break. Memory is bounded by
+    a block of some 1 MB of text. Lines after a header that differs from the first are not read.
 
     Parameters
     ----------
@@ -552,8 +552,8 @@ def parse_lines(
 
     Parameters
     ----------
-    starts, ends : (n,) bytes of `data` where each line starts, and ends behind its line feed.
-    layout : `data_offset` and `comment` are not looked at.
+    starts, ends : (n,) bytes of `data` where each line starts, and ends after its line feed.
+    layout : `data_offset` and `comment` are ignored.
     records, offsets : (n,) record number and byte offset of each line, as blocks and rejects state them.
     """
     table = _parsed(data, starts, ends, layout, kinds)
@@ -576,7 +576,7 @@ def line_blocks(
 ) -> Iterator[tuple[int, bytes | Reject]]:
     """Yield pieces of whole lines from byte `start` of the text on, each with its offset.
 
-    A reject stands for a line without end, or for all that follows the break of a compressed stream.
+    A reject replaces a line without end, or everything after the break of a compressed stream.
 
     Parameters
     ----------

@@ -3,9 +3,9 @@
     tables/assets_found/<number>-<digest>.parquet     what a run found
     tables/asset_edits/<number>-<digest>.parquet      what people changed
     tables/asset_commits/<number>.parquet             written last: it makes the rows part of the inventory
-    inventory/published/<token>.parquet               rows of a home as it was published or last read
+    inventory/published/<token>.parquet               rows of an inventory file as published or last read
 
-A file of rows that no commit names is left over from a program that was stopped; the next append removes it.
+A file of rows that no commit names remained from an interrupted program; the next append removes it.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ class AssetTruth:
     def alone(self, wait_s: float = 30.0) -> Iterator[None]:
         """Lock out other writers of this inventory, waiting for one that is writing.
 
-        The system lets go of the lock when its process ends, however it ends.
+        The system releases the lock when its process ends, however it ends.
 
         Raises
         ------

@@ -42,7 +42,7 @@ class _Part:
 class Manifest:
     """All output records, with one writer at a time (the run with the store's lock).
 
-    What changes is written as a part of its own. Parts are merged with those before them that are no more than twice
+    Changes are written as a separate part. Parts are merged with those before them that are no more than twice
     as large, so a record is written again as often as the survey doubles, not each time that some tasks end.
 
     Records stay in tables; only those of products that are asked for one by one become Python's.

@@ -15,7 +15,7 @@ from roadscan.store.schema import TableSchema
 def merged(paths: Sequence[Path], schema: TableSchema, rows: int) -> Iterator[pa.Table]:
     """Yield the rows of files that are each sorted by the schema, in common order; equal keys keep the files' order.
 
-    Only the sort columns are held as a whole. Of each file, a piece of the result needs rows that follow one
+    Only the sort columns are in memory as a whole. Of each file, a piece of the result needs rows that follow one
     another, so just their row groups are read.
 
     Parameters

@@ -2,7 +2,7 @@
 
 A log's record has a copy, which takes its place; without one the log is read again. Of a damaged part of the manifest
 the sound rows stay. What else it said is not known: it may have replaced or forgotten records of parts before it. So
-the files of those are held against their digests, and what does not hold counts as stale.
+the files of those are verified against their digests, and what differs counts as stale.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ def salvaged(
 
     Returns
     -------
-    kept : what a record says of the local file; None where no row group is sound.
+    kept : record entry of the local file; None where no row group is sound.
     lost, spans : rows that are lost, and the epochs (GPS ns) of each row group that is.
 
     Damage beside the rows (in the footer, say) loses none: the same rows make the same bytes, which the recorded digest

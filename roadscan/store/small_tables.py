@@ -1,8 +1,8 @@
 """Reads and writes small tables as whole files: the estimated clocks, mountings and trajectories.
 
-No record of the manifest names them, and no run makes all of them. So each says by itself what mends it. A list of
-their digests (``manifest/held.json``) tells damage that the checksums of their pages do not cover; a table that someone
-put there, and roadscan did not write, is not in it.
+No record of the manifest names them, and no run makes all of them. So each one itself says how to repair it. A list of
+their digests (``manifest/held.json``) reveals damage that the checksums of their pages do not cover; it lists no table
+that someone put there and roadscan did not write.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def read_small(store: Store, name: str) -> pa.Table | None:
     Raises
     ------
     DamagedError
-        Says what mends it.
+        Says how to repair it.
     StoreError
         It cannot be read.
     """

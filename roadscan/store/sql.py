@@ -151,7 +151,7 @@ def query(
 ) -> pa.Table:
     """Run one SQL statement over the store's views (:func:`connect`).
 
-    The files that it opens are held against their records where they changed since they were last verified. One that is
+    The files that it opens are verified against their records if they changed since the last verification. One that is
     damaged is an error, or joins `damaged` (as :class:`AnswerError`), and the answer is given.
     """
     opened = _opened(store, logs, damaged, unconfined)

@@ -1,8 +1,8 @@
 """A read-only file system for SQL: one survey's files of a store.
 
 DuckDB can confine statements to folders, but not to reading: what may be read may be written (``COPY … TO``, which
-may stand inside a ``WITH``, ``ATTACH``, ``EXPORT DATABASE``). So statements reach files through this file system alone,
-which has no way to write, and DuckDB's own is switched off.
+may stand inside a ``WITH``, ``ATTACH``, ``EXPORT DATABASE``). So statements access files only through this file system,
+which has no way to write, and DuckDB's is switched off.
 """
 
 from __future__ import annotations

@@ -153,7 +153,7 @@ class Store:
     def read_table(self, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN) -> pa.Table:
         """Return a small Parquet file with verified page checksums; `change` says how to repair it.
 
-        Read by this thread alone: a thread of Arrow's that still let go of the bytes when the interpreter ends would
+        Read by this thread alone: a thread of Arrow's that still releases the bytes when the interpreter ends would
         end the process with SIGABRT (`pq.read_table` hands them to such threads).
         """
         return self.parse_table(self.read_bytes(relative), relative, columns, change)

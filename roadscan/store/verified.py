@@ -1,7 +1,7 @@
 """Remembers which files of SQL were verified against their records, and their stamps at that time.
 
-DuckDB does not look at checksums. A file whose size and time are as they were when its digest was found right was not
-written since, and a look at those costs microseconds. What changed since, or was never held, is read once.
+DuckDB does not verify checksums. A file whose size and time are as they were when its digest was found right was not
+written since, and checking them takes microseconds. What changed since, or was never verified, is read once.
 
 The note is no record: where it is lost or damaged, files are read once more.
 """
@@ -53,7 +53,7 @@ def recorded_files(store: Store, logs: Iterable[LogRecord], manifest: Manifest) 
 def faults_of_opened(store: Store, opened: Mapping[str, Stamp], recorded: pa.Table) -> list[AnswerError]:
     """Return the faults of files that a query opened (paths and stamps); verified ones are not read again.
 
-    A file of an object store is held by its size alone, unless its time or tag has changed since it was verified: the
+    A file of an object store is verified by its size alone, unless its time or tag has changed since then: the
     object store checks what it keeps, and to read all of it would cost more than the query.
     """
     paths = sorted(opened)

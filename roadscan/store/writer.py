@@ -118,8 +118,8 @@ class LogWriter:
 
         Parameters
         ----------
-        is_out : says of the rows of a file (n,), in order of time, which are taken out.
-        may_be_out : says by the epochs of a file whether it need be looked at.
+        is_out : returns which rows of a file (n,), in order of time, are taken out.
+        may_be_out : returns, by the epochs of a file, whether any of its rows can be.
         """
         schema, left_out = table_schema(table), 0
         for key in sorted(key for key in self._bins if key[0] == table):

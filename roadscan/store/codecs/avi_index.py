@@ -1,6 +1,6 @@
 """Finds by an AVI's index which frames are still at their places.
 
-An AVI keeps no times: frame k is the k-th in the file. Where one is damaged, a reader goes on with the next, and all
+An AVI stores no times: frame k is the k-th in the file. Where one is damaged, a reader continues with the next, and all
 later frames seem a frame too early; only the index tells which one is gone (Microsoft, *AVI RIFF File
 Reference*: ``idx1`` holds identifier, flags, offset and length of each chunk).
 """

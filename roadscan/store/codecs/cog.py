@@ -1,6 +1,6 @@
 """Writes cloud-optimised GeoTIFFs that omit empty blocks: equal pixels give equal bytes.
 
-GDAL's own driver does neither: it makes overviews of every block of a raster, empty or not, which takes fifteen times
+GDAL's driver does neither: it makes overviews of every block of a raster, empty or not, which takes fifteen times
 as long for a square kilometre with a road through it. GDAL, which reads the files, is the oracle in tests. Pixels are
 float32 with NaN or uint8 with 0 where nothing lies. Blocks go through TIFF's predictors (3 and 2), then DEFLATE, which
 takes least time, or where most of a block may be empty ZSTD, which takes a third of the room for that.

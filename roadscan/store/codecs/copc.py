@@ -177,7 +177,7 @@ def _with_parents(key: Key) -> list[Key]:
 def _pages(entries: npt.NDArray[np.void], start: int) -> tuple[bytes, int]:
     """Return the hierarchy's bytes for offset `start` of the file, and the size of the root page.
 
-    A page below the root begins with the node that stands for it there: with the number of points -1.
+    A page below the root begins with the node that refers to it there, whose number of points is -1.
     """
     if entries.size <= _PAGE_NODES or not (entries["level"] >= _PAGE_LEVEL).any():
         return entries.tobytes(), entries.nbytes

@@ -33,7 +33,7 @@ def write_png(path: Path, grey: Grey, pixel_m: float, texts: Mapping[str, str], 
     Parameters
     ----------
     pixel_m : edge of a pixel (m), stated as pixels a metre.
-    texts : what the file says of itself, keyword → text (Latin 1).
+    texts : metadata, keyword → text (Latin 1).
     smooth : True where lines resemble the line above them; they are then stored as differences.
     """
     rows, columns = grey.shape

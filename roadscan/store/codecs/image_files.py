@@ -1,8 +1,8 @@
 """Checks size and completeness of JPEG, PNG and TIFF files without decoding them.
 
-Decoders fill up what is missing, and allocate what a header claims; so structure is looked at first: what a file cut
+Decoders fill up what is missing, and allocate what a header claims; so the structure is checked first: what a file cut
 short, or filled with zeros at its end, no longer has. Damage inside the compressed pixels stays unseen, as finding it
-means decoding every image. Pillow reads TIFF's tags; it does not say of JPEG and PNG whether they are whole.
+means decoding every image. Pillow reads TIFF's tags; it does not say whether JPEG and PNG are complete.
 
 JPEG: ITU-T T.81, annex B. PNG: W3C PNG (third edition), sections 5 and 11. TIFF: TIFF 6.0, section 2, and BigTIFF.
 """

@@ -1,6 +1,6 @@
 """Decompresses points of LAZ files in a separate process, which damaged bytes may crash without harm.
 
-A decompressor allocates what the file claims; so the chunk table and the sizes inside the chunks are first held
+A decompressor allocates what the file claims; so the chunk table and the sizes inside the chunks are first checked
 against the file's size (LASzip 2.2).
 """
 

@@ -43,7 +43,7 @@ def write_glb(path: Path, mesh: Mesh, about: Mapping[str, Any], generator: str) 
 
     Parameters
     ----------
-    about : what `asset.extras` says of the mesh, beside the digest of the arrays.
+    about : content of `asset.extras`, beside the digest of the arrays.
     """
     upright = mesh.vertices_m[:, [0, 2, 1]] * np.array([1, 1, -1], np.float32)
     arrays = [upright.astype("<f4").tobytes(), _linear(mesh.colour).tobytes(), mesh.triangles.astype("<u4").tobytes()]

@@ -1,7 +1,7 @@
 """Writes cloud-optimised TIFFs from compressed blocks (TIFF 6.0; BigTIFF where 4 GB are not enough).
 
 First come all directories, then the blocks: those of the smallest overview first, those of the image last. Each has
-its size before it and its last four bytes again behind it, as GDAL's own cloud-optimised files do. A block that holds
+its size before it and its last four bytes again behind it, as GDAL's cloud-optimised files do. A block that holds
 nothing is left out (offset and size 0), as GDAL reads sparse files.
 """
 

@@ -1,6 +1,6 @@
 """Reads profiles of a line scanner from the store into reused arrays.
 
-Files of roadscan's own pages are decoded by `codecs/parquet`; those of other writers, and of older stores, by Arrow.
+Files with roadscan's pages are decoded by `codecs/parquet`; those of other writers, and of older stores, by Arrow.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """DEFLATE in zlib's format (RFC 1950, 1951) for rasters: runs of one byte, and Huffman codes for everything else.
 
 Measured heights and intensities hold no repetitions but runs, and looking for them is what takes a compressor's time.
-The data are looked at in segments of 16 bytes: one that goes on with the byte before it belongs to a run (a match at
-distance 1), the bytes of all others are coded one by one. A sample of them tells the code's lengths.
+The data are divided into segments of 16 bytes: one that repeats the byte before it belongs to a run (a match at
+distance 1), the bytes of all others are coded one by one. A sample of them gives the code's lengths.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Checks page headers of Parquet files against the counts in the file's footer before a row group is read.
 
-Arrow passes over a page whose type it does not know. Damage in that one number makes a column shorter, and its later
+Arrow skips a page whose type it does not know. Damage in that one number makes a column shorter, and its later
 rows move up beside those of other columns. Here every page has to be of a known type, and the pages of a column have
 to hold as many values as the footer says. The footer is read here too: pyarrow (26) ends the process when it is asked
 for a column chunk with damaged statistics.

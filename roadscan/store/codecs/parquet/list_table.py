@@ -1,6 +1,6 @@
 """Writes Parquet files of tables with fixed-size lists of numbers.
 
-General writers look at each value's place in its list; here lists have one size, and only the values are looked at.
+General writers examine each value's place in its list; here lists have one size, and only the values are read.
 Any reader of Parquet reads the file: lists are DELTA_BINARY_PACKED, the rest is PLAIN, nothing is compressed further
 (differences of a surface's ranges do not compress). Each page has its CRC-32, and so has the footer: see `sealed`.
 """
@@ -98,7 +98,7 @@ def write_list_table(path: Path, rows: pa.Table, group_rows: int) -> None:
 def sealed(footer: bytes) -> bool | None:
     """Return True if a footer is as this writer left it, False if it is damaged, None if another program wrote it.
 
-    The last of the footer's own entries is the CRC-32 of the footer with the CRC's digits set to 0.
+    The last of the footer's entries is the CRC-32 of the footer with the CRC's digits set to 0.
     """
     found = list(_SEALED.finditer(footer))
     if not found:

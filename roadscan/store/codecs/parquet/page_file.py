@@ -74,7 +74,7 @@ def _read(stream: Any, start: int, end: int) -> bytes:
 class PageFile:
     """Pages of row groups, one row group at a time; it owns its buffer, so use one per thread.
 
-    Bytes are read at once for all columns wanted; each page is held against its CRC-32 before it is looked at.
+    Bytes are read at once for all columns wanted; the CRC-32 of each page is verified before it is decoded.
     """
 
     def __init__(self, source: ByteSource, metadata: pq.FileMetaData) -> None:

@@ -1,6 +1,6 @@
 """Data pages (version 1) of integers and of fixed-size lists of them.
 
-A page is a header, then repetition levels (0 begins a list, 1 goes on with it), then definition levels (how much of
+A page is a header, then repetition levels (0 begins a list, 1 continues it), then definition levels (how much of
 the value's path is there), then the values. Lists of a fixed size have levels that can be stated without looking at the
 values, so a page's levels are compared with those that it has to have, instead of being decoded.
 

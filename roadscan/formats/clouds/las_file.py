@@ -1,6 +1,6 @@
 """Reads LAS and LAZ files in bounded memory, even where their headers claim too much.
 
-laspy trusts what a header claims; so the header block and the variable-length records are first held
+laspy trusts what a header claims; so the header block and the variable-length records are first checked
 against the file's size (ASPRS LAS 1.4 R15).
 """
 

@@ -1,6 +1,6 @@
 """Shared parts of terrestrial reference scans (E57, PLY): CRS, epochs, rows of the table ``cloud``.
 
-A reference scan belongs to no drive: its points are not held against the run's trajectory, and where its
+A reference scan belongs to no drive: its points are not checked against the run's trajectory, and where its
 file says no time, the survey file states the one epoch that all its points get.
 """
 

@@ -25,7 +25,7 @@ Bool = npt.NDArray[np.bool_]
 
 FIELDS: Final = 10  # doubles of a record
 RECORD_BYTES: Final = 8 * FIELDS  # bytes of a record
-CLOCK_EXAMPLE: Final[dict[str, Any]] = {"system": "gps_week_seconds", "week": 2405}
+CLOCK_EXAMPLE: Final[dict[str, Any]] = {"system": "gps_week_seconds", "week": 2405}  # in errors
 
 SIGMAS: Final = {
     "sigma_north_m": 1.0,
@@ -167,8 +167,8 @@ def _block(fields: Float64, first: int, reader: EpochReader) -> Iterator[Accurac
 class CarriedAccuracy:
     """The σ of an SMRMSG file at the epochs of the poses it belongs to.
 
-    Both files are read side by side, in order of time: only the records about the poses at hand are
-    held. Between two records σ is linear in time; there is none beyond the file's span, and in a gap,
+    Both files are read side by side, in order of time: only the records about the current poses are
+    in memory. Between two records σ is linear in time; there is none beyond the file's span, and in a gap,
     where two records are more than 2.5 usual intervals apart (:data:`GAP_INTERVALS`; the usual interval is the
     median of the file's first 1,000).
 

@@ -35,7 +35,7 @@ class Ended:
 def cut_bundles(work: Sequence[float], most: float, workers: int) -> list[range]:
     """Return consecutive pieces as bundles of at most `most` work, or less, to give each worker four.
 
-    A piece with more work is a bundle of its own.
+    A piece with more work is a separate bundle.
     """
     limit = min(most, sum(work) / (4 * max(workers, 1)))
     ends: list[int] = []
@@ -66,7 +66,7 @@ def run_bundles(
     ----------
     work : estimate of a piece's work.
     most : work of a bundle, in the same unit; a run that is killed loses no more of each worker's.
-    report : hears of pieces done, and of their number.
+    report : receives the number of pieces done, and of all.
     """
     tasks = [
         Bundle(function, tuple(pieces[n] for n in numbers))

@@ -33,7 +33,7 @@ def reason_of(error: Exception | None) -> str:
     Raises
     ------
     Stopped
-        where the program was asked to end, and a library made an error of its own of that.
+        where the program was asked to end, and a library raised another error instead.
     """
     stop_if_asked()
     if error is None:

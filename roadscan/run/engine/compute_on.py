@@ -65,7 +65,7 @@ def compute_on(
     ----------
     workers : number of worker processes; 0 computes in this process; None takes one a core.
     scheduler : address such as ``tls://host:8786``.
-    dashboard : hears the address of the embedded cluster's dashboard when it opens; None: there is none.
+    dashboard : receives the address of the embedded cluster's dashboard when it opens; None: there is none.
 
     Raises
     ------

@@ -64,7 +64,7 @@ QUIET_CLUSTER = QUIET_CLIENT | {
     ],
     "distributed.scheduler.dashboard.bokeh-application.allow_websocket_origin": [LOOPBACK, "localhost"],
 }
-"""Settings of a cluster of roadscan's own: a worker's memory is bounded by the size of its blocks, so Dask's spilling
+"""Settings of a private cluster: a worker's memory is bounded by the size of its blocks, so Dask's spilling
 and pausing stay out of the way; nobody looks at its figures, of which it would take hundreds a second; what is tried
 again when a worker dies, :meth:`OnDask.map` decides; and a worker that dies twice within Dask's 15 s would not be
 started anew, but closed. The last two are of the dashboard: it hands no request on to other machines, and no page of
@@ -102,7 +102,7 @@ def embedded(workers: int | None = None, dashboard: Callable[[str], None] | None
     Parameters
     ----------
     workers : number of processes; None: one a core.
-    dashboard : hears the address of the dashboard, which every user of this machine can look at; None: there is none.
+    dashboard : receives the address of the dashboard, which every user of this machine can open; None: there is none.
 
     Raises
     ------

@@ -56,7 +56,7 @@ class OnDask:
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
         """Run all tasks, most of them in parallel; a task is retried once if its worker dies.
 
-        Those that waited at the same worker die with it. So all of them are tried again when the others have ended, on
+        Tasks that waited at the same worker fail with it. So all of them are tried again when the others have ended, on
         half of the threads and no more than are alive, where none waits behind another: what dies there is at fault
         itself.
         """

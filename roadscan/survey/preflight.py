@@ -2,7 +2,7 @@
 
 A check is a function of :class:`Asked` that yields errors. To add one, write it and list it in ``CHECKS`` with the
 first stage that would fail of what it finds. Checks are independent: one that needs the map says nothing where the map
-itself is at fault, since another one tells that. Of a log its header is read, and of logs of positions the first block.
+itself is at fault, since another check reports that. Of a log its header is read, of logs of positions the first block.
 """
 
 from __future__ import annotations

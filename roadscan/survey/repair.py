@@ -1,6 +1,6 @@
 """Repairs damaged tables of ingested rows: their logs are read again; where a log is gone, sound rows are kept.
 
-A log that holds the bytes that it held gives the same rows, and these the same files, so that nothing that was made of
+A log with unchanged bytes gives the same rows, and these give the same files, so that nothing that was made of
 them is stale. What is damaged is never deleted: it is kept below ``damaged/``.
 """
 

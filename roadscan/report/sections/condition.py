@@ -25,14 +25,14 @@ class _Column(NamedTuple):
     """Column of its standard deviation."""
 
 
-_SHAPE: Final = (
+_SHAPE: Final = (  # columns with their decimals
     _Column("MRI (m/km)", "mri_m_per_km", 2, "sigma_mri_m_per_km"),
     _Column("rut left (mm)", "rut_depth_mean_left_mm", 1, "sigma_rut_depth_mean_mm"),
     _Column("rut right (mm)", "rut_depth_mean_right_mm", 1, "sigma_rut_depth_mean_mm"),
     _Column("cross-slope (%)", "cross_slope_mean_percent", 2, "sigma_cross_slope_mean_percent"),
     _Column("faulting (mm)", "faulting_mean_mm", 1, "sigma_faulting_mean_mm"),
 )
-_SURFACE: Final = (
+_SURFACE: Final = (  # columns with their decimals
     _Column("cracked wheel path (%)", "cracked_wheel_path_percent", 1),
     _Column("MPD (mm)", "mpd_mean_mm", 2, "sigma_mpd_mean_mm"),
     _Column("ravelled (%)", "ravelled_percent", 1, "sigma_ravelled_percent"),

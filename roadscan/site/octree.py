@@ -72,7 +72,7 @@ class Cube:
         Raises
         ------
         StoreError
-            where the box is wider than a cube can tell apart.
+            where the box is wider than the steps of a cube.
         """
         edge = max(1, *(b - a for a, b in zip(low, high, strict=True)))
         if edge >= 1 << BITS:

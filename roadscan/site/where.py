@@ -55,7 +55,7 @@ def pictures_of_place(
     Raises
     ------
     ConfigError
-        where no cell tells the height of the place; where no camera has an interior orientation.
+        where no cell gives the height of the place; where no camera has an interior orientation.
     RunError
         where the survey has no pictures, or none has a pose.
     """

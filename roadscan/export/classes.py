@@ -43,11 +43,11 @@ def write_classes(
 ) -> dict[str, int]:
     """Write the class of every reading of a sensor in a run as Parquet (``schemas/reading_classes.toml``).
 
-    The file appears under its name when it is whole. A million readings or so are held at a time.
+    The file appears under its name when it is whole. About a million readings are in memory at a time.
 
     Parameters
     ----------
-    report : hears how many of the sensor's data files are done.
+    report : receives how many of the sensor's data files are done.
 
     Returns
     -------

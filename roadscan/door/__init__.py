@@ -1,6 +1,6 @@
 """The Python interface: a survey's tables, cells, points and files as pandas, GeoPandas, xarray, Arrow and DuckDB.
 
-The command line prints what stands here.
+The command line prints the results of these functions.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class OpenSurvey:
         workers : processes of an embedded cluster, None for one a core; 0 computes in this process.
         scheduler : address of a Dask scheduler, in place of the embedded cluster.
         tiles : tiles to compute whether stale or not, by name.
-        report : hears of each step.
+        report : receives each step.
 
         Raises
         ------
@@ -173,7 +173,7 @@ class OpenSurvey:
     def sql(self, statement: str, *, unconfined: bool = False) -> duckdb.DuckDBPyRelation:
         """Return the answer to an SQL statement; `.df()`, `.arrow()`, `.pl()` or `.fetchall()` fetch it.
 
-        It is computed when it is brought over. Its files are not held against their records, as those of `table` are.
+        It is computed when it is fetched. Its files are not verified against their records, as those of `table` are.
         `unconfined` lets the statement read and write any file.
 
         Raises
@@ -311,7 +311,7 @@ class OpenSurvey:
     ) -> pd.DataFrame:
         """Return pictures that see a place of the map (m), the one with the finest resolution first.
 
-        Without a height it is that of the surveyed ground there. Whether something stands between is not looked at.
+        Without a height it is that of the surveyed ground there. Obstacles between are not considered.
 
         Returns
         -------
@@ -320,7 +320,7 @@ class OpenSurvey:
         Raises
         ------
         RoadscanError
-            where nothing tells the height, or the survey has no pictures with poses.
+            where the height is unknown, or the survey has no pictures with poses.
         """
         import pandas
 

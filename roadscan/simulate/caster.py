@@ -127,7 +127,7 @@ class World:
         interval_gps_ns : (g, n, 2) beginning and end of each group's intervals of poses, short enough for the sensor
             to move evenly within.
         direction : (g, m, 3) unit vectors in the sensor's axes.
-        key : random key of the first ray; each ray takes its own, so count on by g · m.
+        key : random key of the first ray; each ray has one, so the next call starts g · m later.
         """
         groups, count = direction.shape[:2]
         direction = direction.view()

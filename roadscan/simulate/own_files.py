@@ -41,7 +41,7 @@ def refuse_edited(folder: Path) -> None:
 def written_for_the_user(folder: Path) -> Iterator[Path]:
     """Return a folder for the files; at the end their digests are stored, and they are moved to `folder`.
 
-    Whoever is stopped in between finds the old digests and the new ones noted.
+    If it is interrupted, both the old and the new digests are stored.
     """
     record = folder / TRUTH_FOLDER / _WRITTEN
     with tempfile.TemporaryDirectory(dir=folder / TRUTH_FOLDER) as scratch:

@@ -114,7 +114,7 @@ class RoutePath:
     """A free route of straights and arcs.
 
     The curvature is that of the pieces, averaged over `ease_m`: clothoids centred on the joints, so that the whole
-    turns as far as the pieces do. Before the first and after the last piece their curvature goes on.
+    turns as far as the pieces do. Before the first and after the last piece their curvature continues.
     """
 
     def __init__(self, route: Route, number: int, ride: Surface) -> None:
@@ -248,7 +248,7 @@ def path_of(scene: Scene, number: int, ride: Surface, wander_phases: Float64) ->
 def _contacts(path: Path, around_m: Float64) -> tuple[Float64, Float64, Float64]:
     """Return contact points (n − 4, 3) in the map, and vectors of about 1 m ahead and to the right of travel.
 
-    around_m : (n,) even places; the first and last two are only looked at from the others.
+    around_m : (n,) even places; the first and last two only serve the others.
     """
     points = path.points_at(around_m)
     inner = slice(_AXLE_STEPS, -_AXLE_STEPS)

@@ -28,7 +28,7 @@ class Surface:
     """Height and intensity of the road, defined everywhere on it.
 
     The reference line has a curvature that is linear between nodes each 0.5 m. Its height is the sum of grades and
-    waves, held as quintic polynomials that agree with it in value, slope and curvature at the nodes (within
+    waves, stored as quintic polynomials that agree with it in value, slope and curvature at the nodes (within
     1 µm for waves of 2 m). On it lie cross-section, humps, ruts, unevenness, patches, and potholes, cracks or joints,
     all functions of station and offset; and the texture, which only the profilers see.
 

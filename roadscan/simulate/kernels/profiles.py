@@ -225,7 +225,7 @@ def scan_profiles(
 def seen_in_spot(road: RoadArrays, planes: Planes, p: int, y: float, r: float, head: Head) -> tuple[float, float]:
     """Return the mean depth that the parts of a beam's spot show, and the share of them that the camera sees.
 
-    A triangulating head tells the middle of what its camera sees of the spot. What walls hide from the camera is lost;
+    A triangulating head measures the centre of the visible part of the spot. What walls hide from the camera is lost;
     where all is, so is the reading. The parts are taken to fall upright: a beam that leans by half a degree meets a
     floor 100 mm down 1 mm beside. The road is taken as level as far as the camera's line of sight runs below it.
     """

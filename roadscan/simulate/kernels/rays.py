@@ -662,7 +662,7 @@ def merged(echoes: Float64) -> tuple[float, float, float, bool]:
 
     Echoes within a pulse's length of one another merge, and the range is their mean by energy (mixed pixels of time of
     flight scanners: Ye and Borenstein 2002; Tuley, Vandapel, Hebert 2005). Of groups farther apart the strongest
-    counts. Where a group comes from one surface, the ray's middle tells its range, however long the spot on it is.
+    counts. Where a group comes from one surface, the ray's middle gives its range, however long the spot on it is.
     """
     energy, low, high = strongest_group(echoes)
     if energy == 0.0 or is_one_surface(echoes, low, high):
@@ -689,7 +689,7 @@ def is_one_surface(echoes: Float64, low: float, high: float) -> bool:
     """Return whether the echoes (5, 5) within ranges only come from the surface in the ray's middle.
 
     So it is where other objects are met only where they touch it, and ranges on its own change evenly across the ray;
-    where only one side of an axis belongs to the echoes, the object alone tells.
+    where only one side of an axis belongs to the echoes, only the object decides.
     """
     if not is_within(echoes, 0, low, high):
         return False

@@ -96,7 +96,7 @@ def clothoid(curvature: float, rate: float, u: float) -> tuple[float, float, flo
 def project(road: RoadArrays, easting: float, northing: float, near: int) -> tuple[int, float, float]:
     """Return node, station past it and offset of the foot of a map point on the reference line.
 
-    `near` is a node to start from. Beyond both ends the line goes on with its last curvature.
+    `near` is a node to start from. Beyond both ends the line continues with its last curvature.
     """
     nodes = road.nodes
     last = nodes.shape[0] - 2

@@ -258,7 +258,7 @@ def _words(span: Span) -> str:
 
 
 def _hints(survey: Survey, records: Sequence[LogRecord], span: Span, driven: _Driven) -> Iterator[str]:
-    """Yield settings of the log's clock, and of the poses' clock, that would make the times meet: one each."""
+    """Yield settings of the log's and the poses' clock that would make the times meet: at most one of each."""
     sides = [(r.run, r.path, driven.span, span) for r in driven.records if r.path][:1]
     sides += [(r.run, r.path, span, driven.span) for r in records]
     said: set[str] = set()

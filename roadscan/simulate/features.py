@@ -215,7 +215,7 @@ def _gap(slabs: Slabs, station_m: float, road: Road) -> list[float]:
 
 
 def _slabs(road: Road, station_m: Float64, fault_m: Float64) -> list[list[float]]:
-    """Return patches over the paved width between the joints; the slabs before and after end level."""
+    """Return patches over the paved width between the joints; the outermost slabs end level."""
     ends = np.concatenate([station_m[:1] - _RAMP_M, station_m, station_m[-1:] + _RAMP_M])
     near, far = np.append(0.0, -0.5 * fault_m), np.append(0.5 * fault_m, 0.0)
     middle, length = 0.5 * (ends[1:] + ends[:-1]), np.diff(ends)

@@ -214,7 +214,7 @@ def _fastest(pace: float, wanted: float, way_m: float, limit: float) -> float:
 
 
 def _greatest(fits: Callable[[float], bool], low: float, high: float) -> float:
-    """Return the greatest fitting value in [low, high] by bisection: `low` fits, and so do all smaller ones."""
+    """Return the greatest fitting value in [low, high] by bisection: `low` fits, and all below a fitting one."""
     if fits(high):
         return high
     for _ in range(60):

@@ -12,7 +12,7 @@ from roadscan.core.strict import Strict
 
 
 class Interior(Strict):
-    """How a camera's pixels look out: u = cx + fx · x', v = cy + fy · y', where x', y' are the distorted tangents.
+    """Interior orientation: a pixel has u = cx + fx · x', v = cy + fy · y', where x', y' are the distorted tangents.
 
     Tangents are taken in OpenCV's camera axes, x right, y down, z along the optical axis; the sensor frame of the
     rig has x along the optical axis, y right, z down (`axes = "frd"`). In a picture of 360° x' and y' are angles
@@ -48,7 +48,7 @@ class Interior(Strict):
     @model_validator(mode="before")
     @classmethod
     def _of_the_sphere(cls, values: Any) -> Any:
-        """What follows from the size of a picture that holds the whole sphere."""
+        """Return the values with focal length and principal point filled in from the size of a full-sphere picture."""
         if not isinstance(values, dict) or values.get("model") != "equirectangular":
             return values
         width, height = values.get("width_px"), values.get("height_px")

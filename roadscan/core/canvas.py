@@ -1,4 +1,4 @@
-"""What pictures are drawn on. Matplotlib takes most of a second to import: only what draws loads it."""
+"""Creates Matplotlib figures. Matplotlib takes most of a second to import, so only functions that draw load it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def empty_figure(width_in: float, height_in: float, dots_per_inch: int) -> Figure:
-    """A figure that needs no window."""
+    """Return an empty figure that needs no window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # slow to import
     from matplotlib.figure import Figure
 

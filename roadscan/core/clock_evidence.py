@@ -1,4 +1,4 @@
-"""How the clocks of sensors are found: pairs of stamps, or motion that two sensors feel (``[[clocks]]``)."""
+"""Evidence for the clocks of sensors: pairs of stamps, or motion that two sensors share (``[[clocks]]``)."""
 
 from __future__ import annotations
 

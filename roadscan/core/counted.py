@@ -1,4 +1,4 @@
-"""Numbers of things in words."""
+"""Counts in words."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _SIZES: Final = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 
 
 def counted(number: int, one: str) -> str:
-    """A number of things, such as ``1 file`` and ``1,000 files``."""
+    """Return a number of things in words, such as ``1 file`` and ``1,000 files``."""
     return f"{number:,} {one}{'' if number == 1 else 's'}"
 
 

@@ -57,7 +57,7 @@ def _unit_m(crs: str, axis: int) -> float:
 
 
 def crs_from_text(text: str, key: str = "CRS") -> pyproj.CRS:
-    """CRS from ``"EPSG:25832"``, WKT or PROJJSON; a clear error, which names the `key` that holds it, otherwise."""
+    """Return the CRS of ``"EPSG:25832"``, WKT or PROJJSON; an error names the `key` that holds the text."""
     try:
         return pyproj.CRS.from_user_input(text)
     except ProjCrsError as error:
@@ -69,12 +69,12 @@ def crs_from_text(text: str, key: str = "CRS") -> pyproj.CRS:
 
 
 class StatedHeights(NamedTuple):
-    """What a CRS says of its heights."""
+    """What a CRS states about its heights."""
 
     kind: HeightKind | None = None
-    """None where it says nothing."""
+    """Kind of heights; None where the CRS states none."""
     name: str = ""
-    """Name of the CRS that says it."""
+    """Name of the CRS that states it."""
     unit_m: float | None = None
     """Length of the unit of heights (m)."""
 
@@ -83,7 +83,7 @@ NO_HEIGHTS: Final = StatedHeights()
 
 
 def heights_of(crs: pyproj.CRS) -> StatedHeights:
-    """Kind and unit of heights that a CRS states: a vertical one, one with a vertical part, or one of three axes."""
+    """Return the kind and unit of heights that a CRS states: a vertical one, a compound one, or one of three axes."""
     if crs.is_bound and crs.source_crs is not None:
         return heights_of(crs.source_crs)
     parts = crs.sub_crs_list or [crs]  # a compound CRS calls itself vertical
@@ -118,7 +118,7 @@ def one_vertical_datum(one: str, other: str) -> bool:
 
 @functools.lru_cache(maxsize=64)
 def world_frame_of(crs: str) -> str:
-    """World frame (geocentric CRS of the same datum) that positions stated in `crs` live in."""
+    """Return the world frame (geocentric CRS of the same datum) of positions that are stated in `crs`."""
     stated = crs_from_text(crs)
     if stated.is_geocentric:
         return _name_of(stated)
@@ -182,7 +182,7 @@ class Geoid:
 
     @classmethod
     def found(cls, grid: str, folder: Path | None = None) -> Self:
-        """The grid of a name: in `folder` (the survey's own), else in the folders that PROJ keeps grids in."""
+        """Return the grid of a name: from `folder` (the survey's folder), else from PROJ's folders."""
         folders = [*([] if folder is None else [folder.resolve()]), *_proj_folders()]
         file = next((one / grid for one in folders if (one / grid).is_file()), None)
         return cls(grid, file, "" if file is None else _content(file), tuple(map(str, folders)))
@@ -203,11 +203,11 @@ class Geoid:
         return height
 
     def check(self) -> None:
-        """Raise :class:`CrsError` unless the grid is there and can be read."""
+        """Raise :class:`CrsError` unless the grid exists and can be read."""
         _vertical_shift(self)
 
     def here(self) -> Path:
-        """Path of the grid on this machine, its content checked.
+        """Return the path of the grid on this machine, with its content checked.
 
         Raises
         ------
@@ -234,7 +234,7 @@ class Geoid:
 
 
 def _proj_folders() -> list[Path]:
-    """Folders in which PROJ looks for grids."""
+    """Return the folders in which PROJ looks for grids."""
     folders = [*get_data_dir().split(os.pathsep), get_user_data_dir()]
     return [Path(folder) for folder in dict.fromkeys(folders)]
 
@@ -246,7 +246,7 @@ def _content(file: Path) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _vertical_shift(geoid: Geoid) -> pyproj.Transformer:
-    """Transformation that adds a geoid's undulation to heights."""
+    """Return the transformation that adds a geoid's undulation to heights."""
     file = geoid.here()
     try:
         return pyproj.Transformer.from_pipeline(f'+proj=vgridshift +grids="{file}" +multiplier=1')
@@ -328,7 +328,7 @@ class MapFrame:
     height: HeightKind = "ellipsoidal"
     geoid: Geoid | None = None
     vertical_crs: str | None = None
-    """Vertical CRS of the map: named in the products' WKT, and that into which clouds of another are brought."""
+    """Vertical CRS of the map: the products' WKT names it, and clouds in another one are transformed into it."""
     max_datum_error_m: float = 0.05
     """A change of datum less accurate than this is refused."""
 
@@ -368,7 +368,7 @@ class MapFrame:
             )
 
     def _need_geoid(self) -> Geoid | None:
-        """The geoid of orthometric heights, without which no ellipsoidal height comes into the map."""
+        """Return the geoid of orthometric heights, which every ellipsoidal height needs to enter the map."""
         if self.height == "orthometric" and self.geoid is None:
             raise CrsError(
                 "orthometric heights were asked for, and no geoid is named",
@@ -389,7 +389,7 @@ class MapFrame:
 
     @property
     def vertical_unit_m(self) -> float:
-        """Length of the unit of heights (m): that of the vertical CRS where one is named, else the horizontal one.
+        """Return the length of the unit of heights (m): that of the named vertical CRS, else of the horizontal unit.
 
         Programs take heights without a vertical CRS to be in the horizontal unit.
         """
@@ -397,13 +397,13 @@ class MapFrame:
 
     @property
     def vertical_unit(self) -> str:
-        """Name of the unit of heights."""
+        """Return the name of the unit of heights."""
         if self.vertical_crs is not None:
             return str(crs_from_text(self.vertical_crs).axis_info[-1].unit_name)
         return "metre" if self.crs is None else str(crs_from_text(self.crs).axis_info[0].unit_name)
 
     def wkt(self, version: Literal["WKT1_GDAL", "WKT2_2019"] = "WKT2_2019") -> str:
-        """WKT of the horizontal CRS, compound where a vertical CRS is named.
+        """Return the WKT of the horizontal CRS, compound where a vertical CRS is named.
 
         WKT 1 always states the kind and unit of heights: clouds of points need them.
         """
@@ -529,7 +529,7 @@ class MapFrame:
 
 
 class _Step:
-    """A pyproj transformation with units brought to metres on the map side."""
+    """A pyproj transformation with map units converted to metres."""
 
     def __init__(
         self,
@@ -603,7 +603,7 @@ def best_operation(source: pyproj.CRS, target: pyproj.CRS) -> pyproj.Transformer
     none. Coordinates are in the order x, y.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # PROJ's advice to download grids: roadscan never does
+        warnings.simplefilter("ignore", UserWarning)  # PROJ advises to download grids; roadscan never downloads
         group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
     return next((one for one in group.transformers if one.accuracy >= 0), None)
 
@@ -635,7 +635,7 @@ def height_operation(crs: str, vertical: str, frame: MapFrame) -> pyproj.Transfo
 
 
 def accuracy_words(operation: pyproj.Transformer | None) -> str:
-    """How well an operation is known, for messages."""
+    """Return the accuracy of an operation in words, for messages."""
     return "not known to PROJ" if operation is None else f"known to {operation.accuracy:g} m only"
 
 

@@ -18,19 +18,19 @@ from roadscan.core.toml_text import toml
 
 @dataclass(frozen=True)
 class Missing:
-    """A setting of a log that has to be stated, or stated otherwise, before the log can be read."""
+    """A setting of a log that the user has to state, or change, before the log can be read."""
 
     key: str
     """clock, crs, height, geoid, sensor, or options.NAME, as in the survey file."""
     proposed: Any = None
-    """A value that would do, as far as is known; None where nothing is."""
+    """A proposed value; None where nothing is known."""
     choices: tuple[Any, ...] = ()
-    """All values that it may take, where they are few."""
+    """All values that it may take, where there are few."""
     is_example: bool = False
-    """`proposed` shows the form alone: the log says nothing for it."""
+    """`proposed` only shows the form: the log does not say the value."""
 
     def __str__(self) -> str:
-        """As an error asks for it."""
+        """Return the setting as an error asks for it."""
         if self.choices:
             words = [toml(value) for value in self.choices]
             return f"{self.key} = " + " or ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
@@ -50,7 +50,7 @@ class RoadscanError(Exception):
     expected : what should have been there.
     change : what the user can do about it.
     file, record : where it was found (record number or byte offset).
-    missing : settings of the log that would mend it: one, or alternatives, each a setting or several together.
+    missing : settings of the log that would resolve it: one, or alternatives, each a setting or several together.
         `expected` and `change` follow from them where they are not given.
     """
 
@@ -89,26 +89,26 @@ class RoadscanError(Exception):
 
     @property
     def advice(self) -> str:
-        """The line to add, where all that is missing has a proposal; empty otherwise."""
+        """Return the line to add where everything missing has a proposal; empty otherwise."""
         if len(self.missing) != 1 or any(one.proposed is None for one in self.missing[0]):
             return ""
         lines = [f"{one.key} = {toml(one.proposed)}" for one in self.missing[0]]
         return f"add {' and '.join(lines)} to this log"
 
     def asks_for(self, key: str) -> Iterator[Missing]:
-        """The settings of this key, or of options where it ends in a dot, that would mend it."""
+        """Yield the settings of this key (of all options where it ends in a dot) that would resolve the error."""
         for one in (one for group in self.missing for one in group):
             if one.key == key or (key.endswith(".") and one.key.startswith(key)):
                 yield one
 
     def at(self, file: str | Path | None = None, record: int | str | None = None) -> Self:
-        """The same error, found in another file, at another record."""
+        """Return the same error with another file and record."""
         return type(self)(
             self.arrived, expected=self.expected, change=self.change, file=file, record=record, missing=self.missing
         )
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Keep the keyword parts when a worker sends the error to the scheduler."""
+        """Keep the keyword parts when a worker pickles the error for the scheduler."""
         state = (self.arrived, self.expected, self.change, self.file, self.record, self.missing)
         return (_rebuild, (type(self), state))
 
@@ -148,7 +148,7 @@ class NavigationError(RoadscanError):
 
 
 class ProfileError(RoadscanError):
-    """A profile of a road cannot be given the index that was asked for."""
+    """A road profile does not allow the requested index."""
 
 
 class StoreError(RoadscanError):
@@ -156,24 +156,24 @@ class StoreError(RoadscanError):
 
 
 class DamagedError(StoreError):
-    """A file of the store can be read, and does not hold what was written."""
+    """A file of the store can be read, but its content is not what was written."""
 
 
 class FullDiskError(StoreError):
-    """A file could not be written for want of room."""
+    """A file could not be written because the disk is full."""
 
 
 class AnswerError(DamagedError):
-    """A file that an answer is made of is damaged."""
+    """A file from which an answer is computed is damaged."""
 
 
 class RunError(RoadscanError):
-    """Some units of a run failed; the rest is finished and kept."""
+    """Some units of a run failed; the other outputs are complete and kept."""
 
 
 def in_words(error: OSError) -> RoadscanError:
-    """The error of a file, as one that a user can mend: which file, what is wrong with it, and what to change."""
-    if error.filename is None:  # libraries say in their own words which file it is
+    """Return a file error as one that a user can act on: which file, what is wrong with it, and what to change."""
+    if error.filename is None:  # libraries name the file in their own words
         return RoadscanError(error.strerror or str(error) or type(error).__name__)
     arrived, change = _OF_FILES.get(error.errno or 0, (error.strerror or str(error), ""))
     return RoadscanError(arrived, change=change, file=error.filename)

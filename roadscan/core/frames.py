@@ -18,21 +18,21 @@ from roadscan.core.errors import ConfigError
 Float64 = npt.NDArray[np.float64]
 
 DIRECTIONS: Final = {"f": "forward", "r": "right", "d": "down", "b": "back", "l": "left", "u": "up"}
-"""Words of the letters that axes are named by."""
+"""Words for the letters that name axes."""
 
-_UNIT: Final = {**dict(zip("frd", np.eye(3), strict=True)), **dict(zip("blu", -np.eye(3), strict=True))}
+_UNIT: Final = {**dict(zip("frd", np.eye(3), strict=True)), **dict(zip("blu", -np.eye(3), strict=True))}  # body axes
 
 
 def _right_handed() -> dict[str, Float64]:
-    """Matrices whose columns are three of the body's directions, by their letters, without those that mirror."""
+    """Return the right-handed rotations whose columns are body directions, by their three letters."""
     every = {"".join(letters): np.column_stack([_UNIT[c] for c in letters]) for letters in permutations(_UNIT, 3)}
-    return {axes: matrix + 0.0 for axes, matrix in every.items() if np.linalg.det(matrix) > 0.5}  # no −0
+    return {axes: matrix + 0.0 for axes, matrix in every.items() if np.linalg.det(matrix) > 0.5}  # avoids −0
 
 
 BODY_FROM_AXES: Final[dict[str, Float64]] = _right_handed()
-"""Body (forward-right-down) from the 24 ways to mount axes along the body's; a letter each says where x, y, z point."""
+"""Body (forward, right, down) from the 24 axis-aligned mountings; the letters say where x, y, z point."""
 
-ENU_FROM_NED: Final[Float64] = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+ENU_FROM_NED: Final[Float64] = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # its own inverse
 
 
 def body_from_axes(axes: str) -> Float64:
@@ -70,7 +70,7 @@ def rotation_from_rph(roll_rad: npt.ArrayLike, pitch_rad: npt.ArrayLike, heading
 
 
 def rph_from_rotation(level_from_body: Float64) -> tuple[Float64, Float64, Float64]:
-    """Roll, pitch, heading (rad, heading in [0, 2π)) of (…, 3, 3) north-east-down-from-body."""
+    """Return roll, pitch, heading (rad, heading in [0, 2π)) of (…, 3, 3) north-east-down-from-body rotations."""
     r = level_from_body
     roll = np.arctan2(r[..., 2, 1], r[..., 2, 2])
     pitch = -np.arcsin(np.clip(r[..., 2, 0], -1.0, 1.0))

@@ -18,14 +18,14 @@ from roadscan.core.errors import Missing, TimeSystemError
 
 Int64 = npt.NDArray[np.int64]
 
-NS_PER_S: Final = 1_000_000_000
-WEEK_S: Final = 604_800
-WEEKS_A_ROLLOVER: Final = 1024
+NS_PER_S: Final = 1_000_000_000  # nanoseconds in a second
+WEEK_S: Final = 604_800  # seconds in a week
+WEEKS_A_ROLLOVER: Final = 1024  # the ten bits of the week number in the GPS signal overflow after so many weeks
 GPS_EPOCH_UNIX_S: Final = 315_964_800
 """Unix seconds of 1980-01-06T00:00:00 UTC, the origin of GPS time."""
 ADJUSTED_OFFSET_S: Final = 1_000_000_000
 """LAS 'adjusted standard GPS time' is GPS seconds minus 1e9 (ASPRS LAS 1.4 R15, 2.4)."""
-TAI_MINUS_GPS_S: Final = 19
+TAI_MINUS_GPS_S: Final = 19  # constant offset (s): TAI is ahead of GPS time
 
 _LEAP_DATES: Final = (
     "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01",
@@ -35,14 +35,14 @@ _LEAP_DATES: Final = (
 """Days whose midnight (UTC) was preceded by a leap second since 1980 (IERS Bulletin C)."""
 
 _LEAP_UNIX_S: Final[Int64] = np.array(_LEAP_DATES, dtype="datetime64[s]").astype(np.int64)
-_LEAP_GPS_S: Final[Int64] = _LEAP_UNIX_S - GPS_EPOCH_UNIX_S + np.arange(1, _LEAP_UNIX_S.size + 1)
+_LEAP_GPS_S: Final[Int64] = _LEAP_UNIX_S - GPS_EPOCH_UNIX_S + np.arange(1, _LEAP_UNIX_S.size + 1)  # first seconds after
 
-EARLIEST_GPS_NS: Final = 0
+EARLIEST_GPS_NS: Final = 0  # 1980-01-06: GPS time starts here
 LATEST_GPS_NS: Final = 3_155_760_000 * NS_PER_S  # 2080: later stamps are a wrong unit or system
 
 
 class TimeSystem(StrEnum):
-    """The scale a log's stamps are counted on."""
+    """Time system of a log's stamps."""
 
     GPS = "gps"
     """Seconds of GPS time since 1980-01-06."""
@@ -62,7 +62,7 @@ class TimeSystem(StrEnum):
     """The sensor's own counter; `offset_s` (measured) brings it to GPS seconds since 1980."""
 
 
-UNIT_NS: Final[dict[str, int]] = {"s": NS_PER_S, "ms": 1_000_000, "us": 1_000, "ns": 1}
+UNIT_NS: Final[dict[str, int]] = {"s": NS_PER_S, "ms": 1_000_000, "us": 1_000, "ns": 1}  # ns in each unit of stamps
 
 
 def leap_seconds_at_unix(unix_utc_s: npt.ArrayLike) -> Int64:
@@ -89,7 +89,7 @@ def gps_ns_from_utc(moment: dt.datetime) -> int:
 
 
 def leap_second_steps() -> list[tuple[int, int]]:
-    """First GPS second with each number of leap seconds, and that number, ascending."""
+    """Return the first GPS second with each number of leap seconds, and that number, in ascending order."""
     return [(int(first), count) for count, first in enumerate(_LEAP_GPS_S, 1)]
 
 
@@ -129,7 +129,7 @@ def check_week(week: int) -> None:
 
 @dataclass(frozen=True)
 class Clock:
-    """How a log's stamps become GPS time.
+    """Converts a log's stamps to GPS time.
 
     gps = scale(stamp) + offset_s + drift_ppm · 1e-6 · (stamp − reference_s)
 
@@ -192,7 +192,7 @@ class Clock:
         return epochs
 
     def counted_ns(self, stamps: npt.NDArray[np.generic]) -> tuple[Int64, Int64]:
-        """Stamps (n,) in nanoseconds of their own count, and what the time system alone makes of them (GPS ns).
+        """Return stamps (n,) in nanoseconds of the log's count, and the GPS time (ns) that the time system alone gives.
 
         Neither offset nor drift is applied, and a free-running clock may show any time.
         """
@@ -241,7 +241,7 @@ class Clock:
 
     def _refuse(self, stamp: float) -> None:
         shown = str(stamp) if isinstance(stamp, int) else f"{stamp:.0f}"
-        # Which unit would have made sense of this stamp? Say so instead of guessing.
+        # Name the unit that would have fitted the stamp, instead of guessing it.
         fits = [unit for unit, scale in UNIT_NS.items() if unit != self.unit and self._plausible(stamp, scale)]
         hint = f"as '{fits[0]}' it would fit: set clock.unit = \"{fits[0]}\" if that is so" if fits else ""
         clock = {"system": str(self.system), "unit": fits[0]} if fits else None

@@ -1,4 +1,4 @@
-"""The grid: tiles and cells of the map, as one object used everywhere."""
+"""The grid: tiles and cells of the map."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.ids import TileId
 
 QUANTUM_M: Final = 1e-5
-"""Point coordinates are whole numbers of this (10 µm): sums are exact, so results do not depend on order."""
+"""Point coordinates are whole multiples of this (10 µm), so that sums are exact and independent of order."""
 QUANTA_PER_M: Final = 100_000
-"""A metre in these."""
+"""Coordinate quanta in a metre."""
 ENOUGH: Final = 4
-"""Readings that a cell should hold: fewer have no median that leaves an outlier out."""
+"""Readings that a cell should contain: with fewer, the median cannot exclude an outlier."""
 LARGEST_M: Final = 1.0
-"""Larger cells are not proposed."""
+"""Largest cell that is proposed (m)."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Bounds:
     northing_max_m: float
 
     def meets(self, other: Bounds) -> bool:
-        """Whether two boxes share ground."""
+        """Return whether two boxes overlap."""
         return (
             self.easting_min_m < other.easting_max_m
             and other.easting_min_m < self.easting_max_m
@@ -67,7 +67,7 @@ class TileGrid:
         return self.size_quanta // self.cells_per_edge
 
     def tile_at(self, easting_m: float, northing_m: float) -> TileId:
-        """Tile that holds a position (m)."""
+        """Return the tile that contains a position (m)."""
         return TileId(
             math.floor(easting_m * QUANTA_PER_M) // self.size_quanta,
             math.floor(northing_m * QUANTA_PER_M) // self.size_quanta,
@@ -79,7 +79,7 @@ class TileGrid:
         return Bounds(e, n, e + self.size_m, n + self.size_m)
 
     def tiles_in(self, box: Bounds) -> list[TileId]:
-        """Tiles that share ground with a box, by row and column."""
+        """Return the tiles that overlap a box, by row and column."""
         first = self.tile_at(box.easting_min_m, box.northing_min_m)
         end_column = math.ceil(box.easting_max_m / self.size_m)
         end_row = math.ceil(box.northing_max_m / self.size_m)

@@ -13,13 +13,13 @@ RunId = NewType("RunId", str)
 """One recorded drive, from switching on to switching off."""
 
 ALL_RUNS: Final = "*"
-"""Stands for every run in what holds for a sensor: its mounting, its clock."""
+"""Matches every run in values that apply to a sensor: its mounting, its clock."""
 
 _Held = TypeVar("_Held")
 
 
 def of_run(held: Mapping[tuple[str, str], _Held], run: str, sensor: str) -> _Held | None:
-    """What holds for a sensor in a run, of values by run and sensor: the run's own, else that of all runs."""
+    """Return the value for a sensor in a run from values by run and sensor: the run's, else that of all runs."""
     return held.get((run, sensor)) or held.get((ALL_RUNS, sensor))
 
 

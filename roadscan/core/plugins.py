@@ -1,4 +1,4 @@
-"""Formats, products and stages are found: they lie at a place of roadscan, or another package names them."""
+"""Finds formats, products, stages and other kinds, in roadscan's modules and through packages' entry points."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import Any, Final, TypeVar
 from roadscan.core.errors import ConfigError
 
 Kind = TypeVar("Kind")
-_LIBRARY: Final = Path(__file__).parents[1]
+_LIBRARY: Final = Path(__file__).parents[1]  # the package folder of roadscan
 
 
 def found_kinds(
     place: str, base: type[Kind] | tuple[type[Kind], ...], group: str, name: str = "name"
 ) -> dict[str, Any]:
-    """Classes derived from `base`, by their names: those of roadscan's modules at a place, and installed entry points.
+    """Return the classes derived from `base` by name, from roadscan's modules at a path and installed entry points.
 
     Parameters
     ----------
@@ -54,11 +54,11 @@ def _candidates(place: str, base: Any, group: str) -> Iterator[tuple[Any, str]]:
 
 
 def modules_at(place: str) -> Iterator[ModuleType]:
-    """Modules of roadscan whose files match a pattern, imported one by one."""
+    """Import the modules of roadscan whose files match a pattern, one by one."""
     for file in files_at(place):
         yield importlib.import_module(".".join(file.relative_to(_LIBRARY.parent).with_suffix("").parts))
 
 
 def files_at(place: str) -> list[Path]:
-    """Files of roadscan that match a pattern, without importing them; those of packages themselves are left out."""
+    """Return files of roadscan that match a pattern, without importing them; ``__init__`` files are left out."""
     return sorted(file for file in _LIBRARY.glob(place) if not file.name.startswith("__"))

@@ -1,4 +1,4 @@
-"""Folders of code that is run as the user: the cache of compiled kernels, and what workers load."""
+"""Checks folders whose content is executed as the user: the cache of compiled kernels, and code that workers load."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from typing import NamedTuple, NoReturn
 try:
     import grp
     import pwd
-except ImportError:  # a system without such users
+except ImportError:  # systems without user ids
     pass
 
 
 class UnsafeFolderError(RuntimeError):
-    """Others could put code into a folder, which this process would run."""
+    """Other users could write code to a folder, which this process would execute."""
 
 
 class Code(NamedTuple):
-    """What lies in a folder, and what chooses another."""
+    """What a folder contains, and the variable that selects another folder."""
 
     what: str
-    """As an error names it."""
+    """Name of the content, for errors."""
     variable: str
-    """Environment variable that names another place."""
+    """Environment variable that selects another folder."""
 
 
 KERNELS = Code("the cache of compiled code", "NUMBA_CACHE_DIR")
@@ -36,7 +36,7 @@ def check_private(folder: Path, code: Code = KERNELS) -> None:
     """Refuse a folder that others may write to, as OpenSSH does with keys.
 
     The folder, all above it and the files in it have to belong to this user or to root, and nobody else may write to
-    them. Above it, a folder like /tmp will do, where everyone may write and nobody may move what is another's.
+    them. Above it, a folder like /tmp will do, where everyone may write and nobody may move another user's files.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def check_private(folder: Path, code: Code = KERNELS) -> None:
     _check_above(real.parent, code)
     with os.scandir(real) as entries:
         for entry in entries:
-            with contextlib.suppress(FileNotFoundError):  # Numba replaces files by rename
+            with contextlib.suppress(FileNotFoundError):  # Numba replaces files by renaming
                 _check_place(Path(entry.path), entry.stat(follow_symlinks=False), code, sticky=False)
 
 
@@ -80,7 +80,7 @@ def _refuse(place: Path, code: Code, reason: str) -> NoReturn:
 
 
 def _is_private(group: int) -> bool:
-    """True for root's group, and for one of the user's own name that nobody else is in, as many systems make them."""
+    """Return True for root's group, and for a group of the user's name without other members."""
     if group == 0:
         return True
     try:
@@ -91,12 +91,12 @@ def _is_private(group: int) -> bool:
 
 
 def cache_place() -> Path:
-    """Folder below which roadscan keeps what it has compiled and read of its own code; it may not be there yet."""
+    """Return the folder for roadscan's compiled kernels and code digests; it may not exist yet."""
     base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "roadscan"
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder, and those above it that are missing, for this user alone."""
+    """Create a folder and its missing parents, accessible to this user only."""
     for place in reversed([one for one in (folder, *folder.parents) if not one.exists()]):
         place.mkdir(mode=0o700, exist_ok=True)

@@ -40,28 +40,28 @@ class Mounting:
 
 
 UNMOUNTED: Final = Mounting((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-"""What measures in body axes, from the reference point."""
+"""Mounting of a sensor that measures in body axes at the reference point."""
 
 
 @dataclass(frozen=True)
 class Mountings:
-    """Mountings of one sensor, each from an epoch on: a head was taken off and put back, a calibration repeated."""
+    """Mountings of one sensor, each valid from an epoch on, as after a head was remounted or calibrated again."""
 
     since_gps_ns: tuple[int, ...]
-    """Ascending; before the first the first holds."""
+    """Start epochs, ascending; the first mounting also applies before the first epoch."""
     mountings: tuple[Mounting, ...]
 
     @classmethod
     def one(cls, mounting: Mounting) -> Self:
-        """The same mounting at all times."""
+        """Return mountings with the same mounting at all times."""
         return cls((0,), (mounting,))
 
     def longest_lever_m(self) -> float:
-        """Length of the longest lever arm."""
+        """Return the length of the longest lever arm (m)."""
         return max(math.hypot(*mounting.lever_arm_body_m) for mounting in self.mountings)
 
     def pieces(self, epochs_gps_ns: npt.NDArray[np.int64]) -> Iterator[tuple[slice, Mounting]]:
-        """Runs of readings under one mounting, in their order, for epochs (n,) in any order."""
+        """Yield slices of consecutive readings with one mounting, for epochs (n,) in any order."""
         if len(self.mountings) == 1:
             yield slice(0, epochs_gps_ns.size), self.mountings[0]
             return
@@ -146,11 +146,11 @@ class Sensor(Strict):
         return self
 
     def stated_mounting(self) -> list[str]:
-        """Keys by which the rig file says how the sensor is mounted."""
+        """Return the keys of the mounting that the rig file states."""
         return [key for key in _MOUNTING_KEYS if key in self.model_fields_set]
 
     def mounted_as(self, known: Mapping[str, Any]) -> Self:
-        """The sensor with what its log says of its mounting, where the rig file states nothing.
+        """Return the sensor with the mounting that its log states, where the rig file states none.
 
         Parameters
         ----------
@@ -162,11 +162,11 @@ class Sensor(Strict):
         return self.parse({**self.model_dump(exclude_unset=True), **added}) if added else self
 
     def imu_errors(self) -> ImuErrors | None:
-        """Errors of an IMU, None where the rig file states none."""
+        """Return the errors of an IMU; None where the rig file states none."""
         return IMU_GRADES[self.imu] if isinstance(self.imu, str) else self.imu
 
     def mounting(self) -> Mounting:
-        """Mounting as stated in the rig file."""
+        """Return the mounting that the rig file states."""
         if self.body_from_sensor is not None:
             rotation = np.array(self.body_from_sensor)
         else:

@@ -1,6 +1,6 @@
-"""Changes to a rig file that leave every other byte as it is: comments, order, spaces.
+"""Edits a rig file and leaves every other byte as it is: comments, order, spaces.
 
-Only what can be changed safely is: the file has to hold ``[sensors.NAME]`` as a table of its own. The text that comes
+Only what can be changed safely is: the file has to contain ``[sensors.NAME]`` as a separate table. The text that comes
 out is parsed again and has to mean the old file with just these changes, or nothing is written.
 """
 
@@ -35,22 +35,22 @@ Keys = tuple[str, ...]
 
 @dataclass(frozen=True)
 class _Statement:
-    """A table's header, or a key with its value."""
+    """A table header, or a key with its value."""
 
     table: Keys
-    """Of the header, or the table that the key stands in."""
+    """Table of the header, or table that contains the key."""
     key: Keys
     """Empty for a header."""
     value: tuple[int, int]
-    """Begin and end of the value's text."""
+    """Start and end of the value's text."""
     end: int
-    """Begin of the next line."""
+    """Start of the next line."""
     begin: int
-    """Begin of its line."""
+    """Start of its line."""
 
 
 def changed_rig_text(text: str, sensor: str, values: Mapping[str, Any], *, file: str | Path | None = None) -> str:
-    """The text of a rig file with values of one sensor changed.
+    """Return the text of a rig file with changed values of one sensor.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def changed_rig_text(text: str, sensor: str, values: Mapping[str, Any], *, file:
 
 
 def update_rig_file(file: Path, sensor: str, values: Mapping[str, Any]) -> Rig:
-    """Change values of one sensor in a rig file, at once or not at all; returns the rig as it now is.
+    """Change values of one sensor in a rig file atomically, and return the resulting rig.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def update_rig_file(file: Path, sensor: str, values: Mapping[str, Any]) -> Rig:
 
 
 def _replace(file: Path, content: bytes) -> None:
-    """Atomic: the old file, or the new one."""
+    """Replace the file atomically: readers see the old content or the new."""
     target = file.resolve()
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     temporary = Path(name)
@@ -118,7 +118,7 @@ def _replace(file: Path, content: bytes) -> None:
 
 
 def _with_value(text: str, sensor: str, key: str, value: Any, file: str | Path | None) -> str:
-    """The text with one value replaced where it stands, or added to the sensor's table."""
+    """Return the text with one value replaced in place, or added to the sensor's table."""
     own = ("sensors", sensor)
     statements = list(_statements(text, sensor, file))
     header = [s for s in statements if s.table == own and not s.key]
@@ -144,7 +144,7 @@ def _with_value(text: str, sensor: str, key: str, value: Any, file: str | Path |
 
 
 def _with_table(text: str, table: Sequence[_Statement], value: Any, sensor: str, file: str | Path | None) -> str:
-    """The text with the keys of a table of its own replaced, from the last one backwards: places stay right."""
+    """Return the text with the keys of a separate table replaced, last first so that positions stay valid."""
     if not isinstance(value, dict) or any(len(s.key) > 1 for s in table):
         raise _unsafe(sensor, f"'{table[0].table[-1]}' is a table with dotted keys", file)
     stated = {s.key[0]: s for s in table if s.key}
@@ -168,8 +168,8 @@ def _inserted(text: str, place: int, lines: Sequence[str], newline: str) -> str:
 
 
 def _statements(text: str, sensor: str, file: str | Path | None) -> Iterator[_Statement]:
-    """Headers and keys of a text that is valid TOML, in their order."""
-    text = text.replace("\r\n", " \n")  # the same places, one kind of line end
+    """Yield headers and keys of valid TOML text, in their order."""
+    text = text.replace("\r\n", " \n")  # normalised line ends keep all positions
     place = 0
     table: Keys = ()
     while place < len(text):
@@ -195,7 +195,7 @@ def _statements(text: str, sensor: str, file: str | Path | None) -> Iterator[_St
 
 
 def _value_end(text: str, begin: int) -> int:
-    """Where the value that begins here ends: brackets closed, strings and comments passed over."""
+    """Return the end of the value that begins here: brackets are matched, strings and comments skipped."""
     place, depth = begin, 0
     while place < len(text):
         string = _STRING.match(text, place)
@@ -223,7 +223,7 @@ def _line_end(text: str, place: int) -> int:
 
 
 def _parts(dotted: str) -> Keys:
-    """Keys of a dotted key, quotes and escapes resolved."""
+    """Return the parts of a dotted key, with quotes and escapes resolved."""
     value: Any = tomllib.loads(f"{dotted} = 0")
     keys: list[str] = []
     while isinstance(value, dict):
@@ -233,7 +233,7 @@ def _parts(dotted: str) -> Keys:
 
 
 def _plain(value: Any) -> Any:
-    """As TOML gives it back: lists for tuples."""
+    """Return the value as a TOML reader returns it: tuples become lists."""
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items()}
     return [_plain(v) for v in value] if isinstance(value, list | tuple) else value

@@ -1,4 +1,4 @@
-"""How raw readings lie in their sensor's frame."""
+"""Geometry of raw readings in their sensor's frame."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class ScanGeometry(Strict):
     step: float
     """Step from reading to reading (m, or rad)."""
     range_offset_m: float = 0.0
-    """Range of a raw value of 0, were it valid (m)."""
+    """Range of the raw value 0, if it were valid (m)."""
     range_step_m: float = Field(gt=0)
     """Range of one raw unit (m)."""
     reading_period_ns: float = Field(default=0.0, ge=0.0)
-    """Time from one reading to the next (ns); 0 where the whole profile is measured at once."""
+    """Time from one reading to the next (ns); 0 where all readings of a profile are simultaneous."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -45,7 +45,7 @@ class ScanGeometry(Strict):
         return self
 
     def rays(self) -> tuple[Float64, Float64]:
-        """Origins (n, 3) in metres and unit directions (n, 3) of the readings, sensor frame."""
+        """Return origins (n, 3) in metres and unit directions (n, 3) of the readings, in the sensor frame."""
         where = self.first + self.step * np.arange(self.readings)
         zero, one = np.zeros_like(where), np.ones_like(where)
         if self.kind == "cartesian":
@@ -53,18 +53,18 @@ class ScanGeometry(Strict):
         return np.zeros((self.readings, 3)), np.stack([zero, np.sin(where), np.cos(where)], axis=-1)
 
     def raw_limits(self, range_min_m: float, range_max_m: float) -> tuple[int, int]:
-        """Lowest and highest raw value whose range lies within the limits (m); (1, 0) where none does."""
+        """Return the lowest and highest raw value whose range is within the limits (m); (1, 0) where none is."""
         every = self.range_offset_m + self.range_step_m * np.arange(1 << 16)
         kept = 1 + np.flatnonzero((every[1:] >= range_min_m) & (every[1:] <= range_max_m))
         return (int(kept[0]), int(kept[-1])) if kept.size else (1, 0)
 
     def all_epochs(self, epochs_gps_ns: Int64) -> Int64:
-        """Epochs (n · m,) of all readings of profiles, profile by profile, from the epochs of these (n,)."""
+        """Return the epochs (n · m,) of all m readings of n profiles, profile by profile."""
         later_ns = self.reading_epochs(np.zeros(self.readings, np.int64), np.arange(self.readings))
         return (epochs_gps_ns[:, None] + later_ns).reshape(-1)
 
     def reading_epochs(self, epochs_gps_ns: Int64, reading: npt.NDArray[np.integer[Any]]) -> Int64:
-        """Epochs (n,) of readings by their numbers in the profile (n,), from the epochs of their profiles (n,)."""
+        """Return the epochs (n,) of readings from their numbers in the profile (n,) and their profiles' epochs (n,)."""
         if not self.reading_period_ns:
             return epochs_gps_ns
         later_ns: Int64 = np.floor(reading * self.reading_period_ns + 0.5).astype(np.int64)

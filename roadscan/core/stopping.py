@@ -1,7 +1,7 @@
-"""The request to end the program (Ctrl-C, or a signal of the system), remembered until the program ends.
+"""Remembers a request to end the program (Ctrl-C, or a system signal) until the program ends.
 
-It is raised as :class:`Stopped`, but a library that was just calling back may hand on an error of its own instead
-(lazrs does). So whoever catches any error asks :func:`stop_if_asked` before it goes on.
+It is raised as :class:`Stopped`, but a library that was just calling back may raise its own error instead
+(lazrs does). So code that catches every error calls :func:`stop_if_asked` before it continues.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NoReturn
 
 
 class Stopped(BaseException):
-    """The program was asked to end (Ctrl-C, or a signal of the system); raised at the place that it had reached.
+    """Raised where the program is interrupted by a request to end (Ctrl-C, or a system signal).
 
     Parameters
     ----------
@@ -31,30 +31,30 @@ class Request:
     number: int
     """The signal's."""
     at_s: float
-    """When it came (s, monotonic)."""
+    """When it was received (s, monotonic)."""
 
 
 _requests: list[Request] = []
 
 
 def request() -> Request | None:
-    """The request that came, if any."""
+    """Return the request to end the program; None where there is none."""
     return _requests[0] if _requests else None
 
 
 def stop(number: int) -> NoReturn:
-    """Remember the request and raise it."""
+    """Remember the request and raise :class:`Stopped`."""
     _requests.append(Request(number, time.monotonic()))
     raise Stopped(number)
 
 
 def forget() -> None:
-    """Forget the request: it is about to be made again."""
+    """Forget the request, because it is about to be repeated."""
     _requests.clear()
 
 
 def stop_if_asked() -> None:
-    """Raise the request again where one came.
+    """Raise the request again if there is one.
 
     Raises
     ------

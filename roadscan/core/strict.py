@@ -1,4 +1,4 @@
-"""Configuration models: an unknown key is an error that names the nearest known one."""
+"""Base class of configuration models: an unknown key is an error that names the nearest known one."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Strict(BaseModel):
     )
 
     later: ClassVar[frozenset[str]] = frozenset()
-    """Fields that came when there were stores already: they are no part of a key while they have their default."""
+    """Fields added after stores existed: they are left out of keys while they have their default."""
 
     def shaping(self) -> dict[str, Any]:
-        """JSON values of the settings, for keys: without later fields that have their default."""
+        """Return the JSON values of the settings, for keys: without `later` fields that have their default."""
         unset = {name for name in self.later if getattr(self, name) == type(self).model_fields[name].default}
         return self.model_dump(mode="json", exclude=unset)
 
@@ -48,11 +48,11 @@ class Strict(BaseModel):
 
 
 MEANINGS: Final[dict[type[BaseModel], dict[str, str]]] = {}
-"""What the fields of models say that are made at run time, and stand in no source."""
+"""Field descriptions of models that are created at run time and have no source."""
 
 
 def meanings(model: type[BaseModel]) -> dict[str, str]:
-    """The docstring under each field of a model, "" where there is none, in the order of the fields.
+    """Return the docstring of each field of a model in the order of the fields, "" where there is none.
 
     Read from the source when asked for: pydantic would look for them in every process that starts, for a tenth of the
     time that all imports take.
@@ -75,7 +75,7 @@ def _docstrings_of(kind: type) -> dict[str, str]:
 
 
 OPEN_QUESTION: Final = "#?"
-"""Begins a line that waits for its author: `roadscan init` writes one for each thing it must not guess."""
+"""Starts a line that the user has to complete: `roadscan init` writes one for each thing it must not guess."""
 
 
 def load_toml(path: str | Path) -> dict[str, Any]:
@@ -126,9 +126,9 @@ def _refuse_open_questions(text: str, path: str | Path) -> None:
 
 
 def faults_in_words(model: type[BaseModel], values: Any, error: ValidationError) -> list[str]:
-    """Every fault of a validation in words, one for each key: where, what stands there, what is expected."""
+    """Return every fault of a validation in words, one for each key: where, what stands there, what is expected."""
     faults = error.errors(include_url=False)
-    told: dict[tuple[str, str], list[str]] = {}  # a value that fits no member of a union has a fault for each
+    told: dict[tuple[str, str], list[str]] = {}  # a value that fits no member of a union causes a fault for each member
     for fault in faults:
         if _is_beside(fault, faults):
             continue
@@ -141,14 +141,12 @@ def faults_in_words(model: type[BaseModel], values: Any, error: ValidationError)
 
 
 def _is_too_short(fault: Any) -> bool:
-    """A list of fixed length lacks its end."""
+    """Return whether a list of fixed length is too short."""
     return fault["type"] == "missing" and isinstance(fault["loc"][-1], int)
 
 
 def _is_beside(fault: Any, faults: Sequence[Any]) -> bool:
-    """A table where a text could stand too: only the table's own faults help. Of places that a list lacks, the last one
-    says how long it has to be.
-    """
+    """Return whether a fault is implied by another one: a table's own faults, or the last missing item, say more."""
     above = fault["loc"][:-1]
     if _is_too_short(fault):
         return any(_is_too_short(f) and f["loc"][:-1] == above and f["loc"][-1] > fault["loc"][-1] for f in faults)
@@ -165,7 +163,7 @@ def _got(fault: Any) -> str:
 
 
 def _toml_value(value: Any) -> str:
-    """A value as it stands in the file."""
+    """Return a value as it is written in the file."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, dt.date | dt.time):
@@ -216,23 +214,23 @@ _WORDS: Final[dict[str, str]] = {
     "datetime_from_date_parsing": _INSTANT, "timezone_naive": _INSTANT, "timezone_aware": _INSTANT,
     "none_required": "nothing: leave the key out",
 }  # fmt: skip
-"""What is expected, by the kind of a fault of pydantic."""
+"""Expected value in words, by the kind of a pydantic fault."""
 
 NAME_PATTERN: Final = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
-"""What an id may be."""
+"""Pattern of valid ids."""
 _PATTERNS: Final[dict[str, str]] = {
     NAME_PATTERN: "1 to 64 letters (A–Z, a–z), digits, '_', '-' or '.', of which the first is a letter or a digit",
 }
 
 
 def pattern_in_words(pattern: str, words: str) -> str:
-    """The pattern; a text that does not follow it is told of in these words."""
+    """Return the pattern, and register the words that describe it in errors."""
     _PATTERNS[pattern] = words
     return pattern
 
 
 def _expected(fault: Any, holder: type[BaseModel] | None, where: str) -> str:
-    """What a fault says, as a part of a sentence."""
+    """Return the expected value of a fault as a part of a sentence."""
     kind, context = str(fault["type"]), fault.get("ctx", {})
     match kind:
         case "extra_forbidden":
@@ -262,7 +260,7 @@ _LABELS: Final = ("path", "id", "sensor")
 
 
 def _place(location: Sequence[int | str], values: Any) -> str:
-    """Where in the file: a key, of the log (by its path), the run or the pass that it belongs to."""
+    """Return the place in the file: a key, with the log (by path), run or pass to which it belongs."""
     label, rest, value = "", list(location), values
     for depth, part in enumerate(location):
         value = _inside(value, part)
@@ -276,7 +274,7 @@ def _place(location: Sequence[int | str], values: Any) -> str:
 
 
 def _label(entry: str, value: Any) -> str:
-    """What a log, a run or a pass is called in the file, "" where it says nothing."""
+    """Return the name of a log, run or pass in the file; "" where it has none."""
     name = next((value[key] for key in _LABELS if key in value), None) if isinstance(value, dict) else None
     return f"{entry} '{name}'" if isinstance(name, str) else f"{entry} {name}" if isinstance(name, int) else ""
 
@@ -288,13 +286,13 @@ def _inside(value: Any, part: int | str) -> Any:
 
 
 def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[int | str], type[BaseModel] | None]:
-    """Keys of the file that lead to `location`, and the model that holds the last of them."""
+    """Return the keys of the file that lead to `location`, and the model that contains the last of them."""
     place: list[int | str] = []
     holder: type[BaseModel] | None = None
     annotation: Any = model
     for part in location:
         annotation, choices = _without_none(annotation)
-        if choices:  # pydantic names the member of a union, which the file does not
+        if choices:  # pydantic names the member of a union, which is no key of the file
             annotation = next((c for c in choices if _is_called(c, part)), None)
             continue
         if part == "[key]":
@@ -312,7 +310,7 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list
 
 
 def _is_called(member: Any, name: int | str) -> bool:
-    """Whether pydantic calls a member of a union so: by its class, or by the word that tells the members apart."""
+    """Return whether pydantic names a union member so: by its class, or by its discriminator."""
     if getattr(member, "__name__", "") == name:
         return True
     fields = getattr(member, "model_fields", {}).values()
@@ -320,7 +318,7 @@ def _is_called(member: Any, name: int | str) -> bool:
 
 
 def _without_none(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
-    """The annotation without `None`, and its members where it is still a union."""
+    """Return the annotation without `None`, and its members where it is still a union."""
     if get_origin(annotation) is Annotated:
         annotation = get_args(annotation)[0]
     if get_origin(annotation) not in {Union, UnionType}:

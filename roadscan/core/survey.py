@@ -75,11 +75,11 @@ class MapConfig(Strict):
         return self
 
     def geoid_named(self, name: str, folder: Path) -> Geoid:
-        """The geoid grid of a name, by the survey's `folder`: in the folder `grids`, else in those of PROJ."""
+        """Return the geoid grid of a name: from `grids`, below the survey's `folder`, else from PROJ's folders."""
         return Geoid.found(name, None if self.grids is None else folder / self.grids)
 
     def frame(self, folder: Path) -> MapFrame:
-        """The map frame these settings describe, of a survey file in `folder`.
+        """Return the map frame of these settings, for a survey file in `folder`.
 
         Raises
         ------
@@ -138,7 +138,7 @@ class ClockConfig(Strict):
         return self
 
     def clock(self) -> Clock:
-        """The clock these settings describe; what pairs say of it is added by whoever reads them."""
+        """Return the clock of these settings; corrections from pairs are added by the caller."""
         return Clock(**self.model_dump(exclude={"pairs"}))
 
 
@@ -167,11 +167,11 @@ class ClockDefaults(Strict):
         return self
 
     def clock(self) -> Clock | None:
-        """The clock of a log that states none; None where there is no default."""
+        """Return the clock of a log that states none; None where there is no default."""
         return None if self.system is None else Clock(self.system, self.unit, self.week, self.date)
 
     def dated(self, clock: ClockConfig) -> ClockConfig:
-        """A stated clock with the week or date that it lacks."""
+        """Return a stated clock, with the default week or date where it has none."""
         lacks = clock.week is None and clock.date is None
         if lacks and clock.system is TimeSystem.GPS_WEEK:
             return clock.model_copy(update={"week": self.week, "date": self.date})
@@ -216,7 +216,7 @@ class LogConfig(Strict):
     """Settings of the format (`roadscan formats NAME`)."""
 
     def completed(self, defaults: LogDefaults) -> LogConfig:
-        """The log with the geoid, week and date of the defaults where it states none.
+        """Return the log with the default geoid, week and date where it states none.
 
         Default CRS, kind of heights and time system are not put in: only the log's reader knows whether its file says
         its own.
@@ -444,37 +444,37 @@ class SurveySection(Strict):
     meaning: ClassVar[str]
     """What it is for, in a line."""
     may_be_left_out: ClassVar[bool] = False
-    """True where a survey file without the table has none; False where it has one of default values then."""
+    """True where a survey file without the table has no such settings; False where defaults apply then."""
 
     def check_survey(self, config: SurveyConfig) -> None:
         """Raise :class:`ValueError` where the settings do not fit the rest of the survey file."""
 
     @classmethod
     def of(cls, survey: Survey) -> Self:
-        """The table of a survey, of default values where its file has none."""
+        """Return the section of a survey, with default values where its file has none."""
         return cls.stated(survey) or cls()
 
     @classmethod
     def stated(cls, survey: Survey) -> Self | None:
-        """The table of a survey; None where it may be left out, and is."""
+        """Return the section of a survey; None where it is optional and left out."""
         return cast("Self | None", getattr(survey.config, cls.table))
 
 
 @functools.cache
 def survey_file_model() -> type[SurveyConfig]:
-    """The model of a whole survey file: what every survey states, and a field a table of a feature."""
+    """Return the model of a whole survey file: the common settings, and a field for each section of a feature."""
     sections: dict[str, type[SurveySection]] = found_kinds("*/settings.py", SurveySection, ENTRY_POINT_GROUP, "table")
     fields: dict[str, Any] = {
         name: (kind | None, None) if kind.may_be_left_out else (kind, kind()) for name, kind in sections.items()
     }
     model = create_model("SurveyFile", __base__=SurveyConfig, __module__=__name__, **fields)
     MEANINGS[model] = {name: kind.meaning for name, kind in sections.items()}
-    globals()[model.__name__] = model  # by this name it travels to workers
+    globals()[model.__name__] = model  # workers find the class by this name
     return model
 
 
 def _with_defaults(config: SurveyConfig) -> SurveyConfig:
-    """The survey file with what its defaults say of each log (:meth:`LogConfig.completed`)."""
+    """Return the survey file with the defaults applied to each log (:meth:`LogConfig.completed`)."""
     defaults = config.defaults
     if defaults is None:
         return config
@@ -490,7 +490,7 @@ def _check_section(section: SurveySection, config: SurveyConfig, file: str | Pat
 
 
 class Survey:
-    """A loaded survey file: configuration with its rig and folder."""
+    """A loaded survey file: configuration, rig and folder."""
 
     def __init__(self, config: SurveyConfig, rig: Rig, folder: Path) -> None:
         self.config = config
@@ -505,7 +505,7 @@ class Survey:
 
     @classmethod
     def parse(cls, values: dict[str, Any], *, folder: Path, file: str | Path | None = None) -> Self:
-        """Check `values` as a survey file in `folder`."""
+        """Validate `values` as a survey file in `folder`."""
         config = _with_defaults(survey_file_model().parse(values, file=file))
         for name in type(config).model_fields.keys() - SurveyConfig.model_fields.keys():
             if (section := getattr(config, name)) is not None:
@@ -531,32 +531,32 @@ class Survey:
 
     @property
     def store_url(self) -> str:
-        """Where tables and products live: an absolute folder, or a URL."""
+        """Return the location of tables and products: an absolute folder, or a URL."""
         store = self.config.store
         return store if "://" in store else str((self.folder / store).resolve())
 
     def has(self, section: str) -> bool:
-        """Whether the survey file has a table that may be left out."""
+        """Return whether the survey file has an optional section."""
         return getattr(self.config, section) is not None
 
     def resolve(self, path: Path) -> Path:
-        """Absolute path of one that the survey file states relative to itself."""
+        """Return the absolute path of a path that is relative to the survey file."""
         return (self.folder / path).resolve()
 
     def frame(self) -> MapFrame:
-        """The survey's map, its geoid grid resolved."""
+        """Return the survey's map, with its geoid grid resolved."""
         return self.config.map.frame(self.folder)
 
     def geoid(self, name: str | None) -> Geoid | None:
-        """The geoid grid that the survey file or a log record names; None where it names none."""
+        """Return the geoid grid that the survey file or a log record names; None where it names none."""
         return None if not name else self.config.map.geoid_named(name, self.folder)
 
     def sensor(self, name: str) -> Sensor:
-        """Sensor of the rig by name."""
+        """Return a sensor of the rig by name."""
         return self.rig.sensors[name]
 
     def passes(self, run_spans_gps_ns: dict[RunId, tuple[int, int]]) -> list[LanePass]:
-        """Passes with their spans; a run without any stated is one pass.
+        """Return the passes with their spans; a run without stated passes is one pass.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Values as TOML text, for lines that are shown to people or written into settings files."""
+"""Formats values as TOML text, for messages and settings files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
 
 
 class Unknown(str):
-    """A value that nobody has stated: it stands in a line as it is, without quotes."""
+    """A value that nobody has stated: it is written as it is, without quotes."""
 
 
 UNKNOWN: Final = Unknown("????")
@@ -19,7 +19,7 @@ UNKNOWN_DATE: Final = Unknown("????-??-??")
 
 
 def toml(value: Any) -> str:
-    """The value as TOML: strings quoted, tables inline.
+    """Return the value as TOML: strings quoted, tables inline.
 
     Raises
     ------
@@ -40,11 +40,11 @@ def toml(value: Any) -> str:
         return value.isoformat().replace("+00:00", "Z")
     if isinstance(value, dt.date):
         return value.isoformat()
-    if isinstance(value, str):  # JSON's escapes are a part of TOML's
+    if isinstance(value, str):  # TOML accepts all JSON escapes
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     raise TypeError(f"a value of type {type(value).__name__} has no form in TOML")
 
 
 def toml_key(key: str) -> str:
-    """The key as it stands before ``=`` or in a header, quoted where it must be."""
+    """Return the key as it stands before ``=`` or in a header, quoted where necessary."""
     return key if _BARE.fullmatch(key) else toml(key)

@@ -1,4 +1,4 @@
-"""Witnesses: what a run asks whether an input is true; and findings: what it was told."""
+"""Witnesses check whether an input is true; findings report what they found."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from importlib import import_module
 from typing import Any, Final, Literal
 
 Told = Literal["error", "rejects", "findings"]
-"""Where a fault is told: ``error`` ends the command or the log with a message; ``rejects`` counts the records in the
-summary and lists each in the table `rejects`; ``findings`` is a line of the summary, of `status` and of the report."""
+"""Where a fault is reported: ``error`` ends the command or the log with a message; ``rejects`` counts the records in
+the summary and lists each in the table `rejects`; ``findings`` is a line of summary, `status` and report."""
 
 
 @dataclass(frozen=True)
 class Witness:
-    """One way to see that an input is wrong. `docs/witnesses.md` lists all of them; each is a constant of the module
-    that asks it, and a test names it with ``@pytest.mark.witness("name")``.
+    """A check that can show an input to be wrong. `docs/witnesses.md` lists all; each is a constant of the module that
+    applies it, and a test names it with ``@pytest.mark.witness("name")``.
     """
 
     name: str
@@ -28,12 +28,12 @@ class Witness:
     asks: str
     """The witness: what the input is compared with."""
     does: str
-    """What the run does where they contradict: what is left out, refused or kept."""
+    """What the run does on a contradiction: what is left out, refused or kept."""
     told: tuple[Told, ...]
-    """Where that is told."""
+    """Where the result is reported."""
 
     def finds(self, subject: str, text: str, left_out: int = 0) -> Finding:
-        """What this witness said of an input.
+        """Return a finding of this witness about an input.
 
         Parameters
         ----------
@@ -46,7 +46,7 @@ class Witness:
 
 @dataclass(frozen=True)
 class Finding:
-    """What a witness said of an input of this survey."""
+    """The result of a witness for an input of this survey."""
 
     witness: str
     """Name of the witness."""
@@ -59,12 +59,12 @@ class Finding:
 
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Finding:
-        """A finding from the JSON object in which a record keeps it."""
+        """Return the finding of a JSON object in a record."""
         return cls(**stored)
 
     @property
     def line(self) -> str:
-        """Subject and text, as the summary prints them."""
+        """Return subject and text as the summary prints them."""
         return f"{self.subject}: {self.text}" if self.subject else self.text
 
 
@@ -72,7 +72,7 @@ _PACKAGE: Final = "roadscan"
 
 
 def witnesses() -> dict[str, Witness]:
-    """All witnesses by name, sorted: the constants of this class in all modules of roadscan (imports each of them).
+    """Return all witnesses by name, sorted: the constants of this class in all modules of roadscan (imports each).
 
     Raises
     ------

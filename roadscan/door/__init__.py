@@ -1,6 +1,6 @@
-"""The door for Python: a survey's tables, cells, points and files as pandas, GeoPandas, xarray, Arrow and DuckDB.
+"""The Python interface: a survey's tables, cells, points and files as pandas, GeoPandas, xarray, Arrow and DuckDB.
 
-The command line prints what stands here.
+The command line prints the results of these functions.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Box = tuple[float, float, float, float]
 
 
 def open_survey(survey_file: str | Path = "SURVEY.toml") -> OpenSurvey:
-    """The survey that a survey file describes; nothing is read yet.
+    """Return the survey that a survey file describes; nothing is read yet.
 
     Raises
     ------
@@ -89,7 +89,7 @@ class OpenSurvey:
         tiles: Sequence[str] | None = None,
         report: Callable[[str], None] | None = None,
     ) -> Status:
-        """Do what is missing or stale; returns the state after it.
+        """Compute what is missing or stale; return the resulting status.
 
         Parameters
         ----------
@@ -97,7 +97,7 @@ class OpenSurvey:
         workers : processes of an embedded cluster, None for one a core; 0 computes in this process.
         scheduler : address of a Dask scheduler, in place of the embedded cluster.
         tiles : tiles to compute whether stale or not, by name.
-        report : hears of each step.
+        report : receives each step.
 
         Raises
         ------
@@ -127,8 +127,8 @@ class OpenSurvey:
         return run_plan(self.survey, self.store, workers)
 
     def verify(self) -> list[str]:
-        """The faults of all files that the store should hold, each of which is read and compared with its record; and
-        the ingested rows that are lost.
+        """Return the faults of all files that the store should have, each read and compared with its record; and the
+        lost rows.
         """
         from roadscan.inventory.of_survey import inventory_faults
         from roadscan.store.salvage import read_lost
@@ -141,13 +141,13 @@ class OpenSurvey:
         )
 
     def report(self) -> str:
-        """The report page as HTML; it needs nothing beside it."""
+        """Return the report page as self-contained HTML."""
         from roadscan.report.page import report_page
 
         return report_page(self.session)
 
     def changes_since(self, earlier: OpenSurvey) -> gpd.GeoDataFrame:
-        """Change of the road's condition since an earlier survey, a row a quantity of a section, with its line.
+        """Return changes of the road's condition since an earlier survey: a row per quantity of a section, with a line.
 
         Raises
         ------
@@ -163,13 +163,13 @@ class OpenSurvey:
 
     @property
     def inventory(self) -> Inventory:
-        """The inventory of assets that the survey belongs to, with the home that people edit."""
+        """Return the inventory of assets to which the survey belongs, with the file that people edit."""
         from roadscan.inventory.of_survey import open_inventory
 
         return open_inventory(self.session)
 
     def connect(self, *, unconfined: bool = False) -> duckdb.DuckDBPyConnection:
-        """A DuckDB connection in which each table of the survey is a view; the caller closes it.
+        """Return a DuckDB connection with one view per table of the survey; the caller closes it.
 
         Its statements reach the store and memory; `unconfined` lets them read and write any file.
         """
@@ -179,9 +179,9 @@ class OpenSurvey:
         return connect(self.store, known_keys(self.survey, self.store), unconfined=unconfined)
 
     def sql(self, statement: str, *, unconfined: bool = False) -> duckdb.DuckDBPyRelation:
-        """Answer to an SQL statement; `.df()`, `.arrow()`, `.pl()` or `.fetchall()` bring it over.
+        """Return the answer to an SQL statement; `.df()`, `.arrow()`, `.pl()` or `.fetchall()` fetch it.
 
-        It is computed when it is brought over. Its files are not held against their records, as those of `table` are.
+        It is computed when it is fetched. Its files are not verified against their records, as those of `table` are.
         `unconfined` lets the statement read and write any file.
 
         Raises
@@ -205,7 +205,7 @@ class OpenSurvey:
 
     @property
     def tables(self) -> list[str]:
-        """Names of the tables that there are."""
+        """Return the names of the existing tables."""
         with self.connect() as connection:
             return sorted(name for (name,) in connection.execute("SHOW TABLES").fetchall())
 
@@ -218,7 +218,7 @@ class OpenSurvey:
         start: Instant | None = None,
         end: Instant | None = None,
     ) -> pd.DataFrame:
-        """A table as a DataFrame; as a GeoDataFrame in the map's CRS where it has a geometry.
+        """Return a table as a DataFrame; as a GeoDataFrame in the map's CRS where it has a geometry.
 
         Parameters
         ----------
@@ -255,7 +255,7 @@ class OpenSurvey:
         return _frame(rows, self.crs)
 
     def assets(self, kind: str) -> pd.DataFrame:
-        """Assets of a kind, such as `pole` or `kerb`, as a GeoDataFrame in the map's CRS; geometries have heights.
+        """Return assets of a kind, such as `pole` or `kerb`, as a GeoDataFrame in the map's CRS, with heights.
 
         Raises
         ------
@@ -267,7 +267,7 @@ class OpenSurvey:
         return self.table(asset_schema(kind).table)
 
     def trajectory(self, run: str, *, start: Instant | None = None, end: Instant | None = None) -> pd.DataFrame:
-        """Poses of a run on the map, as readings are placed by them: clocks, corrections and smoothing applied.
+        """Return a run's poses on the map as they place readings: with clocks, corrections and smoothing applied.
 
         Returns
         -------
@@ -282,7 +282,7 @@ class OpenSurvey:
         return poses_on_map(self.session, run, *limits)
 
     def cells(self, *, bbox: Box | None = None, tile: str | None = None) -> xr.Dataset:
-        """Cells of the survey, or of a part of it, as a grid.
+        """Return cells of the survey, or of a part of it, as a grid.
 
         Returns
         -------
@@ -299,7 +299,7 @@ class OpenSurvey:
         return cell_grid(self.session, _box(bbox), tile)
 
     def points(self, tile: str) -> pd.DataFrame:
-        """Points of a tile, placed anew from the raw readings with all filters and corrections.
+        """Return points of a tile, computed from the raw readings with all filters and corrections.
 
         Returns
         -------
@@ -317,9 +317,9 @@ class OpenSurvey:
     def pictures_of(
         self, easting_m: float, northing_m: float, height_m: float | None = None, *, reach_m: float = 60.0
     ) -> pd.DataFrame:
-        """Pictures that see a place of the map (m), that with the finest resolution first.
+        """Return pictures that see a place of the map (m), the one with the finest resolution first.
 
-        Without a height it is that of the surveyed ground there. Whether something stands between is not looked at.
+        Without a height it is that of the surveyed ground there. Obstacles between are not considered.
 
         Returns
         -------
@@ -328,7 +328,7 @@ class OpenSurvey:
         Raises
         ------
         RoadscanError
-            where nothing tells the height, or the survey has no pictures with poses.
+            where the height is unknown, or the survey has no pictures with poses.
         """
         import pandas
 
@@ -340,12 +340,12 @@ class OpenSurvey:
 
     @property
     def products(self) -> dict[str, MadeProduct]:
-        """Products that have files, by name."""
+        """Return products that have files, by name."""
         manifest = self.session.manifest
         return {name: MadeProduct(name, self) for name in sorted(manifest.files()) if self.paths_of(name)}
 
     def paths_of(self, product: str) -> list[str]:
-        """Full paths of a product's files, in order of their names."""
+        """Return the full paths of a product's files, in order of their names."""
         session = self.session
         own = (r.path for r in session.manifest.of(product).values() if r.path)
         return sorted(session.store.path(path) for path in own)
@@ -373,7 +373,7 @@ class OpenSurvey:
 
     @property
     def session(self) -> Session:
-        """What is known of the survey and its store by now, for code that goes deeper."""
+        """The session of the survey, for code that goes deeper."""
         return Session(self.survey, self.store)
 
 
@@ -386,7 +386,7 @@ class MadeProduct:
 
     @property
     def title(self) -> str:
-        """What it is, in a line."""
+        """Description of the product, in a line."""
         from roadscan.tiles.product import products
 
         known = products().get(self.name)
@@ -399,30 +399,30 @@ class MadeProduct:
 
 @dataclass(frozen=True)
 class LogTables(Mapping[str, "pa.Table"]):
-    """What a log holds: Arrow tables by name, as `schemas/` states their columns."""
+    """Content of a log: Arrow tables by name, with the columns of `schemas/`."""
 
     path: Path
     format: str
     tables: dict[str, pa.Table]
     attributes: dict[str, Any]
-    """What the rows need to be understood: scan geometry, world frame, CRS."""
+    """Attributes needed to understand the rows: scan geometry, world frame, CRS."""
     rejects: list[Reject]
     """Records that could not be read, with the reason."""
     findings: list[Finding] = field(default_factory=list)
-    """What its reader doubts."""
+    """Findings of its reader."""
 
     def __getitem__(self, name: str) -> pa.Table:
-        """A table by name."""
+        """Return a table by name."""
         if name not in self.tables:
             raise KeyError(f"{self.path} ({self.format}) has no table '{name}'; it has {', '.join(self.tables)}")
         return self.tables[name]
 
     def __iter__(self) -> Iterator[str]:
-        """Names of the tables."""
+        """Iterate over the names of the tables."""
         return iter(self.tables)
 
     def __len__(self) -> int:
-        """How many tables there are."""
+        """Return the number of tables."""
         return len(self.tables)
 
 
@@ -436,7 +436,7 @@ def read_log(
     geoid: str | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> LogTables:
-    """Tables of one log of any format, without a survey.
+    """Return the tables of one log of any format, without a survey.
 
     Parameters
     ----------
@@ -467,13 +467,13 @@ def read_log(
 
 
 class _Heard(Reporter):
-    """Hands on the lines of a run."""
+    """Forwards the lines of a run."""
 
     def __init__(self, hear: Callable[[str], None]) -> None:
         self._hear = hear
 
     def line(self, text: str) -> None:
-        """Hand on a line."""
+        """Forward a line."""
         self._hear(text)
 
 
@@ -531,7 +531,7 @@ def _quoted(text: str) -> str:
 
 
 def _frame(rows: pa.Table, crs: str | None) -> pd.DataFrame:
-    """A DataFrame, or a GeoDataFrame where a column holds geometries."""
+    """Return a DataFrame, or a GeoDataFrame where a column has geometries."""
     kinds = {name: str(kind) for name, kind in zip(rows.schema.names, rows.schema.types, strict=True)}
     shapes = [name for name, kind in kinds.items() if "geoarrow" in kind or (kind == "binary" and name in _GEOMETRIES)]
     frame = rows.to_pandas()
@@ -544,4 +544,4 @@ def _frame(rows: pa.Table, crs: str | None) -> pd.DataFrame:
 
 
 _GEOMETRIES = ("geometry", "outline", "line", "centre")
-"""Columns of GeoParquet tables that DuckDB hands on as WKB."""
+"""Columns of GeoParquet tables that DuckDB returns as WKB."""

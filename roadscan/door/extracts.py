@@ -1,4 +1,4 @@
-"""Parts of a survey as arrays: poses on the map, cells as a grid, points of a tile; and the tables of one log."""
+"""Extracts parts of a survey as arrays: poses on the map, cells as a grid, points of a tile; and tables of one log."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 
 Float64 = npt.NDArray[np.float64]
 
-_MOST_CELLS: Final = 400_000_000
+_MOST_CELLS: Final = 400_000_000  # larger grids are refused
 _RASTERS: Final = {"height_m": "height_robust_m", "intensity": "intensity_mean", "count": "count"}
 
 
 def poses_on_map(session: Session, run: str, first_gps_ns: int | None, end_gps_ns: int | None) -> pd.DataFrame:
-    """Poses of a run at the knots of its trajectory, indexed by `epoch_gps_ns`, as readings are placed by them.
+    """Return poses of a run at the knots of its trajectory, indexed by `epoch_gps_ns`, as they place readings.
 
     Columns: easting_m, northing_m, height_m on the map; roll_deg, pitch_deg, heading_deg of the body (x forward,
     y right, z down) against north, east, down of the place, in a local world against y, x, −z; sigma_north_m,
@@ -65,7 +65,7 @@ def poses_on_map(session: Session, run: str, first_gps_ns: int | None, end_gps_n
 
 
 def _level_from_world(world: str, position_world_m: Float64) -> Float64:
-    """(n, 3, 3) rotations to north, east, down of each place; in a local world to y, x, −z."""
+    """Return (n, 3, 3) rotations to north, east, down of each place; in a local world to y, x, −z."""
     if world == LOCAL_WORLD:
         return np.broadcast_to(ENU_FROM_NED.T, (len(position_world_m), 3, 3))
     lon_lat = np.radians(geodetic_from_world(world, position_world_m)[:, :2])
@@ -73,7 +73,7 @@ def _level_from_world(world: str, position_world_m: Float64) -> Float64:
 
 
 def cell_grid(session: Session, box: Bounds | None, tile: str | None) -> xr.Dataset:
-    """Cells of the whole survey, of a box on the map (m) or of one tile, over `y` and `x` (centres, m, ascending).
+    """Return cells of the survey, of a box on the map (m) or of one tile, over `y` and `x` (centres, m, ascending).
 
     Variables: height_m (robust height, NaN where no reading lies), intensity (mean), count.
 
@@ -123,7 +123,7 @@ def cell_grid(session: Session, box: Bounds | None, tile: str | None) -> xr.Data
 
 
 def points_of_tile(session: Session, tile: str) -> pd.DataFrame:
-    """Points of a tile, placed anew from the raw readings: place, epoch, intensity, class and pass of each.
+    """Return points of a tile, computed from the raw readings: position, epoch, intensity, class and pass of each.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def points_of_tile(session: Session, tile: str) -> pd.DataFrame:
 def read_tables(
     log_format: LogFormat, source: LogSource
 ) -> tuple[dict[str, pa.Table], dict[str, Any], list[Reject], list[Finding]]:
-    """Tables of a log by name, the attributes that its rows need, the records that could not be read, and doubts.
+    """Return a log's tables by name, the attributes of its rows, its rejects, and its findings.
 
     Rows that break a rule of their schema are rejects, as at ingest.
     """

@@ -1,1 +1,1 @@
-"""Readings and passes as files of other programs."""
+"""Exports readings and passes as files of other programs."""

@@ -1,4 +1,4 @@
-"""Classes of readings: what became of each, and which filter left it out. Nothing is deleted for it."""
+"""Exports classes of readings: the result of each, and the filter that left it out. Nothing is deleted."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def write_classes(
 ) -> dict[str, int]:
     """Write the class of every reading of a sensor in a run as Parquet (``schemas/reading_classes.toml``).
 
-    The file appears under its name when it is whole. A million readings or so are held at a time.
+    The file appears under its name when it is whole. About a million readings are in memory at a time.
 
     Parameters
     ----------
-    report : hears how many of the sensor's data files are done.
+    report : receives how many of the sensor's data files are done.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def write_classes(
 
 
 def _refuse_other_file(out: Path) -> None:
-    """Raise :class:`ConfigError` where the file to write is there and is not an older one of its kind."""
+    """Raise :class:`ConfigError` where the file to write exists and is no older one of its kind."""
     if not out.exists():
         return
     try:
@@ -105,7 +105,7 @@ def _encodings() -> dict[str, Any]:
 
 
 def _slices(plan: SurveyPlan, run: str, sensor: str) -> list[RawSlice]:
-    """Data files of a sensor in a run, in order of log and time."""
+    """Return the data files of a sensor in a run, in order of log and time."""
     known = {f"{source.run}/{source.sensor}" for source, _ in plan.sources}
     found = [s for s in plan.slices() if (s.source.run, s.source.sensor) == (run, sensor)]
     if not found:
@@ -120,7 +120,7 @@ def _slices(plan: SurveyPlan, run: str, sensor: str) -> list[RawSlice]:
 def _batches(
     plan: SurveyPlan, slices: list[RawSlice], report: Callable[[int, int], None]
 ) -> Iterator[dict[str, npt.NDArray[Any]]]:
-    """Columns of the table, chunk by chunk."""
+    """Yield the columns of the table, chunk by chunk."""
     lines = None if plan.centre_lines is None else load_buffer(plan.centre_lines, plan.ground.map)
     row = 0
     report(0, len(slices))
@@ -137,7 +137,7 @@ def _batches(
 
 
 def _numbered(rows: pa.RecordBatch, first: int, geometry: ScanGeometry | None) -> dict[str, npt.NDArray[Any]]:
-    """Epoch, row and number of every reading of some rows."""
+    """Return epoch, row and number of every reading of some rows."""
     epochs = rows.column("epoch_gps_ns").to_numpy()
     row = first + np.arange(rows.num_rows)
     if geometry is None:
@@ -158,7 +158,7 @@ def _beside(
     lines: CentreLineBuffer | None,
     plan: SurveyPlan,
 ) -> None:
-    """Mark readings (n,) outside all passes, and those of points off the centre lines, which passed all else.
+    """Mark readings (n,) outside all passes, and those of points off the centre lines that passed all other filters.
 
     kept : points of the readings of class `KEPT`, in their order.
     """
@@ -171,7 +171,7 @@ def _beside(
 
 
 def _near(points: Placed, lines: CentreLineBuffer, plan: SurveyPlan) -> npt.NDArray[np.bool_]:
-    """Which points (n,) lie in the buffer, tile by tile as products see them."""
+    """Return which points (n,) lie in the buffer, tile by tile as in products."""
     tiles, tile_of = np.unique(points.tiles, axis=0, return_inverse=True)
     order = np.argsort(tile_of, kind="stable")
     ends = np.cumsum(np.bincount(tile_of, minlength=len(tiles)))

@@ -1,4 +1,4 @@
-"""Heights of points averaged in the cells of a curved grid."""
+"""Averages heights of points in the cells of a curved grid."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Int64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class CurvedHeights:
-    """Sums of heights beside a reference line; a point counts at the node nearest to it.
+    """Sums of heights beside a reference line; a point counts at the nearest node.
 
     Nodes stand at the line's vertices, `v_step_m` apart from `v_first_m` (right, negative) to the left.
     """
@@ -29,7 +29,7 @@ class CurvedHeights:
     sums: Int64 = field(init=False)
     """(rows, columns) sums of heights, quanta."""
     counts: npt.NDArray[np.int32] = field(init=False)
-    """(rows, columns) points a node."""
+    """(rows, columns) points per node."""
 
     def __post_init__(self) -> None:
         shape = (len(self.line.vertices_m), self.columns)
@@ -37,7 +37,7 @@ class CurvedHeights:
         object.__setattr__(self, "counts", np.zeros(shape, np.int32))
 
     def add(self, x_m: Float64, y_m: Float64, height_quanta: npt.NDArray[np.int32], steps: Int64) -> int:
-        """Add points (n,); returns how many lie beside the grid.
+        """Add points (n,); return how many lie beside the grid.
 
         Parameters
         ----------
@@ -52,14 +52,14 @@ class CurvedHeights:
         )  # fmt: skip
 
     def heights_m(self) -> Float64:
-        """(rows, columns) mean height of each node; NaN where no point lies."""
+        """Return (rows, columns) mean height of each node; NaN where no point lies."""
         mean = np.full(self.sums.shape, np.nan)
         np.divide(self.sums * QUANTUM_M, self.counts, out=mean, where=self.counts > 0)
         return mean
 
 
 def fill_holes(heights_m: Float64, v_nodes: int, u_nodes: int) -> tuple[Float64, int]:
-    """Close small holes by straight lines, first across the road, then along it.
+    """Fill small holes by linear interpolation, first across the road, then along it.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def fill_holes(heights_m: Float64, v_nodes: int, u_nodes: int) -> tuple[Float64,
 
 
 def _filled(values: Float64, most: int) -> Float64:
-    """Holes of at most `most` neighbours along the second axis, closed by straight lines."""
+    """Return values with holes of at most `most` neighbours along the second axis filled by linear interpolation."""
     known = ~np.isnan(values)
     where = np.arange(values.shape[1])
     before = np.maximum.accumulate(np.where(known, where, -1), axis=1)
@@ -91,7 +91,7 @@ def _filled(values: Float64, most: int) -> Float64:
 
 
 def inner_holes(heights_m: Float64) -> int:
-    """How many nodes without a height lie between others of their row, and rows without any."""
+    """Return how many nodes without a height lie between others of their row, including rows without any."""
     known = ~np.isnan(heights_m)
     begun = np.logical_or.accumulate(known, axis=1)
     goes_on = np.logical_or.accumulate(known[:, ::-1], axis=1)[:, ::-1]

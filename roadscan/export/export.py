@@ -1,4 +1,4 @@
-"""What every export needs: the readings of one sensor in one run, and files that appear whole or not at all."""
+"""Shared parts of exports: the readings of one sensor in one run, and atomic output folders."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from roadscan.store.logs import DataFile
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export wrote."""
+    """Result of an export."""
 
     files: tuple[Path, ...]
     notes: tuple[str, ...]
-    """What the user should know of them."""
+    """Notes for the user."""
 
 
 def source_in(plan: SurveyPlan, run: str, sensor: str) -> tuple[ReadingSource, list[DataFile]]:
-    """The readings of a sensor in a run, and their files in the order of time."""
+    """Return the readings of a sensor in a run, and their files in the order of time."""
     found = [(s, f) for s, f in plan.sources if (s.run, s.sensor) == (run, sensor)]
     if not found:
         known = sorted({f"{s.run}/{s.sensor}" for s, _ in plan.sources})
@@ -43,7 +43,7 @@ def source_in(plan: SurveyPlan, run: str, sensor: str) -> tuple[ReadingSource, l
 
 @contextlib.contextmanager
 def published(out: Path) -> Iterator[Path]:
-    """A scratch folder beside `out` that takes its name at the end; `out` must not hold anything yet."""
+    """Return a scratch folder beside `out` that is renamed to it at the end; `out` must not contain anything yet."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{out} is there already", expected="a new or empty folder", change="choose another --out")
     out.parent.mkdir(parents=True, exist_ok=True)

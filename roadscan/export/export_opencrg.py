@@ -1,4 +1,4 @@
-"""Heights of a pass as an OpenCRG grid."""
+"""Exports heights of a pass as an OpenCRG grid."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from roadscan.store.store import Store
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_MOST_NODES: Final = 1 << 28
+_MOST_NODES: Final = 1 << 28  # larger grids are refused
 
 
 @dataclass(frozen=True)
 class CrgSettings:
-    """How a pass's heights become an OpenCRG grid."""
+    """Settings of an OpenCRG grid of a pass."""
 
     pass_id: int | None = None
-    """Pass; not needed where the run has one."""
+    """Pass; not needed where the run has only one."""
     u_step_m: float = 0.05
-    """Distance from row to row."""
+    """Distance from row to row (m)."""
     v_step_m: float = 0.05
     """Distance from column to column."""
     left_m: float = 2.0
@@ -124,7 +124,7 @@ def _pass(plan: SurveyPlan, run: str, pass_id: int | None) -> LanePass:
 def _driven_line(
     plan: SurveyPlan, source: ReadingSource, lane_pass: LanePass, settings: CrgSettings
 ) -> tuple[ReferenceLine, Int64, Int64]:
-    """The reference line of a pass, the trajectory's epochs in it (k,), and the line's step beside each of them."""
+    """Return a pass's reference line, the trajectory's epochs in it (k,), and the line's step beside each of them."""
     if source.trajectory is None:
         raise ConfigError(f"run '{source.run}' has no trajectory")
     span = (lane_pass.start_gps_ns, lane_pass.end_gps_ns)
@@ -140,7 +140,7 @@ def _driven_line(
 def _placed(
     plan: SurveyPlan, source: ReadingSource, files: list[DataFile], lane_pass: LanePass
 ) -> Iterator[tuple[Int64, Float64, Float64, npt.NDArray[np.int32]]]:
-    """Epochs (n,), easting and northing (m), and heights (quanta) of a pass's points, chunk by chunk."""
+    """Yield epochs (n,), easting and northing (m), and heights (quanta) of a pass's points, chunk by chunk."""
     first, end = lane_pass.start_gps_ns, lane_pass.end_gps_ns
     slices = []
     for file in files:
@@ -169,7 +169,7 @@ def _comments(plan: SurveyPlan, source: ReadingSource, lane_pass: LanePass) -> t
 
 
 def _grid(sums: CurvedHeights, settings: CrgSettings, comments: tuple[str, ...]) -> tuple[CurvedRegularGrid, list[str]]:
-    """The grid of all rows and columns that hold a point, and notes on its holes."""
+    """Return the grid of all rows and columns with a point, and notes on its holes."""
     line = sums.line
     heights, filled = fill_holes(
         sums.heights_m(), int(settings.hole_m / settings.v_step_m), int(settings.hole_m / settings.u_step_m)

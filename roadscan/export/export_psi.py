@@ -1,4 +1,4 @@
-"""Profiles of a run as PSI containers."""
+"""Exports profiles of a run as PSI containers."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from roadscan.store.store import Store
 
 Int64 = npt.NDArray[np.int64]
 
-_MM_PER_M: Final = 1e3
+_MM_PER_M: Final = 1e3  # millimetres of a metre
 _PIECE_BYTES: Final = 48 << 20
-"""Most bytes of ranges and intensities of one file, however slowly the vehicle goes."""
-_LEAST_ROW_M: Final = 1e-6
+"""Most bytes of ranges and intensities in one file, however slow the vehicle is."""
+_LEAST_ROW_M: Final = 1e-6  # least distance of rows
 
 
 @dataclass(frozen=True)
 class PsiSettings:
-    """How a run's profiles become PSI files."""
+    """Settings of a run's PSI files."""
 
     length_m: float = 5.0
-    """Road a file."""
+    """Length of road in one file (m)."""
 
 
 def export_psi(
@@ -80,7 +80,7 @@ def export_psi(
 
 
 def _cartesian(source: ReadingSource) -> ScanGeometry:
-    """Geometry of profiles as PSI can state it."""
+    """Return the geometry of profiles as PSI can state it."""
     stated = source.attribute.get("scan_geometry")
     if source.table != "scans" or stated is None:
         raise ConfigError(f"'{source.sensor}' is no line scanner", expected="a sensor with profiles for PSI")
@@ -96,7 +96,7 @@ def _cartesian(source: ReadingSource) -> ScanGeometry:
 
 
 def _batches(store: Store, source: ReadingSource, files: list[DataFile]) -> Iterator[pa.RecordBatch]:
-    """Row groups of data files."""
+    """Yield the row groups of data files."""
     for file in files:
         for group in range(len(file.group_rows)):
             yield from read_rows(store, source, file.path, [group]).combine_chunks().to_batches()
@@ -104,7 +104,7 @@ def _batches(store: Store, source: ReadingSource, files: list[DataFile]) -> Iter
 
 @dataclass
 class _PsiWriter:
-    """Gathers profiles and writes a file for each piece of road."""
+    """Collects profiles and writes a file for each piece of road."""
 
     folder: Path
     plan: SurveyPlan
@@ -120,7 +120,7 @@ class _PsiWriter:
     _piece: tuple[int, bool] | None = None
 
     def add(self, batch: pa.RecordBatch) -> None:
-        """Take profiles in the order of time."""
+        """Add profiles in the order of time."""
         epochs = batch.column("epoch_gps_ns").to_numpy()
         found = self.travel.trajectory.poses(epochs).found
         self.without_pose += int((~found).sum())
@@ -143,7 +143,7 @@ class _PsiWriter:
         self._held.append((epochs, _lists(part, "range"), _lists(part, "intensity") if piece[1] else None))
 
     def flush(self) -> None:
-        """Write the profiles held."""
+        """Write the collected profiles."""
         if not self._held:
             return
         epochs = np.concatenate([e for e, _, _ in self._held])
@@ -191,11 +191,11 @@ class _PsiWriter:
 
 
 def _lists(batch: pa.RecordBatch, column: str) -> npt.NDArray[Any]:
-    """(rows, readings) of a fixed-size list column."""
+    """Return (rows, readings) of a fixed-size list column."""
     flat: npt.NDArray[Any] = batch.column(column).flatten().to_numpy(zero_copy_only=False)
     return flat.reshape(batch.num_rows, -1)
 
 
 def _latin(text: str, room: int) -> str:
-    """As much of a text as a header's field of `room` characters holds."""
+    """Return as much of a text as fits into a header's field of `room` characters."""
     return text.encode("latin-1", errors="replace").decode("latin-1")[:room].strip()

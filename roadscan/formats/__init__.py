@@ -1,1 +1,1 @@
-"""Raw logs in: one file a format, found by itself."""
+"""Readers of raw logs: one file per format, found automatically."""

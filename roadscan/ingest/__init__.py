@@ -1,1 +1,1 @@
-"""Raw logs into tables: fingerprints, keys and rows of logs; whether their times meet."""
+"""Reads raw logs into tables: fingerprints, keys and rows of logs, and checks of their times and poses."""

@@ -1,4 +1,4 @@
-"""What the writers of arrays share: epochs of stamps, arrays of numbers, and Parquet files that appear whole."""
+"""Shared parts of the array writers: epochs of stamps, arrays of numbers, and Parquet files written atomically."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ _CALENDAR: Final = (TimeSystem.UNIX_UTC, TimeSystem.UNIX_GPS, TimeSystem.UNIX_TA
 
 @dataclass(frozen=True)
 class WrittenLog:
-    """A log that was written."""
+    """The result of writing a log."""
 
     path: Path
     rows: int
-    """Poses, profiles or returns."""
+    """Number of poses, profiles or returns."""
     first_epoch_gps_ns: int
     last_epoch_gps_ns: int
 
 
 def epochs_gps_ns(stamps: Any, clock: ClockLike, name: str) -> Int64:
-    """GPS time (n,) in ns since 1980-01-06 of `stamps` (n,).
+    """Return the GPS time (n,) in ns since 1980-01-06 of `stamps` (n,).
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def _checked(values: npt.NDArray[Any], name: str) -> Int64:
 
 
 def float_array(values: Any, shape: tuple[int, ...], name: str) -> Float64:
-    """`values` as float64 of `shape`, or :class:`ConfigError`."""
+    """Return `values` as float64 of `shape`, or raise :class:`ConfigError`."""
     try:
         found = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -118,7 +118,7 @@ def float_array(values: Any, shape: tuple[int, ...], name: str) -> Float64:
 
 
 def whole_array(values: Any, shape: tuple[int, ...], kind: npt.DTypeLike, name: str) -> npt.NDArray[Any]:
-    """`values` as whole numbers of a type and `shape`, or :class:`ConfigError` where one does not fit into it."""
+    """Return `values` as integers of a type and `shape`, or raise :class:`ConfigError` where one does not fit."""
     found, limits = float_array(values, shape, name), np.iinfo(kind)
     wrong = ~((found >= max(limits.min, 0)) & (found <= limits.max) & (found == np.rint(found)))
     if wrong.any():
@@ -132,7 +132,7 @@ def whole_array(values: Any, shape: tuple[int, ...], kind: npt.DTypeLike, name: 
 
 @contextmanager
 def parquet_file(path: Path, schema: pa.Schema) -> Iterator[pq.ParquetWriter]:
-    """A Parquet file to be filled; it appears under its name when it is whole, or not at all."""
+    """Open a Parquet file for writing; it appears under its name only when it is complete."""
     scratch = path.with_name(path.name + ".part")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:

@@ -1,4 +1,4 @@
-"""Epochs of a log in the order of its file: time that goes back, rows that stand twice, jumps against its rate.
+"""Checks the epochs of a log in file order: time that goes back, repeated rows, jumps relative to the log's rate.
 
 Tables are sorted by time. A clock that starts anew, or a log appended to itself, would be sorted into what came before.
 """
@@ -53,19 +53,19 @@ TIME_JUMPS: Final = Witness(
 )
 
 _ORDERED: Final = ("scans", "imu", "encoder", "gnss", "trajectory", "trajectory_accuracy", "images")
-"""Tables whose rows are written one after another as they are measured."""
+"""Tables whose rows are written in the order in which they are measured."""
 _EVEN: Final = ("imu",)
-"""Tables whose sensors measure at one rate without a pause."""
-_GAP_PERIODS: Final = 1.5
+"""Tables whose sensors measure at a constant rate without pauses."""
+_GAP_PERIODS: Final = 1.5  # steps longer than this many usual periods are gaps
 _JUMP_NS: Final = NS_PER_S
-_JUMP_PERIODS: Final = 20
+_JUMP_PERIODS: Final = 20  # steps longer than this many usual periods are jumps, if also longer than `_JUMP_NS`
 _MOST_GAPS: Final = 200_000
-"""The last gaps of a log that are remembered."""
+"""Most gaps of a log that are remembered; the oldest are dropped."""
 _MOST_LEAPS: Final = 100
-"""A chunk in which time goes back more often is of several streams, and has no leaps."""
-_FOR_RATE: Final = 64
+"""A chunk with more backward steps has several streams and is not searched for leaps."""
+_FOR_RATE: Final = 64  # first epochs from which the log's rate is estimated
 _RATE_QUANTILE: Final = 0.1
-"""Short steps are the log's rate, where rows are lost or late among its first."""
+"""Quantile of the first steps that is taken as the period, because rows may be lost or late among them."""
 
 BACK: Final = "the stamp goes back to a time that the log holds already"
 RESTART: Final = "the count of the clock goes back: it started anew"
@@ -75,35 +75,35 @@ TWICE: Final = "the row stands twice, one after the other"
 
 @dataclass
 class _Series:
-    """Rows of one table of one file, in its order."""
+    """Rows of one table of one file, in file order."""
 
     free: bool
-    """The clock counts from an unknown instant, and cannot go back."""
+    """The clock counts from an unknown instant and cannot go back."""
     even: bool
     rows: int = 0
     back: int = 0
     """How often time goes back."""
     farthest_ns: int = 0
-    """By how much at the most."""
+    """Largest step back (ns)."""
     first_record: int = -1
     first_ns: int = 0
-    """Record and epoch at which it first went back."""
+    """Record and epoch at which time first goes back."""
     refused: int = 0
     moved: int = 0
-    """Rows that went back and are used."""
+    """Rows behind a backward step that are used."""
     jumps: list[tuple[int, int, int]] = field(default_factory=list)
-    """Record behind a jump forward, its epoch and its length (ns)."""
+    """Record after a forward jump, its epoch and its length (ns)."""
     _start_ns: int = 0
     _top_ns: int | None = None
     _usual_ns: int = 0
     _sample: list[int] = field(default_factory=list)
     """First epochs."""
     _gaps: list[tuple[int, int]] = field(default_factory=list)
-    """Stretches without a row (first and last epoch); between all rows, as long as the rate is not known."""
+    """Intervals without a row (first and last epoch); between all rows until the rate is known."""
     _last: pa.RecordBatch | None = None
 
     def take(self, epochs: Int64, batch: pa.RecordBatch, first_record: int) -> list[tuple[Int64, str]]:
-        """Rows (by index) of a batch that are left out, with the reason; `epochs` (n,), n > 0."""
+        """Return the rows (by index) of a batch that are left out, with reasons; `epochs` (n,), n > 0."""
         self.rows += epochs.size
         series = np.concatenate([[epochs[0] if self._top_ns is None else self._top_ns], epochs])
         if self._top_ns is None:
@@ -123,7 +123,7 @@ class _Series:
         return out
 
     def _learn(self, epochs: Int64) -> None:
-        """Find the log's rate from its first rows, in whatever order they come."""
+        """Estimate the log's rate from its first rows, in whatever order they come."""
         if len(self._sample) >= _FOR_RATE:
             return
         self._sample += epochs[: _FOR_RATE - len(self._sample)].tolist()
@@ -134,7 +134,7 @@ class _Series:
 
     @property
     def backward(self) -> str:
-        """How time goes back, and what became of the rows."""
+        """Return in words how time goes back, and what was done with the rows."""
         used = f", and {self.moved:,} at times of which it holds no other row are used" if self.moved else ""
         return (
             f"time goes back {_times(self.back)}, by {self.farthest_ns / NS_PER_S:.3f} s at the most, first at record "
@@ -144,7 +144,7 @@ class _Series:
 
     @property
     def forward(self) -> str:
-        """How time jumps forward."""
+        """Return in words how time jumps forward."""
         record, epoch, length = max(self.jumps, key=lambda one: one[2])
         return (
             f"time jumps forward {_times(len(self.jumps))}, by {length / NS_PER_S:.3f} s at the most (record "
@@ -152,7 +152,7 @@ class _Series:
         )
 
     def _backward(self, epochs: Int64, first_record: int, twice: Int64) -> list[tuple[Int64, str]]:
-        """Rows of a batch in which time goes back."""
+        """Return the rows of a batch in which time goes back, with reasons."""
         leaping = self._leaping(epochs)
         steady = np.flatnonzero(~leaping)
         before = self._top_ns if self._top_ns is not None else int(epochs[steady[0]])
@@ -177,7 +177,7 @@ class _Series:
         return [*out, (refused, RESTART if self.free else BACK)] if refused.size else out
 
     def _leaping(self, epochs: Int64) -> Bool:
-        """Rows (n,) whose stamps jump forward and come back to where the log's rate leads."""
+        """Return which rows (n,) have stamps that jump forward and return to where the log's rate leads."""
         leaping = np.zeros(epochs.size, dtype=bool)
         returns = np.flatnonzero(np.diff(epochs) < 0)
         if not self._usual_ns or returns.size > _MOST_LEAPS:
@@ -200,7 +200,7 @@ class _Series:
         return max(_JUMP_NS, _JUMP_PERIODS * self._usual_ns)
 
     def _fit(self, epochs: Int64) -> Bool:
-        """True for epochs (n,) about which the log holds no row: in one of its gaps, or before its first."""
+        """Return which epochs (n,) lie in a gap of the log or before its first row."""
         early = (epochs < self._start_ns) & (not self.free)
         if not self._gaps:
             return early
@@ -209,7 +209,7 @@ class _Series:
         return np.asarray(early | ((gap >= 0) & (epochs < ends[gap])))
 
     def _note(self, series: Int64, steps: Int64, first_record: int) -> None:
-        """Take rows in order; `first_record` −1 where they are not one after another."""
+        """Record the steps of rows in order; `first_record` is −1 where record numbers are not consecutive."""
         self._top_ns = int(series[-1])
         wide = np.flatnonzero(steps > _GAP_PERIODS * self._usual_ns)
         self._gaps += zip(series[wide].tolist(), series[wide + 1].tolist(), strict=True)
@@ -219,7 +219,7 @@ class _Series:
             self.jumps += [(first_record + int(k), int(series[k + 1]), int(steps[k])) for k in far]
 
     def _twice(self, batch: pa.RecordBatch, epochs: Int64) -> Int64:
-        """Rows that equal the row before them."""
+        """Return the rows that equal the row before them."""
         same = np.flatnonzero(np.diff(epochs) == 0) + 1
         joint = batch
         if self._last is not None and self._top_ns == epochs[0] and self._last.schema.equals(batch.schema):
@@ -239,7 +239,7 @@ def _times(count: int) -> str:
 
 
 def _equal(a: pa.Array, b: pa.Array) -> Bool:
-    """Whether values (n,) are the same; missing ones are."""
+    """Return whether values (n,) are equal; missing values equal each other."""
     if pa.types.is_nested(a.type):
         return _equal_lists(a, b)
     same = pc.fill_null(pc.equal(a, b), False)
@@ -248,7 +248,7 @@ def _equal(a: pa.Array, b: pa.Array) -> Bool:
 
 
 def _equal_lists(a: pa.Array, b: pa.Array) -> Bool:
-    """The same of lists of numbers; those of several lengths, or with missing ones among them, count as different."""
+    """Return whether lists of numbers are equal; lists of varying length or with missing numbers count as different."""
     lengths = {*pc.unique(pc.list_value_length(a)).to_pylist(), *pc.unique(pc.list_value_length(b)).to_pylist()}
     if len(lengths) > 1 or None in lengths:
         return np.zeros(len(a), dtype=bool)
@@ -258,14 +258,14 @@ def _equal_lists(a: pa.Array, b: pa.Array) -> Bool:
 
 @dataclass
 class _Returns:
-    """Chunks of returns; within one they stand in no order of time."""
+    """Chunks of returns; within a chunk they are in no order of time."""
 
     _top_ns: int | None = None
     _back: int = 0
     _farthest_ns: int = 0
 
     def take(self, batch: pa.RecordBatch) -> None:
-        """Compare a chunk with those before it."""
+        """Compare a chunk with the chunks before it."""
         ends = pc.min_max(batch.column("epoch_gps_ns")).as_py() if "epoch_gps_ns" in batch.schema.names else {}
         last_ns = ends.get("max")
         if last_ns is None:
@@ -276,7 +276,7 @@ class _Returns:
         self._top_ns = max(last_ns, self._top_ns or last_ns)
 
     def findings(self) -> Iterator[Finding]:
-        """Whether whole chunks lie before others that precede them in the file."""
+        """Yield a finding where whole chunks precede others that were recorded earlier."""
         if self._back:
             yield TIME_GOES_BACK.finds(
                 "",
@@ -287,7 +287,7 @@ class _Returns:
 
 @dataclass
 class EpochOrder(LogCheck):
-    """Follows the epochs of one log, table by table, in the order of its files."""
+    """Checks the epochs of one log, table by table, in the order of its files."""
 
     free: bool
     """The log's clock counts from an unknown instant."""
@@ -295,7 +295,7 @@ class EpochOrder(LogCheck):
     _returns: _Returns = field(default_factory=_Returns)
 
     def refused(self, rows: Rows) -> list[tuple[Int64, str]]:
-        """Rows of a chunk (by index) that are left out, with their reasons."""
+        """Return the rows of a chunk (by index) that are left out, with reasons."""
         batch = rows.batch
         if rows.table == "returns" and batch.num_rows:
             self._returns.take(batch)
@@ -303,14 +303,14 @@ class EpochOrder(LogCheck):
             return []
         column = batch.column("epoch_gps_ns")
         if column.null_count or not pa.types.is_int64(column.type):
-            return []  # the rules of the table's columns refuse them
+            return []  # the schema's rules for columns reject them
         wheel = str(batch.column("wheel")[0]) if "wheel" in batch.schema.names else ""
         key = (rows.table, rows.file, wheel)
         series = self._series.setdefault(key, _Series(self.free, rows.table in _EVEN))
         return series.take(column.to_numpy(), batch, rows.first_record)
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
-        """Say what is doubtful of the log's time."""
+        """Report what is doubtful about the log's time."""
         writer.findings += self._findings()
 
     def _findings(self) -> Iterator[Finding]:

@@ -1,6 +1,6 @@
-"""When logs were recorded, before any is read through: whether the times of a run meet shows in a moment.
+"""Finds when logs were recorded before any is read completely, so that times that never meet show at once.
 
-A small log is read. Of a large one the first chunk is, and what its format finds at its end without reading it through
+A small log is read completely. Of a large one, the first chunk is read, and what its format finds at its end directly
 (`LogFormat.ending`). Where that end is not known, a log counts as one that lasts two days.
 """
 
@@ -21,31 +21,31 @@ from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource
 from roadscan.store.logs import DataFile, LogRecord
 
 _WHOLE_BYTES: Final = 4 << 20
-"""Logs of at most so many bytes are read to their end."""
+"""Logs up to this size are read to their end."""
 _LONGEST_NS: Final = 2 * 86_400 * NS_PER_S
-"""No log lasts longer."""
+"""Assumed longest duration of a log (ns)."""
 _LOOKED_AT: Final = ("scans", "returns", "imu", "encoder", "gnss", "trajectory")
-"""Tables of logs that are looked at."""
+"""Tables whose logs are looked at."""
 
 
 @dataclass(frozen=True)
 class LookedAt:
-    """A log as far as it was looked at: a record of what is known of its rows."""
+    """A partially read log, as a record of what is known of its rows."""
 
     record: LogRecord
     ends: bool
-    """Whether its last epoch is known; if not, its span is that of its first rows."""
+    """Whether its last epoch is known; if not, its span covers only its first rows."""
 
     @property
     def longest(self) -> tuple[int, int]:
-        """First and last epoch (GPS ns) that it may have."""
+        """Return the earliest and latest epoch (GPS ns) that it may have."""
         (table,) = self.record.tables
         first, last = self.record.span(table) or (0, 0)
         return (first, last) if self.ends else (first, max(last, first + _LONGEST_NS))
 
 
 def look_at(run: str, sensor: str, log_format: LogFormat, source: LogSource, header: LogHeader) -> LookedAt | None:
-    """When a log begins and ends; None where its first rows have no epochs, or cannot be read."""
+    """Return when a log begins and ends; None where its first rows have no epochs, or cannot be read."""
     if not set(_LOOKED_AT) & set(log_format.yields):
         return None
     try:
@@ -60,7 +60,7 @@ def look_at(run: str, sensor: str, log_format: LogFormat, source: LogSource, hea
         ends = whole
         for one in () if whole else _timed(log_format.ending(source, header), whole=True):
             last, ends = max(last, _span(one)[1]), True
-    except (RoadscanError, OSError):  # other checks tell of it, or who reads the log through
+    except (RoadscanError, OSError):  # other checks or the full read report it
         return None
     file = DataFile("", rows, 0, "", (rows,), ((first, last),))
     record = LogRecord(
@@ -81,12 +81,12 @@ def look_at(run: str, sensor: str, log_format: LogFormat, source: LogSource, hea
 
 
 def key_of_look(run: str, path: Path) -> str:
-    """What stands in place of a log's key, which takes its fingerprint."""
+    """Return a substitute for the log's key, which would need its fingerprint."""
     return f"{run}/{path}"
 
 
 def never_meeting(survey: Survey, logs: Sequence[LookedAt]) -> list[Fault]:
-    """Logs of a survey that cannot overlap the poses of their run, however long those last whose end is not known."""
+    """Return the logs that cannot overlap the poses of their run, even if those of unknown end last longest."""
     return [
         fault
         for run in dict.fromkeys(one.record.run for one in logs)
@@ -101,7 +101,7 @@ def _never_meeting(survey: Survey, logs: Sequence[LookedAt]) -> list[Fault]:
 
 
 def named(log: LookedAt, path: str) -> LookedAt:
-    """The same with its path in the survey file."""
+    """Return the same with its path in the survey file."""
     return replace(log, record=replace(log.record, path=path))
 
 
@@ -110,7 +110,7 @@ def _meet(a: tuple[int, int], b: tuple[int, int]) -> bool:
 
 
 def _timed(items: Iterator[Item], whole: bool) -> Iterator[Rows]:
-    """Rows with epochs: all of them, or the first."""
+    """Yield rows with epochs: all of them, or only the first."""
     try:
         for item in items:
             if isinstance(item, Rows) and item.table in _LOOKED_AT and item.batch.num_rows:

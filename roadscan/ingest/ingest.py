@@ -1,4 +1,4 @@
-"""Ingest: raw logs → tables. A log read once is not read again; a damaged record costs itself alone."""
+"""Ingests raw logs into tables. A log is read once; a damaged record costs only itself."""
 
 from __future__ import annotations
 
@@ -44,26 +44,26 @@ DATA_TABLES: Final = ("scans", "returns", "cloud")
 """Tables whose readings become points."""
 
 _SMALL_BYTES: Final = 64 << 20
-"""Logs that are smaller together are read in this process: to start workers takes longer."""
+"""If all logs together are smaller than this, this process reads them: starting workers takes longer."""
 
 
 @dataclass(frozen=True)
 class IngestResult:
-    """What came of one log."""
+    """The result of ingesting one log."""
 
     record: LogRecord
     fresh: bool
-    """False where the store already held it."""
+    """False where the store already has the log."""
 
 
 @dataclass(frozen=True)
 class IngestTask:
-    """One log to be read, by any worker that sees the log and the store."""
+    """One log to be read by any worker that can access the log and the store."""
 
     store: Store
     log: PlannedLog
     replaces: tuple[LogRecord, ...] = ()
-    """The same bytes read before under other settings; no two tasks replace the same."""
+    """Earlier records of the same bytes under other settings; no two tasks replace the same one."""
 
 
 def ingest(
@@ -73,11 +73,11 @@ def ingest(
     compute: Compute | None = None,
     logs: Logs | None = None,
 ) -> list[IngestResult]:
-    """Bring every log of the survey file into the tables: a task a log, trajectories before the others.
+    """Read every log of the survey file into the tables: one task for each log, trajectories first.
 
     Parameters
     ----------
-    report : hears of each log, in the order of :func:`plan_logs` whichever ends first.
+    report : receives each log, in the order of :func:`plan_logs` whichever ends first.
     compute : where logs are read; this process by default.
     logs : what :func:`plan_logs` says, where that is known.
 
@@ -114,7 +114,7 @@ def ingest(
 
 
 def ingest_log(task: IngestTask) -> IngestResult:
-    """Bring one log into the tables, unless it is there already (runs on a worker)."""
+    """Read one log into the tables, unless the store has it already (runs on a worker)."""
     store, log = task.store, task.log
     if has_log(store, log.key):
         return IngestResult(read_log_records(store, [log.key])[0], fresh=False)
@@ -132,7 +132,7 @@ def ingest_log(task: IngestTask) -> IngestResult:
 def record_of(
     log: PlannedLog, header: LogHeader, writer: LogWriter, tables: dict[str, tuple[DataFile, ...]]
 ) -> LogRecord:
-    """The record of a log that was read."""
+    """Return the record of a log that was read."""
     return LogRecord(
         key=log.key,
         run=log.run,
@@ -151,7 +151,7 @@ def record_of(
 
 
 def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
-    """The rows of a log, finished in a scratch folder, and what its header says."""
+    """Read a log's rows into a scratch folder; return their writer and the log's header."""
     header = task.log.format.header(task.log.source)
     writer, checks = LogWriter(folder, header.list_size), _checks(task.log.source, header)
     for item in _items(task.log, header):
@@ -166,7 +166,7 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
 
 
 def _check_there(task: IngestTask) -> None:
-    """A log that was ingested and moved away is planned as it was; it is missed where the store lost its record."""
+    """Raise an error where an ingested log was moved away and the store lost its record."""
     if task.log.source.path.exists():
         return
     aside = f"damaged/{record_path(task.log.key)}"
@@ -179,7 +179,7 @@ def _check_there(task: IngestTask) -> None:
 
 
 def _check_unchanged(log: PlannedLog) -> None:
-    """Its key is that of the bytes that were fingerprinted: rows of others must not go by it."""
+    """Refuse to publish when the file changed after it was fingerprinted."""
     path, options = log.source.path, log.source.options
     try:
         same = stamp_of(path, log.format, log.format.companions(path, options)) == log.stamp
@@ -190,7 +190,7 @@ def _check_unchanged(log: PlannedLog) -> None:
 
 
 def survey_records(survey: Survey, store: Store, logs: Logs | None = None) -> list[LogRecord]:
-    """Records of the survey file's logs; a log that was never ingested is an error."""
+    """Return the records of the survey file's logs; a log that was never ingested is an error."""
     planned, unplanned = plan_logs(survey, store) if logs is None else logs
     missing = [str(u.error) for u in unplanned]
     missing += [f"{p.config.path} is not ingested, or has changed since" for p in planned if not has_log(store, p.key)]
@@ -209,7 +209,7 @@ def ingested_of(session: Session) -> list[LogRecord]:
 
 
 def _tasks(store: Store, logs: Sequence[PlannedLog], listed: frozenset[str], held: frozenset[str]) -> list[IngestTask]:
-    """A task a log. What the survey file still lists (`listed` keys: two layers of one file, say) is not replaced."""
+    """Return one task for each log. Logs that are still listed (`listed` keys) are not replaced."""
     missing = [log for log in logs if log.key not in held]
     older: dict[tuple[str, str, str], list[LogRecord]] = {}
     for old in read_log_records(store) if missing else ():
@@ -222,7 +222,7 @@ def _tasks(store: Store, logs: Sequence[PlannedLog], listed: frozenset[str], hel
 def _ingested(
     tasks: Sequence[IngestTask], held: frozenset[str], compute: Compute
 ) -> Iterator[Done[IngestTask, IngestResult]]:
-    """What came of each task, in their order; logs that the store holds (`held` keys) are sent nowhere."""
+    """Yield the result of each task, in their order; logs in the store (`held` keys) are not sent to workers."""
     missing = [t for t in tasks if t.log.key not in held]
     if len(missing) < 2 or sum(t.log.bytes for t in missing) < _SMALL_BYTES:
         yield from Inline().map(ingest_log, tasks)
@@ -240,13 +240,13 @@ def _ingested(
 
 
 def _reason(done: Done[IngestTask, IngestResult]) -> str:
-    """Why a log failed; what is no fault of a log or of its worker goes on."""
+    """Return why a log failed; raise errors that are no fault of the log or its worker."""
     error = done.error or StoreError("no result", file=done.task.log.source.path)
     if isinstance(error, FullDiskError):
         return f"{done.task.log.source.path}: its rows cannot be kept: {error}"
     if isinstance(error, RoadscanError):
         return str(error)
-    if isinstance(error, OSError):  # of reading, a format has told
+    if isinstance(error, OSError):  # of reading, a format has reported
         return f"{done.task.log.source.path}: its rows cannot be kept: {error}; see to the store's disk"
     if type(error).__name__ == "KilledWorker":
         return f"{done.task.log.source.path}: the worker process died twice while it read this log"
@@ -254,7 +254,7 @@ def _reason(done: Done[IngestTask, IngestResult]) -> str:
 
 
 def _widen(spans: dict[str, tuple[int, int]], record: LogRecord) -> None:
-    """Take the record's trajectory into the span of its run."""
+    """Extend the span of the record's run by its trajectory."""
     span = record.span("trajectory")
     if span is not None:
         before = spans.get(record.run, span)
@@ -273,7 +273,7 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
 
 
 def _checks(source: LogSource, header: LogHeader) -> list[LogCheck]:
-    """All that follow the rows of a log, in the order in which they are asked."""
+    """Return the checks that follow the rows of a log, in the order in which they run."""
     free = source.clock is not None and source.clock.system is TimeSystem.FREE
     poses = PoseRecords()
     return [
@@ -305,7 +305,7 @@ def _take(writer: LogWriter, item: Item, checks: Sequence[LogCheck]) -> None:
 
 
 def with_span(log: PlannedLog, span: tuple[int, int] | None) -> PlannedLog:
-    """The log with the span of its run's trajectory (first and last GPS ns), which readers of short stamps need."""
+    """Return the log with the span of its run's trajectory (GPS ns), which readers of short stamps need."""
     return replace(log, source=replace(log.source, trajectory_span_gps_ns=span))
 
 

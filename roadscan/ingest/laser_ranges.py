@@ -1,4 +1,4 @@
-"""Whether each laser of a spinning lidar measures the ranges that the lasers above and below it do."""
+"""Checks each laser of a spinning lidar: its ranges have to agree with those of the lasers above and below it."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ LASER_RANGE: Final = Witness(
 
 _TABLE: Final = "returns"
 _OFF_M: Final = 0.06
-"""Makers promise ±20 mm; of a recording of an HDL-32E, the largest median against the neighbours is 24 mm."""
-_SIGMAS: Final = 10.0
+"""Least reported offset (m): makers promise ±20 mm; the largest median in an HDL-32E recording is 24 mm."""
+_SIGMAS: Final = 10.0  # least offset, in its σ, that is reported
 _ALIKE: Final = 0.5
-"""Share of its offset within which the medians of all quarters of the turn lie, and the scatter (1 σ) about it."""
+"""Largest deviation of the medians of all quarters of the turn, and largest scatter (1 σ), as shares of the offset."""
 _LEAST: Final = 100
-"""Firings of a quarter of the turn that count."""
-_MOST_LASERS: Final = 4
-_EVERY: Final = 8
+"""Least firings of a quarter of the turn."""
+_MOST_LASERS: Final = 4  # if more lasers are off, none is left out
+_EVERY: Final = 8  # one chunk in this many is examined
 _MOST_CHUNKS: Final = 40
-"""One chunk in so many is looked at, at most so many: some ten million returns of a long capture."""
-_MOST_RES_M: Final = 1.0
-_NEAREST_M: Final = 1.0
+"""Most chunks that are examined: some ten million returns of a long capture."""
+_MOST_RES_M: Final = 1.0  # larger differences to the neighbours (m) are not of one surface
+_NEAREST_M: Final = 1.0  # nearer returns (m) are not compared
 _EVEN: Final = 0.7
-"""Least ratio of the ranges of the two neighbours: beyond, they do not see one surface."""
-_AZIMUTH_RAD: Final = np.radians(2.0)
+"""Least ratio of the two neighbours' ranges: below it, they do not measure one surface."""
+_AZIMUTH_RAD: Final = np.radians(2.0)  # largest difference of azimuth to the neighbours (rad)
 
 
 @dataclass
 class LaserRanges(LogCheck):
-    """Compares the ranges of neighbouring lasers, in some chunks of one log."""
+    """Compares the ranges of neighbouring lasers in some chunks of one log."""
 
     in_sensor_frame: bool
     _chunks: int = 0
@@ -59,7 +59,7 @@ class LaserRanges(LogCheck):
     _beside: dict[int, tuple[int, int]] = field(default_factory=dict)
 
     def take(self, rows: Rows, refused: Sequence[npt.NDArray[np.int64]]) -> None:
-        """Look at a chunk, or not."""
+        """Examine a chunk if its turn has come."""
         if rows.table != _TABLE:
             return
         batch = rows.batch
@@ -90,7 +90,7 @@ class LaserRanges(LogCheck):
             self._compare(ranges, azimuths, known[three].tolist(), level[three])
 
     def _compare(self, ranges: Float64, azimuths: Float64, lasers: Sequence[int], level: Float64) -> None:
-        """Residuals of the first of three lasers against the two others, by firing; `level` (3,) elevations (rad)."""
+        """Add one laser's residuals against two others, by firing; `level` (3,) holds their elevations (rad)."""
         mid, one, other = (ranges[:, k] for k in lasers)
         span = float(np.sin(level[2] - level[1]))
         if span <= 0:
@@ -110,7 +110,7 @@ class LaserRanges(LogCheck):
         self._found.setdefault(lasers[0], []).append((off[good], quarter, *pulls))
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
-        """Leave the returns of lasers whose ranges are off out of the finished table."""
+        """Leave the returns of lasers with wrong ranges out of the finished table."""
         wrong, is_clear = self._wrong()
         is_out = is_clear and len(wrong) <= _MOST_LASERS
         for laser, (off_m, sigma_m, firings) in sorted(wrong.items()):
@@ -120,8 +120,8 @@ class LaserRanges(LogCheck):
             writer.findings.append(_finding(laser, off_m, sigma_m, firings, count))
 
     def _wrong(self) -> tuple[dict[int, tuple[float, float, int]], bool]:
-        """Offset and σ (m) of each laser that is off, and the firings that say so; and whether they explain all that
-        does not fit.
+        """Return offset and σ (m) of each wrong laser and its number of firings; and whether they explain all
+        residuals.
 
         A wrong laser pulls the residuals of those beside it, so the one that explains most of them is taken, and its
         pull off, until none is left.
@@ -144,7 +144,7 @@ class LaserRanges(LogCheck):
             _, by_m, k = min(tried, default=(0.0, 0.0, 0))
             if abs(by_m) <= _OFF_M:
                 break
-            others = off_m[k] - by_m  # what other wrong lasers add to its residuals
+            others = off_m[k] - by_m  # effect of other wrong lasers on its residuals
             sigma_m = _sigma_of(residuals[k] - others, quarters[k], by_m)
             if sigma_m is None:
                 break
@@ -154,12 +154,12 @@ class LaserRanges(LogCheck):
 
 
 def _is_of(laser: int, rows: pa.Table) -> npt.NDArray[np.bool_]:
-    """Rows (n,) of a laser."""
+    """Return which rows (n,) are of a laser."""
     return np.asarray(rows.column("laser").to_numpy() == laser)
 
 
 def _explained(off_m: Float64, pull: Float64) -> tuple[float, float]:
-    """Sum of the residuals (m) that are left where one laser is off, and the offset (m) that leaves the least."""
+    """Return the remaining sum of residuals (m) if one laser is wrong, and the offset (m) that minimises it."""
     own = np.flatnonzero(np.abs(pull) > 0)
     ratios, weights = off_m[own] / pull[own], np.abs(pull[own])
     order = np.argsort(ratios)
@@ -169,7 +169,7 @@ def _explained(off_m: Float64, pull: Float64) -> tuple[float, float]:
 
 
 def _sigma_of(off_m: Float64, quarters: npt.NDArray[np.int64], middle_m: float) -> float | None:
-    """σ of an offset (m); None where the quarters of the turn do not agree on it, or it may be the scene's."""
+    """Return σ of an offset (m); None where the quarters of the turn disagree, or the scene may cause it."""
     medians = [
         float(np.median(off_m[quarters == q])) for q in np.unique(quarters) if (quarters == q).sum() >= _LEAST
     ]  # fmt: skip

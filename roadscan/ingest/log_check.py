@@ -1,4 +1,4 @@
-"""What a check of a log is: it follows the rows while they are read, and is asked once they stand in the tables."""
+"""The interface of a check: it sees each chunk of rows while a log is read, and reports at the end."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from roadscan.store.writer import LogWriter
 
 Int64 = npt.NDArray[np.int64]
 Refused: TypeAlias = tuple[Int64, str]
-"""Rows of a chunk (by index) that are left out, and why."""
+"""Rows of a chunk (by index) that are left out, with the reason."""
 
 
 class LogCheck:
-    """Follows the rows of one log; each check overrides what it needs."""
+    """Checks the rows of one log; subclasses override what they need."""
 
     def refused(self, rows: Rows) -> Sequence[Refused]:
-        """Rows of a chunk that are left out."""
+        """Return the rows of a chunk that are left out."""
         return ()
 
     def take(self, rows: Rows, refused: Sequence[Int64]) -> None:
-        """Look at a chunk of which rows (by index) were `refused`, by this check or another."""
+        """Examine a chunk of which rows (by index) were `refused`, by this check or another."""
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
-        """Leave rows out of the finished tables, and say in `writer.findings` what is doubtful."""
+        """Leave rows out of the finished tables, and add findings to `writer.findings`."""
 
 
 @dataclass(frozen=True)
 class Refuses(LogCheck):
-    """A check that looks at each chunk by itself."""
+    """A check that treats each chunk independently."""
 
     judge: Callable[[Rows], Sequence[Refused]]
 
     def refused(self, rows: Rows) -> Sequence[Refused]:
-        """Rows of a chunk that are left out."""
+        """Return the rows of a chunk that are left out."""
         return self.judge(rows)

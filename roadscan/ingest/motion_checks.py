@@ -1,4 +1,4 @@
-"""What the poses of a log say of themselves as findings: heading, pitch, constant values, speeds, spacing and σ."""
+"""Checks a log's poses for contradictions among themselves: heading, pitch, constant values, speeds, spacing and σ."""
 
 from __future__ import annotations
 
@@ -64,25 +64,25 @@ POSE_SIGMA: Final = Witness(
 )
 
 _BLOCK: Final = 50_000
-"""Poses that are looked at together."""
+"""Poses that are examined together."""
 _LEAST_BETWEEN_M: Final = 0.005
-"""A smaller error between poses is below what a trajectory is known to."""
+"""Least error between poses (m) that is reported: smaller ones are below the accuracy of a trajectory."""
 _POINTING: Final = 0.8
-"""Below this ratio, velocities are less off in size than in direction: by 37° and more."""
+"""Below this ratio, velocities differ less in size than in direction, by 37° or more."""
 _LEAST_BARE_S: Final = 2.0
-"""Files of σ, of one a second, may begin and end up to a second beside the poses."""
+"""Least span without σ (s) that is reported: files of σ, one a second, may start and end a second beside the poses."""
 _SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_down_m")
-_NONE: Final = np.zeros(0, np.int64)
+_NONE: Final = np.zeros(0, np.int64)  # no epochs without a fix
 
 
 @dataclass(frozen=True)
 class MotionCheck(LogCheck):
-    """Asks whether the poses of a log contradict themselves."""
+    """Checks whether the poses of a log contradict each other."""
 
     records: PoseRecords
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
-        """Say what they contradict; all poses stay."""
+        """Report contradictions; all poses are kept."""
         world = str(header.attributes.get("world_frame"))
         motion, sigma = PoseMotion(world), _Stated()
         for rows in writer.tables(POSES):
@@ -96,7 +96,7 @@ class MotionCheck(LogCheck):
 
 
 def _course(motion: PoseMotion) -> Iterator[Finding]:
-    """Heading against course, pitch against slope."""
+    """Yield findings on heading against course, and pitch against slope."""
     if (heading := motion.heading()) is not None:
         why = "the heading, its north or the axes of the log are wrong, or the unit is mounted turned"
         if heading.is_mounted is not None:
@@ -128,7 +128,7 @@ def _course(motion: PoseMotion) -> Iterator[Finding]:
 
 
 def _constant(same: Sequence[Same]) -> Iterator[Finding]:
-    """Values that do not change, those of one span together."""
+    """Yield findings on values that do not change, grouped by span."""
     spans: dict[tuple[int, int, int], list[Same]] = {}
     for one in same:
         spans.setdefault((one.first_gps_ns, one.last_gps_ns, one.poses), []).append(one)
@@ -184,18 +184,18 @@ def _spacing(motion: PoseMotion) -> Iterator[Finding]:
 
 @dataclass
 class _Stated:
-    """Which poses of a log state a σ."""
+    """Finds which poses of a log state a σ."""
 
     poses: int = 0
     bare: int = 0
     zero: int = 0
     longest: tuple[int, int] = (0, 0)
-    """Epochs of the longest span without one."""
+    """Epochs of the longest span without σ."""
     open_from: int | None = field(default=None)
-    """Epoch since which none was stated."""
+    """Epoch since which no σ was stated."""
 
     def take(self, rows: pa.Table) -> None:
-        """Look at a block of poses."""
+        """Examine a block of poses."""
         epochs = rows.column("epoch_gps_ns").to_numpy()
         values = np.stack([rows.column(name).to_numpy(zero_copy_only=False) for name in _SIGMAS], axis=-1)
         bare: npt.NDArray[np.bool_] = np.asarray(np.isnan(values.astype(np.float64)).any(axis=1))
@@ -211,7 +211,7 @@ class _Stated:
             self._keep(self.open_from, int(epochs[-1]))
 
     def findings(self) -> Iterator[Finding]:
-        """Zeros, and spans without a σ in a log that states some."""
+        """Yield findings on zeros, and on spans without σ in a log that states some."""
         if self.zero:
             yield POSE_SIGMA.finds(
                 "",

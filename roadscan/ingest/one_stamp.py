@@ -1,4 +1,4 @@
-"""Rows that carry one stamp: their clock stood still, and all that they measured would lie on one line."""
+"""Finds rows with one stamp: their clock stood still, so all their measurements would be placed on one line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from roadscan.ingest.reading.format import Rows
 from roadscan.store.logs import LogRecord
 
 STAMPED: Final = ("scans", "imu", "encoder", "gnss")
-"""Tables of which each row has a time of its own. Returns of one sweep may share theirs."""
+"""Tables in which each row has a time. Returns of one sweep may share theirs."""
 
 
 ONE_STAMP: Final = Witness(
@@ -32,29 +32,29 @@ ONE_STAMP: Final = Witness(
 )
 
 VERSION: Final = 1
-"""Raised when other rows are left out, so that logs with a stamp a row are read again."""
+"""Raised when other rows are left out, so that logs with one stamp per row are read again."""
 LEAST_ROWS: Final = 10
-"""So many rows in a row with one stamp are no rounding of stamps that a survey can use."""
+"""Consecutive rows with one stamp from which it is no rounding that a survey can use."""
 STANDS: Final = "the clock stands: the row has the stamp of the rows before it"
 
 
 class StandingClock(LogCheck):
-    """Leaves out rows whose clock stood still, but the first of each stretch."""
+    """Leaves out rows whose clock stood still, except the first of each run of equal stamps."""
 
     def __init__(self) -> None:
         self._before: dict[tuple[str, str], tuple[int, int]] = {}
-        """Epoch of the last row of a table and file, and how many rows before had it."""
+        """Epoch of the last row of a table and file, and how many rows before it had that epoch."""
 
     def refused(self, rows: Rows) -> list[Refused]:
-        """Rows of a chunk (by index) that are left out."""
+        """Return the rows of a chunk (by index) that are left out."""
         if rows.table not in STAMPED or not rows.batch.num_rows or "epoch_gps_ns" not in rows.batch.schema.names:
             return []
         column = rows.batch.column("epoch_gps_ns")
         if column.null_count or not pa.types.is_int64(column.type):
-            return []  # the rules of the table's columns refuse them
+            return []  # the schema's rules for columns reject them
         epochs = column.to_numpy()
         epoch, before = self._before.get((rows.table, rows.file), (int(epochs[0]), 0))
-        starts = np.flatnonzero(np.diff(epochs, prepend=epoch - 1))  # the first is one, whatever came before
+        starts = np.flatnonzero(np.diff(epochs, prepend=epoch - 1))  # the first row follows none
         lengths = np.diff(starts, append=epochs.size)
         carried = np.zeros(starts.size, np.int64)
         carried[0] = before if epochs[0] == epoch else 0
@@ -65,12 +65,12 @@ class StandingClock(LogCheck):
 
 
 def one_stamp_logs(records: Sequence[LogRecord]) -> list[Fault]:
-    """Logs of which most rows have the stamp of their neighbours."""
+    """Return a fault for logs of which most rows have the stamp of their neighbours."""
     return [_fault(r, table) for r in records for table in STAMPED if r.tables.get(table) and _stands(r, table)]
 
 
 def one_stamp_findings(records: Sequence[LogRecord]) -> list[Finding]:
-    """Logs of which some rows are left out since their clock stood still."""
+    """Return findings for logs of which some rows were left out because their clock stood still."""
     return [
         ONE_STAMP.finds(
             r.path,
@@ -84,12 +84,12 @@ def one_stamp_findings(records: Sequence[LogRecord]) -> list[Finding]:
 
 
 def _stands(record: LogRecord, table: str) -> bool:
-    """Whether the clock stood for most of the rows that were left out, or for all that are left (in a first look)."""
+    """Return whether the clock stood for most left-out rows, or (in a first look) for all remaining ones."""
     return record.reject_reasons.get(STANDS, 0) > record.rows or _share(record, table) == 1.0
 
 
 def _share(record: LogRecord, table: str) -> float:
-    """Share of a table's rows that lie in row groups of one stamp; single rows are left out."""
+    """Return the share of a table's rows in row groups with one stamp; single rows are ignored."""
     groups = [
         (rows, first == last)
         for file in record.tables.get(table, ())

@@ -1,4 +1,4 @@
-"""Logs that cannot give anything: those without a row, and those whose times do not meet the poses of their run.
+"""Finds logs that cannot contribute: those without a row, and those whose times never meet the poses of their run.
 
 Both show in the records of ingested logs, before a reading is placed. What is said of clocks is a suggestion and is
 never applied: which of two logs has the wrong clock, only who drove can know.
@@ -39,43 +39,43 @@ Clocks = Mapping[tuple[str, str], ClockCorrection]
 """Estimated corrections by run ('*' for all) and sensor."""
 
 MEASURED: Final = ("scans", "returns", "images", "imu", "encoder", "gnss", "trajectory_accuracy")
-"""Tables whose rows belong to the time that the vehicle drove. Clouds have been placed by another program."""
+"""Tables whose rows were measured while the vehicle drove. Clouds were georeferenced by another program."""
 DRIVEN: Final = {"trajectory": "the poses", "gnss": "the GNSS positions"}
-"""Tables that say when a run was driven, in words; the first that a run has counts."""
+"""Tables that show when a run was driven, in words; the first that a run has is used."""
 _MOST_HOURS: Final = 14
-"""No time zone is farther from UTC."""
-_REASONS: Final = 3
+"""Largest offset of a time zone from UTC (h)."""
+_REASONS: Final = 3  # reasons for rejects that are listed
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A log that gives nothing, or logs of which the same is true, and why."""
+    """A log that contributes nothing, or logs with one common fault, and why."""
 
     keys: tuple[str, ...]
-    """Of the log's record, or of several that share one fault."""
+    """Keys of the records of the log, or of all logs with this fault."""
     path: str
     """Path in the survey file, or several."""
     reason: str
 
     @property
     def told(self) -> tuple[str, str]:
-        """Unit and reason, as a run lists its failures."""
+        """Return unit and reason, as a run lists its failures."""
         return self.path, self.reason
 
 
 class NothingPlacedError(RunError):
-    """No log of readings is left that could be placed."""
+    """No log of readings is left that could be georeferenced."""
 
     @classmethod
     def of(cls, faults: Sequence[Fault]) -> Self:
-        """The error that tells why, log by log."""
+        """Return the error with the reason of each log."""
         lines = [f"{one.path}: {one.reason}" for one in faults]
         listed = f" {lines[0]}" if len(lines) == 1 else "".join(f"\n  - {line}" for line in lines)
         return cls(f"no reading can be placed:{listed}")
 
 
 def empty_logs(records: Sequence[LogRecord]) -> list[Fault]:
-    """Logs without a single row."""
+    """Return the logs without a single row."""
     return [Fault((r.key,), r.path, _empty(r)) for r in records if not r.rows and r.sensor != NAVIGATION]
 
 
@@ -85,7 +85,7 @@ def _empty(record: LogRecord) -> str:
 
 
 def no_row(reject_reasons: Mapping[str, int], file: Path | None = None) -> FormatError:
-    """The error of a log that yields no row, with the number of its rejected records by reason."""
+    """Return the error of a log that yields no row, with the number of its rejected records by reason."""
     rejected = sum(reject_reasons.values())
     if not rejected:
         return FormatError("the log holds no record", change="see what it holds with `roadscan inspect`", file=file)
@@ -97,7 +97,7 @@ def no_row(reject_reasons: Mapping[str, int], file: Path | None = None) -> Forma
 
 
 def reject_words(record: LogRecord) -> str:
-    """Why records of a log were rejected, by count, and where all of them are listed."""
+    """Return why records of a log were rejected, by count, and where all of them are listed."""
     return f"{_reasons(record.reject_reasons)} (listed in the table `rejects`)"
 
 
@@ -119,7 +119,7 @@ REJECTED_SHARE: Final = Witness(
 
 
 def reject_findings(records: Sequence[LogRecord], share: float) -> list[Finding]:
-    """Logs of which more than a share of the records was rejected, and rows are left."""
+    """Return findings for logs with rows of which more than a share of the records was rejected."""
     return [
         REJECTED_SHARE.finds(
             r.path, f"{r.rejected:,} records were rejected beside {r.rows:,} rows: {reject_words(r)}", r.rejected
@@ -130,9 +130,7 @@ def reject_findings(records: Sequence[LogRecord], share: float) -> list[Finding]
 
 
 def can_be_placed(records: Sequence[LogRecord], faults: Sequence[Fault], tables: Sequence[str]) -> bool:
-    """Whether a log with rows in one of `tables` is left that is not at fault, and whose run has poses; clouds need
-    none.
-    """
+    """Return whether a faultless log with rows in one of `tables` is left, whose run has poses; clouds need none."""
     keys = {key for fault in faults for key in fault.keys}
     sound = [r for r in records if r.key not in keys]
     driven = {r.run for r in sound if r.tables.get("trajectory") or r.tables.get("gnss")}
@@ -140,7 +138,7 @@ def can_be_placed(records: Sequence[LogRecord], faults: Sequence[Fault], tables:
 
 
 def apart_logs(survey: Survey, records: Sequence[LogRecord], clocks: Clocks, *, estimated: bool) -> list[Fault]:
-    """Logs that do not overlap the poses of their run in time; where it has none, its GNSS.
+    """Return logs that do not overlap the poses of their run in time (its GNSS where it has none).
 
     Parameters
     ----------
@@ -164,7 +162,7 @@ def apart_logs(survey: Survey, records: Sequence[LogRecord], clocks: Clocks, *, 
 
 @dataclass(frozen=True)
 class _Timed:
-    """A log, the table of its readings, and their span on time."""
+    """A log, the table of its readings, and their time span."""
 
     record: LogRecord
     table: str
@@ -180,7 +178,7 @@ def _timed(record: LogRecord, clock: ClockCorrection | None) -> _Timed | None:
 
 
 def _together(logs: Sequence[_Timed]) -> list[list[_Timed]]:
-    """Logs that overlap one another in time: what is wrong with one of them is wrong with all."""
+    """Return groups of logs that overlap in time: a fault of one applies to all."""
     groups: list[list[_Timed]] = []
     last = 0
     for log in sorted(logs, key=lambda one: one.span):
@@ -207,7 +205,7 @@ class _Driven:
 
     @property
     def span(self) -> Span:
-        """From the first to the last."""
+        """Return the span from first to last."""
         return _union(self.spans)
 
 
@@ -233,7 +231,7 @@ def _meet(a: Span, b: Span) -> bool:
 
 
 def _fault(survey: Survey, run: str, logs: Sequence[_Timed], driven: _Driven) -> Fault:
-    """What is said of logs of a run that overlap one another, and not the poses."""
+    """Return the fault of overlapping logs of a run that do not overlap the poses."""
     records = [one.record for one in logs]
     span = _union([one.span for one in logs])
     hints = list(_hints(survey, records, span, driven))
@@ -260,7 +258,7 @@ def _words(span: Span) -> str:
 
 
 def _hints(survey: Survey, records: Sequence[LogRecord], span: Span, driven: _Driven) -> Iterator[str]:
-    """Settings of the log's clock, and of the poses' clock, that would make the times meet: at most one of each."""
+    """Yield settings of the log's and the poses' clock that would make the times meet: at most one of each."""
     sides = [(r.run, r.path, driven.span, span) for r in driven.records if r.path][:1]
     sides += [(r.run, r.path, span, driven.span) for r in records]
     said: set[str] = set()
@@ -283,13 +281,13 @@ def _stated_clock(survey: Survey, run: str, path: str) -> ClockConfig | None:
 
 
 def _would_meet(span: Span, other: Span) -> bool:
-    """Whether half of the shorter one would lie within the other."""
+    """Return whether half of the shorter span would lie within the other."""
     shorter = min(span[1] - span[0], other[1] - other[0])
     return min(span[1], other[1]) - max(span[0], other[0]) >= shorter / 2
 
 
 def _changes(clock: ClockConfig | None, own: Span, other: Span) -> Iterator[tuple[int, str]]:
-    """What else a clock could be: seconds added to the epochs, and the setting in words."""
+    """Yield alternative clocks: seconds added to the epochs, and the setting in words."""
     stated = 0.0 if clock is None else clock.offset_s
     first_s = own[0] // NS_PER_S
     missing_s = ((other[0] + other[1]) - (own[0] + own[1])) / 2 / NS_PER_S
@@ -328,7 +326,7 @@ def _other_week(clock: ClockConfig, own: Span, weeks: int) -> Iterator[tuple[int
 
 
 def _slips(first_s: int, missing_s: float) -> Iterator[tuple[int, str]]:
-    """Amounts by which clocks are wrong in practice (s), whatever their system."""
+    """Yield common clock errors (s) of any time system."""
     leap_s = int(leap_seconds_at_gps(first_s))
     sign = 1 if missing_s > 0 else -1
     yield sign * leap_s, f"the {leap_s} leap seconds between UTC and GPS time"
@@ -355,7 +353,7 @@ _COUNTS: Final = (
 
 
 def _epoch_s(system: TimeSystem, count_s: int) -> int:
-    """GPS seconds of a count of seconds."""
+    """Return the GPS seconds of a count of seconds."""
     match system:
         case TimeSystem.GPS_ADJUSTED:
             return count_s + ADJUSTED_OFFSET_S
@@ -370,7 +368,7 @@ def _epoch_s(system: TimeSystem, count_s: int) -> int:
 
 
 def _count(system: TimeSystem, gps_s: int) -> int:
-    """Count of seconds that a clock of a system shows at GPS seconds."""
+    """Return the count of seconds that a clock of a system shows at GPS seconds."""
     if system is TimeSystem.UNIX_UTC:
         return gps_s + GPS_EPOCH_UNIX_S - int(leap_seconds_at_gps(gps_s))
     return gps_s - _epoch_s(system, 0)

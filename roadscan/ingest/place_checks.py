@@ -1,5 +1,5 @@
-"""Records that lie where no road is: points outside the area of their CRS, fixes at latitude 0,
-longitude 0. One such place would size all that is made of an extent, so it is left out before its row is kept.
+"""Finds records where no road is: points outside the area of their CRS, fixes at latitude 0, longitude 0. One such
+place would enlarge every extent, so it is left out before its row is stored.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ NO_FIX_GNSS: Final = Witness(
 )
 
 BEYOND_DEG: Final = 10.0
-"""Points farther than this outside the area of their CRS are left out, as `preflight` refuses positions."""
+"""Points farther outside the area of their CRS are left out, as `preflight` refuses such positions (degrees)."""
 NO_FIX: Final = "the position is latitude 0, longitude 0, or the centre of the Earth: there was no fix"
 _OUTSIDE: Final = f"the point lies over {BEYOND_DEG:g}° outside the area of the cloud's CRS"
-_NO_FIX_M: Final = 1e-3
+_NO_FIX_M: Final = 1e-3  # positions this near to latitude 0, longitude 0, or to the Earth's centre are no fix
 
 PLACED: Final = ("cloud", "gnss")
-"""Tables whose rows are looked at."""
+"""Tables whose rows are checked."""
 
 Fault = tuple[npt.NDArray[np.int64], str]
 
 
 def place_faults(table: str, batch: pa.RecordBatch, header: LogHeader) -> list[Fault]:
-    """Rows of a batch that lie where no road is, with the reason; none of other tables than `PLACED`."""
+    """Return the rows of a batch where no road is, with the reason; none for tables that are not in `PLACED`."""
     if table == "cloud":
         return _cloud_faults(batch, header.attributes)
     if table == "gnss" and header.attributes.get("world_frame", LOCAL_WORLD) != LOCAL_WORLD:
@@ -65,7 +65,7 @@ def place_faults(table: str, batch: pa.RecordBatch, header: LogHeader) -> list[F
 
 
 def without_fix(position_world_m: Float64) -> Bool:
-    """Which geocentric positions (n, 3) are latitude 0, longitude 0, or the centre of the Earth."""
+    """Return which geocentric positions (n, 3) are latitude 0, longitude 0, or the centre of the Earth."""
     with np.errstate(invalid="ignore"):
         x, y, z = position_world_m.T
         at_zero: Bool = (np.hypot(y, z) < _NO_FIX_M) & (x > -_NO_FIX_M)
@@ -89,7 +89,7 @@ def _faults(*found: tuple[Bool, str]) -> list[Fault]:
 
 @functools.lru_cache(maxsize=64)
 def _box_m(crs: str) -> tuple[float, float, float, float]:
-    """West, south, east, north (m) of the area of a CRS and 10° around it; of the Earth's girth where it has none."""
+    """Return west, south, east, north (m) of a CRS's area and 10° around it; of the whole Earth where it has none."""
     whole = (-GRID_MAX_M, -GRID_MAX_M, GRID_MAX_M, GRID_MAX_M)
     try:
         known = None if crs == LOCAL_WORLD else crs_from_text(crs)

@@ -1,4 +1,4 @@
-"""Which logs a survey has: found, fingerprinted, and keyed by everything that shapes their rows."""
+"""Plans the logs of a survey: finds and fingerprints them, and computes their keys."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CONTROL_SENSOR: Final = "control"
 
 @dataclass(frozen=True)
 class PlannedLog:
-    """A log of the survey file with all that identifies it."""
+    """A log of the survey file with everything that identifies it."""
 
     run: str
     sensor: str
@@ -90,7 +90,7 @@ def plan_logs(survey: Survey, store: Store, *, only_looks: bool = False) -> Logs
 
 
 def _check_mounting(format_: LogFormat, name: str, sensor: Sensor, path: Path) -> None:
-    """Refuse a lever arm or axes for readings that their maker has placed in the vehicle's frame already."""
+    """Refuse a lever arm or axes for readings that are already in the vehicle's frame."""
     if not format_.vehicle_axes or sensor.mounts_vehicle_frame:
         return
     applied = Sensor(kind=sensor.kind, axes=format_.vehicle_axes)
@@ -128,7 +128,7 @@ def _open_log(survey: Survey, config: LogConfig | ControlConfig, sources: Source
 
 
 def _source_defaults(survey: Survey, config: LogConfig | ControlConfig) -> SourceDefaults:
-    """What the survey file says of all logs and this one does not state."""
+    """Return the survey file's defaults for what this log does not state."""
     stated = survey.config.defaults
     if stated is None or not isinstance(config, LogConfig):
         return SourceDefaults()
@@ -170,7 +170,7 @@ def _plan_log(
     name = sensor or (format_.yields[0] if is_log else CONTROL_SENSOR)
     key = key_of(*shaping, *_checks_of(format_))
     if not path.exists() and not has_log(store, key):
-        # It was archived after an earlier reader or earlier checks had read it: its rows stay.
+        # It was archived after an earlier version of reader or checks had read it: its rows stay.
         earlier = (
             key_of(format_.name, before, *shaping[2:], *checks)
             for before in range(format_.version, 0, -1)
@@ -181,7 +181,7 @@ def _plan_log(
 
 
 def _checks_of(format_: LogFormat) -> list[list[object]]:
-    """Versions of the checks that leave out rows of a format: part of the key of its logs."""
+    """Return the versions of the checks that leave out rows of a format, as part of the key of its logs."""
     found: list[list[object]] = []
     if {POSES, FIXES} & set(format_.yields):
         found.append(["poses", POSE_CHECKS])
@@ -193,7 +193,7 @@ def _checks_of(format_: LogFormat) -> list[list[object]]:
 
 
 def _earlier_checks(format_: LogFormat) -> list[list[list[object]]]:
-    """What :func:`_checks_of` was in earlier versions, the latest first."""
+    """Return what :func:`_checks_of` returned in earlier versions, the latest first."""
     places: list[list[object]] = [["places", 1]] if set(PLACED) & set(format_.yields) else []
     first: list[list[object]] = [["poses", 1]] if POSES in format_.yields else []
     second: list[list[object]] = [["poses", 2]] if {POSES, FIXES} & set(format_.yields) else []
@@ -204,7 +204,7 @@ def _earlier_checks(format_: LogFormat) -> list[list[list[object]]]:
 def log_source(
     survey: Survey, config: LogConfig | ControlConfig, path: Path, format_: LogFormat, options: Strict
 ) -> LogSource:
-    """What a reader is told of a log; nothing of the log is read for it.
+    """Return the description of a log for its reader; nothing of the log is read.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Poses and GNSS positions that no vehicle can have taken are left out of a log's rows; steps of them are named.
+"""Leaves out poses and GNSS positions that no vehicle can have taken, and reports steps of them.
 
-It is done when all rows of the log are read and lie in order of time: readers stream, and a pose shows to be wrong by
+This needs all rows of the log in order of time: readers stream, and a pose is only seen to be wrong by
 those that follow it. No row is changed; one that is left out is a reject of its record. Velocities that a log states
-are held until then, and kept in no table.
+are kept until then, and stored in no table.
 """
 
 from __future__ import annotations
@@ -80,15 +80,15 @@ POSE_STAMPS: Final = Witness(
 )
 
 POSES, FIXES = "trajectory", "gnss"
-"""Tables whose positions are looked at."""
+"""Tables whose positions are checked."""
 _NOUN: Final = {POSES: "pose", FIXES: "GNSS position"}
 _GNSS_VELOCITY: Final = ("velocity_north_m_per_s", "velocity_east_m_per_s", "velocity_down_m_per_s")
 _BESIDE: Final = 4_000
-"""Poses of the files before and after that are looked at together with those of a file."""
+"""Poses of the files before and after that are examined together with those of a file."""
 _NO_FIX_SHARE: Final = 0.5
-"""Where more poses than that lie at latitude 0, longitude 0, it is the place of the survey (a simulated one)."""
+"""If more poses lie at latitude 0, longitude 0, it is the place of the survey (a simulated one)."""
 _NAMED: Final = 3
-"""So many steps are named, the largest."""
+"""Largest steps that are listed."""
 
 _ELSEWHERE: Final = "the position leaps away from the ones before and after it, as no vehicle moves"
 _FROZEN: Final = "position and attitude repeat those of the pose before to the bit, while the vehicle drives on"
@@ -97,13 +97,13 @@ _TURNED: Final = "the attitude leaps away from the poses before and after it, as
 
 @dataclass
 class PoseRecords(LogCheck):
-    """Which records the poses, or the GNSS positions, of a log come from, and the velocities that it states."""
+    """The records of a log's poses or GNSS positions, and the velocities that the log states."""
 
     _parts: list[tuple[str, Int64, Int64, Int64]] = field(default_factory=list)
     _velocities: list[npt.NDArray[np.float32]] = field(default_factory=list)
 
     def take(self, item: Rows, refused: Sequence[Int64]) -> None:
-        """Remember epochs, records and velocities of rows with positions, but those that were refused."""
+        """Store epochs, records and velocities of rows with positions, except the refused ones."""
         if item.table not in _NOUN or not item.batch.num_rows:
             return
         count = item.batch.num_rows
@@ -116,7 +116,7 @@ class PoseRecords(LogCheck):
             self._velocities.append(item.velocity_level_m_per_s[kept])
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
-        """Leave out the places that no vehicle can have taken."""
+        """Leave out the positions that no vehicle can have taken."""
         for table in _NOUN:
             if writer.rows[table]:
                 check_poses(writer, table, str(header.attributes["world_frame"]), self)
@@ -135,14 +135,14 @@ class PoseRecords(LogCheck):
         return epochs[order], velocities[order]
 
     def of(self, epochs: Int64) -> Iterator[tuple[str, int, int, int]]:
-        """File, record, offset and epoch of each pose that has one of these epochs, in the order of the log."""
+        """Yield file, record, offset and epoch of each pose with one of these epochs, in the order of the log."""
         for file, own, records, offsets in self._parts:
             for k in np.flatnonzero(np.isin(own, epochs)).tolist():
                 yield file, int(records[k]), int(offsets[k]), int(own[k])
 
 
 def check_poses(writer: LogWriter, table: str, world: str, records: PoseRecords) -> None:
-    """Leave out of a finished log's rows the places that no vehicle can have taken; they become rejects and findings.
+    """Leave positions that no vehicle can have taken out of a finished log; they become rejects and findings.
 
     Parameters
     ----------
@@ -165,19 +165,19 @@ def check_poses(writer: LogWriter, table: str, world: str, records: PoseRecords)
 
 @dataclass
 class _Found:
-    """What is wrong with the poses, or GNSS positions, of a log, from all of its files."""
+    """Faults of a log's poses, or GNSS positions, over all of its files."""
 
     table: str
     reasons: dict[int, str] = field(default_factory=dict)
     """Epoch (GPS ns) of each pose to leave out, and why."""
     largest: dict[str, tuple[float, int]] = field(default_factory=dict)
-    """Size (m, rad) and epoch of the largest leap by reason."""
+    """Size (m, rad) and epoch of the largest leap, by reason."""
     steps: list[tuple[int, Step]] = field(default_factory=list)
     covered: list[tuple[int, Step]] = field(default_factory=list)
     stalls: list[tuple[int, Stall]] = field(default_factory=list)
 
     def add(self, epochs: Int64, leaps: Leaps) -> None:
-        """Take what was found in a file."""
+        """Add the faults of a file."""
         for mask, size, reason in (
             (leaps.position, leaps.shift_m, _ELSEWHERE),
             (leaps.attitude, leaps.turn_rad, _TURNED),
@@ -190,7 +190,7 @@ class _Found:
         self.stalls += [(int(epochs[one.after]), one) for one in leaps.stalls]
 
     def findings(self, told: Sequence[tuple[str, int, int, int]]) -> list[Finding]:
-        """One for the poses that were left out, one for each kind of steps."""
+        """Return one finding for the poses that were left out, and one for each kind of steps."""
         found: list[Finding] = []
         record_of = {epoch: record for _, record, _, epoch in told}
         for reason, (size, epoch) in sorted(self.largest.items()):
@@ -231,12 +231,12 @@ class _Found:
         return found
 
     def _counted(self, count: int, one: str, many: str) -> str:
-        """How many poses or positions, with the verb that fits."""
+        """Return the number of poses or positions in words, with the verb."""
         return f"{counted(count, _NOUN[self.table])} {one if count == 1 else many}"
 
 
 def _step_words(steps: Sequence[tuple[int, Step]], noun: str) -> str:
-    """How often poses or positions step, and the largest steps."""
+    """Return in words how often poses or positions step, and the largest steps."""
     largest = sorted(steps, key=lambda one: (-one[1].shift_m, -one[1].turn_rad, one[0]))[:_NAMED]
     words = ", ".join(f"by {_size_words(one)} at {iso_from_gps_ns(epoch)}" for epoch, one in largest)
     if len(steps) == 1:
@@ -246,7 +246,7 @@ def _step_words(steps: Sequence[tuple[int, Step]], noun: str) -> str:
 
 
 def _stall_words(stalls: Sequence[tuple[int, Stall]]) -> str:
-    """How far the stamps jump, at the largest gap."""
+    """Return in words how far the stamps jump, at the largest gap."""
     epoch, one = max(stalls, key=lambda stall: stall[1].gap_s)
     more = f", and {counted(len(stalls) - 1, 'time')} more" if len(stalls) > 1 else ""
     jump_s = one.gap_s - one.way_m / one.speed_m_per_s
@@ -264,7 +264,7 @@ def _size_words(step: Step) -> str:
 
 
 def _without_fix(writer: LogWriter, world: str) -> Int64:
-    """Epochs of poses at latitude 0, longitude 0, or at the centre of the Earth."""
+    """Return epochs of poses at latitude 0, longitude 0, or at the centre of the Earth."""
     if world == LOCAL_WORLD:
         return np.zeros(0, np.int64)
     found, total = list[Int64](), 0
@@ -277,17 +277,17 @@ def _without_fix(writer: LogWriter, world: str) -> Int64:
 
 
 class _Reading(NamedTuple):
-    """How rows become a track."""
+    """How rows are converted to a track."""
 
     world: str
     no_fix: Int64
-    """Epochs of poses that have no place."""
+    """Epochs of poses without a position."""
     velocities: tuple[Int64, npt.NDArray[np.float32]] | None
-    """Epochs and velocities of the log's rows, of a trajectory that states them."""
+    """Epochs and velocities of the log's rows, for a trajectory that states them."""
 
 
 def _judged(writer: LogWriter, table: str, reading: _Reading) -> Iterator[tuple[Int64, Leaps, Int64]]:
-    """What :func:`_judge` says of each file of poses, together with poses of the files before and after it."""
+    """Yield the result of :func:`_judge` for each file of poses, with the poses of the files before and after it."""
     window: list[pa.Table] = []
     for rows in [*writer.tables(table), None]:
         if len(window) > 0:
@@ -298,7 +298,7 @@ def _judged(writer: LogWriter, table: str, reading: _Reading) -> Iterator[tuple[
 
 
 def _judge(own: pa.Table, rows: pa.Table, reading: _Reading) -> tuple[Int64, Leaps, Int64]:
-    """Epochs and leaps of the poses of a table, and epochs of those that are frozen, with those around it."""
+    """Return epochs and leaps of the poses of a table, and epochs of frozen ones, given the poses around it."""
     first, last = (int(own.column("epoch_gps_ns")[k].as_py()) for k in (0, -1))
     track = pose_track(rows, *reading)
     still = frozen(track) if "qw" in rows.column_names else np.zeros(track.epochs_gps_ns.size, bool)
@@ -319,7 +319,7 @@ def _judge(own: pa.Table, rows: pa.Table, reading: _Reading) -> tuple[Int64, Lea
 def pose_track(
     rows: pa.Table, world: str, no_fix: Int64, velocities: tuple[Int64, npt.NDArray[np.float32]] | None = None
 ) -> PoseTrack:
-    """Places of rows of `POSES` or `FIXES`, the first of each epoch, without those that have no fix.
+    """Return the positions of rows of `POSES` or `FIXES`, the first of each epoch, without those that have no fix.
 
     GNSS has no attitude: it is taken to be one and the same.
     """
@@ -354,7 +354,7 @@ def pose_track(
 
 
 def _world_velocities(world: str, epochs: Int64, position: Float64, level: Float64) -> Float64:
-    """Velocities (n, 3) in a world frame of those north, east, down; where down is missing, that of the positions."""
+    """Return velocities (n, 3) in a world frame from north, east, down; a missing down is taken from the positions."""
     north, east = level[:, 0], level[:, 1]
     if world == LOCAL_WORLD:
         from_level = np.broadcast_to([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]], (len(level), 3, 3))

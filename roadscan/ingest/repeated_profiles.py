@@ -1,4 +1,4 @@
-"""Profiles that repeat the one before, reading by reading: a scanner that is stuck, or a buffer that is sent again."""
+"""Finds profiles that repeat the one before in every reading: a scanner that is stuck, or a buffer sent again."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ REPEATED_PROFILES: Final = Witness(
 )
 
 LEAST_REPEATS: Final = 3
-"""So many profiles in a row that equal the one before are no chance: a coarse scanner at a standstill repeats some."""
+"""Consecutive repeats from which they are no coincidence: a coarse scanner at a standstill repeats some."""
 _SAMPLED: Final = 8
 """Readings of a profile that are compared first: most profiles differ in one of them."""
 
 
 class RepeatedProfiles(LogCheck):
-    """Counts repeated profiles of a log while it streams by, in the order of its file."""
+    """Counts repeated profiles of a log while it streams, in file order."""
 
     def __init__(self) -> None:
         self._last: npt.NDArray[np.generic] | None = None
@@ -59,7 +59,7 @@ class RepeatedProfiles(LogCheck):
         self._last = ranges[-1].copy()
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
-        """Say how many profiles repeat."""
+        """Report how many profiles repeat."""
         self._count(repeats=False, epoch_gps_ns=0)
         if not self._repeats:
             return
@@ -82,7 +82,7 @@ class RepeatedProfiles(LogCheck):
 
 
 def _equal_rows(before: npt.NDArray[np.generic], after: npt.NDArray[np.generic]) -> npt.NDArray[np.bool_]:
-    """Rows (n,) of two arrays (n, k) that are equal and show something: readings that are not all the same."""
+    """Return which rows (n,) of two arrays (n, k) are equal and not all of one value."""
     columns = np.linspace(0, after.shape[1] - 1, _SAMPLED).astype(int)
     same: npt.NDArray[np.bool_] = (before[:, columns] == after[:, columns]).all(axis=1)
     rows = np.flatnonzero(same)

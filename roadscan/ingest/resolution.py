@@ -1,4 +1,4 @@
-"""The resolution that the values of a log have, measured from its rows: columns of 32 bits, too few decimals.
+"""Measures the resolution of a log's values from its rows: 32-bit columns, too few decimals.
 
 A column is rounded where all its values lie on a grid, and neighbours jump about on it: an even motion that happens to
 lie on the grid does not.
@@ -34,37 +34,37 @@ COARSE_VALUES: Final = Witness(
 )
 
 POSITION_M: Final = 0.02
-"""Positions in coarser steps are named: a fifth of the usual cell of 0.1 m."""
+"""Coarser steps of positions (m) are reported: a fifth of the usual cell of 0.1 m."""
 _ANGLE_DEG: Final = 0.05
-"""Angles in coarser steps are named: 1 cm at 10 m."""
+"""Coarser steps of angles (degrees) are reported: 1 cm at 10 m."""
 _WAY_M: Final = 0.05
-"""Stamps are named whose steps are longer than a vehicle needs for this way; errors are a third of a step."""
+"""Stamps are reported if the vehicle drives farther than this (m) in one step; errors are a third of a step."""
 
 _ROWS: Final = 20_000
-"""Rows that are looked at, the first of the log."""
-_LEAST_ROWS: Final = 20
+"""Rows that are examined, from the start of the log."""
+_LEAST_ROWS: Final = 20  # least rows and values for a verdict
 _JUMPING: Final = 0.3
-"""Second differences of rounded values are larger than this share of the step …"""
+"""Second differences of rounded values exceed this share of the step …"""
 _SHARE: Final = 0.1
 """… in more than this share of the rows."""
-_METRES_PER_DEG: Final = 111_320.0
+_METRES_PER_DEG: Final = 111_320.0  # length of a degree of latitude
 _TABLES: Final = ("trajectory", "gnss", "cloud")
 
 
 class _Column(NamedTuple):
-    """Values as the log may hold them."""
+    """Values in the unit that the log may have stored."""
 
     name: str
     values: Float64
     unit: str
     to_tolerance: float
-    """What a unit is in that of the tolerance (m, °)."""
+    """Size of the column's unit in that of the tolerance (m, °)."""
     most: float
-    """Steps up to this are fine, in the unit of the tolerance."""
+    """Largest acceptable step, in the unit of the tolerance."""
 
 
 def resolution_findings(writer: LogWriter, header: LogHeader, source: LogSource) -> list[Finding]:
-    """What is coarse in the rows of a finished log: one finding, or none."""
+    """Return one finding on the coarse values of a finished log, or none."""
     words = [
         words
         for table in _TABLES
@@ -80,7 +80,7 @@ def resolution_findings(writer: LogWriter, header: LogHeader, source: LogSource)
 
 
 def _coarse(table: str, rows: pa.Table, header: LogHeader, source: LogSource) -> Iterator[str]:
-    """Words for each coarse column of a table."""
+    """Yield a description of each coarse column of a table."""
     world = str(header.attributes.get("world_frame", LOCAL_WORLD))
     columns = list(_cloud_columns(rows) if table == "cloud" else _place_columns(rows, world, source))
     yield from _coarse_columns(columns, _sigma_m(rows) if table == "gnss" else 0.0)
@@ -91,7 +91,7 @@ def _coarse(table: str, rows: pa.Table, header: LogHeader, source: LogSource) ->
 
 
 def _coarse_columns(columns: Sequence[_Column], sigma: float) -> Iterator[str]:
-    """Words for columns that are coarser than they may be, and than their σ; none where no column jumps on its grid."""
+    """Yield descriptions of columns coarser than tolerance and σ; none if no column jumps on its grid."""
     found = [(column, *_grid_of(column)) for column in columns]
     if not any(jumps and step * column.to_tolerance > max(column.most, sigma) for column, step, jumps in found):
         return
@@ -103,7 +103,7 @@ def _coarse_columns(columns: Sequence[_Column], sigma: float) -> Iterator[str]:
 
 
 def _grid_of(column: _Column) -> tuple[float, bool]:
-    """Grid of a column in its unit; degrees may have been held as radians."""
+    """Return the grid of a column in its unit; degrees may have been stored as radians."""
     step, jumps = grid_of(column.values)
     if step == 0.0 and column.unit == "°":
         step, jumps = grid_of(np.radians(column.values))
@@ -112,7 +112,7 @@ def _grid_of(column: _Column) -> tuple[float, bool]:
 
 
 def _coarse_stamps(rows: pa.Table) -> Iterator[str]:
-    """Words for stamps that are rounded, where the vehicle moves by more meanwhile."""
+    """Yield descriptions of stamps that are rounded to more than the vehicle's motion allows."""
     epochs = rows.column("epoch_gps_ns").to_numpy()
     step_s, jumps = grid_of((epochs - epochs[0]).astype(np.float64) / NS_PER_S)
     xyz = _values(rows, "x_world_m", "y_world_m", "z_world_m")
@@ -126,7 +126,7 @@ def _coarse_stamps(rows: pa.Table) -> Iterator[str]:
 
 
 def grid_of(values: Float64) -> tuple[float, bool]:
-    """Step of the grid on which values (n,), in order of time, lie, 0 for none; and whether they jump about on it.
+    """Return the step of the grid of values (n,) in order of time (0 for none), and whether they jump on it.
 
     Looked for are tens and parts of ten, these of a minute of 60 to the unit, halves of halves, and 32-bit numbers.
     """
@@ -146,7 +146,7 @@ def grid_of(values: Float64) -> tuple[float, bool]:
 
 
 def _steps(values: Float64) -> list[float]:
-    """Steps that are looked for, the largest first: none that is finer than a millionth of the range."""
+    """Return the candidate steps, the largest first, down to a millionth of the range."""
     least = max(float(np.ptp(values)) * 1e-6, 1e-9)
     tens = [10.0**k for k in range(1, -10, -1)]
     every = tens + [one / 60.0 for one in tens] + [2.0**-k for k in range(1, 12)]
@@ -167,7 +167,7 @@ def _cloud_columns(rows: pa.Table) -> Iterator[_Column]:
 
 
 def _place_columns(rows: pa.Table, world: str, source: LogSource) -> Iterator[_Column]:
-    """Positions in the CRS that is stated for the log, which its values are in."""
+    """Yield the positions in the log's stated CRS."""
     xyz = _values(rows, "x_world_m", "y_world_m", "z_world_m")
     xyz = xyz[np.isfinite(xyz).all(axis=1)]
     stated = source.defaults.crs if source.crs is None else source.crs
@@ -191,7 +191,7 @@ def _place_columns(rows: pa.Table, world: str, source: LogSource) -> Iterator[_C
 
 
 def _angle_columns(rows: pa.Table, world: str) -> Iterator[_Column]:
-    """Roll, pitch and heading against the local level."""
+    """Yield roll, pitch and heading relative to the local level."""
     quaternion = _values(rows, "qw", "qx", "qy", "qz")
     xyz = _values(rows, "x_world_m", "y_world_m", "z_world_m")
     if world == LOCAL_WORLD:
@@ -205,7 +205,7 @@ def _angle_columns(rows: pa.Table, world: str) -> Iterator[_Column]:
 
 
 def _sigma_m(rows: pa.Table) -> float:
-    """Usual stated σ of positions (m); 0 where none is stated."""
+    """Return the usual stated σ of positions (m); 0 where none is stated."""
     if "sigma_north_m" not in rows.column_names:
         return 0.0
     sigma = _values(rows, "sigma_north_m")[:, 0]

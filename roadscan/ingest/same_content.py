@@ -1,4 +1,4 @@
-"""Logs that hold the same bytes under two names: a copy, or one drive that would count as two."""
+"""Finds logs with the same bytes under two names: a copy, or one drive that would count twice."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ SAME_CONTENT: Final = Witness(
 _READINGS: Final = ("scans", "returns", "cloud", "images")
 """Tables of which no two runs share a log. One trajectory may cover several runs."""
 _FRAME: Final = ("crs", "height", "geoid", "vertical_crs")
-"""What the coordinates of two clouds have to be, for their middles to be compared."""
+"""Attributes of the coordinates that two clouds must share for their means to be compared."""
 _SAME_MIDDLE_M: Final = 0.005
-"""Two clouds of as many points of the same times are one where their means differ by less: the coarsest usual scale is
-0.01 m, and two scanners of one vehicle are farther apart."""
+"""Two clouds with equal counts and times are one if their means differ by less (m): the coarsest usual scale is 0.01 m,
+and two scanners of one vehicle are farther apart."""
 _COMPARED_BYTES: Final = 1 << 20
-"""Bytes of either end that are compared, where sizes are the same."""
+"""Bytes at either end that are compared between files of equal size."""
 
 
 def same_content_findings(survey: Survey, records: Sequence[LogRecord]) -> list[Finding]:
-    """Copies among the survey file's logs, and readings that count twice."""
+    """Return findings on copies among the survey file's logs, and on readings that count twice."""
     listed = {(run.id, str(log.path)): log for run in survey.config.runs for log in run.logs}
     return [*_copies(survey, listed, records), *_twice(listed, records), *_same_points(records)]
 
@@ -44,7 +44,7 @@ def same_content_findings(survey: Survey, records: Sequence[LogRecord]) -> list[
 def _copies(
     survey: Survey, listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord]
 ) -> Iterator[Finding]:
-    """Logs without a record of their own, whose bytes and settings are those of another."""
+    """Yield findings on logs without a record whose bytes and settings are those of another."""
     known = {(r.run, r.path) for r in records}
     for (run, path), config in listed.items():
         file = survey.resolve(config.path)
@@ -61,7 +61,7 @@ def _copies(
 
 
 def _twice(listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord]) -> Iterator[Finding]:
-    """Readings of the same bytes in two runs, or of two sensors by the same settings."""
+    """Yield findings on readings of the same bytes in two runs, or of two sensors with the same settings."""
     groups: dict[str, list[LogRecord]] = defaultdict(list)
     for record in records:
         if any(table in record.tables for table in _READINGS):
@@ -96,7 +96,7 @@ def same_points(records: Sequence[LogRecord]) -> Iterator[tuple[LogRecord, LogRe
 
 
 def _same_points(records: Sequence[LogRecord]) -> Iterator[Finding]:
-    """What is said of such clouds."""
+    """Yield findings on such clouds."""
     for first, later in same_points(records):
         text = f"its {later.rows:,} points have the times and the middle of those of {first.path}"
         if first.run == later.run:
@@ -114,7 +114,7 @@ def _settings(config: LogConfig) -> dict[str, object]:
 
 
 def _is_copy(file: Path, other: Path) -> bool:
-    """Whether two files are of one size and have the same ends."""
+    """Return whether two files have the same size and the same ends."""
     try:
         size = file.stat().st_size
         if size != other.stat().st_size:

@@ -1,4 +1,4 @@
-"""Fingerprints of raw logs: what a log is known by, whatever its path."""
+"""Fingerprints raw logs, which identify them whatever their path."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _SOURCES: Final = "manifest/sources.json"
 _COPY: Final = "manifest/sources_copy.json"
 
 _NEAR: Final = 2
-"""So many folders above the survey file's a log is still near."""
+"""Most folders above the survey file's in which a log is named by a relative path."""
 
 Known = list[Any]
 """Size (bytes), time of the last change (ns) and digest of a file."""
 
 
 class Sources:
-    """Fingerprints of raw logs; a file of unchanged size and time is not read again, a log moved away is remembered.
+    """Fingerprints of raw logs; unchanged files (by size and time) are not read again, and moved logs are remembered.
 
     Logs are known by their paths from the survey file's folder, where they lie below it or near it: survey, store and
     logs may move together.
@@ -45,7 +45,7 @@ class Sources:
         self._now: dict[str, Any] = {}
 
     def format(self, path: Path, stated: str | None) -> LogFormat:
-        """Format of a log: as stated, as remembered, or found from its bytes."""
+        """Return the format of a log: as stated, as remembered, or found from its bytes."""
         if self._forgotten and not is_there(path):
             raise FormatError(
                 "the log does not exist",
@@ -61,7 +61,7 @@ class Sources:
         return format_named(stated) if stated else claimed_format(path)
 
     def begin(self, path: Path, format_: LogFormat, companions: list[Path]) -> dict[str, Future[Known]]:
-        """Start to fingerprint a log's files and companions, by their names: hashing runs in threads."""
+        """Start to fingerprint a log's files and companions in threads; return the results by file name."""
         before = self._before.get(self._name(path), {"files": {}})["files"]
         if path.exists():
             named = _named(path, format_, companions)
@@ -74,8 +74,8 @@ class Sources:
         raise FormatError("the log does not exist", change="check its path in the survey file", file=path)
 
     def end(self, path: Path, format_: LogFormat, begun: dict[str, Future[Known]]) -> tuple[str, int, str]:
-        """Fingerprint over names and contents of a log's files and companions, their bytes in all, and their stamp as
-        of :func:`stamp_of`.
+        """Return the fingerprint over names and contents of a log's files and companions, their total bytes, and their
+        stamp as of :func:`stamp_of`.
         """
         files = {name: future.result() for name, future in begun.items()}
         self._now[self._name(path)] = {"format": format_.name, "files": files}
@@ -86,7 +86,7 @@ class Sources:
         return combined.hexdigest(), sum(size for size, _, _ in files.values()), stamp
 
     def save(self) -> None:
-        """Keep what was learnt; logs that are no longer listed stay known.
+        """Store the fingerprints; logs that are no longer listed are kept.
 
         Who may only read the store can ask it all the same, and learns it each time.
         """
@@ -120,7 +120,7 @@ def open_sources(store: Store, folder: Path, *, only_looks: bool = False) -> Ite
 
 
 def listed_name(path: Path, folder: Path) -> str:
-    """What the list calls a log: its path from the survey file's folder where it is near, else its absolute path."""
+    """Return a log's name in the list: its path from the survey file's folder if near, else its absolute path."""
     try:
         name = Path(os.path.relpath(path, folder))
     except ValueError:  # on another drive
@@ -129,19 +129,19 @@ def listed_name(path: Path, folder: Path) -> str:
 
 
 def _renamed(known: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """What is known of logs by the names that they have now: older lists hold absolute paths alone."""
+    """Return what is known of logs by their present names: older lists only have absolute paths."""
     named = {listed_name(Path(path), folder): of for path, of in known.items() if Path(path).is_absolute()}
     return named | {path: of for path, of in known.items() if not Path(path).is_absolute()}
 
 
 def remembered_formats(store: Store, folder: Path) -> dict[str, str]:
-    """Names of the formats of logs that the store knows, by :func:`listed_name`: such a log may have moved away."""
+    """Return the formats of logs that the store knows, by :func:`listed_name`: such a log may have moved away."""
     known, _ = _remembered(store)
     return {path: str(of["format"]) for path, of in _renamed(known or {}, folder).items()}
 
 
 def stamp_of(path: Path, format_: LogFormat, companions: list[Path]) -> str:
-    """Hash of the sizes and times of a log's files and companions: another one says that it changes, being uploaded.
+    """Return a hash of the sizes and times of a log's files and companions; it changes while a log is being uploaded.
 
     Raises
     ------
@@ -157,13 +157,13 @@ def _stamp(files: dict[str, tuple[int, int]]) -> str:
 
 
 def _named(path: Path, format_: LogFormat, companions: list[Path]) -> dict[str, Path]:
-    """Files of a log and its companions by the names that they have in its fingerprint."""
+    """Return files of a log and its companions by their names in its fingerprint."""
     named = {_name(file, path): file for file in format_.files(path)}
     return named | {f"beside:{file.name}": file for file in companions if file not in named.values()}
 
 
 def is_unchanged(store: Store, folder: Path, path: Path, format_: LogFormat, companions: list[Path]) -> bool:
-    """True if a log's files still hold the bytes that they were fingerprinted with; reads all of them.
+    """Return True if a log's files still have the fingerprinted bytes; reads all of them.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def is_unchanged(store: Store, folder: Path, path: Path, format_: LogFormat, com
 
 
 def damaged_sources(store: Store) -> list[str]:
-    """In words, whether what is known of logs is damaged; the next run mends it."""
+    """Return in words whether the list of fingerprints is damaged; the next run repairs it."""
     known, is_whole = _remembered(store)
     if is_whole:
         return []
@@ -186,8 +186,8 @@ def damaged_sources(store: Store) -> list[str]:
 
 
 def _remembered(store: Store) -> tuple[dict[str, Any] | None, bool]:
-    """What is known of logs by path, and whether that is as it was kept. It may be that of the copy, or None: then
-    their files are read again.
+    """Return what is known of logs by path, and whether that is undamaged. It may be from the copy, or None: then their
+    files are read again.
     """
     if not store.exists(_SOURCES):
         return {}, True
@@ -212,7 +212,7 @@ def _fingerprint(file: Path, known: Known | None) -> Known:
             return known
         old = known is not None and known[0] == stat.st_size and ":" not in known[2]
         if known is not None and old and digest_holds(file, known[2]):
-            return [stat.st_size, stat.st_mtime_ns, known[2]]  # an older algorithm's: the log's key follows from it
+            return [stat.st_size, stat.st_mtime_ns, known[2]]  # of an older algorithm: the log's key depends on it
         return [stat.st_size, stat.st_mtime_ns, file_digest(file)]
     except OSError as error:
         raise FormatError(f"the log cannot be read: {error.strerror}", file=file) from error

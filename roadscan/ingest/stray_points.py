@@ -1,4 +1,4 @@
-"""Points of a cloud that lie far from all others of it, and points that stand in it twice."""
+"""Finds points of a cloud that are far from all others of it, and points that occur twice."""
 
 from __future__ import annotations
 
@@ -36,39 +36,39 @@ POINTS_TWICE: Final = Witness(
     told=("rejects",),
 )
 
-_CELL_M: Final = np.array([50.0, 50.0, 100.0])
+_CELL_M: Final = np.array([50.0, 50.0, 100.0])  # edges of a cell: two horizontal, one vertical (m)
 _FEW: Final = 3
-"""Points beside which a cell and its neighbours hold no others are strays; more are something that was seen."""
+"""Most points of a cell without others in it or its neighbours that are strays; more are a real object."""
 _LEAST_IN_CELL: Final = 100
-"""A cloud of which half of the points lie in cells that hold fewer is too thin to say what is far from it: a scanner
-leaves more on a square metre of road, and a survey from the air about as many in a cell."""
+"""A cloud with half of its points in cells of fewer is too thin to find strays: a scanner leaves more on a square metre
+of road, and an airborne survey about as many in a cell."""
 _MOST_STRAYS: Final = 0.01
-"""A cloud of which a larger share lies alone is thin, and holds no strays."""
-_BITS: Final = 21
-_HALF: Final = 1 << (_BITS - 1)
+"""If a larger share of a cloud is isolated, it is thin and has no strays."""
+_BITS: Final = 21  # bits of a cell's index along each axis: three fit into 64
+_HALF: Final = 1 << (_BITS - 1)  # added to indices to make them positive
 STRAY: Final = "the point lies alone, over 50 m or over 100 m of height from all others of the cloud"
 TWICE: Final = "the point stands twice in the cloud"
 _TABLE: Final = "cloud"
 _PLACE: Final = ("x_m", "y_m", "z_m")
 _SAME: Final = ("epoch_gps_ns", *_PLACE, "return_number", "intensity")
-"""Columns by which two points are one."""
-_ODD: Final = np.uint64(0x9E3779B97F4A7C15)
-_MIXER: Final = np.uint64(0xBF58476D1CE4E5B9)
+"""Columns in which two equal points agree."""
+_ODD: Final = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ / golden ratio, an odd multiplier of the hash
+_MIXER: Final = np.uint64(0xBF58476D1CE4E5B9)  # a multiplier of splitmix64
 
 
 @dataclass
 class CloudPoints(LogCheck):
-    """Follows the points of one log of a cloud."""
+    """Checks the points of one log of a cloud."""
 
     _counts: dict[int, int] = field(default_factory=dict)
-    """Points by cell."""
+    """Number of points by cell."""
     _first: dict[int, list[tuple[str, int, int]]] = field(default_factory=dict)
-    """File, record and byte offset of the points of cells that hold few."""
+    """File, record and byte offset of the points of cells with few."""
     _sum_m: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     _points: int = 0
 
     def take(self, rows: Rows, refused: Sequence[Int64]) -> None:
-        """Count the points of a chunk but those `refused` (by index)."""
+        """Count the points of a chunk except those `refused` (by index)."""
         if rows.table != _TABLE:
             return
         kept = np.ones(rows.batch.num_rows, dtype=bool)
@@ -94,7 +94,7 @@ class CloudPoints(LogCheck):
                 self._first.setdefault(key, []).append((rows.file, number, offset))
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
-        """Leave strays and points that stand twice out of the finished table; say where the cloud's middle is."""
+        """Leave strays and duplicate points out of the finished table; record the cloud's mean."""
         if not writer.rows[_TABLE]:
             return
         strays = self._strays()
@@ -110,7 +110,7 @@ class CloudPoints(LogCheck):
             header.attributes["middle_m"] = (self._sum_m / self._points).round(3).tolist()
 
     def _strays(self) -> Int64:
-        """Cells whose points are left out."""
+        """Return cells whose points are left out."""
         none = np.zeros(0, dtype=np.int64)
         if not self._first:
             return none
@@ -135,18 +135,18 @@ def _places(rows: pa.RecordBatch | pa.Table) -> npt.NDArray[np.float64]:
 
 
 def _cells(xyz_m: npt.NDArray[np.float64]) -> Int64:
-    """Key (n,) of the cell of each place (n, 3); places that are no numbers share one."""
+    """Return the key (n,) of the cell of each position (n, 3); positions that are not finite share one."""
     cells = np.clip(np.nan_to_num(np.floor(xyz_m / _CELL_M)), -_HALF + 1, _HALF - 2).astype(np.int64) + _HALF
     return np.asarray((cells[:, 0] << 2 * _BITS) + (cells[:, 1] << _BITS) + cells[:, 2], dtype=np.int64)
 
 
 def _has_ties(epochs_gps_ns: Int64) -> bool:
-    """Whether two rows of a file, in order of time, share an epoch."""
+    """Return whether two rows of a file, in order of time, share an epoch."""
     return bool((np.diff(epochs_gps_ns) == 0).any())
 
 
 def _again(rows: pa.Table) -> Bool:
-    """Rows (n,) that are those of a row before them, at epochs of which every row stands twice or more.
+    """Return which rows (n,) repeat an earlier row, at epochs of which every row occurs twice or more.
 
     Where only some of an epoch's rows are equal, they are points that a coarse scale has put in one place.
     """

@@ -1,4 +1,4 @@
-"""Thumbnails of a kind's assets for the report: cut-outs where there are any, else returns of classified points."""
+"""Draws thumbnails of a kind's assets for the report: cut-outs where there are any, else classified points."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from roadscan.store.manifest import read_recorded
 
 MOST: Final = 4
 """Thumbnails of a kind."""
-_TRIED: Final = 12
-_KEPT_SQUARES: Final = 4
-_HEIGHT_M: Final = 3.0
-_ABOVE_PLATE_M: Final = 1.0
+_TRIED: Final = 12  # assets that are tried, the most probable first
+_KEPT_SQUARES: Final = 4  # squares whose points stay in memory
+_HEIGHT_M: Final = 3.0  # assumed height of an asset without one (m)
+_ABOVE_PLATE_M: Final = 1.0  # height above a plate's place that is shown (m)
 
 
 class Thumbnails:
-    """Draws thumbnails of a survey's assets; points of a square are read once while kinds look at them."""
+    """Draws thumbnails of a survey's assets; points of a square are read once for neighbouring assets."""
 
     def __init__(self, session: Session) -> None:
         config = AssetsConfig.stated(session.survey)
@@ -45,7 +45,7 @@ class Thumbnails:
         self._read: OrderedDict[str, tuple[Any, Any, Any]] = OrderedDict()
 
     def of(self, layer: Layer) -> bytes | None:
-        """A sheet of a kind's most probable assets, cut-outs before returns; None where nothing shows them."""
+        """Return a sheet of a kind's most probable assets, cut-outs before points; None where nothing shows them."""
         rows = layer.rows
         cut = [name is not None for name in rows["cut_out"].to_pylist()] if "cut_out" in rows.schema.names else []
         has_cut = np.array(cut or [False] * rows.num_rows)
@@ -61,7 +61,7 @@ class Thumbnails:
         return sheet(found) if found else None
 
     def _one(self, layer: Layer, number: int) -> npt.NDArray[np.uint8] | None:
-        """The cut-out of an asset, or its returns."""
+        """Return the cut-out of an asset, or its points."""
         row = {name: layer.rows[name][number].as_py() for name in layer.rows.schema.names}
         record = self._cut_outs.get(row.get("cut_out") or "")
         if record is not None:
@@ -84,7 +84,7 @@ class Thumbnails:
         return str(self._grid.squares.tile_at(rows["easting_m"][number].as_py(), rows["northing_m"][number].as_py()))
 
     def _points_of(self, square: str) -> tuple[Any, Any, Any] | None:
-        """Classified points of a square, if there are any."""
+        """Return the classified points of a square, if there are any."""
         record = self._points.get(square)
         if record is None:
             return None

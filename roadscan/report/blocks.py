@@ -1,4 +1,4 @@
-"""What a section of the report consists of: paragraphs, tables, figures of a picture. The template makes HTML of it.
+"""The contents of a report section: paragraphs, tables, pictures. The template converts them to HTML.
 
 All text is escaped by the template: names and messages come from logs and survey files.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
 MOST_ROWS: Final = 60
-"""A longer table is cut, and says so."""
+"""Most rows of a table: a longer one is cut, and says so."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Table:
     rows: Sequence[Sequence[str]]
     caption: str = ""
     full_table: str = ""
-    """Name of the SQL table that holds all rows, where the page may show some of them only."""
+    """Name of the SQL table with all rows, where the page may show only some of them."""
     numbers: bool = True
 
     @property
@@ -42,26 +42,26 @@ class Table:
 
     @property
     def left_out(self) -> int:
-        """Rows that it does not show."""
+        """Number of rows that it does not show."""
         return max(len(self.rows) - MOST_ROWS, 0)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture, held in the page itself."""
+    """A picture that is embedded in the page."""
 
     kind: ClassVar[str] = "picture"
     content: bytes
     """PNG or JPEG."""
     caption: str
     width_mm: float = 170.0
-    """Width on paper, at most."""
+    """Largest width on paper."""
     link: str = ""
-    """Where it leads in the page of a published site: what stands behind the page's name, from ``#`` on."""
+    """Its link in the page of a published site: the part of the address after the page's name, from ``#`` on."""
 
     @property
     def address(self) -> str:
-        """The picture as a data address."""
+        """The picture as a data URL."""
         kind = "jpeg" if self.content[:2] == b"\xff\xd8" else "png"
         return f"data:image/{kind};base64,{base64.b64encode(self.content).decode('ascii')}"
 
@@ -86,9 +86,9 @@ class Drawing:
     squares: Sequence[tuple[float, float, float, str]] = ()
     """Left, top, edge and colour of squares behind the lines."""
     marks: Sequence[tuple[float, float, str, str]] = ()
-    """Left, top, text and colour of marks with a name."""
+    """Left, top, text and colour of named marks."""
     scale_bar: tuple[float, str] = (0.0, "")
-    """Length in the units of the drawing, and what it stands for."""
+    """Length in the units of the drawing, and its text."""
     legend: Sequence[tuple[str, str]] = ()
     """Colour and text."""
     caption: str = ""

@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing beside it: no script, no font, no address of another place."""
+"""The report as a self-contained HTML page: no script, no font, no external address."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from roadscan.run.session import Session
 from roadscan.site.report_copy import REPORT
 
 PATH: Final = "report/report.html"
-"""Where it lies, relative to the survey's root."""
+"""Its path, relative to the survey's root."""
 
 
 def report_page(session: Session) -> str:
-    """The report of a survey as HTML; the same store gives the same text.
+    """Return the report of a survey as HTML; the same store gives the same text.
 
     A section whose tables are damaged says so in its place; the others stand.
     """
@@ -43,7 +43,7 @@ def report_page(session: Session) -> str:
 
 
 def keep_report(session: Session) -> str:
-    """Where the report lies, relative to the survey's root; written where it differs from the one that is there."""
+    """Write the report if it changed; return its path relative to the survey's root."""
     page = report_page(session).encode("utf-8")
     manifest = session.manifest
     known, key = manifest.get(REPORT, REPORT), key_of(page.hex())

@@ -1,4 +1,4 @@
-"""What a section of the report is, and which there are: modules of `report/sections/`, and entry points."""
+"""Sections of the report: their base class, and all of them: modules of `report/sections/`, and entry points."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ENTRY_POINT_GROUP: Final = "roadscan.report_sections"
 
 @dataclass(frozen=True)
 class Material:
-    """What sections are made of; what several of them ask for is found once."""
+    """The data of a survey for sections; shared results are computed once."""
 
     session: Session
 
@@ -56,11 +56,11 @@ class Section(ABC):
 
     @abstractmethod
     def blocks(self, material: Material) -> Iterator[Block]:
-        """What the section shows; nothing where the survey has nothing of its kind: it is left out then."""
+        """Yield the blocks of the section; none where the survey has nothing of its kind, so that it is left out."""
 
 
 @functools.cache
 def sections() -> tuple[Section, ...]:
-    """All sections, in the order of the page."""
+    """Return all sections, in the order of the page."""
     known = found_kinds("report/sections/*.py", Section, ENTRY_POINT_GROUP)
     return tuple(sorted((kind() for kind in known.values()), key=lambda s: (s.position, s.name)))

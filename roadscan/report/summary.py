@@ -1,4 +1,4 @@
-"""What a survey's store holds after a run: readings and their fates, tiles, area, σ, overlap, rejects, failures, files.
+"""Summary of a survey's store after a run: counts of readings, tiles, area, σ, overlap, rejects, failures, files.
 
 All of it comes from the manifest and the records of logs; no reading and no cell is read.
 """
@@ -45,18 +45,18 @@ class LogSummary:
 
 @dataclass(frozen=True)
 class TilesSummary:
-    """The tiles, over all of them."""
+    """Figures over all tiles."""
 
     looked_at: int
     """Tiles that a reading may have touched."""
     with_readings: int
-    """Those of them that hold a reading; the others have no file."""
+    """Those of them with a reading; the others have no file."""
     cells: int
-    """Cells that hold a reading."""
+    """Cells with a reading."""
     area_m2: float
-    """Their area."""
+    """Area of the cells with a reading."""
     overlap_area_m2: float | None
-    """Area of the cells that two or more passes saw; None where a tile's record does not say it."""
+    """Area of the cells that two or more passes measured; None where a tile's record does not say it."""
     sigma_horizontal_m: Spread | None
     """Largest horizontal 1 σ of the poses that placed a tile's readings; None where no trajectory states it."""
     sigma_down_m: Spread | None
@@ -80,37 +80,37 @@ class ProductFiles:
     files: int
     bytes: int
     folder: str
-    """Where they lie: the folder that holds them all."""
+    """The folder that contains them all."""
 
 
 @dataclass(frozen=True)
 class SurveySummary:
-    """What a survey's store holds."""
+    """Contents of a survey's store."""
 
     survey: str
     store: str
     """Its folder or URL."""
     logs: LogSummary
     readings: dict[str, int]
-    """Readings by what became of them (`kept`, `range`, …); empty before the tiles are made."""
+    """Number of readings by result (`kept`, `range`, …); empty before the tiles are made."""
     tiles: TilesSummary | None
     """None before the tiles are made."""
     adjustment: list[str]
-    """What the adjustment of the poses found, in words; empty where nothing was adjusted."""
+    """Results of the adjustment of the poses, in words; empty where nothing was adjusted."""
     findings: list[Finding]
-    """What the witnesses of the inputs said: what was left out, and what is doubtful."""
+    """Findings of the witnesses: what was left out, and what is doubtful."""
     files: dict[str, ProductFiles]
     """Files by product."""
     failures: list[dict[str, str]]
     """What failed in the last run: stage, unit, reason."""
 
     def as_json(self) -> dict[str, Any]:
-        """The summary as values of JSON; lengths in metres, areas in square metres."""
+        """Return the summary as JSON values; lengths in metres, areas in square metres."""
         return dataclasses.asdict(self)
 
 
 def survey_summary(survey: Survey, store: Store) -> SurveySummary:
-    """Sum up what the manifest and the log records say; what is damaged is passed over (`roadscan verify` tells it)."""
+    """Summarise the manifest and the log records; damaged ones are skipped (`roadscan verify` reports them)."""
     damaged: list[StoreError] = []
     manifest = Manifest(store, damaged)
     listed = set(known_keys(survey, store))
@@ -161,7 +161,7 @@ def _spread(values: Iterable[float | None]) -> Spread | None:
 
 
 def _files(outputs: pa.Table, store: Store) -> dict[str, ProductFiles]:
-    """Files by product; those beside a product's own (``las.world``) belong to it."""
+    """Return files by product; those beside a product's own (``las.world``) belong to it."""
     there = outputs.filter(pc.not_equal(outputs.column("path"), ""))
     found: dict[str, list[int]] = {}
     folders: dict[str, PurePosixPath] = {}

@@ -1,1 +1,1 @@
-"""What runs a survey: stages, sessions, tasks on workers, keys, status and progress."""
+"""Runs a survey: stages, sessions, tasks on workers, keys, status and progress."""

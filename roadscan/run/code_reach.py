@@ -1,4 +1,4 @@
-"""Digests of the code that an output depends on, so that a key changes with that code and with no other.
+"""Digests of the code on which an output depends, so that a key changes with that code and no other.
 
 The unit is a definition: a function, a class, or a name that a module assigns. Starting from the function or class
 that makes an output, every definition whose name occurs in one that is reached is reached as well, annotations
@@ -40,7 +40,7 @@ from roadscan.core.private_folder import UnsafeFolderError, cache_place, check_p
 Place: TypeAlias = tuple[str, str | None]
 """A module and a name in it; None for all of the module."""
 Brought: TypeAlias = tuple[str, str, str | None]
-"""A name that an import brings, the module that it names, and the name in that; None where it brings the module."""
+"""A name that an import binds, the module it comes from, and its name there; None where it binds the module."""
 
 CARRIERS: Final = (
     "roadscan.compute.compiler",
@@ -60,15 +60,15 @@ CARRIERS: Final = (
     "roadscan.store.records",
     "roadscan.store.store",
 )
-"""What carries values and bytes, and shapes none: it is not followed. Settings count by their values, files by their
-digests."""
+"""Modules left out of the digest: they transport data and change no result. Settings are covered by their values, files
+by their digests."""
 
 _EFFECTS = "<statements>"
-"""Stands for the statements of a module that define nothing: whoever uses the module depends on them."""
+"""Name for the statements of a module that define nothing: every user of the module depends on them."""
 
 
 def code_digest(*entries: str) -> str:
-    """Hash (16 hexadecimal digits) of all definitions that `entries` reach.
+    """Return a hash (16 hexadecimal digits) of all definitions that `entries` reach.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def code_digest(*entries: str) -> str:
 
 
 def name_of(kind: type) -> str:
-    """The entry of a class for :func:`code_digest`."""
+    """Return the entry of a class for :func:`code_digest`."""
     return f"{kind.__module__}:{kind.__qualname__.partition('.')[0]}"
 
 
@@ -103,7 +103,7 @@ def _computed(entries: tuple[str, ...]) -> str:
 
 
 def reached_code(entries: Iterable[str]) -> dict[str, str]:
-    """Shape of each definition ("module:name") that `entries` reach, in the order in which they are reached."""
+    """Return the shape of each definition ("module:name") that `entries` reach, in the order they are reached."""
     waiting = deque(_place_of(entry) for entry in entries)
     numbers: dict[Place, int] = {}
     entered: dict[str, None] = {}
@@ -117,14 +117,14 @@ def reached_code(entries: Iterable[str]) -> dict[str, str]:
                 numbers[place] = len(numbers)
                 waiting += [used for shape in shapes.get(place[1], ()) for used in shape.uses.values()]
             entered[place[0]] = None
-        if not waiting:  # last: in which file a definition stands changes no number
+        if not waiting:  # last: the file of a definition does not change any number
             effects = [(name, _EFFECTS) for name in entered if _module(name).shapes[_EFFECTS]]
             waiting += [one for one in effects if one not in numbers]
     return {f"{name}:{own}": _numbered((name, own), numbers) for name, own in numbers if own in _module(name).shapes}
 
 
 def _origin(place: Place) -> Place:
-    """Where a name is defined that a module only hands on."""
+    """Return where a name is defined that a module only re-exports."""
     name, definition = place
     if definition is None or _is_carrier(place):
         return place
@@ -138,14 +138,14 @@ def _is_carrier(place: Place) -> bool:
 
 
 def _numbered(place: Place, numbers: dict[Place, int]) -> str:
-    """The shapes of a definition, with the number of each definition of ours in place of its name."""
+    """Return the shapes of a definition, with numbers in place of the names of our definitions."""
     module, texts = _module(place[0]), []
     for shape in module.shapes[place[1] or ""]:
         words = [shape.libraries.get(name, name) for name in shape.names]
         for at, name in enumerate(shape.names):
             if name in shape.uses and (used := _origin(shape.uses[name])) in numbers:
                 words[at] = f"#{numbers[used]}"
-        parts = _NAME.split(shape.text)  # texts and, between them, numbers of names
+        parts = _NAME.split(shape.text)  # text and numbers of names alternate
         parts[1::2] = [words[int(number)] for number in parts[1::2]]
         texts.append("".join(parts))
     return "\n".join(texts)
@@ -153,15 +153,15 @@ def _numbered(place: Place, numbers: dict[Place, int]) -> str:
 
 @dataclass
 class _Shape:
-    """What a statement of a module defines: its text, and what the names in it stand for."""
+    """Definition by a statement of a module: its text, and the meaning of the names in it."""
 
     text: str
     """Its syntax tree, with a mark for each of `names`."""
     names: list[str]
     uses: dict[str, Place] = field(default_factory=dict)
-    """Names of definitions of ours."""
+    """Names of our definitions."""
     libraries: dict[str, str] = field(default_factory=dict)
-    """Names that imports bring from libraries: in full."""
+    """Full names of what is imported from libraries."""
 
 
 @dataclass
@@ -169,24 +169,24 @@ class _Module:
     """Definitions of a module."""
 
     shapes: dict[str, list[_Shape]] = field(default_factory=dict)
-    """By name; more than one where several statements define it."""
+    """Shapes by name; several where several statements define it."""
     imports: dict[str, Place] = field(default_factory=dict)
-    """What a name that the module imports stands for."""
+    """Meaning of each imported name."""
 
 
 class _Definition(NamedTuple):
-    """What a source says of a name that it defines."""
+    """A source's definition of a name."""
 
     name: str
     text: str
     names: list[str]
     """Names that occur in it."""
     brought: list[Brought]
-    """By imports inside it."""
+    """Imports inside it."""
 
 
 class _Outline(NamedTuple):
-    """What a module's source says, whatever other modules there are."""
+    """Content of a module's source, independent of other modules."""
 
     brought: list[Brought]
     definitions: list[_Definition]
@@ -210,7 +210,7 @@ def _module(name: str) -> _Module:
 
 
 def _meant(brought: Iterable[Brought]) -> tuple[dict[str, Place], dict[str, str]]:
-    """What each name stands for that imports bring: a place in a package of ours, or the full name in a library."""
+    """Return the meaning of each imported name: a place in a package of ours, or the full name in a library."""
     places: dict[str, Place] = {}
     libraries: dict[str, str] = {}
     for name, source, inside in brought:
@@ -226,7 +226,7 @@ def _meant(brought: Iterable[Brought]) -> tuple[dict[str, Place], dict[str, str]
 
 
 def _outline_of(name: str, source: bytes, package: str) -> _Outline:
-    """The outline of a module, as it was kept or made from its source and kept."""
+    """Return the outline of a module from the cache, or create it and cache it."""
     folder, digest = _kept_outlines(), hashlib.blake2b(package.encode() + b"\0" + source, digest_size=16).hexdigest()
     if folder is None:
         return _read_outline(source.decode(), package)
@@ -245,7 +245,7 @@ def _outline_of(name: str, source: bytes, package: str) -> _Outline:
 
 @functools.cache
 def _kept_outlines() -> Path | None:
-    """Folder of the outlines that this code made; None where it cannot be written, or others could write to it."""
+    """Return the cache folder of outlines; None where it cannot be written, or others could write to it."""
     version = hashlib.blake2b(Path(__file__).read_bytes(), digest_size=6).hexdigest()
     folder = cache_place() / f"outlines-{version}"
     try:
@@ -275,7 +275,7 @@ def _definitions(node: ast.stmt, package: str) -> Iterator[_Definition]:
 
 @contextlib.contextmanager
 def _uncollected() -> Iterator[None]:
-    """Python's collector rests: it would look through a syntax tree again and again while that grows."""
+    """Suspend garbage collection, which would scan a growing syntax tree again and again."""
     resting = gc.isenabled()
     gc.disable()
     try:
@@ -286,7 +286,7 @@ def _uncollected() -> Iterator[None]:
 
 
 def _names_of(node: ast.stmt) -> list[str]:
-    """Names that a statement of a module defines; what defines none is an effect, unless it only imports or tells."""
+    """Return the names that a statement defines; others are effects, unless they are imports or docstrings."""
     match node:
         case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
             return [name]
@@ -303,13 +303,13 @@ def _names_of(node: ast.stmt) -> list[str]:
 
 
 def _shape(part: object, names: dict[str, int], without: Iterable[str] = ()) -> Iterator[str]:
-    """Text of a syntax tree without docstrings, and with a mark for each name, which `names` numbers.
+    """Yield the text of a syntax tree without docstrings, with a mark for each name, which `names` numbers.
 
     It does not differ between versions of Python, as that of :func:`ast.dump` does.
     """
     match part:
         case ast.Expr(value=ast.Constant(value=str())) | ast.Import() | ast.ImportFrom():
-            return  # what an import brings stands behind the names
+            return  # imported names follow the names
         case ast.Name(id=name):
             yield f"\1{names.setdefault(name, len(names))}\2"
         case ast.AST():
@@ -338,7 +338,7 @@ _IMPORTS = (ast.Import, ast.ImportFrom, ast.If)
 
 
 def _brought(node: ast.AST, package: str) -> Iterator[Brought]:
-    """What an import statement, or those under `if TYPE_CHECKING`, brings."""
+    """Yield the names bound by an import statement, or by those under `if TYPE_CHECKING`."""
     match node:
         case ast.If(test=ast.Name(id="TYPE_CHECKING"), body=body):
             for one in body:
@@ -372,7 +372,7 @@ def _package_of(name: str, file: Path) -> str:
 
 @functools.cache
 def _file_of(module: str) -> Path | None:
-    """Source of a module of roadscan, or of a package that an entry lies in; None for libraries."""
+    """Return the source file of a module of roadscan, or of a package with an entry; None for libraries."""
     top, _, below = module.partition(".")
     if top not in _OWN:
         return None
@@ -390,7 +390,7 @@ _OWN = {"roadscan"}
 
 
 def _count_in(packages: Iterable[str]) -> None:
-    """Let the code of further packages count: those that add a product or a stage of their own."""
+    """Include the code of further packages: those that add a product or a stage."""
     if new := set(packages) - _OWN:
         _OWN.update(new)
         for known in (_file_of, _module, _digest_of):

@@ -1,10 +1,10 @@
-"""Memory that a worker needs, by the readings of its block."""
+"""Estimates a worker's memory from the readings of its block."""
 
 from __future__ import annotations
 
 from typing import Final
 
 BYTES_PER_READING: Final = 100
-"""Memory of a worker per reading of its block, measured: points, sorting and one tile's products."""
+"""Measured memory of a worker per reading of its block (bytes): points, sorting and one tile's products."""
 WORKER_BASE_BYTES: Final = 400 << 20
-"""Memory of a worker before its first block: Python and its libraries."""
+"""Memory of a worker before its first block (bytes): Python and its libraries."""

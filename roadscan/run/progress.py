@@ -1,4 +1,4 @@
-"""Progress: bars on a terminal, plain lines in a log."""
+"""Shows progress: bars on a terminal, plain lines in a log."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from roadscan.run.session import Reporter
 
 
 class Shown(Reporter):
-    """What both kinds share: they know how far a stage is."""
+    """Common base: stores the progress of each stage."""
 
     def __init__(self) -> None:
         self._done: dict[str, tuple[int, int]] = {}
 
     def progress(self, stage: str, done: int, total: int) -> None:
-        """Keep how far a stage is."""
+        """Store the progress of a stage."""
         self._done[stage] = (done, total)
 
     def where(self, stage: str) -> str:
-        """How far a stage is, in words."""
+        """Return the progress of a stage in words."""
         if stage not in self._done:
             return f"in the stage {stage}" if stage else "before the first stage"
         done, total = self._done[stage]
@@ -30,7 +30,7 @@ class Shown(Reporter):
 
 
 class LineReporter(Shown):
-    """Plain lines on standard error; at most one every few seconds a stage."""
+    """Plain lines on standard error; at most one every few seconds per stage."""
 
     def __init__(self, every_s: float = 5.0) -> None:
         super().__init__()
@@ -43,7 +43,7 @@ class LineReporter(Shown):
         sys.stderr.flush()
 
     def progress(self, stage: str, done: int, total: int) -> None:
-        """Print how far a stage is."""
+        """Print the progress of a stage."""
         super().progress(stage, done, total)
         now = time.monotonic()
         if total and (done == total or now - self._last.get(stage, 0.0) >= self._every_s):
@@ -51,7 +51,7 @@ class LineReporter(Shown):
             self.line(f"{stage}: {done} of {total}")
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing: there is nothing to close."""
 
 
 class TerminalReporter(Shown):
@@ -81,5 +81,5 @@ class TerminalReporter(Shown):
         self._bars.update(self._ids[stage], completed=done, total=total)
 
     def close(self) -> None:
-        """Leave the bars as they stand."""
+        """Close the bars as they are."""
         self._bars.stop()

@@ -1,4 +1,4 @@
-"""Which tiles to reprocess: named tiles, a box on the map, or a span of GPS time."""
+"""Selects tiles to reprocess: named tiles, a box on the map, or a span of GPS time."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from roadscan.core.ids import TileId
 
 
 class SelectionError(ConfigError):
-    """The choice names what the survey does not hold; the store is as it was."""
+    """The selection names something that the survey does not have; the store is unchanged."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """A choice of tiles; the parts that are given add up."""
+    """A selection of tiles; its parts are combined."""
 
     named: tuple[TileId, ...] = ()
     box: Bounds | None = None
     """Box on the map (m)."""
     span_gps_ns: tuple[int, int] | None = None
-    """Tiles that a reading of this span may have touched."""
+    """Selects tiles that readings of this span may have touched."""

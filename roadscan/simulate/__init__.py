@@ -1,4 +1,4 @@
-"""A survey with known truth, written as raw logs. It shares no geometry code with the pipeline."""
+"""Simulates a survey with known truth as raw logs. It shares no geometry code with the pipeline."""
 
 from roadscan.simulate.run import SimulatedSurvey, simulate
 from roadscan.simulate.scene import Scene, shipped_scenes

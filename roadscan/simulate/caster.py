@@ -1,4 +1,4 @@
-"""Rays cast into a scene: the world as the kernels see it, and the way from a sensor's poses to what its rays meet."""
+"""Casts rays into a scene: builds the world for the kernels, and converts a sensor's poses to what its rays meet."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 SLOT_NS: Final = 100_000_000
-"""Moving cars drive evenly within slots of this length, counted from a pass's first profile, however the sensors'
-rays come in blocks."""
+"""Length of the slots within which moving cars drive evenly, counted from a pass's first profile, however the sensors'
+rays are divided into blocks (ns)."""
 _MIDDLE_SHARE: Final = 1.0 - math.exp(-0.5)
-"""Share of a Gaussian beam's energy within half of its radius; the radius is where it has fallen to e⁻²."""
+"""Share of a Gaussian beam's energy within half of its radius, at which it has fallen to e⁻²."""
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Rays of one group (a packet of a lidar, a turn of a mirror, a picture) that is the same for all groups."""
+    """Rays of one group (a packet of a lidar, a turn of a mirror, a picture), equal for all groups."""
 
     origin_m: Float64
     """(m, 3) in the sensor's axes."""
@@ -48,10 +48,10 @@ class Pattern:
     −1, or no array: not known. Sub-rays are cast where neighbours meet different things, and where they are not known.
     """
     steps: tuple[int, int] = (1, 1)
-    """Rays on each side, along and across the scan, that half the width reaches to; see :func:`steps_within`."""
+    """Rays on each side, along and across the scan, within half the width; see :func:`steps_within`."""
 
     def fan(self) -> tuple[Float64, Float64]:
-        """Tangents (s, 2) of the sub-rays' angles and their shares of the energy (s,): the middle, then each side."""
+        """Return tangents (s, 2) of the sub-rays' angles and their energy shares (s,): the middle, then each side."""
         if self.divergence_deg == 0.0:
             return np.zeros((1, 2)), np.ones(1)
         half = math.tan(math.radians(self.divergence_deg / 2))
@@ -61,7 +61,7 @@ class Pattern:
 
 @dataclass(frozen=True)
 class Hits:
-    """What g groups of m rays have met."""
+    """Results of g groups of m rays."""
 
     range_m: Float64
     """(g, m) exact range; NaN: nothing, or glass."""
@@ -72,10 +72,10 @@ class Hits:
     object_id: npt.NDArray[np.int32]
     """(g, m) 0: the road, −1: nothing."""
     is_mixed: npt.NDArray[np.bool_]
-    """(g, m) True where the range is a mixture: the point then lies in the ray's middle, and on nothing."""
+    """(g, m) True where the range is a mixture: the point is then in the ray's middle, and on nothing."""
 
     def of_groups(self, groups: int) -> Self:
-        """The same rays in another number of groups."""
+        """Return the same rays in another number of groups."""
         shape = (groups, -1)
         return type(self)(
             self.range_m.reshape(shape),
@@ -87,7 +87,7 @@ class Hits:
 
 
 class World:
-    """A scene with all that rays can meet. Make one for a survey: it looks at the whole road.
+    """A scene with all that rays can meet. Make one per survey, because it examines the whole road.
 
     Parameters
     ----------
@@ -98,9 +98,9 @@ class World:
         self.scene = scene
         self.surface = surface
         self.objects: list[Object] = objects_of(scene, surface)
-        """What stands still."""
+        """Standing objects."""
         self.moving: list[Object] = moving_objects(scene, surface)
-        """What moves, as it is at a pass's first profile."""
+        """Moving objects, as they are at a pass's first profile."""
         bodies = np.concatenate([np.zeros((0, BODY_COLUMNS)), *(o.bodies for o in self.objects)])
         owners = [np.full(len(o.bodies), o.id, np.int32) for o in self.objects]
         self.arrays = kernels.World(
@@ -127,11 +127,11 @@ class World:
         interval_gps_ns : (g, n, 2) beginning and end of each group's intervals of poses, short enough for the sensor
             to move evenly within.
         direction : (g, m, 3) unit vectors in the sensor's axes.
-        key : random key of the first ray; each ray takes its own, so count on by g · m.
+        key : random key of the first ray; each ray has one, so the next call starts g · m later.
         """
         groups, count = direction.shape[:2]
         direction = direction.view()
-        direction.flags.writeable = False  # as those that are one for all groups: the kernel is compiled once
+        direction.flags.writeable = False  # as rays that are one for all groups: the kernel is compiled once
         flat = np.ascontiguousarray(interval_gps_ns.reshape(-1, 2))
         at, rotation = drive.poses(flat.reshape(-1)).sensor(mount, body_from_axes)
         middle = at[at.shape[0] // 2]
@@ -190,7 +190,7 @@ class World:
         )
 
     def _movers(self, drive: Drive, first: int, last: int, centre: Float64, reach_m: float) -> kernels.Movers:
-        """Cars that move within reach of a place (2,) in the slots from `first` to `last`."""
+        """Return cars that move within reach of a place (2,) in the slots from `first` to `last`."""
         slots, slot_s = range(first, last + 1), SLOT_NS * 1e-9
         bodies, velocities, owners = [], [], []
         for car, known in zip(self.scene.roadside.moving_cars, self.moving, strict=True):
@@ -219,10 +219,10 @@ class World:
 
 
 def steps_within(divergence_deg: float, step_deg: float) -> int:
-    """Steps from ray to ray after which half of a ray's width has been passed."""
+    """Return the rays within half of a ray's width."""
     return 1 + math.floor(0.5 * divergence_deg / step_deg)
 
 
 def ray_key(scene: Scene, drive: Drive, sensor: str) -> int:
-    """Random key of a sensor's first ray in a pass."""
+    """Return the random key of a sensor's first ray in a pass."""
     return int(stream(scene.seed, drive.number, f"{sensor} rays").integers(0, 2**62))

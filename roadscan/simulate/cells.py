@@ -1,4 +1,4 @@
-"""The map of cells in which rays look for the road and for bodies."""
+"""The map of cells in which rays search for the road and for bodies."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _CHUNK_SAMPLES: Final = 640
-"""Stations looked at at once."""
+"""Stations that are examined at a time."""
 _IN_TILE: Final = TILE_CELLS * TILE_CELLS
 
 
 def cells_of(road: Road, surface: Surface, bodies: Float64) -> Cells:
-    """The map of a road and of the bodies (n, 18) beside it."""
+    """Return the map of a road and of the bodies (n, 18) beside it."""
     extent = _extents(bodies)
     corner, tiles = _tiles(road, surface, extent)
     count = int(tiles.max()) + 1
@@ -47,10 +47,10 @@ def cells_of(road: Road, surface: Surface, bodies: Float64) -> Cells:
 
 
 def _bound(road: Road, surface: Surface, cells: Cells) -> None:
-    """Look at the whole road, piece by piece."""
+    """Bound the whole road, piece by piece."""
     nodes = surface.arrays.nodes
     first, last = nodes[0, STATION], nodes[-1, STATION]
-    # The narrowest thing across the road needs a few places over its width.
+    # The narrowest feature across the road needs a few samples over its width.
     widths = [rut.width_m / 8 for rut in road.ruts] + [road.crown_rounding_m / 2, SAMPLE_M]
     across = math.ceil(2 * road.edge_m / max(min(widths), 0.02))
     offset = road.edge_m * (2.0 * np.arange(-1, across + 2, dtype=np.float64) / across - 1.0)
@@ -62,7 +62,7 @@ def _bound(road: Road, surface: Surface, cells: Cells) -> None:
 
 
 def _extents(bodies: Float64) -> Float64:
-    """Least and greatest easting, northing (n, 4) of bodies."""
+    """Return the least and greatest easting and northing (n, 4) of bodies."""
     half_length, half_width = bodies[:, body.HALF_LENGTH], bodies[:, body.HALF_WIDTH]
     is_round = np.isin(bodies[:, body.KIND], (body.CYLINDER, body.ELLIPSOID))
     sine, cosine = np.abs(bodies[:, body.SINE]), np.abs(bodies[:, body.COSINE])
@@ -73,14 +73,14 @@ def _extents(bodies: Float64) -> Float64:
 
 
 def _tiles(road: Road, surface: Surface, extent: Float64) -> tuple[Float64, npt.NDArray[np.int32]]:
-    """Corner (2,) of the map, and number of each tile in which there is road or a body."""
+    """Return the corner (2,) of the map, and the number of each tile with road or a body."""
     nodes = surface.arrays.nodes
     offset = np.linspace(-road.edge_m, road.edge_m, math.ceil(2 * road.edge_m / CELL_M) + 1)
     places = []
     for first in range(0, nodes.shape[0], 4096):
         e, n, _ = surface.place(nodes[first : first + 4096, STATION][:, None], offset)
         points = np.stack([e.ravel() - surface.origin_enh_m[0], n.ravel() - surface.origin_enh_m[1]], axis=-1)
-        # A place's neighbours are less than a metre away.
+        # A sample's neighbours are less than a metre away.
         spread = [points + np.array(move) for move in ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))]
         places.append(np.unique(np.floor(np.concatenate(spread) / TILE_M).astype(np.int64), axis=0))
     i, j, _ = _squares(extent, np.zeros(2), TILE_M)
@@ -93,14 +93,14 @@ def _tiles(road: Road, surface: Surface, extent: Float64) -> tuple[Float64, npt.
 
 
 def _covered(extent: Float64, corner: Float64, tiles: npt.NDArray[np.int32]) -> tuple[Int64, Int64]:
-    """Cells that bodies reach into, and the body of each."""
+    """Return the cells that bodies overlap, and the body of each."""
     i, j, body_of = _squares(extent, corner, CELL_M)
     tile = tiles[j // TILE_CELLS, i // TILE_CELLS].astype(np.int64)
     return (tile * TILE_CELLS + j % TILE_CELLS) * TILE_CELLS + i % TILE_CELLS, body_of
 
 
 def _squares(extent: Float64, corner: Float64, size_m: float) -> tuple[Int64, Int64, Int64]:
-    """Column and row of the squares of a grid that bodies reach into, and the body of each."""
+    """Return column and row of the squares of a grid that bodies overlap, and the body of each."""
     low = np.floor((extent[:, :2] - corner) / size_m).astype(np.int64)
     high = np.floor((extent[:, 2:] - corner) / size_m).astype(np.int64)
     size = high - low + 1

@@ -1,4 +1,4 @@
-"""The vehicle's motion over the road: position and attitude at any instant of a pass."""
+"""The vehicle's motion over the road: position and attitude at any time of a pass."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ __all__ = ["RUN_UP_S", "Drive", "Poses", "drives_of"]
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_HEAVE_HZ, _ROLL_HZ, _PITCH_HZ, _YAW_HZ = 1.3, 0.9, 1.6, 0.35
-_PITCH_SHARE: Final = 0.7
-_YAW_SHARE: Final = 0.3
+_HEAVE_HZ, _ROLL_HZ, _PITCH_HZ, _YAW_HZ = 1.3, 0.9, 1.6, 0.35  # frequencies of the body's motion on its springs
+_PITCH_SHARE: Final = 0.7  # amplitude of pitch as a share of that of roll
+_YAW_SHARE: Final = 0.3  # amplitude of yaw as a share of that of roll
 _CALM_M_PER_S: Final = 1.0
-"""Speed at which the road shakes the springs half as much as it does at high speed."""
+"""Speed (m/s) at which the road moves the springs half as much as at high speed."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Poses:
     """n rotations"""
 
     def sensor(self, mount: Mount, body_from_axes: Float64) -> tuple[Float64, Float64]:
-        """ECEF origin (n, 3) and ecef_from_sensor (n, 3, 3) of a sensor, with its true mounting.
+        """Return the ECEF origin (n, 3) and ecef_from_sensor (n, 3, 3) of a sensor with its true mounting.
 
         body_from_sensor = R(roll, pitch, heading) · body_from_axes, Z-Y-X.
         """
@@ -53,7 +53,7 @@ class Poses:
 
 
 class Drive:
-    """One pass: path length driven as a function of time, and the pose there.
+    """One pass: path length as a function of time, and the pose there.
 
     The path follows a lane with the driver's wander, or a route; the body stands on a smooth version of the road (long
     waves, crown and grade) and moves on its springs, which add to roll, pitch and heading of the road under it. Time
@@ -74,7 +74,7 @@ class Drive:
         self.start_gps_ns = gps_ns_from_utc(scene.start) + round(number * scene.pause_s * NS_PER_S)
         """Epoch of the first profile."""
         self.length_m = path.length_m
-        """Driven from the first to the last profile (m)."""
+        """Path length from the first to the last profile (m)."""
         self._motion = Motion(one, scene.vehicle, number, path.length_m, float(phases[0]))
         self._springs = _Springs(scene.vehicle, phases[3:7])
         self._imu_height_m = scene.vehicle.imu_height_m
@@ -87,7 +87,7 @@ class Drive:
 
     @property
     def duration_s(self) -> float:
-        """From the first to the last profile (s)."""
+        """Time from the first to the last profile (s)."""
         return self._motion.duration_s
 
     @property
@@ -97,24 +97,24 @@ class Drive:
 
     @property
     def recorded_span_gps_ns(self) -> tuple[int, int]:
-        """First and last epoch that trajectory, IMU, GNSS and encoder record: with run-up, run-out and standstill."""
+        """First and last epoch of trajectory, IMU, GNSS and encoder: with run-up, run-out and standstill."""
         first, last = self._motion.recorded_span_s
         return self.start_gps_ns + round(first * NS_PER_S), self.start_gps_ns + round(last * NS_PER_S)
 
     def epoch_gps_ns(self, driven_m: Float64) -> Int64:
-        """Epochs at which a path length is first driven (n,)."""
+        """Return the epochs (n,) at which path lengths are first reached."""
         return self.start_gps_ns + np.rint(self._motion.time_s(driven_m) * NS_PER_S).astype(np.int64)
 
     def driven_m(self, epoch_gps_ns: Int64) -> Float64:
-        """Path length driven at epochs (n,): the inverse of :meth:`epoch_gps_ns` where the vehicle moves."""
+        """Return path lengths at epochs (n,): the inverse of :meth:`epoch_gps_ns` where the vehicle moves."""
         return self._motion.driven_m(self._seconds(epoch_gps_ns))
 
     def station_m(self, epoch_gps_ns: Int64) -> Float64:
-        """Station of the IMU reference point (n,)."""
+        """Return the station of the IMU reference point (n,)."""
         return self._stand.station_m(self.driven_m(epoch_gps_ns))
 
     def poses(self, epoch_gps_ns: Int64) -> Poses:
-        """True poses at epochs (n,), up to a quarter of a second outside the recorded span.
+        """Return true poses at epochs (n,), up to a quarter of a second outside the recorded span.
 
         Raises ValueError further outside: what the vehicle does there is not known.
         """
@@ -134,13 +134,13 @@ class Drive:
         return Poses(position, Rotation.from_quat((_times(self._ecef_from_level) @ quaternion).T))
 
     def _seconds(self, epoch_gps_ns: Int64) -> Float64:
-        """Seconds since the first profile (n,)."""
+        """Return seconds since the first profile (n,)."""
         seconds: Float64 = (epoch_gps_ns - self.start_gps_ns).astype(np.float64) / NS_PER_S
         return seconds
 
 
 def drives_of(scene: Scene, earth: Earth, ride: Surface) -> list[Drive]:
-    """All passes of a scene.
+    """Return all passes of a scene.
 
     Raises
     ------
@@ -162,7 +162,7 @@ def drives_of(scene: Scene, earth: Earth, ride: Surface) -> list[Drive]:
 
 
 class _Springs:
-    """The body on its suspension: waves that fade when the vehicle slows down, and lean."""
+    """The body on its suspension: waves that fade at low speed, and lean."""
 
     def __init__(self, vehicle: Vehicle, phases: Float64) -> None:
         self._waves = list(zip((_HEAVE_HZ, _ROLL_HZ, _PITCH_HZ, _YAW_HZ), phases, strict=True))
@@ -173,7 +173,7 @@ class _Springs:
     def at(
         self, time_s: Float64, speed: Float64, along: Float64, aside: Float64
     ) -> tuple[Float64, Float64, Float64, Float64]:
-        """Heave (m, upwards), yaw, pitch and roll (rad), (n,) each.
+        """Return heave (m, upwards), yaw, pitch and roll (rad), (n,) each.
 
         speed : (m/s); along, aside : acceleration of the body forward and to its right (m/s²).
         """
@@ -190,7 +190,7 @@ class _Springs:
 
 
 def _attitude(heading: Float64, pitch: Float64, roll: Float64) -> tuple[Float64, Float64]:
-    """Quaternions (4, n: x, y, z, w) of Z-Y-X angles, and the body's down axis (3, n)."""
+    """Return quaternions (4, n: x, y, z, w) of Z-Y-X angles, and the body's down axis (3, n)."""
     sh, ch, sp, cp, sr, cr = (f(a / 2) for a in (heading, pitch, roll) for f in (np.sin, np.cos))
     x, y = sr * cp * ch - cr * sp * sh, cr * sp * ch + sr * cp * sh
     z, w = cr * cp * sh - sr * sp * ch, cr * cp * ch + sr * sp * sh
@@ -198,6 +198,6 @@ def _attitude(heading: Float64, pitch: Float64, roll: Float64) -> tuple[Float64,
 
 
 def _times(rotation: Rotation) -> Float64:
-    """Matrix (4, 4) that multiplies quaternions (x, y, z, w) by a rotation from the left."""
+    """Return the matrix (4, 4) that multiplies quaternions (x, y, z, w) by a rotation from the left."""
     x, y, z, w = rotation.as_quat()
     return np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])

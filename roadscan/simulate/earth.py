@@ -1,4 +1,4 @@
-"""Where map and scene lie on the Earth: pyproj for the figure of the Earth, SciPy for rotations."""
+"""Relates map and scene to the Earth: pyproj for its figure, SciPy for rotations."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Float64 = npt.NDArray[np.float64]
 
 
 LOCAL: Final = "local"
-"""A frame of x to the right of y, z up, that is not tied to the Earth: flat, and at rest."""
-_ENU_FROM_NED: Final = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""CRS of a frame with x to the right of y, z up, that is not tied to the Earth: flat, and at rest."""
+_ENU_FROM_NED: Final = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # its own inverse
 _RATE_RAD_PER_S: Final = 7.292115e-5
 """Rate of the Earth's rotation: WGS 84."""
-_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
+_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # gravity of a local frame, upwards
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,12 @@ class Earth:
 
     @property
     def geographic_crs(self) -> str:
-        """Name of the CRS of latitude, longitude and ellipsoidal height that the logs are written in."""
+        """Name of the CRS of latitude, longitude and ellipsoidal height in the logs."""
         authority = self._geographic.to_authority(min_confidence=90)
         return ":".join(authority) if authority else str(self._geographic.to_wkt())
 
     def ecef_from_map(self, enh_m: Float64) -> Float64:
-        """ECEF positions (n, 3) of map coordinates (n, 3)."""
+        """Return ECEF positions (n, 3) of map coordinates (n, 3)."""
         if self.is_local:
             return np.array(enh_m, dtype=np.float64)
         to_degrees, to_ecef, units = self._steps
@@ -65,7 +65,7 @@ class Earth:
         return np.stack(to_ecef.transform(lon, lat, up), axis=-1)
 
     def map_from_ecef(self, xyz_m: Float64) -> Float64:
-        """Map coordinates (n, 3) of ECEF positions (n, 3)."""
+        """Return map coordinates (n, 3) of ECEF positions (n, 3)."""
         if self.is_local:
             return np.array(xyz_m, dtype=np.float64)
         to_degrees, to_ecef, units = self._steps
@@ -75,20 +75,20 @@ class Earth:
         return enh
 
     def geographic_from_ecef(self, xyz_m: Float64) -> Float64:
-        """Longitude, latitude (degrees) and ellipsoidal height (m), (n, 3), of ECEF positions (n, 3)."""
+        """Return longitude, latitude (degrees) and ellipsoidal height (m), (n, 3), of ECEF positions (n, 3)."""
         _, to_ecef, _ = self._steps
         x, y, z = np.ascontiguousarray(xyz_m.T)
         return np.stack(to_ecef.transform(x, y, z, direction="INVERSE"), axis=-1)
 
     def ecef_from_level(self, xyz_m: Float64) -> Rotation:
-        """Rotations that turn north-east-down vectors at ECEF positions (n, 3) into ECEF."""
+        """Return rotations of north-east-down vectors at ECEF positions (n, 3) into ECEF."""
         if self.is_local:
             return Rotation.concatenate([_ENU_FROM_NED] * len(xyz_m))
         lon, lat, _ = self.geographic_from_ecef(xyz_m).T
         return ecef_from_ned(lon, lat)
 
     def specific_force_at_rest(self, xyz_m: Float64) -> Float64:
-        """What accelerometers at rest on the Earth feel (n, 3), in ECEF axes (m/s²): normal gravity, upwards.
+        """Return the specific force (n, 3) at rest on the Earth, in ECEF axes (m/s²): normal gravity, upwards.
 
         Somigliana's formula on the ellipsoid and its change with height to second order (Groves 2013, eq. 2.134–2.139),
         with the constants of WGS 84.
@@ -108,7 +108,7 @@ class Earth:
 
     @property
     def rotation_ecef_rad_per_s(self) -> Float64:
-        """Rate of the Earth's rotation (3,), ECEF."""
+        """Return the Earth's rotation rate (3,), ECEF."""
         return np.array([0.0, 0.0, 0.0 if self.is_local else _RATE_RAD_PER_S])
 
     @functools.cached_property
@@ -134,7 +134,7 @@ class Earth:
 
 
 def ecef_from_ned(longitude_deg: Float64, latitude_deg: Float64) -> Rotation:
-    """Rotations that turn north-east-down vectors at geodetic positions (n,) into ECEF.
+    """Return rotations of north-east-down vectors at geodetic positions (n,) into ECEF.
 
     Rz(longitude) · Ry(−90° − latitude): at latitude −90° north-east-down is ECEF itself, turned by the longitude.
     """
@@ -154,7 +154,7 @@ class LocalMap:
 
     @classmethod
     def around(cls, earth: Earth, anchor_ecef_m: Float64, origin_enh_m: Float64, reach_m: float) -> LocalMap:
-        """Fit to exact projections of 27 points within `reach_m`; within 100 m the rest is below 0.1 µm.
+        """Fit to exact projections of 27 points within `reach_m`; within 100 m the remainder is below 0.1 µm.
 
         anchor_ecef_m : (3,); origin_enh_m : (3,) map coordinates that the result counts from.
         """
@@ -168,7 +168,7 @@ class LocalMap:
         return cls(anchor_ecef_m, ecef_from_enu, np.ascontiguousarray((fitted / scale[:, None]).T))
 
     def enu_from_ecef(self, xyz_m: Float64) -> Float64:
-        """East, north, up of the anchor (n, 3) of ECEF positions (n, 3)."""
+        """Return east, north, up at the anchor (n, 3) of ECEF positions (n, 3)."""
         enu: Float64 = (xyz_m - self.anchor_ecef_m) @ self.ecef_from_enu
         return enu
 

@@ -1,4 +1,4 @@
-"""What is local on the road, as rows of numbers by half metre: defects, patches, paint and spills."""
+"""Local features of the road, as rows of numbers by half metre: defects, patches, paint and spills."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from roadscan.simulate.scene.road import Alligator, Joints, Patch, Ravelling, Ro
 Float64 = npt.NDArray[np.float64]
 
 _FACE_M = 0.001
-"""Width of the face of a slab, seen from above."""
+"""Width of a slab's face, seen from above (m)."""
 _RAMP_M = 5.0
-"""Length of the slabs that lead to the first fault and from the last one."""
+"""Length of the slabs that lead to the first fault and from the last one (m)."""
 RECTANGLE, ELLIPSE, RING, BAND = 0.0, 1.0, 2.0, 3.0
 """Kinds of painted or spilt items."""
 
 
 @dataclass(frozen=True)
 class Features:
-    """Rows as :class:`roadscan.simulate.kernels.road.RoadArrays` has them, and the stations they reach over (m, 2)."""
+    """Rows as in :class:`roadscan.simulate.kernels.road.RoadArrays`, and the station ranges they cover (m, 2)."""
 
     defects: Float64
     defect_reach_m: Float64
@@ -37,7 +37,7 @@ class Features:
 
 
 def of_road(road: Road, seed: int, first_m: float, last_m: float, length_m: float, *, smooth: bool) -> Features:
-    """All features between two stations; none where the surface shall be `smooth`."""
+    """Return all features between two stations; none where the surface is to be `smooth`."""
     if smooth:
         nothing = [np.zeros((0, n)) for n in (8, 2, 9, 2, 8, 2)]
         return Features(*nothing)
@@ -56,7 +56,7 @@ def of_road(road: Road, seed: int, first_m: float, last_m: float, length_m: floa
 
 
 def by_node(rows: Float64, reach_m: Float64, station: Float64) -> tuple[Float64, Float64]:
-    """Rows in the order of the half metres they reach into, and for each node its first and end row (n, 2)."""
+    """Return rows in the order of the half metres they overlap, and each node's first and end row (n, 2)."""
     first = np.clip(np.floor((reach_m[:, 0] - station[0]) / NODE_STEP_M).astype(np.int64), 0, station.size - 1)
     last = np.clip(np.floor((reach_m[:, 1] - station[0]) / NODE_STEP_M).astype(np.int64), 0, station.size - 1)
     count = last - first + 1
@@ -68,7 +68,7 @@ def by_node(rows: Float64, reach_m: Float64, station: Float64) -> tuple[Float64,
 
 
 def humps(road: Road) -> tuple[Float64, Float64]:
-    """(m, 4) speed humps, and the stations that they reach over (m, 2)."""
+    """Return (m, 4) speed humps, and the station ranges that they cover (m, 2)."""
     half = [h.top_m / 2 + h.ramp_m for h in road.humps]
     rows = [[h.station_m, reach, 1.0 / h.ramp_m, h.height_m] for h, reach in zip(road.humps, half, strict=True)]
     reach = [[h.station_m - reach, h.station_m + reach] for h, reach in zip(road.humps, half, strict=True)]
@@ -76,7 +76,7 @@ def humps(road: Road) -> tuple[Float64, Float64]:
 
 
 def lines(road: Road) -> Float64:
-    """(m, 6) markings along the road."""
+    """Return (m, 6) markings along the road."""
     rows = []
     for line in road.markings:
         broken = line.dash_m > 0.0 and line.gap_m > 0.0
@@ -90,12 +90,12 @@ def _table(rows: list[list[float]], columns: int) -> Float64:
 
 
 def _shifts(repeat_m: float, length_m: float) -> Float64:
-    """Stations by which features are repeated."""
+    """Return the station shifts by which features are repeated."""
     return repeat_m * np.arange(math.ceil(length_m / repeat_m), dtype=np.float64) if repeat_m > 0.0 else np.zeros(1)
 
 
 def _repeated(rows: Float64, shifts_m: Float64, column: int, far_end: int = -1, kind: float = np.nan) -> Float64:
-    """Rows again at each shift: `column` holds their station, `far_end` that of the other end of those of a kind."""
+    """Return rows repeated at each shift: `column` has their station, `far_end` that of the other end of some kinds."""
     if not rows.size or shifts_m.size == 1:
         return rows
     again = np.repeat(rows[None], shifts_m.size, axis=0)
@@ -153,7 +153,7 @@ def _alligators(road: Road, seed: int) -> list[list[float]]:
 
 
 def _cell_borders(field: Alligator, rng: np.random.Generator) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    """Borders of random cells (Voronoi) that lie inside the field's ellipse."""
+    """Return borders of random cells (Voronoi) inside the field's ellipse."""
     half = np.array([field.length_m, field.width_m]) / 2
     count = max(8, round(4 * 2.25 * half[0] * half[1] / field.cell_m**2))
     cells = Voronoi(rng.uniform(-1.5, 1.5, (count, 2)) * half)
@@ -181,7 +181,7 @@ def _lost_stones(road: Road, seed: int) -> list[list[float]]:
 
 
 def _within(place: Ravelling, rng: np.random.Generator) -> Float64:
-    """Middles of lost stones (n, 2), stations and offsets, even over the place."""
+    """Return centres of lost stones (n, 2), stations and offsets, uniform over the place."""
     half = np.array([place.length_m, place.width_m]) / 2
     mean_square = 1.0 + 0.6**2 / 12  # of diameters over their mean
     count = round(place.lost_share * 4.0 * half[0] * half[1] / (math.pi * place.stone_m**2 / 4 * mean_square))
@@ -200,7 +200,7 @@ def _patch(p: Patch) -> list[float]:
 
 
 def faults_of(slabs: Slabs, seed: int, number: int) -> tuple[Float64, Float64]:
-    """Stations of the joints (n,), and their faults, positive where the slab behind is lower (n,; m)."""
+    """Return stations of the joints (n,), and their faults, positive where the slab behind is lower (n,; m)."""
     rng = stream(seed, number, "slabs")
     most = max(int((slabs.end_m - slabs.start_m) / slabs.length_m[0]), 0) + 1
     stations = slabs.start_m + np.append(0.0, np.cumsum(rng.uniform(*slabs.length_m, most)))
@@ -215,7 +215,7 @@ def _gap(slabs: Slabs, station_m: float, road: Road) -> list[float]:
 
 
 def _slabs(road: Road, station_m: Float64, fault_m: Float64) -> list[list[float]]:
-    """Patches over the paved width between the joints; before the first and behind the last a slab ends level."""
+    """Return patches over the paved width between the joints; the outermost slabs end level."""
     ends = np.concatenate([station_m[:1] - _RAMP_M, station_m, station_m[-1:] + _RAMP_M])
     near, far = np.append(0.0, -0.5 * fault_m), np.append(0.5 * fault_m, 0.0)
     middle, length = 0.5 * (ends[1:] + ends[:-1]), np.diff(ends)
@@ -239,7 +239,7 @@ def _patch_reach(rows: Float64) -> Float64:
 
 
 def _spilt(road: Road) -> list[list[float]]:
-    """Stains and tyre marks."""
+    """Return stains and tyre marks."""
     rows = [[ELLIPSE, s.shade, s.station_m, s.offset_m, s.length_m / 2, s.width_m / 2, 0.0, 0.0] for s in road.stains]
     rows += [
         [BAND, mark.shade, s0, o0, mark.width_m / 2, 0.0, s1, o1]
@@ -251,7 +251,7 @@ def _spilt(road: Road) -> list[list[float]]:
 
 
 def _painted(road: Road) -> list[list[float]]:
-    """Stop bars, zebra crossings and targets."""
+    """Return stop bars, zebra crossings and targets."""
     paint = road.brightness.marking
     rows: list[list[float]] = []
     for bar in road.stop_bars:

@@ -1,4 +1,4 @@
-"""The survey's own files: ``SURVEY.toml``, ``RIG.toml`` and the control points."""
+"""Writes the survey's files: ``SURVEY.toml``, ``RIG.toml`` and the control points."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from roadscan.simulate.surface import Surface
 SURVEY_FILE: Final = "SURVEY.toml"
 RIG_FILE: Final = "RIG.toml"
 CONTROL_FILE: Final = "control.csv"
-_LONGEST_RAW: Final = 65_535
+_LONGEST_RAW: Final = 65_535  # largest raw range
 
 
 def run_id(number: int) -> str:
-    """Name of the run of pass `number`, counted from 0."""
+    """Return the name of the run of pass `number`, counted from 0."""
     return f"run-{number + 1}"
 
 
@@ -134,7 +134,7 @@ def write_control(scene: Scene, surface: Surface, file: Path) -> None:
 
 
 def _control_places(scene: Scene) -> tuple[npt.NDArray[np.float64], list[str]]:
-    """Stations and offsets (n, 2) of the control points, and their roles."""
+    """Return stations and offsets (n, 2) of the control points, and their roles."""
     targets = scene.road.targets
     if targets:
         return np.array([[t.station_m, t.offset_m] for t in targets]), [t.role for t in targets]
@@ -178,7 +178,7 @@ def _sensor(
 
 
 def _interior(camera: Camera) -> list[str]:
-    """Interior orientation as it is in truth: no calibration of a simulated camera errs."""
+    """Return the true interior orientation: calibrations of simulated cameras have no error."""
     size = ["[sensors.camera.interior]", f"width_px = {camera.width_px}", f"height_px = {camera.height_px}"]
     if camera.model == "equirectangular":
         return [*size, f"model = {_text(camera.model)}"]
@@ -192,7 +192,7 @@ def _interior(camera: Camera) -> list[str]:
 
 
 def _imu_errors(errors: ImuErrors | ImuGrade) -> str:
-    """Line of an IMU's errors: its grade, or the values of a data sheet."""
+    """Return the line of an IMU's errors: its grade, or the values of a data sheet."""
     if isinstance(errors, str):
         return f"imu = {_text(errors)}"
     return "imu = { " + ", ".join(f"{name} = {value!r}" for name, value in errors.model_dump().items()) + " }"
@@ -204,5 +204,5 @@ def _profiler_limits(head: Head) -> tuple[float, float]:
 
 
 def _text(value: str) -> str:
-    """TOML basic string; JSON's escapes are a part of TOML's."""
+    """Return a TOML basic string; TOML accepts all JSON escapes."""
     return json.dumps(value, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""The logs of one pass: what the rig's sensors write, in which format, and what the survey file has to state of it."""
+"""The logs of one pass: what the sensors write, in which format, and what the survey file has to state of it."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ class SimulatedLog:
     name: str
     """File or folder, relative to the run's folder."""
     write: Callable[[], Iterator[int]]
-    """Writes it, a piece a step; yields the records of each."""
+    """Writes the log, one piece per step; yields the records of each."""
     content: Content = "other"
-    """What its records are, for the summary."""
+    """Kind of its records, for the summary."""
     format: str = ""
     """Format that the survey file states; empty: the log is not listed there."""
     sensor: str | None = None
     """Sensor of the rig."""
     clock: str | None = None
-    """TOML of its clock."""
+    """Its clock as TOML."""
     crs: str | None = None
     """CRS of its positions."""
     options: str | None = None
-    """TOML of the format's settings."""
+    """The format's settings as TOML."""
 
 
 @dataclass(frozen=True)
 class Pass:
-    """One pass with the folders that its logs and hits go to."""
+    """One pass with the folders of its logs and hits."""
 
     scene: Scene
     surface: Surface
     world: World | None
-    """What rays meet; None where nothing on the rig casts any."""
+    """World of the rays; None where nothing on the rig casts any."""
     things: Sequence[Object]
-    """What stands on and beside the road."""
+    """Objects on and beside the road."""
     drive: Drive
     raw: Path
     """Folder of the logs."""
@@ -65,14 +65,14 @@ class Pass:
     true_camera: Path
     """File of the camera's true poses."""
     hits: Callable[[str], Path | None]
-    """File for a sensor's hits; None where they are not wanted."""
+    """Returns the file of a sensor's hits; None where they are not requested."""
 
     def clock(self, sensor: str, usual: TimeSystem) -> SensorClock:
-        """Clock of a sensor (a table of the scene) whose log usually is stamped in `usual`."""
+        """Return the clock of a sensor (a table of the scene) whose log usually has stamps of `usual`."""
         return SensorClock.of(self.scene, getattr(self.scene, sensor).clock, usual)
 
     def logs(self) -> list[SimulatedLog]:
-        """All logs of the pass, the longest work first.
+        """Return all logs of the pass, the longest work first.
 
         Raises
         ------
@@ -130,7 +130,7 @@ class Pass:
 
         clock, first = self.clock("lidar", TimeSystem.UTC_HOUR), lidar.starts_gps_ns(self.drive)
         hour = None
-        if self.drive.earth.is_local:  # no GNSS receiver is attached that would tell the hour
+        if self.drive.earth.is_local:  # no GNSS receiver is attached that would give the hour
             shown = int(clock.shown_gps_ns(np.array([first]))[0])
             hour = f"{{ hour = {utc_from_gps_ns(shown).hour} }}"
         stated = clock.toml(None, first)
@@ -188,7 +188,7 @@ class Pass:
             return gnss.write_nmea(gnss.solve(self.scene, self.drive), self.raw / "gnss.nmea")
 
         yield SimulatedLog("gnss.pos", pos, "other", "rtklib_pos", "gnss", None, crs)
-        yield SimulatedLog("gnss.nmea", nmea)  # the same solutions again: listed, they would count twice
+        yield SimulatedLog("gnss.nmea", nmea)  # the same solutions again: if listed, they would count twice
 
     def _encoder(self) -> Iterator[SimulatedLog]:
         if not self.scene.encoder.on:

@@ -1,4 +1,4 @@
-"""When the vehicle is where: driven length as a function of time, with changes of speed, stops and standstill.
+"""The vehicle's progress: driven length as a function of time, with changes of speed, stops and standstill.
 
 The speed is a *pace*, piecewise polynomial in time, times the driver's wave, a sine of the path: the path length
 ``driven = way + wave(way)``, where ``way`` is the integral of the pace. The pace keeps limits of acceleration and
@@ -23,23 +23,23 @@ from roadscan.simulate.scene import PassScene, Vehicle
 Float64 = npt.NDArray[np.float64]
 
 RUN_UP_S: Final = 0.6
-"""Driven before the first and after the last profile (s); the trajectory covers it."""
+"""Time driven before the first and after the last profile (s); the trajectory covers it."""
 MARGIN_S: Final = 0.25
-"""Known beyond the recorded span (s), for derivatives and sensors' last turns."""
-_WAVE_M: Final = 120.0
+"""Margin of the motion beyond the recorded span (s), for derivatives and sensors' last turns."""
+_WAVE_M: Final = 120.0  # wavelength of the driver's speed variation
 _EASE_S: Final = 0.8
-"""Time in which the driver reaches the full acceleration."""
-_SHORTEST_S: Final = 1e-10
+"""Time in which the driver reaches the full acceleration (s)."""
+_SHORTEST_S: Final = 1e-10  # shorter pieces are left out
 _SNAP_M: Final = 1e-9
-"""The vehicle has reached a stop within this of it."""
+"""Distance from a stop within which the vehicle has reached it (m)."""
 
 
 @dataclass(frozen=True)
 class _Node:
-    """A place where the pace is limited; the vehicle may stand there."""
+    """A place with a limited pace, where the vehicle may stand."""
 
     at_m: float
-    """Way."""
+    """Distance along the way (m)."""
     pace: float
     """Greatest pace there (m/s)."""
     wait_s: float = 0.0
@@ -47,18 +47,18 @@ class _Node:
 
 @dataclass(frozen=True)
 class _Change:
-    """From pace to pace within the limits: acceleration eases in, holds, eases out."""
+    """A change of pace within the limits: acceleration eases in, holds, eases out."""
 
     before: float
     after: float
     ease_s: float
     hold_s: float
     acceleration: float
-    """Its peak (m/s²)."""
+    """Peak acceleration (m/s²)."""
 
     @classmethod
     def of(cls, before: float, after: float, limit: float) -> _Change:
-        """The quickest change with an acceleration up to `limit` and a jerk up to 1.5 limit / _EASE_S."""
+        """Return the quickest change with an acceleration up to `limit` and a jerk up to 1.5 limit / _EASE_S."""
         step = abs(after - before)
         ease = _EASE_S if step >= limit * _EASE_S else math.sqrt(step * _EASE_S / limit)
         peak = limit * ease / _EASE_S
@@ -67,11 +67,11 @@ class _Change:
 
     @property
     def way_m(self) -> float:
-        """Way that it takes: the mean pace is that of its middle."""
+        """Return the distance that it takes: its mean pace is the average of both ends."""
         return (self.before + self.after) / 2 * (2 * self.ease_s + self.hold_s)
 
     def pieces(self) -> list[tuple[float, list[float]]]:
-        """Durations and coefficients of τ, from τ¹ to τ⁵, of its three parts."""
+        """Return durations and coefficients of τ, from τ¹ to τ⁵, of its three parts."""
         a, t = self.acceleration, self.ease_s
         if t == 0.0:
             return []
@@ -85,7 +85,7 @@ class _Change:
 
 
 class Motion:
-    """Driven length, speed and acceleration by the time since the first profile, and back.
+    """Driven length, speed and acceleration as functions of the time since the first profile, and the inverse.
 
     Parameters
     ----------
@@ -107,19 +107,19 @@ class Motion:
         zero = float(self._time_at(np.zeros(1))[0])
         self._way.x = self._way.x - zero
         self.duration_s = float(self.time_s(np.array([length_m]))[0])
-        """From the first to the last profile (s)."""
+        """Time from the first to the last profile (s)."""
         standing = vehicle.standstill_s > 0.0
-        # The first and the last piece go on for ever; where the vehicle stands they are as long as it does.
+        # The first and the last piece are unlimited; where the vehicle stands they are as long as it does.
         start, end = (self._way.x[0], self._way.x[-1]) if standing else (-RUN_UP_S, self.duration_s + RUN_UP_S)
         self.recorded_span_s = float(start), float(end)
-        """From the first to the last instant that is recorded, standstill included (s)."""
+        """First and last recorded time, including standstill (s)."""
 
     def driven_m(self, time_s: Float64) -> Float64:
-        """Driven length (n,) at times (n,)."""
+        """Return driven length (n,) at times (n,)."""
         return self._driven(self._way(time_s))
 
     def state(self, time_s: Float64) -> tuple[Float64, Float64, Float64]:
-        """Driven length (m), speed (m/s) and acceleration along the path (m/s²), (n,) each."""
+        """Return driven length (m), speed (m/s) and acceleration along the path (m/s²), (n,) each."""
         way, pace, change = (self._way(time_s, nu) for nu in range(3))
         phase = self._k * way + self._phase
         factor = 1.0 + self._variation * np.cos(phase)
@@ -127,7 +127,7 @@ class Motion:
         return self._driven(way), factor * pace, factor * change - swing * pace * pace
 
     def time_s(self, driven_m: Float64) -> Float64:
-        """Times (n,) at which lengths are first driven (n,)."""
+        """Return times (n,) at which lengths (n,) are first reached."""
         return self._time_at(self._way_m(driven_m))
 
     def _driven(self, way_m: Float64) -> Float64:
@@ -136,14 +136,14 @@ class Motion:
         return driven
 
     def _way_m(self, driven_m: Float64) -> Float64:
-        """Inverse of :meth:`_driven`, by Newton's method."""
+        """Return the inverse of :meth:`_driven`, by Newton's method."""
         way = driven_m
         for _ in range(6):
             way = way - (self._driven(way) - driven_m) / (1.0 + self._variation * np.cos(self._k * way + self._phase))
         return way
 
     def _time_at(self, way_m: Float64) -> Float64:
-        """Times (n,) at which ways are first driven."""
+        """Return times (n,) at which ways are first reached."""
         piece = np.searchsorted(self._ways[1:-1], way_m - _SNAP_M, side="left")
         coefficients = self._way.c[:, piece]
         ahead, pace = way_m - self._ways[piece], coefficients[4]
@@ -156,7 +156,7 @@ class Motion:
         return out
 
     def _plan(self, one: PassScene, vehicle: Vehicle, length_m: float) -> tuple[list[_Node], list[float]]:
-        """Nodes in the order driven, and the pace between them."""
+        """Return the nodes in the order driven, and the pace between them."""
         first = one.speed_m_per_s or vehicle.speed_m_per_s
         speeds = [first, *(change.speed_m_per_s for change in one.speeds)]
         stops = [_Node(self._of(stop.at_m), 0.0, stop.duration_s) for stop in one.stops]
@@ -196,7 +196,7 @@ def _check(one: PassScene, number: int, length_m: float) -> None:
 
 
 def _reachable(nodes: list[_Node], caps: list[float], limit: float) -> list[_Node]:
-    """The nodes with paces that can be reached from their neighbours within the limits."""
+    """Return the nodes with paces that can be reached from their neighbours within the limits."""
     ways = [b.at_m - a.at_m for a, b in itertools.pairwise(nodes)]
     paces = [node.pace for node in nodes]
     for i in reversed(range(len(ways))):
@@ -207,14 +207,14 @@ def _reachable(nodes: list[_Node], caps: list[float], limit: float) -> list[_Nod
 
 
 def _fastest(pace: float, wanted: float, way_m: float, limit: float) -> float:
-    """Greatest pace up to `wanted` that is reached from `pace` over a way."""
+    """Return the greatest pace up to `wanted` that can be reached from `pace` over a distance."""
     if wanted <= pace:
         return wanted
     return _greatest(lambda w: _Change.of(pace, w, limit).way_m <= way_m, pace, wanted)
 
 
 def _greatest(fits: Callable[[float], bool], low: float, high: float) -> float:
-    """Greatest value in [low, high] that fits, by halving: `low` fits, and so does all below a value that fits."""
+    """Return the greatest fitting value in [low, high] by bisection: `low` fits, and all below a fitting one."""
     if fits(high):
         return high
     for _ in range(60):
@@ -226,7 +226,7 @@ def _greatest(fits: Callable[[float], bool], low: float, high: float) -> float:
 def _joined(
     nodes: list[_Node], caps: list[float], limit: float, standstill_s: float
 ) -> tuple[list[float], list[float], list[list[float]]]:
-    """Breaks (m + 1) in time and way, and coefficients (m, 6) of τ⁵ … τ⁰ of the pieces between.
+    """Return breaks (m + 1) in time and way, and coefficients (m, 6) of τ⁵ … τ⁰ of the pieces between.
 
     The first and the last piece are even: the vehicle stands, or drives on at the same pace.
     """
@@ -257,7 +257,7 @@ def _joined(
 
 
 def _leg(here: _Node, there: _Node, cap: float, limit: float) -> tuple[_Change, _Change]:
-    """The changes of pace after one node and before the next, to the greatest pace that the way between allows."""
+    """Return the changes of pace after one node and before the next, to the greatest pace that the distance allows."""
     way = there.at_m - here.at_m
 
     def changes(pace: float) -> tuple[_Change, _Change]:
@@ -268,7 +268,7 @@ def _leg(here: _Node, there: _Node, cap: float, limit: float) -> tuple[_Change, 
 
 
 def _solved(coefficients: Float64, longest_s: Float64, ahead_m: Float64) -> Float64:
-    """τ (n,) from 0 to `longest_s` where growing polynomials (6, n), constants left out, reach `ahead_m`.
+    """Return τ (n,) from 0 to `longest_s` where growing polynomials (6, n), without constants, reach `ahead_m`.
 
     Newton's method in a bracket that shrinks; where it leaves the bracket, halving.
     """

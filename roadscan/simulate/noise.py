@@ -1,4 +1,4 @@
-"""Random numbers: one independent stream for each purpose and block, so that no result depends on chunks."""
+"""Random numbers: an independent stream for each purpose and block, so that no result depends on chunks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Float64 = npt.NDArray[np.float64]
 
 
 def stream(seed: int, run: int, purpose: str, block: int = 0) -> np.random.Generator:
-    """Generator for one purpose ("profiler_left", "lidar" …) of one block of one run."""
+    """Return the generator for one purpose ("profiler_left", "lidar" …) of one block of one run."""
     key = (run, zlib.crc32(purpose.encode()), block)
     return np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)))
 
@@ -31,7 +31,7 @@ class GaussMarkov:
         self._last = sigma * rng.standard_normal(sigma.size)
 
     def take(self, count: int) -> Float64:
-        """The next (count, k) values, for k components of standard deviation `sigma` (k,)."""
+        """Return the next (count, k) values, for k components of standard deviation `sigma` (k,)."""
         if count == 0:
             return np.zeros((0, self._sigma.size))
         steps = self._sigma * np.sqrt(1.0 - self._keep**2) * self._rng.standard_normal((count, self._sigma.size))

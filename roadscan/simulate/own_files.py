@@ -1,4 +1,4 @@
-"""The files of a simulated survey that a user edits: they are not overwritten where that was done."""
+"""The files of a simulated survey that a user may edit: edited ones are not overwritten."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from roadscan.simulate.files import CONTROL_FILE, RIG_FILE, SURVEY_FILE
 from roadscan.simulate.truth import TRUTH_FOLDER
 
 _WRITTEN: Final = "written.json"
-"""In the truth folder: digests of the files as the simulator wrote them."""
+"""File in the truth folder with digests of the files as the simulator wrote them."""
 _EDITED: Final = (RIG_FILE, CONTROL_FILE, SURVEY_FILE)
 
 
 def refuse_edited(folder: Path) -> None:
-    """Raise :class:`ConfigError` if a file of the simulated survey in `folder` is not as the simulator wrote it."""
+    """Raise :class:`ConfigError` if a user edited a file of the simulated survey in `folder`."""
     record = folder / TRUTH_FOLDER / _WRITTEN
     written = json.loads(record.read_bytes()) if record.is_file() else {}
     arrived = "the file was edited since the simulator wrote it"
@@ -39,9 +39,9 @@ def refuse_edited(folder: Path) -> None:
 
 @contextlib.contextmanager
 def written_for_the_user(folder: Path) -> Iterator[Path]:
-    """A folder to write the files into; at the end their digests are noted, and they take their places in `folder`.
+    """Return a folder for the files; at the end their digests are stored, and they are moved to `folder`.
 
-    Whoever is stopped in between finds the old digests and the new ones noted.
+    If it is interrupted, both the old and the new digests are stored.
     """
     record = folder / TRUTH_FOLDER / _WRITTEN
     with tempfile.TemporaryDirectory(dir=folder / TRUTH_FOLDER) as scratch:

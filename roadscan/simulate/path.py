@@ -1,4 +1,4 @@
-"""Where the vehicle drives: paths over the road by the length driven, and how the body stands on them.
+"""The vehicle's path over the road by the length driven, and how the body stands on it.
 
 *Driven* is the path's length in the map since the first profile (m). A path follows a lane, or is a free route.
 """
@@ -22,36 +22,36 @@ from roadscan.simulate.surface import Surface
 
 Float64 = npt.NDArray[np.float64]
 
-_WANDER_WAVES_M: Final = (83.0, 31.0)
+_WANDER_WAVES_M: Final = (83.0, 31.0)  # wavelengths of the driver's wander
 _STEP_M: Final = 0.25
-"""Distance of the places at which the body's stand is worked out; splines lie between."""
-_AXLE_STEPS: Final = 2
+"""Distance of the places at which the body's stand is computed; splines interpolate between them (m)."""
+_AXLE_STEPS: Final = 2  # steps from the body's middle to an axle
 _AXLE_M: Final = _AXLE_STEPS * _STEP_M
-"""Half the distance between the points of contact that tilt the body."""
+"""Half the distance between the points of contact that tilt the body (m)."""
 _EDGE_STEPS: Final = 6
-"""Places beyond both ends: the axles', and some that keep the splines' ends away."""
+"""Places beyond both ends: the axles', and some to keep the splines' ends away."""
 _LEAN_SIGMA_M: Final = 2.0
-"""The body leans after the path's curvature within about this."""
+"""Length over which the body's lean follows the path's curvature (m)."""
 
 
 class Path(Protocol):
     """A path over the road."""
 
     length_m: float
-    """From the first to the last profile (m)."""
+    """Length from the first to the last profile (m)."""
 
     def points_at(self, driven_m: Float64, aside_m: float = 0.0) -> Float64:
-        """Map points (n, 3) on the road where a length is driven (n,), shifted to the right of travel.
+        """Return map points (n, 3) on the road at driven lengths (n,), shifted to the right of travel.
 
         Raises ConfigError where there is no road.
         """
 
     def station_m(self, driven_m: Float64) -> Float64:
-        """Stations (n,)."""
+        """Return stations (n,)."""
 
 
 class LanePath:
-    """Along a lane: its middle, the shift of the pass, and the driver's wander."""
+    """A path along a lane: its middle, the shift of the pass, and the driver's wander."""
 
     def __init__(self, scene: Scene, number: int, ride: Surface, phases: Float64) -> None:
         one = scene.passes[number]
@@ -76,7 +76,7 @@ class LanePath:
         self._station = CubicSpline(driven, station if self._sign > 0 else station[::-1])
 
     def points_at(self, driven_m: Float64, aside_m: float = 0.0) -> Float64:
-        """Map points on the road: see :class:`Path`."""
+        """Return map points on the road: see :class:`Path`."""
         missing = max(self._reach_m[0] - float(driven_m.min()), float(driven_m.max()) - self._reach_m[1])
         if missing > 0.0:
             raise ConfigError(
@@ -88,7 +88,7 @@ class LanePath:
         return self._ride.points_at(station, self._offset_m(station) + self._sign * aside_m)
 
     def station_m(self, driven_m: Float64) -> Float64:
-        """Stations (n,)."""
+        """Return stations (n,)."""
         station: Float64 = self._station(driven_m)
         return station
 
@@ -114,7 +114,7 @@ class RoutePath:
     """A free route of straights and arcs.
 
     The curvature is that of the pieces, averaged over `ease_m`: clothoids centred on the joints, so that the whole
-    turns as far as the pieces do. Before the first and after the last piece their curvature goes on.
+    turns as far as the pieces do. Before the first and after the last piece their curvature continues.
     """
 
     def __init__(self, route: Route, number: int, ride: Surface) -> None:
@@ -129,7 +129,7 @@ class RoutePath:
         self._start = np.array([float(e), float(n), float(along) + math.radians(route.heading_deg)])
 
     def plan(self, driven_m: Float64) -> tuple[Float64, Float64, Float64]:
-        """Easting, northing (m) and grid heading (rad) where a length is driven (n,).
+        """Return easting, northing (m) and grid heading (rad) at driven lengths (n,).
 
         By Gauss–Legendre quadrature of the clothoids, between all these places and each metre.
         """
@@ -144,7 +144,7 @@ class RoutePath:
         return self._start[0] + e[here] - e[zero], self._start[1] + n[here] - n[zero], self._heading(driven_m)
 
     def points_at(self, driven_m: Float64, aside_m: float = 0.0) -> Float64:
-        """Map points on the road: see :class:`Path`."""
+        """Return map points on the road: see :class:`Path`."""
         e, n, heading = self.plan(driven_m)
         e, n = e + aside_m * np.cos(heading), n - aside_m * np.sin(heading)
         height = self._ride.height_m(e, n)
@@ -161,12 +161,12 @@ class RoutePath:
         return np.stack([e, n, height], axis=-1)
 
     def station_m(self, driven_m: Float64) -> Float64:
-        """Stations (n,)."""
+        """Return stations (n,)."""
         e, n, _ = self.plan(driven_m)
         return self._ride.station_offset_m(e, n)[0]
 
     def _heading(self, driven_m: Float64) -> Float64:
-        """Grid heading (rad), any shape: the integral of the curvature."""
+        """Return the grid heading (rad), any shape: the integral of the curvature."""
         heading: Float64 = self._start[2] + self._curvature[0] * driven_m
         for i, change in enumerate(np.diff(self._curvature)):
             first, last = self._bends[2 * i : 2 * i + 2]
@@ -224,18 +224,18 @@ class Stand:
         self._station: BSpline = make_interp_spline(driven, path.station_m(driven), k=5)
 
     def at(self, driven_m: Float64) -> Float64:
-        """(7, n): north, east, down (m), heading, pitch, roll (rad), curvature to the right (1/m)."""
+        """Return (7, n): north, east, down (m), heading, pitch, roll (rad), curvature to the right (1/m)."""
         rows: Float64 = np.ascontiguousarray(self._spline(driven_m).T)
         return rows
 
     def station_m(self, driven_m: Float64) -> Float64:
-        """Stations (n,)."""
+        """Return stations (n,)."""
         station: Float64 = self._station(driven_m)
         return station
 
 
 def path_of(scene: Scene, number: int, ride: Surface, wander_phases: Float64) -> Path:
-    """The path of a pass.
+    """Return the path of a pass.
 
     wander_phases : (2,) of the driver's wander (rad).
     """
@@ -246,9 +246,9 @@ def path_of(scene: Scene, number: int, ride: Surface, wander_phases: Float64) ->
 
 
 def _contacts(path: Path, around_m: Float64) -> tuple[Float64, Float64, Float64]:
-    """Contact points (n − 4, 3) in the map, and vectors of about 1 m ahead and to the right of travel.
+    """Return contact points (n − 4, 3) in the map, and vectors of about 1 m ahead and to the right of travel.
 
-    around_m : (n,) even places; the first and last two are only looked at from the others.
+    around_m : (n,) even places; the first and last two only serve the others.
     """
     points = path.points_at(around_m)
     inner = slice(_AXLE_STEPS, -_AXLE_STEPS)
@@ -260,7 +260,7 @@ def _contacts(path: Path, around_m: Float64) -> tuple[Float64, Float64, Float64]
 
 
 def _level_at(earth: Earth, enh_m: Float64) -> tuple[Float64, Float64]:
-    """ECEF position (3,) of a map point (3,), and the map's north, east and down there as columns (3, 3)."""
+    """Return the ECEF position (3,) of a map point (3,), and the map's north, east and down there as columns (3, 3)."""
     steps = np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     origin, ahead, behind, above, below = earth.ecef_from_map(enh_m + steps)
     down = _unit(below - above)
@@ -269,7 +269,7 @@ def _level_at(earth: Earth, enh_m: Float64) -> tuple[Float64, Float64]:
 
 
 def _zyx_angles(forward: Float64, aside: Float64) -> Float64:
-    """Heading, pitch, roll (n, 3) of bodies whose x axis is along `forward`, and z at right angles to `aside`."""
+    """Return heading, pitch, roll (n, 3) of bodies with x along `forward`, and z perpendicular to `aside`."""
     x = _unit(forward)
     z = _unit(np.cross(x, aside))
     angles: Float64 = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=-1)).as_euler("ZYX")

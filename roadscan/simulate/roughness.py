@@ -20,28 +20,28 @@ Float64 = npt.NDArray[np.float64]
 
 STEP_M: Final = 0.1
 """Distance between samples along a track (m)."""
-_REFERENCE_PER_M: Final = 0.1
-_LONGEST_M, _SHORTEST_M = 80.0, 0.7
+_REFERENCE_PER_M: Final = 0.1  # n0 of ISO 8608 (cycles/m)
+_LONGEST_M, _SHORTEST_M = 80.0, 0.7  # wavelengths of the unevenness
 _CLASS_DEGREES_M3: Final = {"A": 16e-6, "B": 64e-6, "C": 256e-6, "D": 1024e-6, "E": 4096e-6}
 """G(n0), geometric mean of each class: ISO 8608, table 1."""
-_COHERENCE_WAVE_M: Final = 5.0
+_COHERENCE_WAVE_M: Final = 5.0  # wavelength for which `coherence_m` is stated
 
-_IRI_STEP_M: Final = 0.25
-_IRI_SPEED_M_PER_S: Final = 80.0 / 3.6
-_IRI_START_M: Final = 11.0
+_IRI_STEP_M: Final = 0.25  # step of the IRI (Sayers 1995)
+_IRI_SPEED_M_PER_S: Final = 80.0 / 3.6  # speed of the golden car
+_IRI_START_M: Final = 11.0  # length of the initial mean slope
 _GOLDEN_CAR: Final = (653.0, 63.3, 6.0, 0.15)
 """Tyre and suspension stiffness (1/s²), damping (1/s) and mass ratio: Sayers (1995), table 1."""
 
 
 def track_offsets_m(road: Road) -> Float64:
-    """Offsets of the tracks (t,), a tenth of a lane and at most 0.35 m apart, over the paved width."""
+    """Return offsets of the tracks (t,), a tenth of a lane and at most 0.35 m apart, over the paved width."""
     step = min(road.lane_width_m / 10, 0.35)
     count = max(2, math.ceil(road.paved_m / step))
     return np.linspace(-road.paved_m, road.paved_m, 2 * count + 1)
 
 
 def tracks(road: Road, station_m: Float64, waves_m: Float64, rng: np.random.Generator) -> Float64:
-    """Unevenness (t, s) of all tracks at evenly spaced stations (s,), scaled as the scene states.
+    """Return the unevenness (t, s) of all tracks at evenly spaced stations (s,), scaled as the scene states.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def tracks(road: Road, station_m: Float64, waves_m: Float64, rng: np.random.Gene
 def _unit_tracks(
     offsets_m: Float64, samples: int, waviness: float, coherence_m: float, rng: np.random.Generator
 ) -> Float64:
-    """Tracks (t, samples) of G(n0) = 1 m³.
+    """Return tracks (t, samples) of G(n0) = 1 m³.
 
     A wave of n cycles/m keeps the share exp(−5 m · n · distance / coherence_m) of its likeness from track to track.
     """
@@ -83,13 +83,13 @@ def _unit_tracks(
 
 
 def _complex_normal(rng: np.random.Generator, size: int) -> npt.NDArray[np.complex128]:
-    """Complex normal numbers of variance 1."""
+    """Return complex normal numbers of variance 1."""
     parts = rng.standard_normal((2, size)) / math.sqrt(2.0)
     return np.asarray(parts[0] + 1j * parts[1])
 
 
 def _scale_for(road: Road, offsets_m: Float64, unit: Float64, waves_m: Float64, wanted: float) -> float:
-    """Factor that gives the wheel paths the wanted mean IRI, by bisection."""
+    """Return the factor that gives the wheel paths the wanted mean IRI, by bisection."""
     wheels = [road.lane_offset_m(lane) + side for lane in range(1, road.lanes + 1) for side in (-0.8, 0.8)]
     paths = [unit[int(np.abs(offsets_m - wheel).argmin())] for wheel in wheels]
 
@@ -108,7 +108,7 @@ def _scale_for(road: Road, offsets_m: Float64, unit: Float64, waves_m: Float64, 
 
 
 def iri_m_per_km(height_m: Float64, step_m: float) -> float:
-    """International Roughness Index of a whole profile (m/km): Sayers (1995), the golden car at 80 km/h.
+    """Return the International Roughness Index of a whole profile (m/km): Sayers (1995), the golden car at 80 km/h.
 
     height_m : (s,) heights at even steps of `step_m`; they are resampled to 0.25 m.
     """
@@ -118,14 +118,14 @@ def iri_m_per_km(height_m: Float64, step_m: float) -> float:
 
 
 def accumulated_iri(height_m: Float64) -> Float64:
-    """IRI (s − 1,) accumulated from the start, of heights (s,) each 0.25 m: Sayers et al. (1986), annex.
+    """Return the IRI (s − 1,) accumulated from the start, of heights (s,) each 0.25 m: Sayers et al. (1986), annex.
 
     The car starts at rest on the mean slope of the first 11 m.
     """
     top, bottom = _golden_car()
     slope = np.diff(height_m) / _IRI_STEP_M
     first = (height_m[round(_IRI_START_M / _IRI_STEP_M)] - height_m[0]) / _IRI_START_M
-    # A constant slope is a state of rest, so it is taken out before and changes nothing.
+    # A constant slope is a state of rest, so it is removed first and changes nothing.
     motion = lfilter(top, bottom, slope - first)
     out: Float64 = np.cumsum(np.abs(motion)) / np.arange(1, slope.size + 1) * 1000.0
     return out
@@ -133,7 +133,7 @@ def accumulated_iri(height_m: Float64) -> Float64:
 
 @functools.cache
 def _golden_car() -> tuple[Float64, Float64]:
-    """Numerator and denominator of the filter from the profile's slope to the suspension's slope motion."""
+    """Return numerator and denominator of the filter from the profile's slope to the suspension's slope motion."""
     k1, k2, c, mu = _GOLDEN_CAR
     a = np.array([[0.0, 1.0, 0, 0], [-k2, -c, k2, c], [0, 0, 0, 1], [k2 / mu, c / mu, -(k1 + k2) / mu, -c / mu]])
     dt = _IRI_STEP_M / _IRI_SPEED_M_PER_S

@@ -1,4 +1,4 @@
-"""Simulate a survey: drive every pass, write its logs, and the truth beside them."""
+"""Simulates a survey: drives every pass, writes its logs, and the truth beside them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import Object, objects_of
 
 _AT_ONCE: Final = 2
-"""Logs written at once, each by a thread of its own: the loops let go of the interpreter."""
+"""Logs that are written in parallel by threads: the kernels release the interpreter lock."""
 
 
 @dataclass(frozen=True)
 class SimulatedSurvey:
-    """What was written."""
+    """Counts of what was written."""
 
     folder: Path
     survey_file: Path
@@ -108,7 +108,7 @@ def simulate(
 def _pass(
     known: truth.Truth, world: World | None, things: list[Object], drive: Drive, folder: Path, write_hits: bool
 ) -> Pass:
-    """One pass with its folders, which are made."""
+    """Return one pass with its created folders."""
     run = files.run_id(drive.number)
     raw = folder / "raw" / run
     needed = [raw, known.trajectory_file(run).parent]
@@ -125,7 +125,7 @@ def _pass(
 
 
 def _written(run: str, logs: list[SimulatedLog], tell: Callable[[str], None]) -> Counter[str]:
-    """Write the logs of a pass, two at a time; how many records of each content."""
+    """Write the logs of a pass, two at a time; return the number of records of each content."""
 
     def write(log: SimulatedLog) -> tuple[str, int]:
         tell(f"{run}/{log.name}")
@@ -139,7 +139,7 @@ def _written(run: str, logs: list[SimulatedLog], tell: Callable[[str], None]) ->
 
 
 def _prepare(scene: Scene, folder: Path, overwrite: bool) -> None:
-    """Make the folder, and refuse one that holds anything but this scene's survey, or files that were edited."""
+    """Make the folder; refuse one that contains anything but this scene's survey, or edited files."""
     if folder.exists() and not folder.is_dir():
         raise ConfigError("this is a file", expected="a folder to write the survey into", file=folder)
     if folder.is_dir() and any(folder.iterdir()):

@@ -21,14 +21,14 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 RIDE_WAVELENGTH_M = 10.0
-"""Shorter waves do not move the vehicle: its tyres and springs take them."""
+"""Wavelength below which waves do not move the vehicle, because its tyres and springs absorb them (m)."""
 
 
 class Surface:
-    """Height and intensity of the road, known everywhere on it.
+    """Height and intensity of the road, defined everywhere on it.
 
     The reference line has a curvature that is linear between nodes each 0.5 m. Its height is the sum of grades and
-    waves, held as quintic polynomials that agree with it in value, slope and curvature at the nodes (within
+    waves, stored as quintic polynomials that agree with it in value, slope and curvature at the nodes (within
     1 µm for waves of 2 m). On it lie cross-section, humps, ruts, unevenness, patches, and potholes, cracks or joints,
     all functions of station and offset; and the texture, which only the profilers see.
 
@@ -41,7 +41,7 @@ class Surface:
     def __init__(self, scene: Scene, *, ride: bool = False) -> None:
         road = scene.road
         self.origin_enh_m = np.array([scene.map.easting_m, scene.map.northing_m, scene.map.height_m])
-        """Map coordinates that `arrays` count from."""
+        """Map coordinates of the origin of `arrays`."""
         before = math.ceil(road.lead_m / NODE_STEP_M)
         after = math.ceil((scene.length_m + road.lead_m) / NODE_STEP_M)
         station: Float64 = NODE_STEP_M * np.arange(-before, after + 1, dtype=np.float64)
@@ -70,7 +70,7 @@ class Surface:
         self._nodes: cKDTree | None = None
 
     def height_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike, *, texture: bool = True) -> Float64:
-        """Ellipsoidal height at map points (any shape, m); NaN where there is no road or verge.
+        """Return the ellipsoidal height at map points (any shape, m); NaN where there is no road or verge.
 
         texture : False leaves the macrotexture out, as wide beams do.
         """
@@ -82,23 +82,23 @@ class Surface:
         return np.asarray(height.reshape(shape))
 
     def intensity(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
-        """Intensity at map points (any shape), digital numbers of a profiler."""
+        """Return the intensity at map points (any shape), digital numbers of a profiler."""
         shape = np.broadcast_shapes(np.shape(easting_m), np.shape(northing_m))
         return self._survey(easting_m, northing_m)[:, 4].reshape(shape)
 
     def defect_depth_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
-        """Depth of the pothole, crack or joint at map points (any shape, m); 0 where there is none."""
+        """Return the depth of the pothole, crack or joint at map points (any shape, m); 0 where there is none."""
         shape = np.broadcast_shapes(np.shape(easting_m), np.shape(northing_m))
         return self._survey(easting_m, northing_m)[:, 3].reshape(shape)
 
     def station_offset_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> tuple[Float64, Float64]:
-        """Station and offset (right positive) of map points (any shape, m)."""
+        """Return station and offset (right positive) of map points (any shape, m)."""
         shape = np.broadcast_shapes(np.shape(easting_m), np.shape(northing_m))
         found = self._survey(easting_m, northing_m)
         return found[:, 1].reshape(shape), found[:, 2].reshape(shape)
 
     def place(self, station_m: npt.ArrayLike, offset_m: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
-        """Easting, northing (m) and grid heading (rad) at stations and offsets (any shape)."""
+        """Return easting, northing (m) and grid heading (rad) at stations and offsets (any shape)."""
         station, offset = np.broadcast_arrays(np.asarray(station_m, np.float64), np.asarray(offset_m, np.float64))
         out = np.empty((station.size, 3))
         kernels.place(self.arrays, np.ascontiguousarray(station.ravel()), np.ascontiguousarray(offset.ravel()), out)
@@ -106,14 +106,14 @@ class Surface:
         return e + self.origin_enh_m[0], n + self.origin_enh_m[1], heading
 
     def points_at(self, station_m: Float64, offset_m: Float64) -> Float64:
-        """Map points (n, 3) on the surface without defects and texture, at stations and offsets (n,)."""
+        """Return map points (n, 3) on the surface without defects and texture, at stations and offsets (n,)."""
         e, n, _ = self.place(station_m, offset_m)
         height = np.empty(station_m.size)
         kernels.heights_along(self.arrays, station_m, offset_m, height)
         return np.stack([e, n, height + self.origin_enh_m[2]], axis=-1)
 
     def nearest_node(self, easting_m: Float64, northing_m: Float64) -> Int64:
-        """Node of the reference line nearest to map points (n,)."""
+        """Return the node of the reference line nearest to each map point (n,)."""
         if self._nodes is None:
             self._nodes = cKDTree(self.arrays.nodes[:, :2])
         points = np.stack([easting_m - self.origin_enh_m[0], northing_m - self.origin_enh_m[1]], axis=-1)
@@ -131,7 +131,7 @@ class Surface:
 
 
 def _section(road: Road, tracks: Float64, first_m: float, textured: bool, seed: int, ride: bool) -> Float64:
-    """Constants and ruts as :class:`RoadArrays` holds them; no ruts in the smooth surface."""
+    """Return constants and ruts as in :class:`RoadArrays`; no ruts in the smooth surface."""
     shades = road.brightness
     shoulder = road.shoulder_width_m / 2 if road.shoulder_width_m > 0.0 else 0.25
     offsets = roughness.track_offsets_m(road)
@@ -170,7 +170,7 @@ def _texture(road: Road, seed: int) -> npt.NDArray[np.float32]:
 
 
 def _tracks(scene: Scene, station: Float64, ride: bool) -> tuple[Float64, float]:
-    """Unevenness (t, s), and the station of its first sample; only its long waves in the smooth surface."""
+    """Return unevenness (t, s), and the station of its first sample; only its long waves in the smooth surface."""
     step = roughness.STEP_M
     first = float(station[0]) - 3 * step
     fine: Float64 = first + step * np.arange(math.ceil((float(station[-1]) - first) / step) + 4, dtype=np.float64)
@@ -179,7 +179,7 @@ def _tracks(scene: Scene, station: Float64, ride: bool) -> tuple[Float64, float]
         waves += wave.amplitude_m * np.sin(2 * math.pi / wave.wavelength_m * fine + math.radians(wave.phase_deg))
     found = roughness.tracks(scene.road, fine, waves, stream(scene.seed, 0, "roughness"))
     if ride and found.size:
-        # Half of the amplitude of waves of RIDE_WAVELENGTH_M is left.
+        # Half of the amplitude of waves of RIDE_WAVELENGTH_M remains.
         sigma_m = RIDE_WAVELENGTH_M * math.sqrt(math.log(2.0) / 2.0) / math.pi
         found = gaussian_filter1d(found, sigma_m / step, axis=1, mode="nearest")
         found = np.repeat(found.mean(axis=0, keepdims=True), found.shape[0], axis=0)
@@ -187,7 +187,7 @@ def _tracks(scene: Scene, station: Float64, ride: bool) -> tuple[Float64, float]
 
 
 def _reference_line(road: Road, station: Float64, azimuth_rad: float) -> Float64:
-    """(n, 6) plan of the reference line, by Gauss–Legendre quadrature of the exact clothoids between nodes."""
+    """Return (n, 6) plan of the reference line, by Gauss–Legendre quadrature of the exact clothoids between nodes."""
     curvature = _curvature(road.alignment, station)
     rate = np.append(np.diff(curvature), 0.0) / NODE_STEP_M
     turned = np.append(0.0, np.cumsum((curvature[:-1] + curvature[1:]) / 2 * NODE_STEP_M))
@@ -205,7 +205,7 @@ def _reference_line(road: Road, station: Float64, azimuth_rad: float) -> Float64
 
 
 def _curvature(alignment: list[Element], station: Float64) -> Float64:
-    """Curvature (1/m, right positive) at stations; the pieces follow one another for ever, both ways."""
+    """Return curvature (1/m, right positive) at stations; the pieces repeat without end in both directions."""
     fixed = [0.0 if e.radius_m is None else 1.0 / e.radius_m for e in alignment]
     ends = np.cumsum([e.length_m for e in alignment])
     starts = ends - [e.length_m for e in alignment]
@@ -222,7 +222,7 @@ def _curvature(alignment: list[Element], station: Float64) -> Float64:
 
 
 def _sides(road: Road, station: Float64) -> Float64:
-    """(n, 8) falls and kerb heights at the nodes, each with its change per metre up to the next node."""
+    """Return (n, 8) falls and kerb heights at the nodes, each with its change per metre up to the next node."""
     slopes = road.cross_slopes or [CrossSlope(station_m=0.0, left=road.cross_slope, right=road.cross_slope)]
     at = [s.station_m for s in slopes]
     kerbs = {kerb.side: kerb for kerb in road.kerbs}
@@ -249,7 +249,7 @@ def _kerb_height(kerb: Kerb | None, station: Float64) -> Float64:
 
 
 def _profile(road: Road, station: Float64, ride: bool) -> Float64:
-    """(n, 6) quintic coefficients of the reference line's height from each node to the next."""
+    """Return (n, 6) quintic coefficients of the reference line's height from each node to the next."""
     value, slope, bend = road.grade * station, np.full_like(station, road.grade), np.zeros_like(station)
     grade = road.grade
     for change in road.grades:

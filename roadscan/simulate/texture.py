@@ -1,4 +1,4 @@
-"""Macrotexture of a pavement as a periodic height field of given mean profile depth.
+"""Macrotexture of a pavement as a periodic height field with a given mean profile depth.
 
 Random stones: a band of wavelengths around the grain size, its peaks worn flat by traffic. The mean profile depth is
 that of ISO 13473-1:2019 on profiles along the field.
@@ -20,21 +20,21 @@ Float32 = npt.NDArray[np.float32]
 
 CELLS: Final = 1024
 """Cells along an edge of the field, a power of two."""
-CELL_M: Final = 0.001
+CELL_M: Final = 0.001  # edge of a cell
 _BAND: Final = 0.55
 """Width of the band, as standard deviation of ln(wavelength)."""
 _WORN_SIGMA: Final = 0.5
-"""Peaks above this many standard deviations are worn down …"""
+"""Height of peaks, in standard deviations, above which they are worn down …"""
 _WORN_SHARE: Final = 0.25
-"""… to this share of what stands out."""
-_FINE_PER_CELL: Final = 2
-_BASE_MM: Final = 100.0
-_LOW_PASS_MM: Final = 2.4
+"""… to this share of their excess."""
+_FINE_PER_CELL: Final = 2  # samples in a step of the profile
+_BASE_MM: Final = 100.0  # segment of the mean profile depth (ISO 13473-1)
+_LOW_PASS_MM: Final = 2.4  # cut-off wavelength of the low-pass (ISO 13473-1)
 
 
 @functools.lru_cache(maxsize=4)
 def texture_field(mpd_mm: float, grain_mm: float, seed: int) -> Float32:
-    """Heights (c, c) in metres over station and offset, periodic, mean 0, with the given mean profile depth."""
+    """Return heights (c, c) in metres over station and offset, periodic, mean 0, with the given mean profile depth."""
     rng = stream(seed, 0, "texture")
     frequency = np.fft.fftfreq(CELLS, CELL_M * 1e3)
     f = np.hypot(frequency[:, None], np.fft.rfftfreq(CELLS, CELL_M * 1e3)[None])
@@ -52,7 +52,7 @@ def texture_field(mpd_mm: float, grain_mm: float, seed: int) -> Float32:
 
 
 def mean_profile_depth_mm(height_mm: Float64, step_mm: float) -> float:
-    """Mean profile depth of a profile (mm), ISO 13473-1:2019: 100 mm segments, slope taken out, mean of both peaks.
+    """Return the mean profile depth (mm), ISO 13473-1:2019: 100 mm segments, slope removed, mean of both peaks.
 
     height_mm : (s,) heights at even steps of `step_mm`. The low-pass of 2.4 mm is a Gaussian here.
     """

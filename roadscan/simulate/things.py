@@ -1,4 +1,4 @@
-"""What stands and moves beside the road of a scene: objects, and the simple bodies that they are made of."""
+"""Standing and moving objects beside the road of a scene, and the simple bodies of which they consist."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ Float64 = npt.NDArray[np.float64]
 PIECE_M: Final = 2.0
 """Barriers follow the road in straight pieces no longer than this (m)."""
 BURIED_M: Final = 0.3
-"""Things go on so far below the ground, so that no beam slips through beneath them (m)."""
-_POST_RADIUS_M: Final = 0.03
-_RAIL_POST_RADIUS_M: Final = 0.05
-_PLATE_BEFORE_POST_M: Final = 0.04
+"""Depth below the ground to which objects extend, so that no beam passes beneath them (m)."""
+_POST_RADIUS_M: Final = 0.03  # of posts of signs
+_RAIL_POST_RADIUS_M: Final = 0.05  # of posts of guardrails
+_PLATE_BEFORE_POST_M: Final = 0.04  # from a post's middle to a sign's face
 _PLATE_M: Final = 1e-6
-"""From a sign's face to its back: two thin bodies, of which a beam meets the one on its side (m)."""
+"""Distance from a sign's face to its back (m): two thin bodies, of which a beam meets the one on its side."""
 _PLATES: Final = {
     "rectangle": body.WALL, "round": body.DISC, "triangle": body.TRIANGLE, "octagon": body.OCTAGON,
     "diamond": body.DIAMOND,
 }  # fmt: skip
-_HEIGHT_SHARE: Final = {"round": 1.0, "triangle": math.sqrt(3.0) / 2.0, "octagon": 1.0, "diamond": 1.0}
-_ARM_M: Final = 0.12
-_LAMP_M: Final = (0.5, 0.25, 0.12)
-_WHEEL_M: Final = (0.62, 0.20, 0.60)
-_CLEARANCE_SHARE, _BODY_SHARE, _CABIN_SHARE, _CABIN_BACK = 0.14, 0.62, 0.55, 0.06
-_RUBBER: Final = 30.0
+_HEIGHT_SHARE: Final = {"round": 1.0, "triangle": math.sqrt(3.0) / 2.0, "octagon": 1.0, "diamond": 1.0}  # of width
+_ARM_M: Final = 0.12  # thickness of an arm
+_LAMP_M: Final = (0.5, 0.25, 0.12)  # width, length and height of a lamp
+_WHEEL_M: Final = (0.62, 0.20, 0.60)  # length, width and greatest height of a wheel
+_CLEARANCE_SHARE, _BODY_SHARE, _CABIN_SHARE, _CABIN_BACK = 0.14, 0.62, 0.55, 0.06  # of height or length
+_RUBBER: Final = 30.0  # intensity of tyres
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,12 @@ class Object:
     """One object of the truth."""
 
     id: int
-    """From 1."""
+    """Number from 1."""
     kind: str
     station_m: float
     offset_m: float
     enh_m: tuple[float, float, float]
-    """Its foot, from the scene's origin: easting, northing, height of the ground (m)."""
+    """Foot, from the scene's origin: easting, northing, height of the ground (m)."""
     size_m: tuple[float, float, float]
     """Length along its heading, width, height."""
     heading_rad: float
@@ -79,12 +79,12 @@ class Object:
 
 
 def objects_of(scene: Scene, surface: Surface) -> list[Object]:
-    """Everything beside the road that stands still, in the order of the scene, numbered from 1."""
+    """Return all standing objects beside the road, in the order of the scene, numbered from 1."""
     return [_object(i + 1, *described, surface) for i, described in enumerate(_standing(scene))]
 
 
 def moving_objects(scene: Scene, surface: Surface) -> list[Object]:
-    """The moving cars as they stand at the first profile of their first pass; numbers follow on those that stand."""
+    """Return the moving cars at the first profile of their first pass; numbers continue those of standing objects."""
     first = sum(1 for _ in _standing(scene)) + 1
     out = []
     for i, car in enumerate(scene.roadside.moving_cars):
@@ -102,7 +102,7 @@ def moving_objects(scene: Scene, surface: Surface) -> list[Object]:
 
 
 def objects_table(scene: Scene, surface: Surface) -> pa.Table:
-    """All objects of a scene, as the truth states them.
+    """Return all objects of a scene as a table for the truth.
 
     Columns: object_id, kind, station_m, offset_m, easting_m, northing_m, height_m (of the foot), length_m, width_m,
     size_up_m, heading_deg (of its length, clockwise from grid north), intensity, speed_m_per_s (along the road; what
@@ -134,7 +134,7 @@ def objects_table(scene: Scene, surface: Surface) -> pa.Table:
 
 
 def _standing(scene: Scene) -> Iterator[tuple[str, Standing | Barrier, float]]:
-    """Kind, description and station of everything that stands still."""
+    """Yield kind, description and station of every standing object."""
     side = scene.roadside
     kinds: tuple[tuple[str, Sequence[Standing | Barrier]], ...] = (
         ("sign", side.signs), ("pole", side.poles), ("lamp_post", side.lamp_posts), ("tree", side.trees),
@@ -150,20 +150,20 @@ def _standing(scene: Scene) -> Iterator[tuple[str, Standing | Barrier, float]]:
 
 
 def described_signs(scene: Scene) -> list[tuple[int, Sign]]:
-    """Numbers and descriptions of the signs that stand beside the road."""
+    """Return numbers and descriptions of the standing signs."""
     numbered = enumerate(_standing(scene), 1)
     return [(number, one) for number, (_, one, _) in numbered if isinstance(one, Sign)]
 
 
 def _on_road(one: Standing | Barrier, first_m: float, last_m: float) -> Standing | Barrier:
-    """The description, a barrier as far as the road goes."""
+    """Return the description, with a barrier limited to the road."""
     if not isinstance(one, Barrier) or first_m <= one.start_m <= one.end_m <= last_m:
         return one
     return one.model_copy(update={"start_m": max(one.start_m, first_m), "end_m": min(one.end_m, last_m)})
 
 
 def _stations(one: Standing | Barrier, first_m: float, last_m: float) -> list[float]:
-    """Stations of one description's objects, as far as the road goes."""
+    """Return the stations of a description's objects that are on the road."""
     if isinstance(one, Barrier):
         return [one.start_m] if one.start_m < one.end_m else []
     count = one.count if one.every_m > 0.0 else 1
@@ -183,7 +183,7 @@ class _Place:
     """Of the road."""
 
     def beside(self, ahead_m: float, right_m: float, heading_rad: float) -> tuple[float, float]:
-        """Easting and northing of a point ahead and to the right, seen along a heading."""
+        """Return easting and northing of a point ahead and to the right along a heading."""
         s, c = math.sin(heading_rad), math.cos(heading_rad)
         return self.enh_m[0] + ahead_m * s + right_m * c, self.enh_m[1] + ahead_m * c - right_m * s
 
@@ -196,7 +196,7 @@ def _place(surface: Surface, station_m: float, offset_m: float) -> _Place:
 
 
 def _ground(surface: Surface, easting: float, northing: float) -> float:
-    """Height of the ground at a place from the origin (m); beside the surface it goes on as the verge does."""
+    """Return the height of the ground at a place from the origin (m), extended beside the surface as the verge is."""
     e, n = easting + surface.origin_enh_m[0], northing + surface.origin_enh_m[1]
     height = float(surface.height_m(e, n, texture=False))
     if math.isnan(height):
@@ -217,7 +217,7 @@ def _body(
     shade: float,
     density: float = 1.0,
 ) -> Float64:
-    """A body's row (18,)."""
+    """Return a body's row (18,)."""
     row = np.zeros(body.BODY_COLUMNS)
     row[body.KIND] = kind
     row[[body.EASTING, body.NORTHING]] = place
@@ -233,7 +233,7 @@ def _post(place: tuple[float, float], low: float, high: float, radius: float, sh
 
 
 def _walls(points: Float64, low: Float64, high: Float64, shade: float, skirt: float, density: float = 1.0) -> Float64:
-    """Walls (n, 18) from point to point (n + 1, 2), with the heights (n + 1,) of their lower and upper edge."""
+    """Return walls (n, 18) between points (n + 1, 2), with heights (n + 1,) of their lower and upper edge."""
     rows = np.zeros((len(points) - 1, body.BODY_COLUMNS))
     run = np.diff(points, axis=0)
     length = np.hypot(run[:, 0], run[:, 1])
@@ -257,7 +257,7 @@ def car_bodies(
     shade: float,
     wheel_feet: Sequence[float] | None,
 ) -> Float64:
-    """Bodies (6, 18) of a car: body, cabin, four wheels.
+    """Return bodies (6, 18) of a car: body, cabin, four wheels.
 
     wheel_feet : height of the ground under each wheel (m); that under the car's middle where left out.
     """
@@ -281,7 +281,7 @@ def car_bodies(
 
 
 def wheel_places(length_m: float, width_m: float) -> list[tuple[float, float]]:
-    """Middle of each wheel: ahead and to the right of the car's middle (m)."""
+    """Return the middle of each wheel: ahead and to the right of the car's middle (m)."""
     right = width_m / 2 - _WHEEL_M[1] / 2 + 0.01
     return [(a * 0.31 * length_m, b * right) for a in (1.0, -1.0) for b in (-1.0, 1.0)]
 
@@ -290,7 +290,7 @@ def wheel_places(length_m: float, width_m: float) -> list[tuple[float, float]]:
 
 
 def _object(number: int, kind: str, one: Standing | Barrier, station_m: float, surface: Surface) -> Object:
-    """The object of a description at one of its stations."""
+    """Return the object of a description at one of its stations."""
     place = _place(surface, station_m, one.offset_m)
     size, turned, bodies = _made(one, place, surface)
     shade = one.shade  # type: ignore[union-attr]  # every concrete description has one
@@ -300,7 +300,7 @@ def _object(number: int, kind: str, one: Standing | Barrier, station_m: float, s
 
 @functools.singledispatch
 def _made(one: object, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
-    """Size (length, width, height), heading past the road's (rad) and bodies (n, 18) of an object."""
+    """Return size (length, width, height), heading past the road's (rad) and bodies (n, 18) of an object."""
     raise TypeError(f"nothing stands for {type(one).__name__}")
 
 
@@ -344,7 +344,7 @@ def _(one: LampPost, place: _Place, surface: Surface) -> tuple[tuple[float, floa
 
 
 def _arm(place: _Place, right_m: float, top: float, shade: float) -> Float64:
-    """An arm from a post to the right (negative: to the left) of the road's direction."""
+    """Return an arm from a post to the right (negative: to the left) of the road's direction."""
     middle = place.beside(0.0, right_m / 2, place.heading_rad)
     return _body(body.BOX, middle, place.heading_rad, (_ARM_M / 2, abs(right_m) / 2), (top - _ARM_M, top), shade)
 
@@ -384,7 +384,7 @@ def _(one: Planting, place: _Place, surface: Surface) -> tuple[tuple[float, floa
     right = (np.arange(rows_across) + 0.5) / rows_across * one.width_m - one.width_m / 2
     stations, offsets = (v.ravel() for v in np.meshgrid(place.station_m + ahead, one.offset_m + right))
     at, feet = _points(surface, stations, offsets)
-    # the golden ratio's multiples are spread evenly: tufts of all heights stand everywhere
+    # the golden ratio's multiples are spread evenly: tufts of all heights are everywhere
     tall = one.height_m * (0.5 + 0.5 * np.mod(np.arange(feet.size) * 0.6180339887, 1.0))
     radius = 0.6 * one.tuft_m
     tufts = [
@@ -433,7 +433,7 @@ def _(one: Box, place: _Place, surface: Surface) -> tuple[tuple[float, float, fl
 def _(one: Guardrail, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
     points, ground = _along(surface, one, PIECE_M)
     rail = _walls(points, ground + one.height_m - one.rail_m, ground + one.height_m, one.shade, 0.0)
-    # The posts stand behind the rail, away from the road.
+    # The posts are behind the rail, away from the road.
     behind = _RAIL_POST_RADIUS_M + 0.02 if one.offset_m > 0.0 else -_RAIL_POST_RADIUS_M - 0.02
     count = math.floor((one.end_m - one.start_m) / one.post_every_m + 1e-9) + 1
     stations = one.start_m + one.post_every_m * np.arange(count, dtype=np.float64)
@@ -471,7 +471,7 @@ def _(one: Facade, place: _Place, surface: Surface) -> tuple[tuple[float, float,
 
 
 def _along(surface: Surface, one: Barrier, piece_m: float) -> tuple[Float64, Float64]:
-    """Points (n, 2) along the road and the ground there (n,), from the origin."""
+    """Return points (n, 2) along the road and the ground there (n,), from the origin."""
     count = math.ceil((one.end_m - one.start_m) / piece_m - 1e-9)
     stations: Float64 = np.linspace(one.start_m, one.end_m, count + 1)
     return _points(surface, stations, np.full(count + 1, one.offset_m))
@@ -480,7 +480,7 @@ def _along(surface: Surface, one: Barrier, piece_m: float) -> tuple[Float64, Flo
 def _points(
     surface: Surface, stations: Float64, offsets: Float64, *, heights: bool = True
 ) -> tuple[Float64, Float64]:  # fmt: skip
-    """Points (n, 2) and the ground there (n,), from the origin."""
+    """Return points (n, 2) and the ground there (n,), from the origin."""
     e, n, _ = surface.place(stations, offsets)
     at = np.stack([e, n], axis=-1) - surface.origin_enh_m[:2]
     if not heights:
@@ -496,7 +496,7 @@ def _points(
 def mover_bodies(
     car: MovingCar, surface: Surface, begin_s: float, end_s: float
 ) -> tuple[Float64, Float64] | None:  # fmt: skip
-    """Bodies (6, 18) of a moving car at the beginning of a slot of time, and its velocity (3,) within it.
+    """Return bodies (6, 18) of a moving car at the beginning of a time slot, and its velocity (3,) within it.
 
     begin_s, end_s : since the pass's first profile. None where the car has left the road.
     """

@@ -1,4 +1,4 @@
-"""The vehicle's trajectory: as stated (SBET and SMRMSG, with errors) and as it was (Parquet, in the truth).
+"""Writes the vehicle's trajectory: as stated (SBET and SMRMSG, with errors) and as it was (Parquet, in the truth).
 
 A rig in a local frame has no latitude: there the stated trajectory is a table of poses, too.
 """
@@ -24,12 +24,12 @@ from roadscan.simulate.scene import Scene
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-CHUNK_POSES: Final = 8_192
+CHUNK_POSES: Final = 8_192  # poses of a chunk
 _DIFFERENCE_NS: Final = 2_000_000
-"""Velocities, accelerations and rates are differences over this to both sides."""
-_LEAST_SIGMA_M: Final = 0.001
+"""Step on each side (ns) of the differences for velocities, accelerations and rates."""
+_LEAST_SIGMA_M: Final = 0.001  # no post-processor states less
 _LEAST_SIGMA_DEG: Final = 0.0005
-"""No post-processor states less."""
+"""Least stated σ of an angle (degrees): no post-processor states less."""
 _TRUTH_SCHEMA: Final = pa.schema(
     [
         pa.field("epoch_gps_ns", pa.int64()),
@@ -45,23 +45,23 @@ _LOCAL_SCHEMA: Final = pa.schema(
 
 
 def file_name(drive: Drive) -> str:
-    """Name of the stated trajectory's log."""
+    """Return the file name of the stated trajectory's log."""
     return "trajectory.parquet" if drive.earth.is_local else "trajectory.sbet"
 
 
 def wander_rad(number: int) -> float:
-    """Wander angle that a run's platform heading counts from: not zero, and another one for each run."""
+    """Return the wander angle of a run's platform heading: not zero, and different for each run."""
     return math.radians((2.75, -1.5, 0.6)[number % 3])
 
 
 def first_gps_ns(scene: Scene, drive: Drive) -> int:
-    """Epoch of the first pose."""
+    """Return the epoch of the first pose."""
     step = NS_PER_S // scene.trajectory.poses_per_s
     return drive.recorded_span_gps_ns[0] // step * step
 
 
 def write_trajectory(scene: Scene, drive: Drive, file: Path, truth_file: Path) -> Iterator[int]:
-    """Write the poses of one pass, a chunk a step; yields the poses of each."""
+    """Write the poses of one pass, one chunk per step; yields the poses of each."""
     step = NS_PER_S // scene.trajectory.poses_per_s
     first, last = first_gps_ns(scene, drive), drive.recorded_span_gps_ns[1]
     errors = _Errors(scene, drive.number)
@@ -106,7 +106,7 @@ class _Errors:
         )
 
     def take(self, count: int) -> tuple[Float64, Float64]:
-        """Position errors (count, 3) in metres and attitude errors (count, 3) in radians, of the next poses."""
+        """Return position errors (count, 3) in metres and attitude errors (count, 3) in radians of the next poses."""
         values = self._process.take(count)
         return values[:, :3], values[:, 3:]
 
@@ -144,7 +144,7 @@ def _true_rows(drive: Drive, epochs: Int64) -> pa.RecordBatch:
 
 
 def _local_rows(drive: Drive, epochs: Int64, errors: _Errors) -> pa.RecordBatch:
-    """Stated poses in the local frame, axes forward, right, down."""
+    """Return stated poses in the local frame, axes forward, right, down."""
     here = drive.poses(epochs)
     position, attitude = _stated(drive, here, errors)
     quaternion = attitude.as_quat(canonical=True, scalar_first=True)
@@ -156,7 +156,7 @@ def _batch(columns: list[npt.NDArray[np.generic]], schema: pa.Schema) -> pa.Reco
 
 
 def _stated(drive: Drive, here: Poses, errors: _Errors) -> tuple[Float64, Rotation]:
-    """ECEF positions (n, 3) and attitudes with errors; those of attitude are added to roll, pitch and heading."""
+    """Return ECEF positions (n, 3) and attitudes with errors, those of attitude added to roll, pitch and heading."""
     position_error, attitude_error = errors.take(len(here.position_ecef_m))
     level = drive.earth.ecef_from_level(here.position_ecef_m)
     angles = (level.inv() * here.ecef_from_body).as_euler("ZYX") + attitude_error[:, ::-1]
@@ -164,7 +164,7 @@ def _stated(drive: Drive, here: Poses, errors: _Errors) -> tuple[Float64, Rotati
 
 
 def _sbet(drive: Drive, epochs: Int64, errors: _Errors, wander: float) -> Float64:
-    """SBET records (n, 17); platform heading = true heading + wander angle.
+    """Return SBET records (n, 17); platform heading = true heading + wander angle.
 
     Velocities are along the wander frame (x at azimuth −wander, y to its left, z up); accelerations are the
     body's relative to the Earth, without gravity, and rates likewise, in body axes.
@@ -196,7 +196,7 @@ def _sbet(drive: Drive, epochs: Int64, errors: _Errors, wander: float) -> Float6
 
 
 def _body_motion(before: Poses, here: Poses, after: Poses, dt: float) -> tuple[Float64, Float64]:
-    """Acceleration (m/s²) and angular rate (rad/s) relative to the Earth, in body axes, (n, 3) each."""
+    """Return acceleration (m/s²) and angular rate (rad/s) relative to the Earth, in body axes, (n, 3) each."""
     bend = (after.position_ecef_m - 2 * here.position_ecef_m + before.position_ecef_m) / dt**2
     turn = (before.ecef_from_body.inv() * after.ecef_from_body).as_rotvec() / (2 * dt)
     return here.ecef_from_body.inv().apply(bend), turn

@@ -1,4 +1,4 @@
-"""The truth beside a simulated survey: the scene it was made from, and with it every height on the road."""
+"""The truth beside a simulated survey: the scene from which it was made, and every height on the road."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OBJECTS_FILE: Final = "objects.parquet"
 
 @dataclass(frozen=True)
 class Truth:
-    """What is true of a simulated survey."""
+    """The truth of a simulated survey."""
 
     scene: Scene
     surface: Surface
@@ -33,23 +33,23 @@ class Truth:
     """Folder with ``scene.json``, the true trajectories and, if they were asked for, the true hits."""
 
     def height_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
-        """True ellipsoidal height at map points (any shape, m), with texture; NaN where there is no road or verge."""
+        """Return the true ellipsoidal height at map points (any shape, m), with texture; NaN off road and verge."""
         return self.surface.height_m(easting_m, northing_m)
 
     def intensity(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
-        """True brightness at map points (any shape), digital numbers of a profiler."""
+        """Return the true intensity at map points (any shape), digital numbers of a profiler."""
         return self.surface.intensity(easting_m, northing_m)
 
     def station_offset_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> tuple[Float64, Float64]:
-        """Station and offset from the reference line (right positive) of map points (any shape, m)."""
+        """Return station and offset from the reference line (right positive) of map points (any shape, m)."""
         return self.surface.station_offset_m(easting_m, northing_m)
 
     def trajectory_file(self, run: str) -> Path:
-        """Parquet file of a run's true poses (columns of the table ``trajectory``, world frame ECEF)."""
+        """Return the Parquet file of a run's true poses (columns of the table ``trajectory``, world frame ECEF)."""
         return self.folder / "trajectory" / f"{run}.parquet"
 
     def camera_file(self, run: str) -> Path:
-        """Parquet file of a run's pictures: epoch, file, and the camera's true pose (world frame ECEF)."""
+        """Return the Parquet file of a run's pictures: epoch, file, and the camera's true pose (world frame ECEF)."""
         return self.folder / "camera" / f"{run}.parquet"
 
     @property
@@ -68,12 +68,12 @@ class Truth:
         return self.folder / OBJECTS_FILE
 
     def hits_file(self, run: str, sensor: str) -> Path:
-        """Parquet file of the points that a sensor's beams hit in a run."""
+        """Return the Parquet file of the points that a sensor's beams hit in a run."""
         return self.folder / "hits" / run / f"{sensor}.parquet"
 
 
 def load(folder: str | Path) -> Truth:
-    """Truth of the simulated survey in `folder` (or of its folder ``truth``).
+    """Return the truth of the simulated survey in `folder` (or of its folder ``truth``).
 
     Raises
     ------

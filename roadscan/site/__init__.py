@@ -1,1 +1,1 @@
-"""The published site: documents that a page in a browser reads, from the tables, cells and points of a survey."""
+"""The published site: documents for a page in a browser, made from a survey's tables, cells and points."""

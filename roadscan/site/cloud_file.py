@@ -1,4 +1,4 @@
-"""A kilometre sheet of points as one COPC file: points are kept by square on the disk, and written cell by cell.
+"""Writes a kilometre sheet of points as one COPC file, sorting points by square on disk.
 
 Memory holds the points of one block of tiles, of the cells of one column of the octree, and of the nodes above the
 cells, which are one point a voxel.
@@ -23,21 +23,21 @@ from roadscan.store.codecs.copc import CopcWriter, Key
 from roadscan.tiles.products.cloud_records import SCALE_M, Lattice, layout_of, picked, records_of, without_colours
 
 _SQUARE_M: Final = 16.0
-"""Larger tiles are kept in squares of about this edge."""
+"""Approximate edge of the squares into which larger tiles are divided."""
 _BATCH_POINTS: Final = 1_000_000
-"""Nodes with so many points are compressed side by side."""
+"""Points of the nodes that are compressed in parallel."""
 
 Records = npt.NDArray[np.void]
 
 
 @dataclass(frozen=True)
 class _Square:
-    """Points of a square of the map, where they lie in the scratch file."""
+    """Points of a map square in the scratch file."""
 
     tile: TileId
     part: int
     at: int
-    """First record."""
+    """Index of its first record."""
     count: int
     low: tuple[int, int]
     high: tuple[int, int]
@@ -45,7 +45,7 @@ class _Square:
 
 
 class PointSpool:
-    """Points of a sheet on the disk, square by square."""
+    """Points of a sheet on disk, square by square."""
 
     def __init__(self, path: Path, lattice: Lattice) -> None:
         self._lattice, self._path = lattice, path
@@ -61,7 +61,7 @@ class PointSpool:
         self.first_epoch_gps_ns = np.iinfo(np.int64).max
 
     def fill(self, tiles: Iterable[TilePoints]) -> None:
-        """Take the points of tiles, each tile once and in any order."""
+        """Add the points of tiles, each tile once and in any order."""
         with self._path.open("wb") as stream:
             for points in tiles:
                 self._take(points, stream)
@@ -82,7 +82,7 @@ class PointSpool:
             self.count += own.size
 
     def _parts(self, points: TilePoints, records: Records) -> Iterator[tuple[int, Records]]:
-        """Squares of a tile's points, in the order of the points."""
+        """Yield the squares of a tile's points, in the order of the points."""
         grid = self._lattice.grid
         across = max(1, round(grid.size_m / _SQUARE_M))
         if across == 1:
@@ -96,7 +96,7 @@ class PointSpool:
             yield int(number[order[first]]), picked(records, order[first:end])
 
     def columns(self, cube: Cube) -> Iterator[Records]:
-        """Points of each column of the octree's cells, column by column from the west, each from the south."""
+        """Yield the points of each column of the octree's cells, columns from the west, points from the south."""
         places: dict[tuple[int, int], list[_Square]] = {}
         for square in self._squares:
             spans = []
@@ -154,7 +154,7 @@ def write_cloud(path: Path, spool: PointSpool, lattice: Lattice, facts: dict[str
 def _written(
     writer: CopcWriter, waiting: Sequence[tuple[Key, Records]], at_least: int = _BATCH_POINTS
 ) -> list[tuple[Key, Records]]:
-    """What still waits after nodes of enough points were written."""
+    """Return the nodes that remain after enough points were written."""
     if sum(records.size for _, records in waiting) < at_least:
         return list(waiting)
     writer.add(waiting)

@@ -1,4 +1,4 @@
-"""Degrees on the survey's map without a projection library: polynomials that PROJ's own results were fitted with."""
+"""Converts degrees to the survey's map without a projection library: polynomials fitted to PROJ's results."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from roadscan.site.parts.catalog import from_longitude_latitude, to_longitude_la
 Float64 = npt.NDArray[np.float64]
 
 _AROUND_M: Final = 2000.0
-"""People look for places beside the road, too."""
+"""Margin around the survey (m): people also look for places beside the road."""
 _WITHIN_M: Final = 0.05
-"""A tenth of what a map of a street shows when it is opened."""
+"""Largest error of the polynomials (m): a tenth of what a street map shows when it is opened."""
 _MOST: Final = 9
-"""Of the degree: 55 numbers an axis; a survey for which that is not enough spans continents."""
+"""Highest degree: 55 numbers per axis; a survey that needs more spans continents."""
 _ALONG: Final = 24
-"""Places of the fit along each side; the check takes twice as many, which lie between."""
+"""Places of the fit along each side; the check uses twice as many, between them."""
 
 
 def degrees_on_map(frame: MapFrame, extent_m: Box | None) -> dict[str, Any] | None:
-    """Polynomials from longitude and latitude (degrees, WGS 84) to easting and northing (m).
+    """Return polynomials from longitude and latitude (degrees, WGS 84) to easting and northing (m).
 
     They are within 5 cm of PROJ over the survey and 2 km around it; None for a local map, and where none is as near.
     With x = (longitude − `middle`[0]) / `half`[0] and y of the latitude alike, each of -1 to 1, easting and northing

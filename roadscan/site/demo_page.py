@@ -1,4 +1,4 @@
-"""Where the page of a survey that was just run is: a file that opens by a double click, and how to see more."""
+"""Makes the page of a finished run as one file, and says where it is and how to see more."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from roadscan.site.web_part import HOW_TO_BUILD, web_folder
 
 PAGE: Final = "page.html"
 _FINEST_M: Final = 0.02
-"""Finer pixels and the points are for `roadscan view`: the file is made within seconds."""
+"""Finest pixel (m), so that the file takes seconds; finer pixels and the points are for `roadscan view`."""
 
 
 def page_lines(survey_file: Path) -> list[str]:
-    """Lines that end a run: the address of its page, or why there is none and how to get it."""
+    """Return the last lines of a run: the address of its page, or why there is none and how to get it."""
     how = f"roadscan view {survey_file}"
     if web_folder() is None:
         return [f"look at it    {how}", f"              the page is not built yet: {HOW_TO_BUILD}"]

@@ -1,4 +1,4 @@
-"""A document of the site: where it lies, what it depends on, and how it is written."""
+"""A document of the site: its path, its key, and how it is written."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any, Final, TypeAlias
 from roadscan.run.engine.fingerprint import key_of
 
 _ESCAPED: Final = {ord(one): f"\\u{ord(one):04x}" for one in "<>&"}
-"""Within a page these could end the element that a document stands in."""
+"""Characters that could end the page element around a document."""
 
 EXACT_INTEGER: Final = 2**53
-"""JavaScript's numbers tell whole numbers apart up to this."""
+"""Limit of exact integers in JavaScript."""
 
 
 Ask: TypeAlias = Callable[[str], Path]
-"""Where another document of the site lies, by its path; it is made before where that is due."""
+"""Returns another document of the site by its path; it is made first if necessary."""
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class Document:
     """A file of the site."""
 
     path: str
-    """Relative to the site; letters, digits, ``_``, ``-`` and ``.`` alone."""
+    """Path in the site; only letters, digits, ``_``, ``-`` and ``.``."""
     key: str
-    """Hash of all that shapes it."""
+    """Hash of everything that determines it."""
     write: Callable[[Path, Ask], None]
-    """Writes it to a path; it may ask for other documents."""
+    """Writes it to a path; may request other documents."""
 
 
 def json_document(path: str, value: Any) -> Document:
-    """A document that holds a value as JSON."""
+    """Return a document with a value as JSON."""
     content = json_bytes(value)
 
     def write(file: Path, _ask: Ask) -> None:
@@ -45,13 +45,13 @@ def json_document(path: str, value: Any) -> Document:
 
 
 def json_bytes(value: Any) -> bytes:
-    """A value as JSON in ASCII, in which no text can end or begin an element of a page."""
+    """Return a value as ASCII JSON without characters that could begin or end an element of a page."""
     text = json.dumps(plain(value), ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.translate(_ESCAPED).encode("ascii")
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON knows it: what is not a number is null, a whole number that JavaScript cannot hold is text."""
+    """Return a value for JSON: NaN is null, an integer that JavaScript cannot represent is text."""
     if value is None or isinstance(value, bool | str):
         return value
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""The way of edits from the page into the inventory: the same as that of `roadscan inventory pull`."""
+"""Takes edits from the page into the inventory, as `roadscan inventory pull` does."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from roadscan.run.session import Session
 
 
 class EditDoor:
-    """Takes documents of edits, one after another."""
+    """Applies documents of edits, one after another."""
 
     def __init__(self, open_session: Callable[[], Session]) -> None:
         self._open = open_session
         self._alone = threading.Lock()
 
     def take(self, content: bytes) -> dict[str, Any]:
-        """Take in all sound edits of a document; the answer says what became of each, in the order of the document.
+        """Apply all sound edits of a document; the answer has the result of each, in the order of the document.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What shows a feature: the pictures that see it, and the passes with their logs."""
+"""Evidence for a feature: the pictures that see it, and the passes with their logs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Told = dict[str, Any]
 
 
 def of_pictures(material: Material, row: Mapping[str, Any]) -> Iterator[Told]:
-    """Cut-out of an asset, and the pictures that its column `pictures` names, best first."""
+    """Yield the cut-out of an asset, and the pictures of its column `pictures`, best first."""
     name = row.get("cut_out")
     cut = cut_out_records(material).get(str(name)) if name else None
     if cut is not None:
@@ -39,7 +39,7 @@ def _pictures_named(text: Any) -> list[Mapping[str, Any]]:
 
 
 def of_passes(material: Material, epochs_gps_ns: Iterable[Any], run: str | None = None) -> Iterator[Told]:
-    """Passes at some epochs, of one run where it is named."""
+    """Yield the passes at some epochs, of one run where it is named."""
     wanted = [one for one in epochs_gps_ns if isinstance(one, int)]
     for own in material.plan.passes if wanted else ():
         if run in (None, own.run) and any(own.start_gps_ns <= one < own.end_gps_ns for one in wanted):
@@ -47,14 +47,14 @@ def of_passes(material: Material, epochs_gps_ns: Iterable[Any], run: str | None 
 
 
 def of_pass(material: Material, number: int) -> Told:
-    """A pass by its number; in the layer of passes its row names its logs."""
+    """Return a pass by its number; its row in the layer of passes names its logs."""
     run = next((one.run for one in material.plan.passes if one.pass_id == number), None)
     title = f"pass {number}" + (f" of {run}" if run else "")
     return {"title": title, "kind": "row", "layer": "passes", "row": str(number)}
 
 
 def of_run(material: Material, run: str) -> Iterator[Told]:
-    """Logs of a run."""
+    """Return the logs of a run."""
     for record in _records(material):
         if record.run == run:
             yield {"title": f"{record.sensor}: {record.path} ({record.format}, {record.rows:,} rows)", "kind": "log"}

@@ -1,4 +1,4 @@
-"""A layer of vectors: what it is, and which there are: modules of `site/layers/`, and entry points."""
+"""Vector layers: their description, and all kinds of them: modules of `site/layers/`, and entry points."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ Geometry = Literal["point", "line", "polygon"]
 BLUE, ORANGE, GREEN, RED, SKY, YELLOW, PURPLE, GREY = (
     "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#f0e442", "#cc79a7", "#9e9e9e",
 )  # fmt: skip
-"""Colours that all eyes tell apart (Okabe and Ito 2008), and a grey for what is not known."""
+"""Colours for any colour vision (Okabe and Ito 2008), and a grey for unknown values."""
 
 BELOW_TO_ABOVE: Final = ("#2166ac", "#67a9cf", "#e8d44d", "#ef8a62", "#b2182b")
-"""Five steps of a difference on both sides of zero (ColorBrewer 2, RdBu); the middle one shows on white and black."""
+"""Five steps of a signed difference (ColorBrewer 2, RdBu); the middle one is visible on white and black."""
 
 GOOD_TO_POOR: Final = ("#4575b4", "#91bfdb", "#fee090", "#fc8d59", "#d73027")
-"""Five steps that all eyes tell apart (ColorBrewer 2, RdYlBu)."""
+"""Five steps for any colour vision (ColorBrewer 2, RdYlBu)."""
 
 
 _UNIT_IN_NAME: Final = re.compile(
     r"_(m_per_km|per_km|kg_m3|cm3_per_m2|m2_per_m|m_m2|gps_ns|mm|cm|m2|m3|cm3|m|px|deg|percent|ns|ms)$"
 )
-"""Units with which names of columns and quantities end."""
+"""Units at the end of names of columns and quantities."""
 
 
 _ACRONYM: Final = re.compile(r"\b(hri|iri|mpd|mri|psd|rms)\b")
 
 
 def title_of(name: str, unit: str) -> str:
-    """Title of a column or quantity for people: without the unit, which the page puts beside the values."""
+    """Return the title of a column or quantity without its unit, which the page shows beside the values."""
     bare = _UNIT_IN_NAME.sub("", name) if unit and unit not in ("text", "1", "number", "date") else name
     words = re.sub(r"\bsigma\b", "σ", bare.replace("_", " "))
     return _ACRONYM.sub(lambda found: found[0].upper(), words)
@@ -61,12 +61,12 @@ class SiteColumn:
     meaning: str
     title: str = ""
     sigma: str = ""
-    """Column that holds its 1 σ."""
+    """Column with its 1 σ."""
     edited: tuple[str, tuple[str, ...]] | None = None
-    """Type of its values, and those that there are (all where there are none), where people may change it."""
+    """Type and allowed values (none: all) of a column that people may change."""
 
     def stated(self) -> dict[str, Any]:
-        """As the page reads it."""
+        """Return the JSON values for the page."""
         title = self.title or title_of(self.name, self.unit)
         told: dict[str, Any] = {"name": self.name, "title": title, "unit": self.unit, "meaning": self.meaning}
         told |= {"sigma": self.sigma} if self.sigma else {}
@@ -75,7 +75,7 @@ class SiteColumn:
 
 @dataclass(frozen=True)
 class Style:
-    """How features are coloured: all alike, by classes of a number, or by values of a column."""
+    """Colours of features: one for all, by classes of a number, or by values of a column."""
 
     title: str
     width_px: float
@@ -84,14 +84,14 @@ class Style:
     limits: tuple[float, ...] = ()
     """Limits between the classes, ascending; the colours are those of :data:`GOOD_TO_POOR`."""
     shown_in: tuple[str, float] = ("", 1.0)
-    """Unit of the labels of classes, and how many of them a unit of the column has."""
+    """Unit of the labels of classes, and its number in a unit of the column."""
     is_difference: bool = False
-    """True for a difference, whose limits lie alike on both sides of zero: :data:`BELOW_TO_ABOVE`."""
+    """True for a difference with symmetric limits around zero: :data:`BELOW_TO_ABOVE`."""
     values: Mapping[str, str] = field(default_factory=dict)
     """Colour by value."""
 
     def stated(self) -> dict[str, Any]:
-        """As the page reads it."""
+        """Return the JSON values for the page."""
         told: dict[str, Any] = {"title": self.title, "by": self.by or None, "width_px": self.width_px}
         if not self.by:
             return told | {"colour": self.colour}
@@ -101,7 +101,7 @@ class Style:
         return told | {"classes": list(_classes(self))}
 
     def colour_of(self, row: Mapping[str, Any]) -> str:
-        """Colour of a row, as the page finds it."""
+        """Return the colour of a row, as the page computes it."""
         if not self.by:
             return self.colour
         value = row.get(self.by)
@@ -133,7 +133,7 @@ class SiteLayer:
     """A layer with its features."""
 
     name: str
-    """Letters, digits and ``_``: it becomes a folder."""
+    """Letters, digits and ``_``, as it names a folder."""
     title: str
     group: Group
     geometry: Geometry
@@ -145,16 +145,16 @@ class SiteLayer:
     """(n,) values by column."""
     columns: Sequence[SiteColumn]
     styles: Sequence[Style]
-    """The first is shown at first."""
+    """Styles, the default first."""
     key: str = ""
-    """Column that tells features apart."""
+    """Column that identifies features."""
     label: str = ""
-    """Column whose text stands beside a feature."""
+    """Column whose text is shown beside a feature."""
     visible: bool = True
     arrows: Mapping[str, Any] | None = None
-    """Columns of differences to be drawn as arrows: east, north, up (m), and how much longer they are drawn."""
+    """Columns of differences shown as arrows: east, north, up (m), and their magnification."""
     evidence: Sequence[Sequence[Mapping[str, Any]]] = ()
-    """(n,) what shows each feature; none where this is empty."""
+    """(n,) evidence for each feature; may be empty."""
 
 
 class LayerKind(ABC):
@@ -164,18 +164,18 @@ class LayerKind(ABC):
 
     @abstractmethod
     def layers(self, material: Material) -> Iterator[SiteLayer]:
-        """The layers that the survey has of this kind."""
+        """Yield the survey's layers of this kind."""
 
 
 @functools.cache
 def layer_kinds() -> tuple[LayerKind, ...]:
-    """All kinds of layers, by name."""
+    """Return all kinds of layers, by name."""
     known = found_kinds("site/layers/*.py", LayerKind, ENTRY_POINT_GROUP)
     return tuple(kind() for kind in known.values())
 
 
 def schema_columns(table: str, names: Sequence[str]) -> list[SiteColumn]:
-    """Columns of a table of the store, those that a feature's row can hold; further names stand for themselves."""
+    """Return columns of a stored table that a feature's row can hold; further names are added unchanged."""
     known = {c.name: c for c in table_schema(table).columns}
     return [
         SiteColumn(n, *((known[n].unit, known[n].meaning) if n in known else ("", "")), sigma=_sigma_of(n, names))
@@ -190,7 +190,7 @@ def _sigma_of(name: str, names: Sequence[str]) -> str:
 
 
 def table_layer(material: Material, table: str, about: SiteLayer) -> Iterator[SiteLayer]:
-    """A layer of all rows of a table with shapes, as `about` describes it.
+    """Yield a layer of all rows of a table with shapes, as `about` describes it.
 
     There is none where the survey has no such rows, or where the inventory shows them with its edits.
     """
@@ -209,17 +209,17 @@ def table_layer(material: Material, table: str, about: SiteLayer) -> Iterator[Si
 def described(
     name: str, title: str, group: Group, geometry: Geometry, order: int, styles: Sequence[Style], **further: Any
 ) -> SiteLayer:
-    """A layer without features yet."""
+    """Return a layer without features."""
     return SiteLayer(name, title, group, geometry, order, np.empty(0, object), (), (), styles, **further)
 
 
 def line_of(places_m: npt.NDArray[np.float64]) -> Any:
-    """A line through places (n, 2 or 3), which may be a single one."""
+    """Return a line through places (n, 2 or 3), which may be a single one."""
     return shapely.LineString(places_m if len(places_m) > 1 else np.repeat(places_m, 2, axis=0))
 
 
 def evidence_of_row(row: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Tiles that a row of a table names, and its place on the strips of its road."""
+    """Yield the tiles that a table's row names, and its place on the strips of its road."""
     for one in str(row.get("tiles") or "").split():
         yield {"title": f"tile {one}", "kind": "tile", "tile": one}
     station, road, lane = row.get("station_from_m", row.get("station_m")), row.get("road"), row.get("lane")

@@ -1,4 +1,4 @@
-"""A site whose documents are made when they are asked for, and kept by their keys for the next time."""
+"""A site whose documents are made on request and cached by their keys."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from roadscan.store.asset_truth import COMMITS
 from roadscan.store.store import Store
 
 FOLDER: Final = "site"
-"""Below the survey's root: documents that were made for `roadscan view`."""
+"""Folder of documents for `roadscan view`, below the survey's root."""
 _OUTPUTS: Final = "manifest/outputs"
 
 
@@ -33,7 +33,7 @@ class Served(NamedTuple):
 
 
 class LiveSite:
-    """Documents of a survey's site by path. Several threads may ask; documents of one part are made one by one."""
+    """Documents of a survey's site by path. Several threads may request them; those of one part are made one by one."""
 
     def __init__(self, open_material: Callable[[], Material]) -> None:
         self._open = open_material
@@ -45,7 +45,7 @@ class LiveSite:
         self._cache = _cache_folder(self.material.store)
 
     def document(self, path: str) -> Served | None:
-        """A document, made where it is not there yet; None for a path that the site does not have.
+        """Return a document, made if necessary; None for a path that the site does not have.
 
         Where the survey has changed since, a page that begins anew (it asks for the entry) gets what holds now.
         """
@@ -94,8 +94,7 @@ class LiveSite:
 def open_survey(
     survey_file: str | Path, over: Sequence[str | Path] = (), *, edited: bool = False
 ) -> Callable[[], Material]:
-    """Function that looks at a survey anew, and at others over it; damaged records are no hindrance, what is sound is
-    shown.
+    """Return a function that reads a survey anew, with others over it; damaged records are skipped.
 
     Parameters
     ----------
@@ -113,7 +112,7 @@ def open_survey(
 
 
 def _stamp(material: Material) -> list[list[str]]:
-    """What differs where a survey has changed: its records, and commits of its inventory, which may lie elsewhere."""
+    """Return what differs when a survey has changed: its records, and its inventory's commits (maybe elsewhere)."""
     try:
         commits = truth_of(material.session).truth.store.files(COMMITS)
     except RoadscanError:
@@ -122,7 +121,7 @@ def _stamp(material: Material) -> list[list[str]]:
 
 
 def _cache_folder(store: Store) -> Path:
-    """Where documents are kept: in the store, or in a folder for this process where the store is no folder."""
+    """Return the cache folder: in the store, or for this process where the store is no folder."""
     if store.is_folder:
         folder = Path(store.path(FOLDER))
         folder.mkdir(parents=True, exist_ok=True)

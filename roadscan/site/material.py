@@ -1,4 +1,4 @@
-"""What the parts of a site are made of; what several of them ask for is found once."""
+"""The data of a survey for the parts of its site; shared results are computed once."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SHEET_M: Final = 1000.0
 """Edge of a kilometre sheet."""
 
 BESIDE_ROAD_M: Final = 20.0
-"""What is shown beside a road that is asked for alone."""
+"""Width that is shown beside a single requested road."""
 
 Box = tuple[float, float, float, float]
 """Least easting and northing, greatest easting and northing (m)."""
@@ -43,18 +43,18 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Wishes:
-    """What a site is to hold."""
+    """Contents that a site should have."""
 
     clouds: bool = True
     """Point clouds."""
     pictures: bool = True
     """Pictures of cameras."""
     finest_pixel_m: float = 0.0
-    """Rasters with finer pixels are left out."""
+    """Finest pixel; finer rasters are left out."""
     near: Box | None = None
-    """Only what lies in this box of the map; all where it is None."""
+    """Only what is in this box of the map; everything where it is None."""
     edits: Literal["", "file", "post"] = ""
-    """Whether people may edit assets, and where their edits go: into a file, or to the server."""
+    """Whether people may edit assets, and the destination of their edits: a file, or the server."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class SiteTable:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A survey as the parts of its site ask for it."""
+    """A survey as the parts of its site need it."""
 
     session: Session
     wishes: Wishes = field(default_factory=Wishes)
@@ -99,22 +99,22 @@ class Material:
 
     @property
     def store(self) -> Store:
-        """Where the survey lies."""
+        """Store of the survey."""
         return self.session.store
 
     @cached_property
     def plan(self) -> SurveyPlan:
-        """What places the readings."""
+        """The plan that georeferences readings."""
         return plan_of(self.session)
 
     @cached_property
     def context(self) -> ProductContext:
-        """What products know of the survey."""
+        """Context of products."""
         return product_context(self.plan)
 
     @cached_property
     def tiles(self) -> dict[TileId, OutputRecord]:
-        """Records of all tiles that hold cells, by row and column."""
+        """Records of all tiles with cells, by row and column."""
         found = {TileId.parse(r.unit): r for r in self.session.manifest.of(TILE).values() if r.path}
         return {t: found[t] for t in sorted(found, key=lambda t: (t.row, t.column)) if self._is_near(t)}
 
@@ -125,7 +125,7 @@ class Material:
 
     @cached_property
     def sheets(self) -> dict[str, tuple[TileId, ...]]:
-        """Tiles of each kilometre sheet by its name; a tile lies in the sheet of its south-west corner."""
+        """Tiles of each kilometre sheet by its name; a tile is in the sheet of its south-west corner."""
         found: dict[str, list[TileId]] = {}
         for tile in self.tiles:
             box = self.context.grid.bounds(tile)
@@ -145,7 +145,7 @@ class Material:
 
     @cached_property
     def inventory(self) -> tuple[str, State] | None:
-        """Name of the survey's inventory and its state today; None where nothing was taken into it yet.
+        """Name of the survey's inventory and its state today; None where it is empty.
 
         Raises
         ------
@@ -157,7 +157,7 @@ class Material:
 
     @cached_property
     def tables_in_inventory(self) -> frozenset[str]:
-        """Tables of distresses whose rows the inventory holds, with what people made of them."""
+        """Tables of distresses whose rows are in the inventory, with people's changes."""
         try:
             held = () if self.inventory is None else self.inventory[1].assets
         except DamagedError:
@@ -165,7 +165,7 @@ class Material:
         return frozenset(asset_schema(kind).found_in for kind in held)
 
     def check_edits(self) -> None:
-        """Raise :class:`ConfigError` where the survey has no inventory that could be edited."""
+        """Raise :class:`ConfigError` where the survey has no inventory to edit."""
         if self.inventory is None:
             raise ConfigError(
                 "there is nothing to be edited: the survey's inventory is empty",
@@ -174,24 +174,24 @@ class Material:
             )
 
     def cells(self, tiles: Sequence[TileId] | None = None) -> StoredTiles:
-        """Cells and overviews of tiles, all of them unless some are named."""
+        """Return cells and overviews of tiles, of all tiles unless some are named."""
         chosen = self.tiles if tiles is None else {t: self.tiles[t] for t in tiles if t in self.tiles}
         overviews = self.session.manifest.of(OVERVIEWS)
         own = [overviews[r.unit] for r in chosen.values() if r.unit in overviews and overviews[r.unit].key == r.key]
         return StoredTiles(self.store, list(chosen.values()), [r for r in own if r.path], self.context)
 
     def records(self, table: str) -> list[OutputRecord]:
-        """Records of the Parquet files of a table, by path."""
+        """Return records of a table's Parquet files, by path."""
         location = table_schema(table).location
         found = (r for r in self.session.manifest.all() if r.path.endswith(".parquet"))
         return sorted((r for r in found if r.path.startswith(f"{location}/")), key=lambda r: r.path)
 
     def table(self, name: str) -> SiteTable | None:
-        """All rows of a table of the store; None where it has no file."""
+        """Return all rows of a stored table; None where it has no file."""
         return self.rows_of(self.records(name))
 
     def rows_of(self, records: Sequence[OutputRecord]) -> SiteTable | None:
-        """Rows of some files of one table."""
+        """Return the rows of some files of one table."""
         parts, shapes = [], []
         for record in records:
             content = read_recorded(self.store, record)
@@ -206,7 +206,7 @@ class Material:
         return SiteTable(joined, np.concatenate(shapes) if shapes else None)
 
     def key(self, records: Sequence[OutputRecord], *parts: Any) -> str:
-        """Hash of the content of files, and of what else shapes a document."""
+        """Return a hash of the content of files, and of everything else that determines a document."""
         return key_of([(r.unit, r.digest) for r in records], *parts)
 
     def _is_near(self, tile: TileId) -> bool:
@@ -218,17 +218,17 @@ class Material:
 
 
 def sheet_name(easting_m: float, northing_m: float) -> str:
-    """Name of the kilometre sheet that holds a place: whole kilometres of easting and northing."""
+    """Return the name of the kilometre sheet around a place: whole kilometres of easting and northing."""
     return f"{int(easting_m // SHEET_M)}_{int(northing_m // SHEET_M)}"
 
 
 def box_of(shapes: npt.NDArray[Any]) -> list[float]:
-    """Box of shapes (m), to the hundredth of a millimetre."""
+    """Return the box of shapes (m), rounded to the hundredth of a millimetre."""
     return [round(float(v), 5) for v in shapely.total_bounds(shapes)]
 
 
 def box_of_road(material: Material, road: str) -> Box:
-    """Box of a road of the table `reference_lines`, with what lies beside it (m).
+    """Return the box of a road of the table `reference_lines`, with a margin (m).
 
     Raises
     ------
@@ -248,7 +248,7 @@ def box_of_road(material: Material, road: str) -> Box:
 
 
 def box_from_text(text: str) -> Box:
-    """A box of the map from ``WEST,SOUTH,EAST,NORTH`` (m).
+    """Return the map box of ``WEST,SOUTH,EAST,NORTH`` (m).
 
     Raises
     ------

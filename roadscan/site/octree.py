@@ -1,4 +1,4 @@
-"""An octree over the points of a cloud, a node holding a picture of its cube in ever finer voxels.
+"""An octree over the points of a cloud, in which each node samples its cube in ever finer voxels.
 
 A point stands in one node: the coarsest in which it lies nearest to the centre of its voxel among all points that no
 coarser node took (the additive sampling of Schütz, *Potree*, 2016, and of COPC 1.0).
@@ -30,14 +30,14 @@ from roadscan.tiles.kernels.octree import (
 Int32 = npt.NDArray[np.int32]
 
 LEAF_POINTS: Final = 65_536
-"""A node with no more points is not cut further."""
+"""Nodes with at most this many points are not divided."""
 
 CELL_M: Final = 8.0
-"""A cell, which is cut by itself, has at least this edge."""
+"""Least edge of a cell, which is divided independently."""
 
 
 class NodeKey(NamedTuple):
-    """Place of a node: its level, and its number along x, y and z among the 2^level cubes of an edge."""
+    """Place of a node: its level, and its index along x, y and z among the 2^level cubes of an edge."""
 
     level: int
     x: int
@@ -46,23 +46,23 @@ class NodeKey(NamedTuple):
 
 
 class Node(NamedTuple):
-    """A node that points belong to."""
+    """A node with points."""
 
     key: NodeKey
     points: Int32
-    """(n,) numbers of the points, in the order that they were given."""
+    """(n,) indices of the points, in the given order."""
 
 
 @dataclass(frozen=True)
 class Cube:
-    """The root's cube, in whole steps of the stored coordinates: the points' own box, made as high as it is wide."""
+    """The root's cube, in whole steps of the stored coordinates: the points' box, made as high as it is wide."""
 
     corner: tuple[int, int, int]
     """Least coordinates (steps)."""
     edge: int
-    """Edge (steps); a point at the far end lies in the last node."""
+    """Edge (steps); a point at the far end is in the last node."""
     top: int
-    """Level of the cells that are cut one after another."""
+    """Level of the cells that are divided one after another."""
 
     @classmethod
     def around(cls, low: tuple[int, int, int], high: tuple[int, int, int], cell_steps: float) -> Cube:
@@ -72,7 +72,7 @@ class Cube:
         Raises
         ------
         StoreError
-            where the box is wider than a cube can tell apart.
+            where the box is wider than the steps of a cube.
         """
         edge = max(1, *(b - a for a, b in zip(low, high, strict=True)))
         if edge >= 1 << BITS:
@@ -81,21 +81,21 @@ class Cube:
         return cls(low, edge, top)
 
     def cells(self, axis: int, values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-        """Number (n,) of the cell along an axis (0, 1, 2) of stored coordinates (n,)."""
+        """Return the index (n,) of the cell along an axis (0, 1, 2) of stored coordinates (n,)."""
         return self.parts(axis, values).astype(np.int64) >> (BITS - self.top)
 
     def parts(self, axis: int, values: npt.NDArray[Any]) -> Int32:
-        """Stored coordinates (n,) as parts of the edge, 2^30 of them: bits tell the node on each level."""
+        """Return stored coordinates (n,) in 2^30 parts of the edge, whose bits give the node on each level."""
         parts: Int32 = parts_of_edge(np.ascontiguousarray(values, np.int32), self.corner[axis], self.edge)
         return parts
 
     def first_step(self, axis: int, cell: int) -> int:
-        """Least stored coordinate that can lie in a cell."""
+        """Return the least stored coordinate that can lie in a cell."""
         return self.corner[axis] + -(-cell * self.edge >> self.top)
 
 
 class NodeCutter:
-    """Cuts the cells of a cube into nodes; holds the memory that this takes."""
+    """Divides the cells of a cube into nodes; owns the memory for this."""
 
     def __init__(self, cube: Cube, leaf_points: int = LEAF_POINTS) -> None:
         self._cube, self._leaf = cube, leaf_points
@@ -119,7 +119,7 @@ class NodeCutter:
         shape = Shape(cube.top, self._leaf)
         best, distance = self._voxels
         tables = Tables(best, distance, np.empty(number.size, np.int32))
-        # A node is cut only where it holds more than a leaf, and has eight children.
+        # A node is divided only if it has more points than a leaf, and gets eight children.
         most = cube.top + 1 + 8 * BITS * (number.size // self._leaf + 1)
         rows = np.empty((min(most, number.size + cube.top + 1), NODE_COLUMNS), np.int64)
         for first, end in zip(starts.tolist(), [*starts[1:].tolist(), number.size], strict=True):

@@ -1,4 +1,4 @@
-"""The report inside a site, or beside one: its pictures of places lead into the page."""
+"""Adapts the report to a site around or beside it: its pictures of places become links to the page."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Final
 REPORT: Final = "report"
 """Product of the report's record."""
 _PLACE: Final = b'<a data-place="'
-"""How the report marks a picture of a place; what stands behind the page's name follows."""
+"""The report's mark of a picture of a place; the part of the address after the page's name follows."""
 
 
 def linked_report(content: bytes, site: str | None) -> bytes:
-    """The report with its pictures of places as links into a site.
+    """Return the report with its pictures of places as links into a site.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def linked_report(content: bytes, site: str | None) -> bytes:
 
 
 def site_beside(page: Path) -> str | None:
-    """Way from a page to the site in its folder, or in the folder `site` beside it; None where there is none."""
+    """Return the path from a page to the site in its folder, or in `site` beside it; None where there is none."""
     for folder in ("", "site/"):
         if (page.parent / folder / "survey.json").is_file():
             return folder

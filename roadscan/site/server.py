@@ -1,4 +1,4 @@
-"""A server for one machine: it gives the documents of a site to the browser beside it, and does nothing else.
+"""A local server that only gives the documents of a site to a browser on the same machine.
 
 It listens on a loopback address. It answers GET and HEAD, whole or by one range (RFC 9110, 14), for paths that the site
 names; no path reaches the file system. A request that names another host is refused, so that no page of another origin
@@ -34,12 +34,12 @@ POLICY: Final = (
     "img-src 'self' data: blob:; connect-src 'self' data: blob:; font-src 'self'; manifest-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""What the page may do: run and load what this server gives, and nothing of another origin."""
+"""Content security policy of the page: it runs and loads only what this server gives."""
 _REPORT_POLICY: Final = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-"""The report has no script; its style and its pictures stand in the page."""
+"""Policy of the report, which has no script; its style and its pictures are inline."""
 
 _TYPES: Final = {
     ".css": "text/css; charset=utf-8", ".fgb": "application/vnd.flatgeobuf",
@@ -54,21 +54,21 @@ _TYPES: Final = {
 }  # fmt: skip
 _PATH: Final = re.compile(r"/([A-Za-z0-9_-][A-Za-z0-9_.-]*(?:/[A-Za-z0-9_-][A-Za-z0-9_.-]*)*)?")
 _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
-_LONGEST_HEAD: Final = 8192
+_LONGEST_HEAD: Final = 8192  # longer paths are refused
 TOKEN_HEADER: Final = "X-Roadscan-Edit"
-"""Carries the token; a page of another origin can send no such header without asking this server first."""
-_MOST_EDITS_BYTES: Final = 16_000_000
+"""Header with the token, which a page of another origin can only send with this server's permission."""
+_MOST_EDITS_BYTES: Final = 16_000_000  # larger documents of edits are refused
 
 
 class Documents(Protocol):
-    """Where documents come from."""
+    """Source of documents."""
 
     def document(self, path: str) -> Served | None:
-        """A document by its path; None where there is none."""
+        """Return a document by its path; None where there is none."""
 
 
 class SiteServer(ThreadingHTTPServer):
-    """Serves a site on a loopback port; use it as a context, `serve_forever` answers until `shutdown`.
+    """Serves a site on a loopback port; a context manager, in which `serve_forever` answers until `shutdown`.
 
     With `take`, a function that takes in a document of edits and answers, it takes edits.
     """
@@ -77,24 +77,24 @@ class SiteServer(ThreadingHTTPServer):
     allow_reuse_address = False
 
     def __init__(self, documents: Documents, port: int = 0, take: Callable[[bytes], Any] | None = None) -> None:
-        """Listen; port 0 takes one that is free."""
+        """Listen on a port; 0 selects a free one."""
         self.documents, self.take = documents, take
         self.token = secrets.token_urlsafe(24) if take is not None else ""
         super().__init__((LOOPBACK, port), _Handler)
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Pass over a browser that went away before its answer was there; tell of all else."""
+        """Ignore a browser that closed the connection early; report all other errors."""
         if not isinstance(sys.exc_info()[1], ConnectionError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
     @property
     def address(self) -> str:
-        """Address of the page; it carries the token of edits behind `#`, which browsers send to no server."""
+        """Address of the page with the token of edits after `#`, which browsers send to no server."""
         return f"http://{LOOPBACK}:{self.server_port}/" + (f"#edit={self.token}" if self.token else "")
 
     @property
     def hosts(self) -> frozenset[str]:
-        """Names by which a browser may ask."""
+        """Host names that requests may use."""
         return frozenset(f"{name}:{self.server_port}" for name in (LOOPBACK, "localhost"))
 
 
@@ -110,12 +110,12 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(with_body=True)
 
     def do_HEAD(self) -> None:
-        """Answer with the head alone."""
+        """Answer with the header only."""
         self._answer(with_body=False)
 
     def do_POST(self) -> None:
-        """Take in edits."""
-        self.close_connection = True  # a body may follow that nobody reads
+        """Apply edits."""
+        self.close_connection = True  # an unread body may follow
         if self.server.take is None or urlsplit(self.path).path != f"/{POST}":
             self._refuse_method()
             return
@@ -133,7 +133,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def _refused(self) -> tuple[HTTPStatus, str] | None:
-        """Why edits are not taken; None where they come from this server's own page."""
+        """Return why edits are refused; None where they come from this server's page."""
         host, origin = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
         if host not in [[one] for one in self.server.hosts] or origin != [f"http://{host[0]}"]:
             return HTTPStatus.FORBIDDEN, "edits are taken from this server's own page alone"
@@ -155,10 +155,10 @@ class _Handler(BaseHTTPRequestHandler):
         raise AttributeError(name)
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002  as the base class has it
-        """Say nothing of each request."""
+        """Suppress the log of requests."""
 
     def _refuse_method(self) -> None:
-        self.close_connection = True  # a body may follow that nobody reads
+        self.close_connection = True  # an unread body may follow
         told = "this server is read-only" if self.server.take is None else "only edits are taken, at their address"
         self._text(HTTPStatus.METHOD_NOT_ALLOWED, told, {"Allow": "GET, HEAD"})
 
@@ -211,7 +211,7 @@ class _Handler(BaseHTTPRequestHandler):
         while left:
             piece = stream.read(min(left, 1 << 20))
             if not piece:
-                self.close_connection = True  # the file was cut meanwhile: what was promised cannot be kept
+                self.close_connection = True  # the file was truncated meanwhile: the promised length is impossible
                 return
             self.wfile.write(piece)
             left -= len(piece)
@@ -240,7 +240,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def range_of(asked: str, size: int) -> range | None:
-    """Bytes of a document that a header ``Range`` asks for; empty where it has none of them.
+    """Return the bytes of a document that a ``Range`` header requests; empty where the document has none of them.
 
     None where the whole document is to be sent: for another unit, several ranges, or what is no range.
     """

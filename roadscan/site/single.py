@@ -1,4 +1,4 @@
-"""A site as one file that opens by a double click: a page of a file may ask for no others, so all is inside."""
+"""Writes a site as one self-contained file, because a page opened from a file may load no others."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from roadscan.site.site import KEYS, REPORT_PAGE, publish
 from roadscan.site.web_part import DATA_MARK, single_page
 
 LARGEST_MB: Final = 200.0
-"""Larger pages take browsers long to open."""
+"""Larger pages open slowly in browsers."""
 
 _TEXT: Final = (".json",)
 _NOT_INSIDE: Final = (".parquet", ".vpc", ".tif", ".vrt", ".fgb", ".html")
-"""What is for other programs, or a page of its own."""
+"""Suffixes of files for other programs, and of separate pages."""
 _WEB: Final = ("app/",)
-_BASE64: Final = 4 / 3
+_BASE64: Final = 4 / 3  # growth of bytes encoded as text
 
 
 @dataclass(frozen=True)
 class SinglePage:
-    """What was written."""
+    """Result of writing a page."""
 
     path: Path
     bytes: int
     left_out: tuple[str, ...]
-    """What did not fit, or could not be made."""
+    """Contents that did not fit, or could not be made."""
 
 
 def write_single(
@@ -41,7 +41,7 @@ def write_single(
     largest_mb: float = LARGEST_MB,
     report: Callable[[int, int], None] = lambda _a, _b: None,
 ) -> SinglePage:
-    """Write the site of a survey, or of the part that is wished for, as one file.
+    """Write the site of a survey, or of the requested part, as one file.
 
     Where it would be larger than `largest_mb`, it goes without the pictures of cameras, then without the finest rasters
     one after another, then without the points.
@@ -73,7 +73,7 @@ def write_single(
 
 
 def _ever_less(material: Material) -> Iterator[tuple[Material, str]]:
-    """The material with ever fewer wishes, and what each goes without."""
+    """Yield the material with ever fewer contents, and what each leaves out."""
     wishes = material.wishes
     yield material, ""
     if wishes.pictures:
@@ -89,7 +89,7 @@ def _ever_less(material: Material) -> Iterator[tuple[Material, str]]:
 
 
 def _inside(folder: Path) -> list[Path]:
-    """Files of a site that belong into the page, in an order of their own."""
+    """Return the files of a site that belong into the page, in a fixed order."""
     found = []
     for file in sorted(folder.rglob("*")):
         name = file.relative_to(folder).as_posix()
@@ -99,12 +99,12 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def _size(file: Path) -> float:
-    """Bytes that a file takes in the page."""
+    """Return the bytes of a file in the page."""
     return file.stat().st_size * (1.0 if file.suffix in _TEXT else _BASE64) + 100
 
 
 def _write(path: Path, page: str, folder: Path) -> None:
-    """Write the page with all files inside, and let it appear as a whole."""
+    """Write the page with all files embedded, atomically."""
     before, after = page.split(DATA_MARK)
     scratch = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
     try:
@@ -125,5 +125,5 @@ def _write(path: Path, page: str, folder: Path) -> None:
 
 
 def _without_report(content: bytes) -> bytes:
-    """A document without the way to the report, which is a page of its own."""
+    """Return a document without the path of the report, which is a separate page."""
     return content.replace(f'"report":"{REPORT_PAGE}"'.encode(), b'"report":null')

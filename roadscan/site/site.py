@@ -1,4 +1,4 @@
-"""The site as a whole: its entry, all its documents, and publishing them as a folder."""
+"""The whole site: its entry, all its documents, and publishing them as a folder."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from roadscan.site.web_part import web_documents
 from roadscan.store.codecs import SOFTWARE
 from roadscan.store.manifest import read_recorded
 
-LAYOUT: Final = 1
+LAYOUT: Final = 1  # version of the site's layout
 ENTRY: Final = "survey.json"
 REPORT_PAGE: Final = "report.html"
 _LINKED: Final = "roadscan.site.report_copy:linked_report"
 KEYS: Final = "keys.json"
-"""Which documents the folder holds, with the key of each."""
+"""Documents of the folder, with the key of each."""
 
 
 @functools.lru_cache(maxsize=2)
 def entry(material: Material) -> Document:
-    """`survey.json`, from which a page finds everything."""
+    """Return `survey.json`, from which a page finds everything."""
     context = material.context
     extent_m = material.extent_m
     told: dict[str, Any] = {
@@ -58,14 +58,14 @@ def entry(material: Material) -> Document:
 
 
 def site_documents(material: Material) -> Iterator[Document]:
-    """All documents of the site, in the order in which a page asks for them."""
+    """Yield all documents of the site, in the order in which a page requests them."""
     yield from first_documents(material)
     for part in site_parts():
         yield from part.documents(material)
 
 
 def first_documents(material: Material) -> Iterator[Document]:
-    """The web part, the entry and the report."""
+    """Yield the web part, the entry and the report."""
     yield from web_documents()
     yield entry(material)
     record = _report(material)
@@ -79,19 +79,19 @@ def first_documents(material: Material) -> Iterator[Document]:
 
 @dataclass(frozen=True)
 class Published:
-    """What was published."""
+    """Result of publishing."""
 
     folder: Path
     files: int
     made: int
-    """Files that were made anew; the others stood there."""
+    """Number of files that were written; the others were current."""
     bytes: int
     failures: tuple[tuple[str, str], ...]
-    """Documents that could not be made, and why."""
+    """Documents that could not be made, with reasons."""
 
 
 def publish(material: Material, out: Path, report: Callable[[int, int], None] = lambda _a, _b: None) -> Published:
-    """Publish the site as a folder, which appears as a whole: beside it under another name, then renamed.
+    """Publish the site as a folder, written under another name and then renamed.
 
     What a folder that was published before holds unchanged is taken over.
 
@@ -120,7 +120,7 @@ def publish(material: Material, out: Path, report: Callable[[int, int], None] = 
 
 
 def known_files(out: Path) -> dict[str, Path]:
-    """Files of a folder that was published before, by key; nothing where it is not there or empty."""
+    """Return the files of an already published folder by key; nothing where it is missing or empty."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return {}
     try:
@@ -143,7 +143,7 @@ class _Writer:
         self.failures: list[tuple[str, str]] = []
 
     def add(self, document: Document) -> None:
-        """Take a document over or write it; one that fails is left out and told."""
+        """Reuse or write a document; one that fails is left out and reported."""
         path = self._folder / document.path
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -161,12 +161,12 @@ class _Writer:
         self.bytes += path.stat().st_size
 
     def _ask(self, path: str) -> Path:
-        """A document that was written before: finer pictures come before coarser ones."""
+        """Return an already written document: finer pictures precede coarser ones."""
         return self._folder / path
 
 
 def _linked(known: Path, path: Path) -> None:
-    """The same file under another name; a copy where the system has no links."""
+    """Link a file under another name; copy it where the system has no links."""
     try:
         os.link(known, path)
     except OSError:
@@ -174,7 +174,7 @@ def _linked(known: Path, path: Path) -> None:
 
 
 def _exchange(scratch: Path, out: Path) -> None:
-    """Let a folder take the place of another in two renames; the old one goes last."""
+    """Replace a folder by another in two renames, then delete the old one."""
     old = out.parent / f".{out.name}-{uuid.uuid4().hex}"
     if out.exists():
         out.rename(old)
@@ -211,12 +211,12 @@ def _proj4(crs: Any) -> str:
     import warnings
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # it tells that such a text loses what the WKT beside it keeps
+        warnings.simplefilter("ignore", UserWarning)  # warns that such a text loses what the WKT beside it keeps
         return str(crs.to_proj4())
 
 
 def _origin(material: Material) -> list[float]:
-    """A whole place near the survey, to be taken off before coordinates become floats of 32 bits."""
+    """Return a whole-metre position near the survey, which is subtracted before coordinates become 32-bit floats."""
     extent_m, heights = material.extent_m, _heights(material)
     if extent_m is None:
         return [0.0, 0.0, 0.0]
@@ -225,7 +225,7 @@ def _origin(material: Material) -> list[float]:
 
 
 def _box_of(layers: Sequence[Mapping[str, Any]]) -> Box | None:
-    """Box of all layers, for a survey without tiles; None without any."""
+    """Return the box of all layers, for a survey without tiles; None without any."""
     boxes = [part["bounds_m"] for layer in layers for part in layer["parts"]]
     if not boxes:
         return None

@@ -1,4 +1,4 @@
-"""Pictures that a site shows: those of cameras that have a pose, and cut-outs of assets."""
+"""Pictures that a site shows: those of cameras with a pose, and cut-outs of assets."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from roadscan.surface.tasks.pictures import plan_pictures
 from roadscan.surface.views import PictureRule
 
 _RULE: Final = PictureRule((), 30.0, 0.0, 1)
-"""All cameras with an interior orientation."""
+"""Selects all cameras with an interior orientation."""
 SHOWN_AS_THEY_ARE: Final = {".jpg": ".jpg", ".jpeg": ".jpg", ".png": ".png", ".webp": ".webp"}
-"""What browsers show, with the ending that it has in the site."""
+"""Formats that browsers show, with the suffix in the site."""
 
 
 @functools.lru_cache(maxsize=2)
 def placed_pictures(material: Material) -> PlacedPictures | None:
-    """Pictures with poses; None where the survey has none, or none is wished for."""
+    """Return pictures with poses; None where there are none, or none are requested."""
     if not material.wishes.pictures:
         return None
     try:
         held = plan_pictures(material.plan, _RULE)
     except RoadscanError:
-        return None  # no camera, no interior orientation, no picture with a pose: the page goes without
+        return None  # no camera, interior orientation or picture with a pose: the page goes without
     near = material.wishes.near
     if near is not None:
         held = held.near(Bounds(*near))
@@ -37,14 +37,14 @@ def placed_pictures(material: Material) -> PlacedPictures | None:
 
 
 def picture_url(held: PlacedPictures, number: int) -> str:
-    """Where a picture lies in the site."""
+    """Return the path of a picture in the site."""
     suffix = SHOWN_AS_THEY_ARE.get(held.path(number).suffix.lower(), ".jpg")
     return f"pictures/{int(held.log[number])}/{number:06d}{suffix}"
 
 
 @functools.lru_cache(maxsize=2)
 def picture_urls(material: Material) -> Mapping[tuple[str, str, str], str]:
-    """Where each picture lies in the site, by run, camera and file."""
+    """Return the path of each picture in the site, by run, camera and file."""
     held = placed_pictures(material)
     logs = () if held is None else (held.logs[number] for number in held.log.tolist())
     return {
@@ -54,12 +54,12 @@ def picture_urls(material: Material) -> Mapping[tuple[str, str, str], str]:
 
 @functools.lru_cache(maxsize=2)
 def cut_out_records(material: Material) -> Mapping[str, OutputRecord]:
-    """Records of what was cut out of pictures, by path; none where no pictures are shown."""
+    """Return records of cut-outs, by path; none where no pictures are shown."""
     if placed_pictures(material) is None:
         return {}
     return {one.path: one for one in material.session.manifest.of(CUT_OUTS).values() if one.path}
 
 
 def cut_out_url(record: OutputRecord) -> str:
-    """Where a cut-out lies in the site."""
+    """Return the path of a cut-out in the site."""
     return f"pictures/cut_outs/{record.unit}.jpg"

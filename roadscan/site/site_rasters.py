@@ -28,20 +28,20 @@ from roadscan.tiles.pyramid import overview_factors
 Float32 = npt.NDArray[np.float32]
 Raster: TypeAlias = Literal["height", "hillshade", "intensity", "pavement_intensity", "pavement_shaded"]
 RASTERS: Final[tuple[Raster, ...]] = ("height", "hillshade", "intensity")
-"""What every survey has."""
+"""Rasters of every survey."""
 PAVEMENT: Final[tuple[Raster, ...]] = ("pavement_intensity", "pavement_shaded")
-"""What a survey has that makes these products, in the greys of their settings."""
+"""Rasters of a survey with these products, in the greys of their settings."""
 
-HEIGHT_STEP_M: Final = 1e-4
+HEIGHT_STEP_M: Final = 1e-4  # unit of stored heights
 COARSER: Final = 4
 """Pixels of a coarser level along the edge of one of the next."""
-_WANTED_PX: Final = 512
-_LEAST_PX: Final = 250
-_TILES_HELD: Final = 12
+_WANTED_PX: Final = 512  # largest edge of a picture
+_LEAST_PX: Final = 250  # smallest edge of a picture
+_TILES_HELD: Final = 12  # tiles in memory
 
 
 class Place(NamedTuple):
-    """A picture: its level, and its number to the east and to the north, counted from the map's origin."""
+    """A picture: its level, and its index to the east and to the north, counted from the map's origin."""
 
     level: int
     column: int
@@ -74,15 +74,15 @@ class Pyramid:
 
     @property
     def stored_levels(self) -> int:
-        """Levels that come from the tiles themselves."""
+        """Number of levels that come from the tiles themselves."""
         return 1 + len(overview_factors(self.grid.cells_per_edge))
 
     def pixel_m(self, level: int) -> float:
-        """Edge of a pixel (m)."""
+        """Return the edge of a pixel (m)."""
         return self.factors[level] * self.grid.cell_m
 
     def places(self, level: int) -> npt.NDArray[np.int64]:
-        """(n, 2) column and row of the pictures that a tile lies in, tile by tile for the finest levels."""
+        """Return (n, 2) column and row of the pictures with a tile, tile by tile for the finest levels."""
         found = self._lattice(self.factors[level])
         per_tile = max(1, self.grid.cells_per_edge // (self.factors[level] * self.tile_px))
         order = np.lexsort((found[:, 0], found[:, 1], found[:, 0] // per_tile, found[:, 1] // per_tile))
@@ -90,7 +90,7 @@ class Pyramid:
         return ordered
 
     def holds(self, place: Place) -> bool:
-        """True for a picture that a tile lies in."""
+        """Return True for a picture with a tile."""
         if place.level >= self.stored_levels:
             return (place.column, place.row) in self._coarse(place.level)
         edge_px = self.grid.cells_per_edge // self.factors[place.level]
@@ -99,7 +99,7 @@ class Pyramid:
         return any(TileId(c, r) in self._known for r in rows for c in columns)
 
     def runs(self, level: int) -> list[list[Any]]:
-        """Rows of pictures, each with first and last column of its runs."""
+        """Return rows of pictures, each with first and last column of its runs."""
         found = self._lattice(self.factors[level])
         found = found[np.lexsort((found[:, 0], found[:, 1]))]
         column, row = found[:, 0], found[:, 1]
@@ -113,7 +113,7 @@ class Pyramid:
         return told
 
     def tiles_in(self, level: int, place: Place) -> list[TileId]:
-        """Tiles that a picture and the ring of pixels around it may touch."""
+        """Return the tiles that a picture and the ring of pixels around it may touch."""
         edge_px = self.grid.cells_per_edge // self.factors[level]
         west, south = place.column * self.tile_px - 1, place.row * self.tile_px - 1
         columns = range(west // edge_px, (west + self.tile_px + 1) // edge_px + 1)
@@ -125,7 +125,7 @@ class Pyramid:
         return frozenset(self.tiles)
 
     def _coarse(self, level: int) -> frozenset[tuple[int, int]]:
-        """Pictures of a level above those of the tiles: few."""
+        """Return the pictures of a level above those of the tiles: few."""
         if level not in self._coarse_places:
             self._coarse_places[level] = frozenset((c, r) for c, r in self._lattice(self.factors[level]).tolist())
         return self._coarse_places[level]
@@ -135,7 +135,7 @@ class Pyramid:
         return {}
 
     def _lattice(self, factor: int) -> npt.NDArray[np.int64]:
-        """(n, 2) pictures of a pixel of so many cells, without order."""
+        """Return (n, 2) pictures of pixels of this many cells, unordered."""
         size, edge = self.tile_px * factor, self.grid.cells_per_edge
         low = np.array(self.tiles, np.int64).reshape(-1, 2) * edge
         first, last = low // size, (low + edge - 1) // size
@@ -147,14 +147,14 @@ class Pyramid:
 
 @dataclass(frozen=True)
 class Scales:
-    """How values become whole numbers: value = offset + step · number."""
+    """Conversion of values to integers: value = offset + step · number."""
 
     height_offset_m: float
     intensity_step: float
 
     @classmethod
     def of(cls, summaries: Iterable[TileSummary]) -> Scales:
-        """Heights from a whole metre below the lowest, intensities up to twice the brightest tile's mean."""
+        """Return scales: heights from a whole metre below the lowest, intensities up to twice the brightest mean."""
         known = list(summaries)
         lowest = min((one.height_min_m for one in known), default=0.0)
         brightest = max((one.intensity_mean for one in known), default=255.0)
@@ -162,7 +162,7 @@ class Scales:
 
 
 class Window(NamedTuple):
-    """Values of a picture and of a ring of pixels around it; NaN where nothing lies."""
+    """Values of a picture and of a ring of pixels around it; NaN where no data is."""
 
     height_m: npt.NDArray[np.float64]
     """(px + 2, px + 2) north up."""
@@ -171,7 +171,7 @@ class Window(NamedTuple):
 
 
 class TileWindows:
-    """Windows of the levels that come from the tiles; holds a few tiles in memory."""
+    """Windows of the levels that come from the tiles, with a cache of a few tiles."""
 
     def __init__(self, pyramid: Pyramid, load: LoadCells) -> None:
         self._pyramid, self._load = pyramid, load
@@ -179,7 +179,7 @@ class TileWindows:
         self._last: tuple[Place, Window] | None = None
 
     def window(self, place: Place) -> Window:
-        """What a picture shows."""
+        """Return the values of a picture."""
         if self._last is not None and self._last[0] == place:
             return self._last[1]
         edge = self._pyramid.tile_px
@@ -201,7 +201,7 @@ class TileWindows:
         window.intensity[down, across] = own.intensity[part]
 
     def _tile(self, level: int, tile: TileId) -> Window:
-        """Pixels of a tile, north up, without a ring."""
+        """Return the pixels of a tile, north up, without a ring."""
         if (level, tile) in self._tiles:
             return self._tiles[level, tile]
         factor, size = self._pyramid.factors[level], self._pyramid.grid.cells_per_edge // self._pyramid.factors[level]
@@ -227,7 +227,7 @@ class TileWindows:
 def write_picture(
     path: Path, raster: Raster, window: Window, pixel_m: float, scales: Scales, settings: Strict | None = None
 ) -> None:
-    """Write a raster's picture as PNG: grey with opacity, or a height as a number of 24 bits in red, green and blue.
+    """Write a raster's picture as PNG: grey with opacity, or a height as a 24-bit number in red, green and blue.
 
     settings : of the product that a raster of the pavement is named after.
     """
@@ -255,7 +255,7 @@ def write_picture(
 def coarser_picture(
     path: Path, raster: Raster, below: Callable[[Place], Path | None], place: Place, tile_px: int
 ) -> None:
-    """Write a picture from those of the next finer level that lie in it: the mean of each four by four known pixels."""
+    """Write a picture from those of the next finer level in it: the mean of each four by four known pixels."""
     from PIL import Image
 
     bands = 4 if raster == "height" else 2

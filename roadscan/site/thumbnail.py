@@ -1,4 +1,4 @@
-"""A small picture of the page's map, drawn without a browser: the hillshade and the layers that are shown at first."""
+"""Draws a small picture of the page's map without a browser: the hillshade and the default layers."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from roadscan.site.parts.vectors import site_layers
 from roadscan.site.site_rasters import Place
 
 _GROUND: Final = (238, 240, 243)
-"""Where nothing is known, as the page shows it."""
-_MARK: Final = (194, 24, 91)
+"""Colour of unknown ground, as in the page."""
+_MARK: Final = (194, 24, 91)  # colour of the marked shape
 _SHIFT: Final = 4
-"""Lines are placed to the sixteenth of a pixel."""
+"""Fractional bits of line coordinates: a sixteenth of a pixel."""
 _MOST_PICTURES: Final = 160
-"""Where more pictures of the tiles would have to be made, the layers stand alone."""
+"""Most pictures of the tiles that are made; with more, only the layers are drawn."""
 
 UInt8 = npt.NDArray[np.uint8]
 
 
 def thumbnail(material: Material, box_m: Box, size_px: tuple[int, int], marked: Any = None) -> bytes:
-    """A PNG of the map around the middle of a box (m), which it holds whole.
+    """Return a PNG of the map around the middle of a box (m), with the whole box.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def thumbnail(material: Material, box_m: Box, size_px: tuple[int, int], marked: 
 
 
 def _ground(material: Material, corner: tuple[float, float], pixel_m: float, shape: tuple[int, int]) -> UInt8:
-    """Hillshade (height, width, 3) with its north-western corner there."""
+    """Return the hillshade (height, width, 3) whose north-western corner is there."""
     out = np.full((*shape, 3), _GROUND, np.uint8)
     images = images_of(material)
     fits = [level for level in images.levels if images.pyramid.pixel_m(level) <= pixel_m * 1.01]
@@ -73,7 +73,7 @@ def _ground(material: Material, corner: tuple[float, float], pixel_m: float, sha
         return out
     with TemporaryDirectory(prefix="thumbnail-") as folder:
         greys = {place: _grey(_made(material, place, Path(folder))) for place in places}
-    if len(columns) * len(rows) > _MOST_PICTURES:  # sites far apart, of which the coarsest level is too fine for this
+    if len(columns) * len(rows) > _MOST_PICTURES:  # sites far apart, whose coarsest level is still too fine here
         for place, grey in greys.items():
             left_px = (place.column * tile_m - corner[0]) / pixel_m
             _shrink(out, grey, left_px, (corner[1] - (place.row + 1) * tile_m) / pixel_m, tile_m / pixel_m)
@@ -96,7 +96,7 @@ def _ground(material: Material, corner: tuple[float, float], pixel_m: float, sha
 
 
 def _pictures(images: Images, level: int, columns: range, rows: range) -> list[Place]:
-    """Pictures of a level that there are in some columns and rows; far fewer than these may be."""
+    """Return the existing pictures of a level in some columns and rows, which may be far fewer."""
     if len(columns) * len(rows) <= _MOST_PICTURES:
         return [Place(level, c, r) for r in rows for c in columns if images.pyramid.holds(Place(level, c, r))]
     known = images.pyramid.places(level)
@@ -106,13 +106,13 @@ def _pictures(images: Images, level: int, columns: range, rows: range) -> list[P
 
 
 def _grey(path: Path) -> UInt8:
-    """Grey and opacity (edge, edge, 2) of a picture."""
+    """Return grey and opacity (edge, edge, 2) of a picture."""
     with Image.open(path, formats=("PNG",)) as image:
         return np.asarray(image)
 
 
 def _shrink(out: UInt8, grey: UInt8, left_px: float, top_px: float, edge_px: float) -> None:
-    """Draw a picture as the mean of its known pixels over the pixels of `out` that it covers, over one at least."""
+    """Draw a picture as the mean of its known pixels over the pixels of `out` that it covers, at least one."""
     known = grey[..., 1] > 0
     if known.any():
         left, top = (max(0, int(at)) for at in (left_px, top_px))
@@ -121,7 +121,7 @@ def _shrink(out: UInt8, grey: UInt8, left_px: float, top_px: float, edge_px: flo
 
 
 def _made(material: Material, place: Place, folder: Path) -> Path:
-    """A picture, made once."""
+    """Return a picture, made once."""
     document = images_of(material).document("hillshade", place)
     path = folder / document.path.replace("/", "-")
     if not path.exists():
@@ -140,7 +140,7 @@ def _place_of(material: Material, path: str) -> Place:
 
 
 def _draw(picture: UInt8, layer: SiteLayer, seen: Box, pixel_m: float) -> None:
-    """Draw what is seen of a layer over a picture."""
+    """Draw the visible part of a layer over a picture."""
     style = layer.styles[0]
     around = 20 * pixel_m
     window = shapely.box(seen[0] - around, seen[1] - around, seen[2] + around, seen[3] + around)
@@ -159,14 +159,14 @@ def _draw(picture: UInt8, layer: SiteLayer, seen: Box, pixel_m: float) -> None:
 
 
 class _Pen:
-    """How a feature is drawn."""
+    """Style of a drawn feature."""
 
     def __init__(self, colour: tuple[int, int, int], style: Style, seen: Box, pixel_m: float) -> None:
         self.colour, self.width_px = colour, max(1, round(style.width_px))
         self._corner, self._pixel_m = np.array([seen[0], seen[3]]), pixel_m
 
     def pixels(self, places_m: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
-        """Places (n, 2) of the map as pixels in sixteenths, as OpenCV takes them."""
+        """Return places (n, 2) of the map as pixels in sixteenths, for OpenCV."""
         apart = (places_m[:, :2] - self._corner) / self._pixel_m * (1.0, -1.0) - 0.5
         kept: npt.NDArray[np.int32] = np.rint(np.clip(apart, -1e5, 1e5) * 2**_SHIFT).astype(np.int32)
         return kept

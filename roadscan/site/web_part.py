@@ -1,4 +1,4 @@
-"""The built web part: what a browser runs. It is made from `viewer/` by Node and lies in the wheel."""
+"""The built web part, which a browser runs. Node makes it from `viewer/`, and the wheel contains it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ HOW_TO_BUILD: Final = "build it with `make viewer` (it needs Node), or install r
 PAGE: Final = "index.html"
 SINGLE: Final = "single.html"
 DATA_MARK: Final = "<!--roadscan-data-->"
-"""Where the documents of a single file go."""
+"""Mark in the single page at which its documents are inserted."""
 
 
 def web_folder() -> Path | None:
-    """Folder of the built web part: of the installed package, else of the checkout; None where it was not built."""
+    """Return the folder of the built web part: of the installed package, else of the checkout; None if not built."""
     package = Path(str(resources.files("roadscan")))
     for folder in (package / "viewer" / "dist", package.parent / "viewer" / "dist"):
         if (folder / PAGE).is_file():
@@ -28,7 +28,7 @@ def web_folder() -> Path | None:
 
 
 def web_documents() -> Iterator[Document]:
-    """The page and what belongs to it; nothing where it was not built."""
+    """Yield the page and its files; nothing where it was not built."""
     folder = web_folder()
     if folder is None:
         return
@@ -38,7 +38,7 @@ def web_documents() -> Iterator[Document]:
 
 
 def single_page() -> str:
-    """The page that holds all it runs, with a mark where data go.
+    """Return the self-contained page, with a mark where data are inserted.
 
     Raises
     ------

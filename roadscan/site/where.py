@@ -1,4 +1,4 @@
-"""Pictures that see a place of the map."""
+"""Finds pictures that see a place of the map."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 
 REACH_M: Final = 60.0
-"""Pictures from farther away are not named unless they are asked for (m)."""
+"""Default of the largest distance of a picture (m)."""
 _NEAR_M: Final = 1.0
-"""The height of a place is that of the cells so near to it (m)."""
-_BORDER_PX: Final = 1
-_ANY_ANGLE_DEG: Final = -90.0
+"""Distance within which cells give the height of a place (m)."""
+_BORDER_PX: Final = 1  # least distance of the place from a picture's border
+_ANY_ANGLE_DEG: Final = -90.0  # accepts any angle between view and surface
 
 
 @dataclass(frozen=True)
 class PictureOfPlace:
-    """A picture that sees a place, if nothing stands between."""
+    """A picture that sees a place, if nothing is between."""
 
     run: str
     camera: str
@@ -39,13 +39,13 @@ class PictureOfPlace:
     """Downwards."""
     distance_m: float
     resolution_m: float
-    """What a pixel spans at the place (m)."""
+    """Size of a pixel at the place (m)."""
 
 
 def pictures_of_place(
     session: Session, easting_m: float, northing_m: float, height_m: float | None = None, reach_m: float = REACH_M
 ) -> list[PictureOfPlace]:
-    """Pictures that see a place of the map, that with the finest resolution first.
+    """Return the pictures that see a place of the map, the one with the finest resolution first.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def pictures_of_place(
     Raises
     ------
     ConfigError
-        where no cell tells the height of the place; where no camera has an interior orientation.
+        where no cell gives the height of the place; where no camera has an interior orientation.
     RunError
         where the survey has no pictures, or none has a pose.
     """
@@ -78,7 +78,7 @@ def pictures_of_place(
 
 
 def ground_height_m(session: Session, easting_m: float, northing_m: float) -> float:
-    """Median height of the cells within a metre of a place (m).
+    """Return the median height of the cells within a metre of a place (m).
 
     Raises
     ------

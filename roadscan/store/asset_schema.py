@@ -1,4 +1,4 @@
-"""Schemas of the tables of assets and distresses, read from ``schemas/assets/``: a file a kind, and common columns."""
+"""Schemas of the tables of assets and distresses from ``schemas/assets/``: a file per kind, common columns."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TYPES: Final = {
 }
 _COMMON: Final = "common"
 ASSET_FOLDER: Final = "products/assets"
-"""Folder of the tables, relative to the survey's root: a file a table."""
+"""Folder of the tables, relative to the survey's root: one file per table."""
 _INVENTORY: Final = "inventory"
 
 
@@ -37,7 +37,7 @@ class AssetColumn:
     type: str
     unit: str
     title: str
-    """What people call it: the label in forms and reports."""
+    """Label in forms and reports."""
     meaning: str
     frame: str = ""
     nullable: bool = False
@@ -45,16 +45,16 @@ class AssetColumn:
     max: float | None = None
     values: tuple[str, ...] = ()
     is_evidence: bool = False
-    """It tells of what was seen, not of the asset: people do not change it, and its changes are none of the asset."""
+    """It describes the evidence, not the asset: people do not change it, and its changes are not the asset's."""
     sigma_share: float = 0.0
-    """1 σ of a measured value as a share of it, where that is more than what follows from σ of the place."""
+    """1 σ of a measured value as a share of it, where that exceeds what follows from σ of the position."""
     class_of: str = ""
-    """Column whose value decides which of `values` is found: the first one whose limit in `up_to` is not exceeded."""
+    """Column whose value selects from `values`: the first one whose limit in `up_to` is not exceeded."""
     up_to: tuple[float, ...] = ()
     """Limits of all values but the last, ascending."""
 
     def field(self) -> pa.Field:
-        """The column as Arrow has it, with unit, frame and meaning as metadata."""
+        """Return the Arrow field of the column, with unit, frame and meaning as metadata."""
         metadata = {"unit": self.unit, "frame": self.frame, "meaning": self.meaning}
         return pa.field(self.name, _TYPES[self.type], nullable=self.nullable, metadata=metadata)
 
@@ -72,50 +72,50 @@ class AssetSchema:
     parents: tuple[str, ...]
     """Kinds that it may stand on or hang from."""
     found_in: str
-    """Table of the store that holds what was found of a kind of distress; empty of what the stage `assets` finds."""
+    """Table of the store with the findings of a kind of distress; empty for kinds of the stage `assets`."""
     known_within_m: float | None
-    """Distance up to which outlines are one where four σ are less; None: that of the inventory's settings."""
+    """Distance within which outlines are one object if four σ are less; None: that of the inventory's settings."""
     own: tuple[AssetColumn, ...]
     common: tuple[AssetColumn, ...]
 
     @property
     def geometry_words(self) -> str:
-        """Type of its geometries as GeoParquet and GDAL call it, such as ``Point Z``."""
+        """Return the geometry type in the notation of GeoParquet and GDAL, such as ``Point Z``."""
         return f"{self.geometry.removesuffix('Z')} Z"
 
     @property
     def columns(self) -> tuple[AssetColumn, ...]:
-        """Common columns, then those of the kind; the geometry, WKB with heights, stands after them as `geometry`."""
+        """Return the common columns, then those of the kind; `geometry` (WKB with heights) follows them."""
         return (*self.common, *self.own)
 
     def arrow(self) -> pa.Schema:
-        """Arrow schema of the found assets of the kind."""
+        """Return the Arrow schema of the found assets of the kind."""
         geometry = pa.field("geometry", pa.binary(), nullable=False, metadata={"meaning": f"WKB, {self.geometry}"})
         return pa.schema([c.field() for c in self.columns] + [geometry])
 
 
 def asset_kind_names() -> list[str]:
-    """Names of all kinds: those that the stage `assets` finds, then distresses of the pavement."""
+    """Return the names of all kinds: those that the stage `assets` finds, then distresses of the pavement."""
     return sorted(set(_files()) - {_COMMON, _INVENTORY}, key=lambda name: ("found_in" in _read(name), name))
 
 
 @functools.cache
 def _files() -> dict[str, Path]:
-    """Schema files by name of their kind: roadscan's own, and those of packages that add kinds."""
+    """Return the schema files by name of their kind: roadscan's, and those of packages that add kinds."""
     folders = [folder / "assets" for folder in reversed(schema_folders())]
     return {file.stem: file for folder in folders for file in sorted(folder.glob("*.toml"))}
 
 
 @functools.cache
 def asset_tables() -> dict[str, str]:
-    """Kind by the name of its table, in the order of these, of what the stage `assets` finds."""
+    """Return the kind of each table that the stage `assets` fills, by table name, in the order of the kinds."""
     schemas = [asset_schema(kind) for kind in asset_kind_names()]
     return dict(sorted((one.table, one.kind) for one in schemas if not one.found_in))
 
 
 @functools.cache
 def asset_schema(kind: str) -> AssetSchema:
-    """Schema of a kind of assets.
+    """Return the schema of a kind of assets.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def asset_schema(kind: str) -> AssetSchema:
 
 @functools.cache
 def inventory_columns() -> tuple[AssetColumn, ...]:
-    """Columns that the inventory adds to the table of each kind."""
+    """Return the columns that the inventory adds to the table of each kind."""
     return _columns(_read(_INVENTORY))
 
 

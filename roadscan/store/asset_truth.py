@@ -1,11 +1,11 @@
-"""The truth of the inventory: commits that are appended and never changed, each with one Parquet file of rows.
+"""The log of the inventory: append-only commits, each with one Parquet file of rows.
 
     tables/assets_found/<number>-<digest>.parquet     what a run found
     tables/asset_edits/<number>-<digest>.parquet      what people changed
     tables/asset_commits/<number>.parquet             written last: it makes the rows part of the inventory
-    inventory/published/<token>.parquet               rows of a home as it was published or last read
+    inventory/published/<token>.parquet               rows of an inventory file as published or last read
 
-A file of rows that no commit names is left over from a program that was stopped; the next append removes it.
+A file of rows that no commit names remained from an interrupted program; the next append removes it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from roadscan.store.store import Store, bytes_digest, bytes_hold
 
 try:
     import fcntl
-except ImportError:  # no such locks on this system
+except ImportError:  # systems without such locks
     fcntl = None  # type: ignore[assignment]
 
 CommitKind: TypeAlias = Literal["found", "edits", "undo"]
@@ -39,14 +39,14 @@ COMMITS: Final = "tables/asset_commits"
 _ROWS: Final = {"found": "tables/assets_found", "edits": "tables/asset_edits"}
 _PUBLISHED: Final = "inventory/published"
 _LOCK: Final = "inventory/lock"
-_POLL_S: Final = 0.05
+_POLL_S: Final = 0.05  # time between two attempts to get the lock (s)
 _PUBLISH_ANEW: Final = "publish to a new home: what was changed in this one cannot be told"
 _RESTORE: Final = "restore it from a copy of the store: what people changed cannot be made again"
 
 
 @dataclass(frozen=True)
 class Commit:
-    """One step of the inventory; `schemas/asset_commits.toml` says what each field is."""
+    """One commit of the inventory; `schemas/asset_commits.toml` describes its fields."""
 
     number: int
     kind: CommitKind
@@ -65,7 +65,7 @@ class Commit:
 
 @dataclass(frozen=True)
 class Draft:
-    """A commit before it has a number and an instant."""
+    """A commit before it has a number and a time."""
 
     kind: CommitKind
     who: str
@@ -78,17 +78,17 @@ class Draft:
 
 
 class AssetTruth:
-    """The inventory's commits in a store; a program reads them as they were when it asked first, or appended."""
+    """The inventory's commits in a store, as they were when first read or after the last append."""
 
     def __init__(self, store: Store, units_m: tuple[float, float] = (1.0, 1.0)) -> None:
-        """Take metres of a unit of the map: of its coordinates, and of its heights."""
+        """Take the metres in one unit of the map's coordinates, and of its heights."""
         self.store = store
         self.units_m = units_m
         self._commits: tuple[Commit, ...] | None = None
 
     @property
     def commits(self) -> tuple[Commit, ...]:
-        """All commits, in their order.
+        """Return all commits in their order.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class AssetTruth:
         return self._commits
 
     def renew(self) -> None:
-        """Forget what was read: others may have appended."""
+        """Forget what was read, because other programs may have appended."""
         self._commits = None
 
     def _read_commits(self) -> Iterator[Commit]:
@@ -120,7 +120,7 @@ class AssetTruth:
         return Commit(**{name: rows[0][name] for name in names})
 
     def rows(self, commit: Commit, columns: Sequence[str] | None = None) -> pa.Table:
-        """Rows of a commit, all columns or some; of all, one that was unknown when they were written is null.
+        """Return the rows of a commit; columns that were unknown when they were written are null.
 
         Raises
         ------
@@ -142,7 +142,7 @@ class AssetTruth:
         return pa.table({f.name: rows[f.name] if f.name in known else pa.nulls(count, f.type) for f in fields})
 
     def faults(self) -> list[str]:
-        """What is wrong with the files of the inventory, each with its name; reads all of them."""
+        """Return the faults of the inventory's files, each with its name; reads all of them."""
         found: list[str] = []
         numbers: list[int] = []
         for file in self.store.files(COMMITS, ".parquet"):
@@ -164,9 +164,9 @@ class AssetTruth:
 
     @contextlib.contextmanager
     def alone(self, wait_s: float = 30.0) -> Iterator[None]:
-        """Keep other writers of this inventory out; waits for one that is at work.
+        """Lock out other writers of this inventory, waiting for one that is writing.
 
-        The system lets go of the lock when its process ends, however it ends.
+        The system releases the lock when its process ends, however it ends.
 
         Raises
         ------
@@ -192,7 +192,7 @@ class AssetTruth:
             os.close(opened)
 
     def append(self, draft: Draft, rows: pa.Table | None = None) -> Commit:
-        """Append a commit, which is on the disk when this returns; to be called within :meth:`alone`."""
+        """Append a commit, which is on the disk on return; call it within :meth:`alone`."""
         number = len(self.commits) + 1
         self._clear(number)
         file = digest = ""
@@ -232,11 +232,11 @@ class AssetTruth:
                     self.store.remove(file)
 
     def keep_published(self, token: str, rows: pa.Table) -> None:
-        """Keep the rows of a home under the name that it carries."""
+        """Store the rows of an inventory file under the token that it carries."""
         self.store.write_bytes(f"{_PUBLISHED}/{token}.parquet", parquet_bytes(rows))
 
     def published(self, token: str) -> pa.Table | None:
-        """Rows of a home as they were published or last read; None where this inventory did not make it."""
+        """Return the rows of an inventory file as published or last read; None where this inventory did not make it."""
         file = f"{_PUBLISHED}/{token}.parquet"
         if "/" in token or not self.store.exists(file):
             return None
@@ -244,12 +244,12 @@ class AssetTruth:
 
 
 def _schema_of(kind: CommitKind) -> pa.Schema:
-    """Columns of the rows of a commit."""
+    """Return the columns of the rows of a commit."""
     return evidence_table() if kind == "found" else table_schema("asset_edits").arrow()
 
 
 def parquet_bytes(table: pa.Table) -> bytes:
-    """A table as the content of a Parquet file with checksums; same rows, same bytes."""
+    """Return a table as the content of a Parquet file with checksums; equal rows give equal bytes."""
     out = io.BytesIO()
     pq.write_table(table, out, compression="zstd", row_group_size=65_536, write_page_checksum=True, version="2.6")
     return out.getvalue()

@@ -1,4 +1,4 @@
-"""Small JSON files that hold their own checksum, as last member: any JSON reader opens them, no damage is missed."""
+"""Small JSON files with a checksum as their last member: any JSON reader opens them, and damage is detected."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _END: Final = b"\n}"
 
 
 def checked_json(values: Mapping[str, Any]) -> bytes:
-    """An object that is not empty, with its checksum."""
+    """Return a non-empty object as JSON with its checksum."""
     return _sealed(json.dumps(values, indent=1, sort_keys=True).encode())
 
 
 def parse_checked(content: bytes) -> dict[str, Any]:
-    """The object without its checksum, if it has one, as files of older versions have not; ValueError for damage."""
+    """Return the object without its checksum (files of older versions have none); raise ValueError for damage."""
     mark, _, _ = _SEAL.partition(b"%b")
     start = content.rfind(mark)
     text = content if start < 0 else content[:start] + _END

@@ -1,4 +1,4 @@
-"""Tables as comma-separated values that scripts can read."""
+"""Writes tables as comma-separated values for scripts."""
 
 from __future__ import annotations
 

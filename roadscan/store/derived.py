@@ -1,4 +1,4 @@
-"""Columns that are computed when rows come in, so that no log has to bring them.
+"""Computes columns from incoming rows, so that no log has to contain them.
 
 They stand beside the raw readings for their statistics: a reader learns what a row group holds without decoding it.
 """
@@ -13,7 +13,7 @@ from roadscan.store.schema import TableSchema
 
 
 def with_derived(schema: TableSchema, rows: pa.RecordBatch) -> pa.RecordBatch:
-    """Rows of a table with its derived columns, whatever those held."""
+    """Return the rows of a table with computed derived columns, whatever these contained."""
     if schema.name != "scans":
         return rows
     lists = rows.column("range")

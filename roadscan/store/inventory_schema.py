@@ -1,4 +1,4 @@
-"""Schemas of the inventory: the table of a kind as people see it, and the rows of evidence behind it."""
+"""Schemas of the inventory: each kind's table as people see it, and the rows of evidence behind it."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ GEOMETRY: Final = "geometry"
 EDITED_BY_PEOPLE: Final = frozenset(
     {"status", "condition", "comments", "parent", "valid_from", "valid_to", "road", "station_m", "offset_m", "lane"}
 )
-"""Columns that all kinds have and people may change; beside them the own columns of the kind and the geometry."""
+"""Columns of all kinds that people may change, beside the kind's specific columns and the geometry."""
 
 
 @functools.cache
 def kinds_by_table() -> dict[str, str]:
-    """Kinds by the name of their table."""
+    """Return the kind of each table by name."""
     return {asset_schema(kind).table: kind for kind in asset_kind_names()}
 
 
 @functools.cache
 def asset_columns(kind: str) -> tuple[AssetColumn, ...]:
-    """Columns of a kind's table, without the geometry: the inventory's, the kind's, the common ones."""
+    """Return the columns of a kind's table without the geometry: the inventory's, the kind's, the common ones."""
     schema = asset_schema(kind)
     return (*inventory_columns(), *schema.own, *schema.common)
 
 
 @functools.cache
 def editable_columns(kind: str) -> frozenset[str]:
-    """Columns of a kind that people may change, without the geometry and what tells of its evidence."""
+    """Return the columns of a kind that people may change, without the geometry and those about its evidence."""
     return EDITED_BY_PEOPLE | {c.name for c in asset_schema(kind).own if not c.is_evidence}
 
 
 @functools.cache
 def asset_table(kind: str) -> pa.Schema:
-    """Arrow schema of the inventory's table of a kind; all columns may be null, the geometry (WKB) stands last."""
+    """Return the Arrow schema of a kind's inventory table; all columns may be null, the geometry (WKB) is last."""
     fields = [c.field().with_nullable(True) for c in asset_columns(kind)]
     return pa.schema([*fields, pa.field(GEOMETRY, pa.binary())])
 
 
 @functools.cache
 def evidence_table() -> pa.Schema:
-    """Arrow schema of the table `assets_found`: its own columns, and those of all kinds side by side."""
+    """Return the Arrow schema of the table `assets_found`: its specific columns and those of all kinds."""
     fields = {field.name: field for field in table_schema("assets_found").arrow()}
     for kind in asset_kind_names():
         for field in asset_table(kind):

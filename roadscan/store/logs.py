@@ -1,4 +1,4 @@
-"""Log records: which raw logs the store holds, and where their rows lie."""
+"""Log records: which raw logs the store has, and where their rows are."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FOLDER: Final = "manifest/logs"
 _COPIES: Final = "manifest/log_copies"
 
 NAVIGATION: Final = "navigation"
-"""Sensor of the records of computed trajectories."""
+"""Sensor in the records of computed trajectories."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,10 @@ class DataFile:
 
 @dataclass(frozen=True)
 class LogRecord:
-    """What is known of one ingested log; written last, so a log is in the store whole or not at all."""
+    """Record of one ingested log; written last, so a log is in the store completely or not at all."""
 
     key: str
-    """Fingerprint of the log's bytes and of everything that shaped its rows."""
+    """Fingerprint of the log's bytes and of everything that affected its rows."""
     run: str
     sensor: str
     """Sensor of the rig; 'trajectory' or 'control' for logs without one."""
@@ -56,7 +56,7 @@ class LogRecord:
     path: str
     """Path in the survey file."""
     content: str
-    """Fingerprint of the log's bytes alone."""
+    """Fingerprint of only the log's bytes."""
     source_bytes: int
     tables: dict[str, tuple[DataFile, ...]]
     attributes: dict[str, Any]
@@ -65,35 +65,35 @@ class LogRecord:
     """Records listed in the table ``rejects``."""
     reject_reasons: dict[str, int]
     findings: tuple[Finding, ...] = ()
-    """What its reader, and the checks of its rows, doubt."""
+    """Findings of its reader and of the checks of its rows."""
 
     def span(self, table: str) -> tuple[int, int] | None:
-        """First and last epoch (GPS ns) of the log's rows in a table."""
+        """Return the first and last epoch (GPS ns) of the log's rows in a table."""
         spans = [f.span for f in self.tables.get(table, ()) if f.span is not None]
         return (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else None
 
     def folder(self, table: str) -> str:
-        """Folder of the log's rows in a table, relative to the survey's root."""
+        """Return the folder of the log's rows in a table, relative to the survey's root."""
         return log_folder(table, self.run, self.sensor, self.key)
 
 
 def log_folder(table: str, run: str, sensor: str, key: str) -> str:
-    """Folder of one log's rows in a table."""
+    """Return the folder of one log's rows in a table."""
     return f"tables/{table}/run={run}/sensor={sensor}/log={key}"
 
 
 def log_of(path: str) -> str:
-    """Key of the log whose rows lie in a file below its folder."""
+    """Return the key of the log whose rows are in a file below its folder."""
     return path.partition("/log=")[2].partition("/")[0]
 
 
 def record_path(key: str) -> str:
-    """File of a log's record, relative to the survey's root."""
+    """Return the file of a log's record, relative to the survey's root."""
     return f"{_FOLDER}/{key}.json"
 
 
 def copy_path(key: str) -> str:
-    """File of its copy: raw logs may be archived, and nothing else says how their rows are to be understood."""
+    """Return the file of a record's copy: raw logs may be archived, and nothing else explains their rows."""
     return f"{_COPIES}/{key}.json"
 
 
@@ -107,7 +107,7 @@ def write_log_record(store: Store, record: LogRecord) -> None:
 def read_log_records(
     store: Store, keys: Iterable[str] | None = None, damaged: list[StoreError] | None = None
 ) -> list[LogRecord]:
-    """Records of all logs in the store, or of those named, sorted by run, sensor, start and key.
+    """Return the records of all logs in the store, or of the named ones, sorted by run, sensor, start and key.
 
     One that is damaged is an error, or joins `damaged` and is left out.
     """
@@ -124,28 +124,28 @@ def read_log_records(
 
 
 def log_keys(store: Store) -> list[str]:
-    """Keys of all logs in the store, also of those whose record is damaged."""
+    """Return the keys of all logs in the store, including those with a damaged record."""
     return [path.rsplit("/", 1)[1].removesuffix(".json") for path in store.files(_FOLDER, ".json")]
 
 
 def _start(record: LogRecord) -> int:
-    """First epoch (GPS ns) of a log, 0 for one without rows or epochs."""
+    """Return the first epoch (GPS ns) of a log, 0 for one without rows or epochs."""
     return min(((record.span(table) or (0, 0))[0] for table in record.tables), default=0)
 
 
 def has_log(store: Store, key: str) -> bool:
-    """True if the log of this key is in the store, be its record damaged or not."""
+    """Return True if the log of this key is in the store, even if its record is damaged."""
     return store.exists(record_path(key))
 
 
 def retire_log(store: Store, record: LogRecord) -> None:
-    """Take a log out of the tables without losing it: its record and rows move below ``superseded/``.
+    """Move a log's record and rows below ``superseded/``, so that it leaves the tables without being lost.
 
     Used when the same bytes were read again under other settings (a corrected clock, say).
     """
     path = record_path(record.key)
     store.write_bytes(f"superseded/{path}", store.read_bytes(path))
-    store.remove(path)  # before its rows go: no log is half there
+    store.remove(path)  # before its rows, so that no log is partially present
     store.remove(copy_path(record.key))
     for table in record.tables:
         if store.is_folder and store.exists(record.folder(table)):
@@ -157,13 +157,13 @@ def retire_log(store: Store, record: LogRecord) -> None:
 
 
 def data_file(raw: Mapping[str, Any]) -> DataFile:
-    """What a record holds of a data file, from JSON."""
+    """Return a data file's entry in a record, from JSON."""
     spans = tuple((s[0], s[1]) for s in raw["group_spans"])
     return DataFile(**{**raw, "group_rows": tuple(raw["group_rows"]), "group_spans": spans})
 
 
 def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
-    """The record of the log `key`, from the content of the file `path`."""
+    """Return the record of the log `key`, from the content of the file `path`."""
     try:
         raw = parse_checked(content)
         raw["tables"] = {name: tuple(map(data_file, files)) for name, files in raw["tables"].items()}

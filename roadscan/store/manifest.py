@@ -1,4 +1,4 @@
-"""The manifest of outputs: which file has which key. What is there and verified is not made again."""
+"""The manifest of outputs: which file has which key. Verified outputs are not made again."""
 
 from __future__ import annotations
 
@@ -30,32 +30,32 @@ CHANGED: Final = "changed"
 DAMAGED: Final = "damaged"
 """Its file is not as recorded."""
 _MOST_PARTS: Final = 256
-"""More parts than that are merged: a long run would begin with thousands of files to read."""
+"""Most parts before they are merged: a long run would start by reading thousands of files."""
 _LOOKS: Final = 10
-"""How often parts are listed at most, where a run at work merges them while they are read."""
+"""Most times that parts are listed while another run merges them."""
 
 
 @dataclass(frozen=True)
 class _Part:
-    """A file of records, written once. Parts hold what changed, in the order of their numbers."""
+    """A file of records, written once. Parts contain changes, in the order of their numbers."""
 
     path: str
     rows: int
     records: Packed | None = None
-    """What it holds, where that was written a moment ago and is soon merged."""
+    """Its records, where it was just written and will soon be merged."""
 
 
 class Manifest:
-    """All output records; one writer at a time (the run that holds the store's lock).
+    """All output records, with one writer at a time (the run with the store's lock).
 
-    What changes is written as a part of its own. Parts are merged with those before them that are no more than twice
+    Changes are written as a separate part. Parts are merged with those before them that are no more than twice
     as large, so a record is written again as often as the survey doubles, not each time that some tasks end.
 
     Records stay in tables; only those of products that are asked for one by one become Python's.
     """
 
     def __init__(self, store: Store, damaged: list[StoreError] | None = None) -> None:
-        """Read the parts. One that is damaged is an error, or joins `damaged`: what is sound of it counts then."""
+        """Read the parts. A damaged part is an error, or is added to `damaged`, and its sound records are used."""
         self._store = store
         read = read_parts(store)
         faults = [one.fault for one in read if one.fault is not None]
@@ -66,37 +66,37 @@ class Manifest:
         self._parts = [_Part(one.path, one.table.num_rows) for one in read if one.fault is None]
         self._next = read[-1].number + 1 if read else 0
         self._table, self._moved = latest(pa.concat_tables([RECORDS.empty_table(), *(one.table for one in read)]))
-        self._behind: list[_Part] = []  # parts that the table does not know yet
-        self._rows: dict[str, dict[str, Row]] = {}  # by product and unit, of products that were asked for
+        self._behind: list[_Part] = []  # parts that the table does not include yet
+        self._rows: dict[str, dict[str, Row]] = {}  # by product and unit, for requested products
 
     def get(self, product: str, unit: str) -> OutputRecord | None:
-        """Record of an output, None where it was never finished."""
+        """Return the record of an output, None where it was never finished."""
         row = self._of(product).get(unit)
         return None if row is None else OutputRecord._make(row)
 
     def of(self, product: str) -> dict[str, OutputRecord]:
-        """Records of one product by unit."""
+        """Return the records of one product by unit."""
         return {unit: OutputRecord._make(row) for unit, row in self._of(product).items()}
 
     def all(self) -> list[OutputRecord]:
-        """All records, by product and unit."""
+        """Return all records, by product and unit."""
         return list(map(OutputRecord._make, rows_of(self.table())))
 
     def beside(self, products: Collection[str], units: Collection[str]) -> list[OutputRecord]:
-        """Records of some products, of all units but these."""
+        """Return the records of some products for all units except these."""
         table = self.table()
         own = pc.is_in(table.column("product"), pa.array(sorted(products), pa.string()))
         due = pc.is_in(table.column("unit"), pa.array(list(units), pa.string()))
         return list(map(OutputRecord._make, rows_of(table.filter(pc.and_not(own, due)))))
 
     def without_file(self, product: str) -> set[str]:
-        """Units of a product that are finished and have no file."""
+        """Return the units of a product that are finished and have no file."""
         table = self.table()
         found = pc.and_(pc.equal(table.column("product"), product), pc.equal(table.column("path"), ""))
         return set(table.column("unit").filter(found).to_pylist())
 
     def files(self) -> dict[str, int]:
-        """How many files there are, by product."""
+        """Return the number of files by product."""
         table = self.table()
         found = table.column("product").filter(pc.not_equal(table.column("path"), ""))
         return {one["values"]: one["counts"] for one in found.value_counts().to_pylist()}
@@ -115,7 +115,7 @@ class Manifest:
         return DAMAGED if record.path and self._store.size(record.path) != record.bytes else ""
 
     def add(self, records: Iterable[OutputRecord]) -> None:
-        """Record finished outputs; durable when this returns. Files under older names are removed by :meth:`settle`."""
+        """Record finished outputs durably. :meth:`settle` removes files under older names."""
         added = list(records)
         if not added:
             return
@@ -127,13 +127,13 @@ class Manifest:
         self._moved += [old[3] for old, new in pairs if old is not None and old[3] not in ("", new.path)]
 
     def add_packed(self, records: Packed) -> None:
-        """The same, of many as a worker packed them."""
+        """Record many outputs as a worker packed them."""
         if records.rows:
             self._rows.clear()
             self._append(records)
 
     def settle(self) -> None:
-        """Remove files under older names that no output has any more, also those that a run that was killed left."""
+        """Remove files under older names that no output has any more, including those that a killed run left."""
         table = self.table()
         if self._moved:
             moved = pa.array(sorted(set(self._moved)), pa.string())
@@ -152,25 +152,25 @@ class Manifest:
                 self._store.remove(r.path)
 
     def forget(self, product: str, units: Iterable[str]) -> None:
-        """Drop the records of outputs that could not be made again: their files stay, but count as stale."""
+        """Delete the records of outputs that could not be made again: their files stay, but count as stale."""
         known = [(product, u) for u in units if u in self._of(product)]
         if known:
             begin_changes(self._store, older=True)
             self._forget(known)
 
     def doubt(self, records: Iterable[OutputRecord]) -> None:
-        """Count outputs as stale whose files are damaged; their records stay, so that whoever reads them is told."""
+        """Mark outputs with damaged files as stale; their records stay, so that readers get an error."""
         self.add(record._replace(key=_DAMAGED) for record in records)
 
     def doubt_files(self, paths: Collection[str]) -> None:
-        """The same of files by their full paths, as errors name them; those of no output are passed over."""
+        """Mark the outputs of files as stale, given their full paths as in errors; unknown files are ignored."""
         if paths:
             table = self.table()
             own = pa.array(sorted(path.removeprefix(f"{self._store.root}/") for path in paths), pa.string())
             self.doubt(map(OutputRecord._make, rows_of(table.filter(pc.is_in(table.column("path"), own)))))
 
     def compact(self) -> None:
-        """Bring all parts into one, without what is no more."""
+        """Merge all parts into one, without deleted records."""
         self.settle()
         old, self._parts = self._parts, []
         self._write(Packed.of(self._table, "lz4"))
@@ -178,7 +178,7 @@ class Manifest:
             self._store.remove(part.path)
 
     def _of(self, product: str) -> dict[str, Row]:
-        """Rows of a product by unit."""
+        """Return the rows of a product by unit."""
         rows = self._rows.get(product)
         if rows is None:
             table = self.table()
@@ -187,7 +187,7 @@ class Manifest:
         return rows
 
     def table(self) -> pa.Table:
-        """Every record, by product and unit."""
+        """Return every record, by product and unit."""
         if self._behind:
             news, self._behind = list(map(self._read, self._behind)), []
             self._table, moved = latest(pa.concat_tables([self._table, *news]))
@@ -205,7 +205,7 @@ class Manifest:
             self._merge()
 
     def _merge(self) -> None:
-        """Bring the last parts into one, which says the same as these in their order, but not which files moved."""
+        """Merge the last parts into an equivalent one, without recording which files moved."""
         self.settle()
         rows = self._parts[-1].rows
         first = len(self._parts) - 1
@@ -216,7 +216,7 @@ class Manifest:
         table, _ = latest(pa.concat_tables(list(map(self._read, old))), forgotten=True)
         del self._parts[first:]
         self._write(Packed.of(table, "lz4"))
-        for part in old:  # where these stay, the new part says once more what they say
+        for part in old:  # where these stay, the new part repeats their records
             self._store.remove(part.path)
 
     def _read(self, part: _Part) -> pa.Table:
@@ -232,26 +232,26 @@ class Manifest:
 
 @dataclass(frozen=True)
 class ReadPart:
-    """A part as it was found."""
+    """A part as it was read."""
 
     path: str
     table: pa.Table
-    """Its records; of a damaged one those that are sound."""
+    """Its records; the sound ones where it is damaged."""
     fault: StoreError | None
 
     @property
     def number(self) -> int:
-        """Its place among the parts."""
+        """Number that orders the parts."""
         return int(self.path.rsplit("-", 1)[1].removesuffix(".parquet"))
 
 
 def part_path(number: int) -> str:
-    """File of a part, relative to the survey's root."""
+    """Return the file of a part, relative to the survey's root."""
     return f"{_FOLDER}/part-{number:08d}.parquet"
 
 
 def read_parts(store: Store) -> list[ReadPart]:
-    """Parts and their records, in order; listed again where a run at work has merged some of them meanwhile.
+    """Return the parts with their records, in order; they are listed again if a running merge removed some.
 
     Raises
     ------
@@ -287,7 +287,7 @@ def _read_part(store: Store, path: str) -> ReadPart:
 
 
 def read_recorded(store: Store, record: OutputRecord) -> bytes:
-    """Content of an output's file, as it was recorded.
+    """Return the content of an output's file, verified against its record.
 
     Raises
     ------
@@ -306,7 +306,7 @@ def read_recorded(store: Store, record: OutputRecord) -> bytes:
 
 
 def begin_changes(store: Store, *, older: bool = False) -> bool:
-    """Note that files may lie in the store from now on that no record names; True where that was noted before.
+    """Note that the store may contain unrecorded files from now on; return True where that was already noted.
 
     A run that is killed leaves files that it had not recorded yet. With other settings the next one would make others,
     and those would stay. `older` says that files which lie there already lost their record, too.
@@ -318,7 +318,7 @@ def begin_changes(store: Store, *, older: bool = False) -> bool:
 
 
 def end_changes(store: Store, manifest: Manifest, folders: Iterable[str]) -> list[str]:
-    """Remove the files below some folders that no record names, once all that is due has one; returns their paths.
+    """Remove unrecorded files below some folders once every due output has a record; return their paths.
 
     What lay there before the run that was killed began is nothing of its making, and stays.
     """
@@ -337,17 +337,17 @@ def end_changes(store: Store, manifest: Manifest, folders: Iterable[str]) -> lis
 
 
 def _changed_ns(store: Store, path: str) -> int:
-    """When a file was written (Unix ns), 0 where the store is no folder."""
+    """Return when a file was written (Unix ns), 0 where the store is no folder."""
     return Path(store.path(path)).stat().st_mtime_ns if store.is_folder and store.exists(path) else 0
 
 
 def write_failures(store: Store, failures: list[dict[str, str]]) -> None:
-    """Keep what failed in the last run, for `roadscan status`."""
+    """Store what failed in the last run, for `roadscan status`."""
     store.write_bytes(_FAILURES, json.dumps(failures, indent=1).encode(), lasting=False)
 
 
 def read_failures(store: Store) -> list[dict[str, str]]:
-    """What failed in the last run: unit, error."""
+    """Return what failed in the last run: unit, error."""
     if not store.exists(_FAILURES):
         return []
     try:

@@ -1,4 +1,4 @@
-"""Sorted files of one partition, merged in bounded memory."""
+"""Merges sorted files of one partition in bounded memory."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from roadscan.store.schema import TableSchema
 
 
 def merged(paths: Sequence[Path], schema: TableSchema, rows: int) -> Iterator[pa.Table]:
-    """Rows of files, each sorted by the schema, in the order of them all; equal keys keep the order of the files.
+    """Yield the rows of files that are each sorted by the schema, in common order; equal keys keep the files' order.
 
-    Only the sort columns are held as a whole. Of each file, a piece of the result needs rows that follow one
+    Only the sort columns are in memory as a whole. Of each file, a piece of the result needs rows that follow one
     another, so just their row groups are read.
 
     Parameters
@@ -44,7 +44,7 @@ def merged(paths: Sequence[Path], schema: TableSchema, rows: int) -> Iterator[pa
 
 
 def _rows(file: pq.ParquetFile, begin: int, end: int) -> pa.Table:
-    """Rows [begin, end) of a file."""
+    """Return rows [begin, end) of a file."""
     counts = [file.metadata.row_group(k).num_rows for k in range(file.metadata.num_row_groups)]
     starts = np.cumsum([0, *counts])
     one = int(np.searchsorted(starts, begin, "right")) - 1

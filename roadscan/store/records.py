@@ -1,4 +1,4 @@
-"""Records of outputs as rows of tables: each finished file with its key; what a later record says counts."""
+"""Records of outputs as rows of tables: each finished file with its key; the last record of an output is valid."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ RECORDS: Final = pa.schema(
 )
 
 _GROUP_ROWS: Final = 8192
-"""Rows that a damaged page costs at most."""
+"""Rows of a row group, which a damaged page loses at most."""
 
 _DAMAGE: Final = (pa.ArrowException, OSError, ValueError)
-"""What comes of reading damaged files."""
+"""Errors of reading damaged files."""
 
 Row: TypeAlias = tuple[str, str, str, str, int, str, str]
 
@@ -44,41 +44,41 @@ class OutputRecord(NamedTuple):
     unit: str
     """Tile id, output name, or log key."""
     key: str
-    """Hash of its inputs, of the configuration that matters to it, and of the code; empty where it is forgotten."""
+    """Hash of its inputs, relevant configuration and code; empty where the output is deleted."""
     path: str
     """Relative to the survey's root."""
     bytes: int
     digest: str
     """BLAKE3-128 of the file."""
     detail: str = ""
-    """JSON with figures that later stages need."""
+    """JSON with figures for later stages."""
 
     def figures(self) -> dict[str, Any]:
-        """The detail as values."""
+        """Return the detail as values."""
         return dict(json.loads(self.detail)) if self.detail else {}
 
 
 def table_of(records: Sequence[Row]) -> pa.Table:
-    """Records as a table."""
+    """Return records as a table."""
     columns = list(zip(*records, strict=True)) or [()] * len(RECORDS)
     return pa.Table.from_arrays([pa.array(c, f.type) for c, f in zip(columns, RECORDS, strict=True)], schema=RECORDS)
 
 
 def rows_of(table: pa.Table) -> list[Row]:
-    """The rows of a table, as bare tuples: Python's collector walks over every named one again and again."""
+    """Return the rows of a table as plain tuples, because Python's collector scans named ones again and again."""
     return list(zip(*(table.column(f.name).to_pylist() for f in RECORDS), strict=True))
 
 
 @dataclass(frozen=True)
 class Packed:
-    """Records as the Parquet file that the manifest keeps: made by a worker, written by the run that it works for."""
+    """Records as the Parquet file that the manifest stores: made by a worker, written by its run."""
 
     content: bytes
     rows: int
 
     @classmethod
     def of(cls, table: pa.Table, compression: str = "none") -> Packed:
-        """A table of records, packed; to be compressed where it is long kept, which takes twice the time."""
+        """Return a packed table of records; compression, for long storage, takes twice the time."""
         buffer = io.BytesIO()
         pq.write_table(
             table, buffer, row_group_size=_GROUP_ROWS, compression=compression, use_dictionary=["product"],
@@ -87,19 +87,17 @@ class Packed:
         return cls(buffer.getvalue(), table.num_rows)
 
     def table(self) -> pa.Table:
-        """The records."""
+        """Return the records."""
         return unpacked(self.content)
 
 
 def unpacked(content: bytes) -> pa.Table:
-    """Records of such a file; read by this thread alone, as :meth:`Store.read_table` does."""
+    """Return the records of such a file; read by this thread alone, as :meth:`Store.read_table` does."""
     return _opened(content).read(use_threads=False)
 
 
 def sound_rows(content: bytes) -> tuple[pa.Table, str]:
-    """Records of such a file without the row groups that are damaged, and what is wrong with these; empty if nothing
-    is.
-    """
+    """Return the records of such a file without damaged row groups, and what is wrong with these ("" for nothing)."""
     try:
         return unpacked(content).cast(RECORDS), ""
     except _DAMAGE as error:
@@ -118,7 +116,7 @@ def _opened(content: bytes) -> pq.ParquetFile:
 
 
 def latest(table: pa.Table, *, forgotten: bool = False) -> tuple[pa.Table, list[str]]:
-    """Last row of each product and unit, by both; and the files of which a later record says that they moved.
+    """Return the last row of each product and unit, sorted by both; and the files that a later record replaced.
 
     Parameters
     ----------
@@ -136,13 +134,13 @@ def latest(table: pa.Table, *, forgotten: bool = False) -> tuple[pa.Table, list[
 
 
 def _places(table: pa.Table) -> npt.NDArray[np.int64]:
-    """(rows,) numbers that order the rows by product and unit."""
+    """Return (rows,) numbers that order the rows by product and unit."""
     (product, _), (unit, units) = (_ranks(table.column(name)) for name in ("product", "unit"))
     return product * units + unit
 
 
 def _ranks(column: pa.ChunkedArray) -> tuple[npt.NDArray[np.int64], int]:
-    """Place (rows,) of each text among those that there are, and their number."""
+    """Return the rank (rows,) of each text among the distinct ones, and their number."""
     coded = _codes(column)
     rank = np.empty(len(coded.dictionary), np.int64)
     rank[pc.array_sort_indices(coded.dictionary).to_numpy()] = np.arange(rank.size)
@@ -150,14 +148,14 @@ def _ranks(column: pa.ChunkedArray) -> tuple[npt.NDArray[np.int64], int]:
 
 
 def _codes(column: pa.ChunkedArray) -> pa.DictionaryArray:
-    """A column as numbers of the texts that there are."""
+    """Return a column as indices of its distinct texts."""
     return column.combine_chunks().dictionary_encode()
 
 
 def _moved(
     table: pa.Table, order: npt.NDArray[np.int64], again: npt.NDArray[np.bool_], known: npt.NDArray[np.bool_]
 ) -> list[str]:
-    """Files whose output's next record names another, and no record after that names them again."""
+    """Return files that the output's next record replaces by another, and that no later record names again."""
     path = _codes(table.column("path"))
     code = path.indices.to_numpy()[order]
     nowhere = pc.index(path.dictionary, "").as_py()

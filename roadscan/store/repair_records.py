@@ -1,8 +1,8 @@
-"""Damaged records of the store: set aside, never deleted; what they told of is made again.
+"""Repairs damaged records of the store: they are set aside, never deleted, and what they described is made again.
 
 A log's record has a copy, which takes its place; without one the log is read again. Of a damaged part of the manifest
 the sound rows stay. What else it said is not known: it may have replaced or forgotten records of parts before it. So
-the files of those are held against their digests, and what does not hold counts as stale.
+the files of those are verified against their digests, and what differs counts as stale.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ Report = Callable[[str], None]
 
 
 def repair_records(store: Store, report: Report = lambda _: None) -> None:
-    """Set damaged records aside, by whoever has the store's lock; `report` hears of each, and what it costs."""
+    """Set damaged records aside (requires the store's lock); `report` receives each, with its consequences."""
     _mend_logs(store, report)
     _mend_manifest(store, report)
 
 
 def fault_of(store: Store, folder: Path, path: str, size: int, digest: str) -> str | None:
-    """What is wrong with a recorded file, None where it is as recorded. `folder` is for copies of remote files."""
+    """Return what is wrong with a recorded file, None for nothing. `folder` is for copies of remote files."""
     found = store.size(path)
     if found is None:
         return f"{path}: missing"
@@ -65,7 +65,7 @@ def _mend_logs(store: Store, report: Report) -> None:
 
 
 def _whole_copy(store: Store, key: str) -> bytes | None:
-    """The copy of a log's record, None where it is missing or damaged too."""
+    """Return the copy of a log's record, None where it is missing or damaged too."""
     path = copy_path(key)
     if not store.exists(path):
         return None
@@ -86,7 +86,7 @@ def _mend_manifest(store: Store, report: Report) -> None:
         fault = parts[one].fault
         if fault is not None and not isinstance(fault, DamagedError):
             raise fault  # may be readable tomorrow
-    begin_changes(store, older=True)  # files that only it named lie there without a record now
+    begin_changes(store, older=True)  # files that only it named have no record now
     rows, _ = latest(pa.concat_tables([part.table for part in parts]), forgotten=True)
     doubtful = _doubtful(rows, parts[damaged[-1] + 1 :])
     with store.scratch() as folder:
@@ -94,7 +94,7 @@ def _mend_manifest(store: Store, report: Report) -> None:
     forgotten = table_of([(r.product, r.unit, "", "", 0, "", "") for r in gone])
     rows, _ = latest(pa.concat_tables([rows, forgotten]), forgotten=True)
     store.write_bytes(part_path(parts[-1].number + 1), Packed.of(rows, "lz4").content)
-    for one in damaged:  # last: until then the next run does all of this once more
+    for one in damaged:  # last: until then the next run repeats all of this
         fault = parts[one].fault
         aside = store.set_aside(parts[one].path)
         report(
@@ -104,7 +104,7 @@ def _mend_manifest(store: Store, report: Report) -> None:
 
 
 def _doubtful(rows: pa.Table, later: Sequence[ReadPart]) -> list[OutputRecord]:
-    """Records of files that parts after the last damaged one do not tell of."""
+    """Return the records of files that parts after the last damaged one do not mention."""
     known = {tuple(row) for part in later for row in zip(*_names(part.table), strict=True)}
     product, unit = _names(rows)
     open_ = np.array([pair not in known for pair in zip(product, unit, strict=True)], dtype=bool)

@@ -1,4 +1,4 @@
-"""What is left of a damaged file of ingested rows whose log cannot be read again, and a list of what is lost."""
+"""Salvages the sound rows of a damaged file whose log cannot be read again, and lists what is lost."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ _DAMAGE: Final = (pa.ArrowException, OSError, ValueError, KeyError)
 
 @dataclass(frozen=True)
 class Lost:
-    """Rows of a log that the store holds no more."""
+    """Rows of a log that the store has lost."""
 
     log: str
     """Key of the log."""
     table: str
     file: DataFile
-    """The file as it was when it was whole."""
+    """The file as it was when undamaged."""
     rows: int
     spans: tuple[tuple[int, int], ...]
-    """First and last epoch (GPS ns) of each part that is lost; empty for tables without epochs."""
+    """First and last epoch (GPS ns) of each lost part; empty for tables without epochs."""
     aside: str
-    """Where the damaged file is kept; empty where it was missing."""
+    """Path of the damaged file that was set aside; empty where it was missing."""
     accepted: bool = False
-    """True once the user said that the store goes on without them."""
+    """True once the user accepted that the store continues without them."""
 
     def __str__(self) -> str:
-        """What is lost, in words."""
+        """Return in words what is lost."""
         kept = f"; the damaged file is kept ({self.aside})" if self.aside else ""
         agreed = " (accepted)" if self.accepted else ""
         rows = f"{self.rows:,} of {self.file.rows:,} rows are lost{agreed}"
@@ -50,7 +50,7 @@ class Lost:
 
     @property
     def told(self) -> str:
-        """The same, with what can be done about it."""
+        """Return the same, with what can be done about it."""
         accept = "" if self.accepted else ", or accept that they are gone: `roadscan verify --accept-losses`"
         return f"{self}; put the log back and repeat `roadscan verify --repair`{accept}"
 
@@ -69,7 +69,7 @@ def salvaged(
 
     Returns
     -------
-    kept : what a record says of the local file; None where no row group is sound.
+    kept : record entry of the local file; None where no row group is sound.
     lost, spans : rows that are lost, and the epochs (GPS ns) of each row group that is.
 
     Damage beside the rows (in the footer, say) loses none: the same rows make the same bytes, which the recorded digest
@@ -80,7 +80,7 @@ def salvaged(
     sound = [group for group in groups if group is not None]
     if not sound:
         return None, file.rows, file.group_spans
-    rows = pa.concat_tables(sound).replace_schema_metadata(None)  # the footer's own checksum
+    rows = pa.concat_tables(sound).replace_schema_metadata(None)  # the footer has a separate checksum
     write_parquet(to, rows, table_schema(table))
     kept = describe(to, file.path)
     spans = tuple(file.group_spans[number] for number in gone) if file.group_spans else ()
@@ -88,7 +88,7 @@ def salvaged(
 
 
 def _sound_groups(store: Store, table: str, file: DataFile) -> list[pa.Table | None]:
-    """Each row group as a table, None where it is damaged."""
+    """Return each row group as a table, None where it is damaged."""
     none: list[pa.Table | None] = [None] * len(file.group_rows)
     try:
         opened = pq.ParquetFile(pa.BufferReader(store.read_bytes(file.path)), page_checksum_verification=True)
@@ -100,7 +100,7 @@ def _sound_groups(store: Store, table: str, file: DataFile) -> list[pa.Table | N
 
 
 def _sound_group(opened: pq.ParquetFile, number: int, table: str, file: DataFile) -> pa.Table | None:
-    """A row group whose pages have their checksums, and whose columns, rows and epochs are as recorded."""
+    """Return a row group with valid page checksums whose columns, rows and epochs are as recorded; else None."""
     try:
         rows = opened.read_row_group(number, use_threads=False)
         rows.validate(full=True)
@@ -117,7 +117,7 @@ def _sound_group(opened: pq.ParquetFile, number: int, table: str, file: DataFile
 
 
 def read_lost(store: Store) -> list[Lost]:
-    """Rows that were lost and not read again; none where the list itself is damaged (the damaged files are kept)."""
+    """Return rows that were lost and not read again; none where the list is damaged (the damaged files are kept)."""
     if not store.exists(_LOST):
         return []
     try:

@@ -30,12 +30,12 @@ _TYPES: Final[dict[str, pa.DataType]] = {
 
 
 ENTRY_POINT_GROUP: Final = "roadscan.schemas"
-"""Entry points of packages that add tables: each names a package whose folder holds the schema files."""
+"""Entry points of packages that add tables: each names a package whose folder has the schema files."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column: what `schemas/` says of it."""
+    """One column, as in `schemas/`."""
 
     name: str
     type: str
@@ -49,15 +49,15 @@ class Column:
     max: float | None = None
     values: tuple[str, ...] = ()
     encoding: str = ""
-    """Parquet encoding, where another than the usual one of its type measured better."""
+    """Parquet encoding, where one measured better than the usual one of the type."""
 
     @property
     def is_list(self) -> bool:
-        """True for a list of numbers a row."""
+        """Return True for a list of numbers per row."""
         return self.type.startswith("list<")
 
     def arrow_type(self, list_size: int | None) -> pa.DataType:
-        """Arrow type; fixed-size lists take their length from the log."""
+        """Return the Arrow type; fixed-size lists take their length from the log."""
         if not self.is_list:
             return _TYPES[self.type]
         inner = pa.field("element", _TYPES[self.type[5:-1]], nullable=False)
@@ -85,7 +85,7 @@ class TableSchema:
     """Folder of its Parquet files, relative to the survey's root; None for rows of logs, whose records name them."""
 
     def arrow(self, list_size: int | None = None) -> pa.Schema:
-        """Arrow schema, with unit, frame and meaning as field metadata."""
+        """Return the Arrow schema, with unit, frame and meaning as field metadata."""
         return pa.schema(
             [
                 pa.field(
@@ -99,7 +99,7 @@ class TableSchema:
         )
 
     def column(self, name: str) -> Column:
-        """Column by name."""
+        """Return a column by name."""
         for one in self.columns:
             if one.name == name:
                 return one
@@ -107,7 +107,7 @@ class TableSchema:
         raise SchemaError(f"table '{self.name}' has no column '{name}'{nearest(name, names)}")
 
     def conform(self, batch: pa.RecordBatch, list_size: int | None = None) -> pa.RecordBatch:
-        """Bring a batch to the schema's columns, order and types.
+        """Return a batch with the schema's columns, order and types.
 
         Missing nullable columns become nulls. A missing required column, a column the schema
         does not know, or a type that cannot be cast without loss raises :class:`SchemaError`.
@@ -138,7 +138,7 @@ class TableSchema:
         return pa.RecordBatch.from_arrays(arrays, schema=target)
 
     def faults(self, batch: pa.RecordBatch) -> list[tuple[npt.NDArray[np.int64], str]]:
-        """Rows of a conforming batch that break a column's rule: (row numbers, reason) a rule."""
+        """Return the rows of a conforming batch that violate a column's rule: (row numbers, reason) per rule."""
         found: list[tuple[npt.NDArray[np.int64], str]] = []
         seen = np.zeros(batch.num_rows, dtype=bool)
         for c in self.columns:
@@ -173,24 +173,24 @@ def _broken(column: Column, array: pa.Array) -> list[tuple[npt.NDArray[np.bool_]
 
 
 def schema_folder() -> Path:
-    """Folder of the schema files: inside the installed package, or beside it in a checkout."""
+    """Return the folder of the schema files: inside the installed package, or beside it in a checkout."""
     installed = Path(str(resources.files("roadscan"))) / "schemas"
     return installed if installed.is_dir() else installed.parent.parent / "schemas"
 
 
 def schema_folders() -> list[Path]:
-    """The same, and the folders of packages that add tables."""
+    """Return that folder, and the schema folders of packages that add tables."""
     return [schema_folder(), *(Path(str(resources.files(e.value))) for e in entry_points(group=ENTRY_POINT_GROUP))]
 
 
 def schema_names() -> list[str]:
-    """Names of all tables."""
+    """Return the names of all tables."""
     return sorted(_schema_files())
 
 
 @functools.cache
 def _schema_files() -> dict[str, Path]:
-    """Schema files by name of their table: roadscan's own, and those of packages that add tables."""
+    """Return the schema files by table name: roadscan's, and those of packages that add tables."""
     found: dict[str, Path] = {}
     for file in (file for folder in schema_folders() for file in sorted(folder.glob("*.toml"))):
         if file.stem in found:
@@ -201,7 +201,7 @@ def _schema_files() -> dict[str, Path]:
 
 @functools.cache
 def table_schema(name: str) -> TableSchema:
-    """Schema of a table by name."""
+    """Return the schema of a table by name."""
     file = _schema_files().get(name)
     if file is None:
         raise SchemaError(f"there is no table '{name}'{nearest(name, schema_names())}")

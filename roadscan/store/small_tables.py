@@ -1,8 +1,8 @@
-"""Small tables that are held whole, a file each: what was estimated of clocks, mountings and trajectories.
+"""Reads and writes small tables as whole files: the estimated clocks, mountings and trajectories.
 
-No record of the manifest names them, and no run makes all of them. So each says by itself what mends it. A list of
-their digests (``manifest/held.json``) tells damage that the checksums of their pages do not cover; a table that someone
-put there, and roadscan did not write, is not in it.
+No record of the manifest names them, and no run makes all of them. So each one itself says how to repair it. A list of
+their digests (``manifest/held.json``) reveals damage that the checksums of their pages do not cover; it lists no table
+that someone put there and roadscan did not write.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ REPAIR_HINT: Final = {
     "mounting_corrections": "put it back, or adjust again; if it is removed, mountings hold as they were stated",
     "corrections": "put it back, or compute it again; if it is removed, trajectories hold as they were recorded",
 }
-"""What mends each of the tables where it is damaged."""
+"""How each table is repaired when it is damaged."""
 
 
 def small_path(name: str) -> str:
-    """File of such a table, relative to the survey's root."""
+    """Return the file of such a table, relative to the survey's root."""
     return f"tables/{name}/part-00000.parquet"
 
 
 def read_small(store: Store, name: str) -> pa.Table | None:
-    """The table, None where there is none.
+    """Return the table, None where there is none.
 
     Raises
     ------
     DamagedError
-        Says what mends it.
+        Says how to repair it.
     StoreError
         It cannot be read.
     """
@@ -76,7 +76,7 @@ def write_small(store: Store, name: str, rows: Iterable[Mapping[str, Any]]) -> N
 
 
 def small_records(store: Store) -> dict[str, tuple[int, str]]:
-    """Bytes and digest of the small tables that roadscan wrote, by their paths.
+    """Return bytes and digest of the small tables that roadscan wrote, by their paths.
 
     One whose writing was cut short is the one before it.
     """
@@ -91,7 +91,7 @@ def small_records(store: Store) -> dict[str, tuple[int, str]]:
 
 
 def _known(store: Store) -> dict[str, Any]:
-    """Digests that were kept; none where their list is damaged, which costs nothing but this check."""
+    """Return the stored digests; none where their list is damaged, which only costs this check."""
     if not store.exists(_DIGESTS):
         return {}
     try:

@@ -1,4 +1,4 @@
-"""DuckDB over a store: every table as a view, and spans of time that touch only their partitions."""
+"""Queries a store with DuckDB: every table as a view, and time spans that only touch their partitions."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _PER_TILE = ("cells", "overviews")
 _MISTAKES = (duckdb.CatalogException, duckdb.BinderException, duckdb.ParserException)
 """Errors of the statement."""
 _ALWAYS = ("rejects",)
-"""Tables that answer even before they have a row: no rejects is news too."""
+"""Tables that exist before they have a row: an empty table of rejects is an answer, too."""
 _MISSING = re.compile(r"Table (?:Function )?with name \"?(?P<name>\w+)\"? does not exist")
-"""What DuckDB says of a table, or of a macro of a table, that is not there."""
+"""DuckDB's message for a missing table or table macro."""
 _CONFINED = (
     "SET temp_directory = ''",
     f"SET allowed_directories = ['{PROTOCOL}://']",
@@ -43,19 +43,19 @@ _NO_EXTENSIONS = (
     "SET python_enable_replacements = false",
     "SET enable_external_file_cache = false",
 )
-"""Nothing is fetched from the network, confined or not; each file is opened when it is asked for."""
+"""Settings that prevent downloads, confined or not; files are opened when they are used."""
 _WAY_OUT_OF_STORE = "`--unconfined` (in Python `unconfined=True`) lets a statement reach other files"
 
 
 @dataclass(frozen=True)
 class Opened:
-    """A connection, and what its views are made of."""
+    """A connection, and the sources of its views."""
 
     connection: duckdb.DuckDBPyConnection
     files: StoreFiles
     """The files that it opens."""
     recorded: pa.Table
-    """What is recorded of them."""
+    """Their records."""
     shut: dict[str, StoreError]
     """Tables whose files cannot be opened, and why."""
 
@@ -67,7 +67,7 @@ def connect(
     *,
     unconfined: bool = False,
 ) -> duckdb.DuckDBPyConnection:
-    """A DuckDB connection with one view a table and, for tables in time, one macro a table.
+    """Return a DuckDB connection with one view per table and, for tables in time, one macro per table.
 
     ``returns`` is the whole table; ``returns_between(first_gps_ns, last_gps_ns)`` opens only the files of
     the partitions that hold the span. Hive columns run, sensor, log and gps_bin_s come with each row.
@@ -92,7 +92,7 @@ def _opened(store: Store, logs: Iterable[str] | None, damaged: list[StoreError] 
     except BaseException:
         connection.close()
         raise
-    opened.files.opened.clear()  # a view looks at the first file of its table
+    opened.files.opened.clear()  # a view reads the first file of its table
     return opened
 
 
@@ -127,7 +127,7 @@ def _with_views(
         if table not in files:
             connection.register(table, table_schema(table).arrow().empty_table())
     manifest = Manifest(store, damaged)
-    made = manifest.table()  # not its files: a later record replaces an earlier one
+    made = manifest.table()  # except its files: a later record replaces an earlier one
     if made.num_rows:
         connection.register("outputs", made)
     places = {name: location for name in schema_names() if (location := table_schema(name).location) is not None}
@@ -151,7 +151,7 @@ def query(
 ) -> pa.Table:
     """Run one SQL statement over the store's views (:func:`connect`).
 
-    The files that it opens are held against their records where they changed since they were last verified. One that is
+    The files that it opens are verified against their records if they changed since the last verification. One that is
     damaged is an error, or joins `damaged` (as :class:`AnswerError`), and the answer is given.
     """
     opened = _opened(store, logs, damaged, unconfined)
@@ -177,7 +177,7 @@ def query(
 
 
 def _in_words(error: duckdb.Error, files: StoreFiles) -> RoadscanError:
-    """What a statement did wrong, or was not let do."""
+    """Return a statement's error, or its denied access, as an error of roadscan."""
     if files.refused:
         return RoadscanError(f"the query was refused: {files.refused[-1]}", change=_WAY_OUT_OF_STORE)
     text = _reason(error) if str(error).startswith("Traceback") else str(error)
@@ -196,14 +196,14 @@ def _in_words(error: duckdb.Error, files: StoreFiles) -> RoadscanError:
 
 
 def _refuse_to_fetch(connection: duckdb.DuckDBPyConnection, statement: str) -> None:
-    """RoadscanError where a statement would install an extension: code from the network."""
+    """Raise RoadscanError where a statement would install an extension: code from the network."""
     try:
         parts = connection.extract_statements(statement)
         words = [part.query.split(None, 1)[0].lower() for part in parts if part.type == duckdb.StatementType.LOAD]
         fetches = any(word != "load" for word in words)
     except duckdb.Error:
-        return  # DuckDB says what is wrong with it
-    except ValueError:  # a kind that its Python does not know yet: UPDATE EXTENSIONS
+        return  # DuckDB reports what is wrong with it
+    except ValueError:  # a kind that DuckDB's Python module does not know yet: UPDATE EXTENSIONS
         fetches = True
     if fetches:
         raise RoadscanError(
@@ -214,7 +214,7 @@ def _refuse_to_fetch(connection: duckdb.DuckDBPyConnection, statement: str) -> N
 
 
 def missing_table(error: BaseException | None) -> str | None:
-    """Name of the table or macro that a failed query named and that is not there; None where it failed otherwise."""
+    """Return the missing table or macro that a failed query named; None where it failed otherwise."""
     if not isinstance(error, duckdb.CatalogException):
         return None
     found = _MISSING.search(str(error))
@@ -222,7 +222,7 @@ def missing_table(error: BaseException | None) -> str | None:
 
 
 def _add_utc(connection: duckdb.DuckDBPyConnection) -> None:
-    """Add ``utc(epoch_gps_ns)``: the UTC instant of a GPS epoch, with its zone, cut to microseconds."""
+    """Add ``utc(epoch_gps_ns)``: the UTC instant of a GPS epoch, with its zone, truncated to microseconds."""
     steps = sorted(leap_second_steps(), reverse=True)
     leaps = " ".join(f"WHEN epoch_gps_ns >= {first}000000000 THEN {count}" for first, count in steps)
     micros = f"epoch_gps_ns::BIGINT // 1000 + ({GPS_EPOCH_UNIX_S} - CASE {leaps} ELSE 0 END)::BIGINT * 1000000"
@@ -240,7 +240,7 @@ def _view(
     hive: bool = False,
     filename: bool = False,
 ) -> StoreError | None:
-    """Show some of the files as a table; where that cannot be, why, and `damaged` is told."""
+    """Create a view of some files; where that fails, add the error to `damaged` and return it."""
     files.opened.clear()
     listed = ", ".join("'" + u.replace("'", "''") + "'" for u in sorted(urls))
     options = "hive_partitioning = true, hive_types_autocast = true" if hive else "hive_partitioning = false"
@@ -262,7 +262,7 @@ def _view(
 
 
 def _reason(error: duckdb.Error) -> str:
-    """What an error says, in one line: of a fault in a file's reader, DuckDB tells the way through the code first."""
+    """Return an error's message in one line; for a fault in a file's reader, DuckDB prefixes its call path."""
     lines = str(error).splitlines()
     if lines[0].startswith("Traceback"):
         return next((line for line in lines[1:] if line and not line.startswith(" ")), lines[0])

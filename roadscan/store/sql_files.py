@@ -1,8 +1,8 @@
-"""The file system of SQL: one survey's files of a store, to be read and never written.
+"""A read-only file system for SQL: one survey's files of a store.
 
 DuckDB can confine statements to folders, but not to reading: what may be read may be written (``COPY … TO``, which
-may stand inside a ``WITH``, ``ATTACH``, ``EXPORT DATABASE``). So statements reach files through this file system alone,
-which has no way to write, and DuckDB's own is switched off.
+may stand inside a ``WITH``, ``ATTACH``, ``EXPORT DATABASE``). So statements access files only through this file system,
+which has no way to write, and DuckDB's is switched off.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ PROTOCOL: Final = "store"
 
 
 class Stamp(NamedTuple):
-    """What tells, without reading it, that a file was not written since."""
+    """Size and time that show, without reading it, that a file has not been written since."""
 
     bytes: int
     changed: str
-    """Time of the last change (ns) in a folder; what an object store has for it, empty where it has nothing."""
+    """Time of the last change (ns) in a folder; an object store's equivalent, empty where it has none."""
 
 
 def stamp_of(store: Store, path: str) -> Stamp | None:
-    """Size and time of a file of the store (`path` relative to the survey's root), None where it is missing."""
+    """Return size and time of a file of the store (`path` relative to the survey's root), None where it is missing."""
     try:
         if store.is_folder:
             return _stamp_of_stat(os.stat(store.path(path)))  # noqa: PTH116 — thousands of them
@@ -40,12 +40,12 @@ def stamp_of(store: Store, path: str) -> Stamp | None:
 
 
 def url(store: Store, path: str) -> str:
-    """Name that statements have for a file of the store."""
+    """Return the name of a file of the store in statements."""
     return f"{PROTOCOL}://survey={store.survey_id}/{path}"
 
 
 class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
-    """One survey's files as ``store://survey=<id>/…``; it notes which of them are opened.
+    """One survey's files as ``store://survey=<id>/…``; it records which of them are opened.
 
     Anything else is refused: other modes than reading, ``..``, and links that lead out of the survey's folder.
     """
@@ -60,15 +60,15 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         self._top = f"survey={store.survey_id}"
         self._root = os.path.realpath(store.root) if store.is_folder else None
         self._inside: set[str] = set()
-        """Folders that were followed and found inside."""
+        """Folders whose links were followed and lead inside."""
         self._alone = threading.Lock()  # DuckDB opens files from several threads
         self.opened: dict[str, Stamp] = {}
-        """Files that were opened, relative to the survey's root, as they were then."""
+        """Opened files, relative to the survey's root, with their stamps at that time."""
         self.refused: list[str] = []
-        """What was asked for and not given, in words."""
+        """Denied requests, in words."""
 
     def open(self, path: str, mode: str = "rb", **_: Any) -> Any:
-        """A file's bytes; PermissionError for any other mode and for files outside."""
+        """Return a file's bytes; PermissionError for any other mode and for files outside."""
         if mode != "rb":
             self._refuse(f"{path} cannot be written: SQL only reads the store")
         place = self._place(path)
@@ -84,7 +84,7 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         return stream
 
     def info(self, path: str, **_: Any) -> dict[str, Any]:
-        """Name, size and kind of a file or folder; FileNotFoundError where there is none."""
+        """Return name, size and kind of a file or folder; FileNotFoundError where there is none."""
         place = self._place(path)
         if self._root is not None:
             local = os.stat(place)  # noqa: PTH116 — thousands of them
@@ -94,14 +94,14 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         return {"name": self._strip_protocol(path), "size": found["size"], "type": found["type"]}
 
     def modified(self, path: str) -> Any:
-        """Time of the last change."""
+        """Return the time of the last change."""
         place = self._place(path)
         if self._root is not None:
             return dt.datetime.fromtimestamp(os.stat(place).st_mtime, dt.UTC)  # noqa: PTH116 — thousands of them
         return self._store.fs.modified(place)
 
     def ls(self, path: str, detail: bool = True, **_: Any) -> list[Any]:
-        """Entries of a folder, without links that lead outside."""
+        """Return the entries of a folder, without links that lead outside."""
         found = []
         for entry in self._store.fs.ls(self._place(path), detail=True):
             name = f"{self._strip_protocol(path).rstrip('/')}/{str(entry['name']).rstrip('/').rsplit('/', 1)[1]}"
@@ -109,21 +109,21 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         return found if detail else [one["name"] for one in found]
 
     def glob(self, path: str, maxdepth: int | None = None, **more: Any) -> list[Any]:
-        """Files that fit a pattern; a name without one is itself."""
+        """Return the files that match a pattern; a name without one matches itself."""
         if not any(sign in path for sign in "*?["):
             self._relative(path)
             return [path.removeprefix(f"{PROTOCOL}://")]
         return list(super().glob(path, maxdepth=maxdepth, **more))
 
     def _relative(self, path: str) -> str:
-        """Path below the survey's root."""
+        """Return the path below the survey's root."""
         top, _, relative = path.removeprefix(f"{PROTOCOL}://").partition("/")
         if top != self._top or ".." in relative.split("/"):
             self._refuse(f"{path} is no file of the store: its files are {PROTOCOL}://{self._top}/…")
         return relative
 
     def _place(self, path: str) -> str:
-        """Where the store's own file system has it; PermissionError outside of the survey's folder."""
+        """Return the path in the store's file system; PermissionError outside of the survey's folder."""
         place = self._store.path(self._relative(path))
         if self._root is not None:
             folder = place.rsplit("/", 1)[0]
@@ -143,22 +143,22 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
 
 
 class _LocalFile(io.RawIOBase):
-    """A file with a position for each thread: DuckDB's threads share one, and seek and read in two calls."""
+    """A file with a position for each thread: DuckDB's threads share it, and seek and read in two calls."""
 
     def __init__(self, place: str) -> None:
         self._file = os.open(place, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         self._at = threading.local()
 
     def stamp(self) -> Stamp:
-        """Size and time of the file that is open."""
+        """Return size and time of the open file."""
         return _stamp_of_stat(os.fstat(self._file))
 
     def readable(self) -> bool:
-        """Yes."""
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
-        """Yes."""
+        """Return True."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
@@ -168,11 +168,11 @@ class _LocalFile(io.RawIOBase):
         return start + offset
 
     def tell(self) -> int:
-        """Position of this thread."""
+        """Return the position of this thread."""
         return int(getattr(self._at, "position", 0))
 
     def read(self, size: int | None = -1) -> bytes:
-        """Bytes from this thread's position."""
+        """Return bytes from this thread's position."""
         position = self.tell()
         wanted = self._bytes() - position if size is None or size < 0 else size
         content = self._take(position, max(wanted, 0))
@@ -180,7 +180,7 @@ class _LocalFile(io.RawIOBase):
         return content
 
     def close(self) -> None:
-        """Give the file back; DuckDB drops it without that."""
+        """Close the file; DuckDB may drop it without calling this."""
         if not self.closed:
             super().close()
             self._release()
@@ -196,7 +196,7 @@ class _LocalFile(io.RawIOBase):
 
 
 class _RemoteFile(_LocalFile):
-    """The same of an object store, whose library knows one position a file."""
+    """The same for an object store, whose library has one position per file."""
 
     def __init__(self, stream: Any, size: int) -> None:
         self._stream, self._size = stream, size

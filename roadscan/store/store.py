@@ -36,39 +36,38 @@ from roadscan.core.extras import need
 
 try:
     import fcntl
-except ImportError:  # no such locks on this system
+except ImportError:  # systems without such locks
     fcntl = None  # type: ignore[assignment]
 
 _STAGING: Final = ".staging"
-_CHUNK: Final = 1 << 18  # stays in a core's cache between reading and hashing
+_CHUNK: Final = 1 << 18  # fits into a core's cache between reading and hashing
 _ALGORITHM: Final = "blake3:"
 
 _NO_ROOM_BYTES: Final = 8 << 20
-"""A writer that fails with less free room than that, and does not say why, failed for that: GDAL and others write
-blocks of some megabytes.
-"""
+"""A writer that fails without a reason while less is free (bytes) is taken to have filled the disk: GDAL and others
+write blocks of some megabytes."""
 _MAKE_ROOM: Final = (
     "see to more room, and run again: what is finished stays, and the next run goes on where this one stopped"
 )
 
 MADE_AGAIN: Final = "run `roadscan verify`, which finds all such files; the next run then makes them again"
-"""What mends a damaged product."""
+"""How a damaged product is repaired."""
 
 _T = TypeVar("_T")
 
 
 def file_digest(path: Path) -> str:
-    """BLAKE3-128 of a file's bytes: ``blake3:`` and 32 hexadecimal digits."""
+    """Return the BLAKE3-128 of a file's bytes: ``blake3:`` and 32 hexadecimal digits."""
     return f"{_ALGORITHM}{_hashed(path, blake3()).digest(length=16).hex()}"
 
 
 def bytes_digest(content: bytes) -> str:
-    """As :func:`file_digest`, of the bytes that a file will have."""
+    """Return the same digest for a file's future bytes."""
     return f"{_ALGORITHM}{blake3(content).digest(length=16).hex()}"
 
 
 def digest_holds(path: Path, digest: str) -> bool:
-    """True if a file still has the content of `digest`.
+    """Return True if a file still has the content of `digest`.
 
     A digest without a prefix is BLAKE2b-128, as stores of older versions hold them: such files stay sound.
     """
@@ -78,14 +77,14 @@ def digest_holds(path: Path, digest: str) -> bool:
 
 
 def bytes_hold(content: bytes, digest: str) -> bool:
-    """As :func:`digest_holds`, of a file's content."""
+    """Return the same for a file's content."""
     if ":" in digest:
         return bytes_digest(content) == digest
     return hashlib.blake2b(content, digest_size=16).hexdigest() == digest
 
 
 def _hashed(path: Path, state: Any) -> Any:
-    # Read, not mapped: a sector that the disk cannot read is an OSError then, and no signal that ends the process.
+    # Read, not mapped: an unreadable sector then raises OSError, instead of a signal that ends the process.
     buffer = bytearray(_CHUNK)
     view = memoryview(buffer)
     with path.open("rb", buffering=0) as stream:
@@ -95,7 +94,7 @@ def _hashed(path: Path, state: Any) -> Any:
 
 
 class Store:
-    """One survey's place; cheap to make, safe to send to a worker."""
+    """Location of one survey's store; cheap to create, and safe to send to a worker."""
 
     def __init__(self, url: str, survey_id: str) -> None:
         self.url = url
@@ -105,32 +104,32 @@ class Store:
         self.is_folder = "file" in self.fs.protocol or "local" in self.fs.protocol
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Workers open the file system themselves."""
+        """Pickle without the file system, which workers open themselves."""
         return (Store, (self.url, self.survey_id))
 
     def path(self, relative: str) -> str:
-        """Full path, for the file system `fs`, of one below the root."""
+        """Return the full path in the file system `fs` of a path below the root."""
         return f"{self.root}/{relative}"
 
     def exists(self, relative: str) -> bool:
-        """True if the file or folder is there; StoreError where the store does not answer."""
+        """Return True if the file or folder exists; StoreError where the store does not answer."""
         try:
             return bool(self.fs.exists(self.path(relative)))
-        except Exception as error:  # each library of an object store has its own
+        except Exception as error:  # each library of an object store has different ones
             raise StoreError(
                 f"the store {self.url} cannot be reached: {error}",
                 change="see to its address, the network and your keys",
             ) from error
 
     def size(self, relative: str) -> int | None:
-        """Bytes of a file, None where it is missing."""
+        """Return the bytes of a file, None where it is missing."""
         try:
             return int(self.fs.size(self.path(relative)))
         except FileNotFoundError:
             return None
 
     def files(self, relative: str, suffix: str = "") -> list[str]:
-        """Files below a folder, relative to the root, sorted."""
+        """Return the files below a folder, relative to the root, sorted."""
         if not self.exists(relative):
             return []
         found = self.fs.find(self.path(relative))
@@ -138,7 +137,7 @@ class Store:
         return sorted(f[start:] for f in found if f.endswith(suffix))
 
     def read_bytes(self, relative: str) -> bytes:
-        """Content of a small file."""
+        """Return the content of a small file."""
         try:
             return bytes(self.fs.cat_file(self.path(relative)))
         except FileNotFoundError as error:
@@ -153,9 +152,9 @@ class Store:
             ) from error
 
     def read_table(self, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN) -> pa.Table:
-        """Content of a small Parquet file; `change` says what mends it. Pages that have a checksum are held against it.
+        """Return a small Parquet file with verified page checksums; `change` says how to repair it.
 
-        Read by this thread alone: a thread of Arrow's that still let go of the bytes when the interpreter ends would
+        Read by this thread alone: a thread of Arrow's that still releases the bytes when the interpreter ends would
         end the process with SIGABRT (`pq.read_table` hands them to such threads).
         """
         return self.parse_table(self.read_bytes(relative), relative, columns, change)
@@ -163,7 +162,7 @@ class Store:
     def parse_table(
         self, content: bytes, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN
     ) -> pa.Table:
-        """The same, of content that was read from there."""
+        """Return the same of content that was read from there."""
         try:
             file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
             return file.read(None if columns is None else list(columns), use_threads=False)
@@ -171,7 +170,7 @@ class Store:
             raise DamagedError(f"the file is damaged: {error}", change=change, file=self.path(relative)) from error
 
     def write_bytes(self, relative: str, content: bytes, *, lasting: bool = True) -> None:
-        """Write a small file at once; StoreError where the store cannot be written.
+        """Write a small file atomically; StoreError where the store cannot be written.
 
         One that is `lasting` is on the disk when this returns, with its name.
         """
@@ -199,7 +198,7 @@ class Store:
 
     @contextlib.contextmanager
     def scratch(self) -> Iterator[Path]:
-        """A temporary local folder, on the store's own disk where it is a folder."""
+        """Return a temporary local folder, on the store's disk where it is a folder."""
         if self.is_folder:
             folder = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
             with _in_words(str(folder)):
@@ -213,7 +212,7 @@ class Store:
             shutil.rmtree(folder, ignore_errors=True)
 
     def publish(self, local: Path, relative: str, *, lasting: bool = False) -> None:
-        """Move a finished local file into the store under its final name; on the disk itself if it is `lasting`."""
+        """Move a finished local file into the store under its final name, durably if it is `lasting`."""
         target = self.path(relative)
         if self.is_folder:
             try:
@@ -228,7 +227,7 @@ class Store:
             local.unlink()
 
     def publish_folder(self, local: Path, relative: str) -> None:
-        """Move a finished local folder into the store, in place of one of that name, once all of it is on the disk."""
+        """Move a finished local folder durably into the store, replacing one of that name."""
         if self.is_folder:
             for path in (local, *local.rglob("*")):
                 sync = _sync_folder if path.is_dir() else _sync_file
@@ -245,7 +244,7 @@ class Store:
             self.fs.put_file(str(file), f"{self.path(relative)}/{file.relative_to(local).as_posix()}")
 
     def remove(self, relative: str) -> None:
-        """Remove a file or folder if it is there; a folder vanishes at once."""
+        """Remove a file or folder if it exists; a folder disappears at once."""
         if not self.is_folder:
             if self.exists(relative):
                 self.fs.rm(self.path(relative), recursive=True)
@@ -259,7 +258,7 @@ class Store:
         shutil.rmtree(doomed, ignore_errors=True)
 
     def set_aside(self, relative: str, *, keep: bool = False) -> str:
-        """Move a damaged file below ``damaged/``, for whoever wants to look at it; returns its name there.
+        """Move a damaged file below ``damaged/`` for later examination; return its name there.
 
         With `keep` it stays under its old name too, until another takes its place at once.
         """
@@ -278,7 +277,7 @@ class Store:
         return aside
 
     def local_copy(self, relative: str, folder: Path) -> Path:
-        """Path of a local file with the content of a stored one (itself, where the store is a folder)."""
+        """Return the path of a local file with the content of a stored one (itself, where the store is a folder)."""
         if self.is_folder:
             return Path(self.path(relative))
         target = folder / Path(relative).name
@@ -287,7 +286,7 @@ class Store:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep a second run out of a folder store; leftovers of dead runs are cleared."""
+        """Lock out a second run of a folder store; leftovers of dead runs are cleared."""
         if not self.is_folder:
             yield
             return
@@ -325,14 +324,14 @@ class Store:
 
 def _move_aside(file: Path, aside: Path, keep: bool) -> None:
     if keep:
-        with contextlib.suppress(OSError):  # a file system without links
+        with contextlib.suppress(OSError):  # file systems without links
             aside.hardlink_to(file)
             return
     file.rename(aside)
 
 
 def _made(folder: Path, write: Callable[[], _T], lasting: bool = False) -> _T:
-    """What comes of `write`, which needs the folder: it is made where it is missing."""
+    """Return the result of `write`, creating its folder where it is missing."""
     try:
         return write()
     except FileNotFoundError:
@@ -341,7 +340,7 @@ def _made(folder: Path, write: Callable[[], _T], lasting: bool = False) -> _T:
 
 
 def _make_folder(folder: Path, lasting: bool) -> None:
-    """Make a folder and those above it that are missing; on the disk itself if they are to be `lasting`."""
+    """Create a folder and its missing parents, durably if they are `lasting`."""
     missing = [one for one in (folder, *folder.parents) if not one.exists()] if lasting else []
     folder.mkdir(parents=True, exist_ok=True)
     for one in missing:
@@ -349,7 +348,7 @@ def _make_folder(folder: Path, lasting: bool) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to the disk, where the system can do that."""
+    """Flush the names in a folder to the disk, where the system can do that."""
     with contextlib.suppress(OSError):
         opened = os.open(folder, os.O_RDONLY)
         try:
@@ -359,13 +358,13 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _sync_file(path: Path) -> None:
-    """Bring a file's bytes to the disk; OSError where it does not take them."""
+    """Flush a file's bytes to the disk; OSError where that fails."""
     with path.open("rb+") as stream:
         os.fsync(stream.fileno())
 
 
 def _opened(url: str) -> tuple[Any, str]:
-    """File system and path of a store; a folder's name may hold what chains file systems in URLs (``::``).
+    """Return file system and path of a store; a folder's name may contain the URL separator ``::`` of fsspec.
 
     Lists of what an object store holds are not kept: workers write to it at the same time.
     """
@@ -387,7 +386,7 @@ def _opened(url: str) -> tuple[Any, str]:
 
 @contextlib.contextmanager
 def told_if_full(folder: Path) -> Iterator[None]:
-    """Say what is full where a writer fails in a folder for want of room, whatever words its library has for that.
+    """Report which disk is full where a writer fails for want of room, whatever its library's message.
 
     Raises
     ------
@@ -405,9 +404,9 @@ def told_if_full(folder: Path) -> Iterator[None]:
 
 
 def full_disk(folder: Path, error: Exception) -> FullDiskError:
-    """What to tell of a writer that failed in a folder for want of room."""
+    """Return the error for a writer that failed in a folder for want of room."""
     there = next((one for one in (folder, *folder.parents) if one.exists()), folder)
-    if _STAGING in folder.parts:  # say the store's name, not that of a folder that is gone in a moment
+    if _STAGING in folder.parts:  # name the store, not a temporary folder
         folder = Path(*folder.parts[: folder.parts.index(_STAGING)])
     with contextlib.suppress(OSError):
         room = shutil.disk_usage(there)
@@ -417,7 +416,7 @@ def full_disk(folder: Path, error: Exception) -> FullDiskError:
 
 
 def _names_want_of_room(error: BaseException) -> bool:
-    """True if an error, or one that led to it, is that of a full disk or of a quota that is used up."""
+    """Return True if an error, or one of its causes, is that of a full disk or an exhausted quota."""
     found: BaseException | None = error
     while found is not None:
         if isinstance(found, OSError) and found.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -429,7 +428,7 @@ def _names_want_of_room(error: BaseException) -> bool:
 
 
 def _has_no_room(folder: Path) -> bool:
-    """True if next to nothing is free where a writer failed that does not say why, as GDAL."""
+    """Return True if almost nothing is free where a writer failed without a reason, as GDAL does."""
     try:
         return shutil.disk_usage(folder).free < _NO_ROOM_BYTES
     except OSError:
@@ -438,7 +437,7 @@ def _has_no_room(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def _in_words(file: str) -> Iterator[None]:
-    """A disk that is full or must not be written is no fault of the program."""
+    """Convert the errors of a full or read-only disk to errors of roadscan."""
     try:
         yield
     except OSError as error:
@@ -453,18 +452,18 @@ def _in_words(file: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Keep other processes of this machine out: of several that find the lock of a dead run, one takes it."""
+    """Lock out other processes of this machine: of several that find the lock of a dead run, one takes it."""
     with contextlib.ExitStack() as stack:
         if fcntl is not None:
             opened = os.open(folder, os.O_RDONLY)
             stack.callback(os.close, opened)
-            with contextlib.suppress(OSError):  # a file system without such locks
+            with contextlib.suppress(OSError):  # file systems without such locks
                 fcntl.flock(opened, fcntl.LOCK_EX)
         yield
 
 
 def _check_dead(lock: Path) -> None:
-    """StoreError where the process that a lock names may be at work; words that no run writes name none."""
+    """Raise StoreError where the process of a lock may be running; text that no run writes names none."""
     try:
         owner = lock.read_text().split()
     except FileNotFoundError:
@@ -487,7 +486,7 @@ def _check_dead(lock: Path) -> None:
 
 
 def process_lives(pid: int) -> bool:
-    """True if a process of this machine has that number."""
+    """Return True if a process of this machine has that number."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):

@@ -1,7 +1,7 @@
-"""Which files of SQL were held against their records, and how they looked then.
+"""Remembers which files of SQL were verified against their records, and their stamps at that time.
 
-DuckDB does not look at checksums. A file whose size and time are as they were when its digest was found right was not
-written since, and a look at those costs microseconds. What changed since, or was never held, is read once.
+DuckDB does not verify checksums. A file whose size and time are as they were when its digest was found right was not
+written since, and checking them takes microseconds. What changed since, or was never verified, is read once.
 
 The note is no record: where it is lost or damaged, files are read once more.
 """
@@ -35,14 +35,14 @@ _SUFFIX: Final = ".parquet"
 
 
 class Recorded(NamedTuple):
-    """What a record says of a file."""
+    """Recorded properties of a file."""
 
     bytes: int
     digest: str
 
 
 def recorded_files(store: Store, logs: Iterable[LogRecord], manifest: Manifest) -> pa.Table:
-    """Every Parquet file that a record names (columns path, bytes, digest): ingested, made or estimated."""
+    """Return every recorded Parquet file (columns path, bytes, digest): ingested, made or estimated."""
     data = [(f.path, f.bytes, f.digest) for log in logs for own in log.tables.values() for f in own]
     data += [(path, *one) for path, one in small_records(store).items()]
     ingested = _table(data, _RECORDED)
@@ -51,9 +51,9 @@ def recorded_files(store: Store, logs: Iterable[LogRecord], manifest: Manifest) 
 
 
 def faults_of_opened(store: Store, opened: Mapping[str, Stamp], recorded: pa.Table) -> list[AnswerError]:
-    """What is wrong with files that a query opened (paths and stamps); those that are right are not read again.
+    """Return the faults of files that a query opened (paths and stamps); verified ones are not read again.
 
-    A file of an object store is held by its size alone, unless its time or tag has changed since it was verified: the
+    A file of an object store is verified by its size alone, unless its time or tag has changed since then: the
     object store checks what it keeps, and to read all of it would cost more than the query.
     """
     paths = sorted(opened)
@@ -74,7 +74,7 @@ def faults_of_opened(store: Store, opened: Mapping[str, Stamp], recorded: pa.Tab
 
 
 def note_verified(store: Store, stamps: Mapping[str, Stamp], *, anew: bool = False) -> None:
-    """Keep how files looked whose digest was found right, beside what was known, or in its place if `anew`.
+    """Store the stamps of verified files, in addition to known ones, or in their place if `anew`.
 
     Who may only read the store asks it all the same, and holds such files each time.
     """
@@ -92,7 +92,7 @@ def note_verified(store: Store, stamps: Mapping[str, Stamp], *, anew: bool = Fal
 
 
 def note_written(store: Store, since_ns: int, recorded: pa.Table) -> None:
-    """Note the recorded files that were written after a time (ns): their digests were taken as they were published."""
+    """Note the recorded files written after a time (ns): their digests were taken when they were published."""
     if not store.is_folder:
         return
     paths = recorded.column("path").to_pylist()
@@ -110,7 +110,7 @@ def note_written(store: Store, since_ns: int, recorded: pa.Table) -> None:
 
 
 def held_faults(store: Store) -> list[str]:
-    """What is wrong with the small tables that are held whole."""
+    """Return the faults of the small tables."""
     records = small_records(store)
     found: list[str | None] = []
     for path in map(small_path, REPAIR_HINT):
@@ -126,7 +126,7 @@ def _held_of(paths: Iterable[str]) -> list[str]:
 
 
 def _fault_of_held(store: Store, path: str) -> str | None:
-    """Of a small table without a record: its pages have checksums."""
+    """Return the fault of a small table without a record, by the checksums of its pages."""
     try:
         read_small(store, path.split("/")[1])
     except StoreError as error:
@@ -135,7 +135,7 @@ def _fault_of_held(store: Store, path: str) -> str | None:
 
 
 def _held_against(store: Store, files: Mapping[str, Recorded]) -> dict[str, str | None]:
-    """What is wrong with each of some files, read whole on all cores; None where it is as recorded."""
+    """Return the faults of some files, read completely on all cores; None for each that is as recorded."""
     with tempfile.TemporaryDirectory(prefix="roadscan-") as folder, ThreadPoolExecutor(os.cpu_count()) as threads:
         place = Path(folder)
         faults = threads.map(lambda path: fault_of(store, place, path, *files[path]), files)
@@ -158,7 +158,7 @@ def _table(rows: Sequence[tuple[str, int, str]], schema: pa.Schema) -> pa.Table:
 
 
 def _looked_up(paths: Sequence[str], table: pa.Table) -> dict[str, tuple[int, str]]:
-    """The other two columns of the rows of a table that name a path; of several the last."""
+    """Return the other two columns of the rows that name a path; the last row of several."""
     known = table.filter(pc.is_in(table.column("path"), pa.array(paths, pa.string())))
     columns = [known.column(name).to_pylist() for name in known.column_names]
     return {path: (size, text) for path, size, text in zip(*columns, strict=True)}

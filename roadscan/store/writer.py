@@ -1,4 +1,4 @@
-"""Rows in, sorted partitions of GPS time out, in bounded memory."""
+"""Writes rows as sorted partitions of GPS time, in bounded memory."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from roadscan.store.schema import TableSchema, table_schema
 from roadscan.store.store import Store, file_digest
 
 BUDGET_BYTES: Final = 128 << 20
-"""Rows held in memory before the fullest partitions are written out."""
+"""Bytes of rows in memory before the fullest partitions are written."""
 
 
 @dataclass
@@ -34,7 +34,7 @@ class _Bin:
     batches: list[pa.RecordBatch] = field(default_factory=list)
     bytes: int = 0
     row_bytes: float = 1.0
-    """Bytes of a row, as the largest batch average."""
+    """Bytes of a row: the largest average of a batch."""
     parts: list[tuple[Path, int, int]] = field(default_factory=list)
     """Written parts with their first and last epoch."""
 
@@ -42,7 +42,7 @@ class _Bin:
 def _once(
     faults: Sequence[tuple[npt.NDArray[np.int64], str]]
 ) -> list[tuple[npt.NDArray[np.int64], str]]:  # fmt: skip
-    """The same with each row under its first reason alone."""
+    """Return the faults with each row only under its first reason."""
     found: list[tuple[npt.NDArray[np.int64], str]] = []
     for rows, reason in faults:
         rest = np.setdiff1d(rows, np.concatenate([bad for bad, _ in found])) if found else rows
@@ -62,12 +62,12 @@ class LogWriter:
         self.rows: Counter[str] = Counter()
         self.reject_reasons: Counter[str] = Counter()
         self.findings: list[Finding] = []
-        """What is doubtful of the log; kept in its record."""
+        """Findings on the log; stored in its record."""
 
     def add(
         self, table: str, batch: pa.RecordBatch, refused: Sequence[tuple[npt.NDArray[np.int64], str]] = ()
     ) -> list[tuple[npt.NDArray[np.int64], str]]:
-        """Take rows of a table; returns the rows refused, with their reasons: those `refused` already, and others."""
+        """Add rows of a table; return the rows refused, with their reasons: those `refused` already, and others."""
         schema = table_schema(table)
         rows = schema.conform(batch, self._list_size)
         faults = _once([*refused, *schema.faults(rows)])
@@ -95,7 +95,7 @@ class LogWriter:
         self.reject_reasons[reason] += records
 
     def finish(self) -> None:
-        """Write what is held and merge parts that overlap in time."""
+        """Write the remaining rows and merge parts that overlap in time."""
         for key in sorted(self._bins):
             self._flush(key)
         for (table, start), held in sorted(self._bins.items()):
@@ -103,7 +103,7 @@ class LogWriter:
                 held.parts = self._merge(table, start, held)
 
     def tables(self, table: str, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Rows of a finished table, file by file, in order of time."""
+        """Yield the rows of a finished table, file by file, in order of time."""
         for key in sorted(key for key in self._bins if key[0] == table):
             for path, _, _ in self._bins[key].parts:
                 yield pq.read_table(path, columns=None if columns is None else list(columns), partitioning=None)
@@ -114,12 +114,12 @@ class LogWriter:
         is_out: Callable[[pa.Table], npt.NDArray[np.bool_]],
         may_be_out: Callable[[npt.NDArray[np.int64]], bool] = lambda _: True,
     ) -> int:
-        """Take rows out of a finished table; returns how many.
+        """Take rows out of a finished table; return how many.
 
         Parameters
         ----------
-        is_out : says of the rows of a file (n,), in order of time, which are taken out.
-        may_be_out : says by the epochs of a file whether it need be looked at.
+        is_out : returns which rows of a file (n,), in order of time, are taken out.
+        may_be_out : returns, by the epochs of a file, whether any of its rows can be.
         """
         schema, left_out = table_schema(table), 0
         for key in sorted(key for key in self._bins if key[0] == table):
@@ -139,14 +139,14 @@ class LogWriter:
         return left_out
 
     def publish(self, store: Store, run: str, sensor: str, key: str) -> dict[str, tuple[DataFile, ...]]:
-        """Move the finished tables into the store, each at once."""
+        """Move the finished tables into the store, each atomically."""
         out = self.files(run, sensor, key)
         for table in out:
             store.publish_folder(self._folder / table, log_folder(table, run, sensor, key))
         return {table: tuple(files.values()) for table, files in out.items()}
 
     def files(self, run: str, sensor: str, key: str) -> dict[str, dict[Path, DataFile]]:
-        """Finished files by table and by where they lie now, as :meth:`publish` would record them."""
+        """Return finished files by table and present path, as :meth:`publish` would record them."""
         out: dict[str, dict[Path, DataFile]] = {}
         for table in sorted({t for t, _ in self._bins}):
             local = self._folder / table
@@ -166,7 +166,7 @@ class LogWriter:
         held.parts.append(self._write(table, start, len(held.parts), rows))
 
     def _merge(self, table: str, start: int, held: _Bin) -> list[tuple[Path, int, int]]:
-        """Parts anew, one after another in time, none larger than what is held in memory."""
+        """Merge parts into consecutive ones in time, none larger than the rows in memory."""
         apart = held.parts[0][0].parent / "overlapping"
         apart.mkdir()
         moved = [path.rename(apart / path.name) for path, _, _ in held.parts]
@@ -194,7 +194,7 @@ class LogWriter:
 
 
 def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
-    """Write rows in the encodings that measured best for their kind; same rows, same bytes."""
+    """Write rows in the encodings that measured best for their kind; equal rows give equal bytes."""
     if is_list_table(rows.schema):
         write_list_table(path, rows, schema.row_group_rows)
         return
@@ -205,7 +205,7 @@ def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
 
 
 def parquet_bytes(rows: pa.Table, schema: TableSchema) -> bytes:
-    """Content of a small file of rows without lists of readings, as :func:`write_parquet` writes them."""
+    """Return the content of a small file of rows without lists of readings, as :func:`write_parquet` writes them."""
     stream = pa.BufferOutputStream()
     _write_by_arrow(stream, rows, schema)
     content: bytes = stream.getvalue().to_pybytes()
@@ -240,7 +240,7 @@ def _write_by_arrow(to: Path | pa.NativeFile, rows: pa.Table, schema: TableSchem
 
 
 def sorted_rows(schema: TableSchema, rows: pa.Table) -> pa.Table:
-    """Rows in the schema's order; equal keys keep the order they came in."""
+    """Return rows in the schema's order; equal keys keep their input order."""
     keys = [rows.column(name).to_numpy() for name in schema.sort]
     if len(keys) == 1 and (keys[0][1:] >= keys[0][:-1]).all():
         return rows
@@ -267,7 +267,7 @@ def _overlap(parts: list[tuple[Path, int, int]]) -> bool:
 
 
 def describe(path: Path, relative: str) -> DataFile:
-    """What a record says of a finished local file that will lie at `relative`."""
+    """Return a record's entry for a finished local file that will be at `relative`."""
     metadata = pq.read_metadata(path)
     groups = [metadata.row_group(k) for k in range(metadata.num_row_groups)]
     spans: list[tuple[int, int]] = []

@@ -1,1 +1,1 @@
-"""What is done with a survey as a whole: checked before a run, run, looked after, repaired, asked."""
+"""Operations on a whole survey: check it before a run, run it, show its state, repair it, query it."""

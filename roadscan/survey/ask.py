@@ -1,4 +1,4 @@
-"""A question to a survey's tables; what is not there yet is told with what makes it."""
+"""Queries a survey's tables; for a missing table, the error says what makes it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def ask(
     *,
     unconfined: bool = False,
 ) -> pa.Table:
-    """Result of a DuckDB statement over the tables of a survey (:func:`roadscan.store.sql.query`).
+    """Return the result of a DuckDB statement over a survey's tables (:func:`roadscan.store.sql.query`).
 
     Raises
     ------
@@ -53,13 +53,13 @@ def ask(
 
 
 def not_made(name: str, survey: Survey) -> RoadscanError | None:
-    """The error that says what makes a table that is not there yet; None where no such table is known."""
+    """Return the error that says what makes a missing table; None where no such table is known."""
     way = _way_to(name.removesuffix("_between"), survey)
     return None if way is None else RoadscanError(f"the table '{name}' is not made yet", change=way)
 
 
 def _way_to(table: str, survey: Survey) -> str | None:
-    """What makes a table; None where no such table is known."""
+    """Return what makes a table; None where no such table is known."""
     if table in asset_tables():
         return (
             f"`roadscan assets` makes it, where the survey file's [assets] asks for the kind '{asset_tables()[table]}'"

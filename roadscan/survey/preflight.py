@@ -1,8 +1,8 @@
-"""Preflight: all mistakes of a survey that show before any log is read through, told at once, one line a cause.
+"""Preflight: finds all mistakes of a survey that show before any log is read completely; one line per cause.
 
 A check is a function of :class:`Asked` that yields errors. To add one, write it and list it in ``CHECKS`` with the
 first stage that would fail of what it finds. Checks are independent: one that needs the map says nothing where the map
-itself is at fault, since another one tells that. Of a log its header is read, and of logs of positions the first block.
+itself is at fault, since another check reports that. Of a log its header is read, of logs of positions the first block.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ from roadscan.tiles.tasks.wanted_products import check_product, wanted_tile_prod
 FARTHEST_DEG: Final = 10.0
 """Positions farther than this outside the area of the map's CRS are refused (degrees): a metre of such a map is no
 metre of the road. Between 1° and that a run goes on, and says so."""
-_NEAR_DEG: Final = 1.0
+_NEAR_DEG: Final = 1.0  # between this and `FARTHEST_DEG` outside, the run goes on with a note
 
 WORST_SCALE: Final = 0.05
-"""Maps on which lengths are wrong by more are refused, as Web Mercator far from the equator: widths of lanes and areas
+"""Largest scale error of an accepted map: on Web Mercator far from the equator, for example, widths of lanes and areas
 of potholes would be wrong by as much. Maps that surveyors use keep within 0.002."""
 
 KINDS: Final[dict[str, tuple[SensorKind, ...]]] = {
@@ -76,7 +76,7 @@ KINDS: Final[dict[str, tuple[SensorKind, ...]]] = {
     "trajectory": ("gnss", "imu"),
     "trajectory_accuracy": ("gnss", "imu"),
 }
-"""Kinds of sensors whose logs fill a table; what is not listed may come from any."""
+"""Kinds of sensors whose logs fill a table; tables that are not listed may come from any."""
 
 _PLACED: Final = ("scans", "returns")
 _POSITIONS: Final = ("trajectory", "gnss")
@@ -88,7 +88,7 @@ Place: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
 
 @dataclass(frozen=True)
 class CheckedLog:
-    """A log of the survey file, as far as it can be opened."""
+    """A log of the survey file, opened as far as possible."""
 
     run: str
     config: LogConfig | ControlConfig
@@ -101,12 +101,12 @@ class CheckedLog:
 
     @property
     def yields(self) -> tuple[str, ...]:
-        """Tables that it fills, none where its format is not known."""
+        """Tables that it fills, none where its format is unknown."""
         return () if self.format is None else self.format.yields
 
 
 class Asked:
-    """A survey and its store, and what several checks ask of them."""
+    """A survey and its store, with cached answers that several checks need."""
 
     def __init__(self, survey: Survey, store: Store) -> None:
         self.survey = survey
@@ -114,7 +114,7 @@ class Asked:
 
     @cached_property
     def frame(self) -> MapFrame | None:
-        """The map, None where its settings are at fault."""
+        """The map, None where its settings are faulty."""
         try:
             return self.survey.frame()
         except RoadscanError:
@@ -132,12 +132,12 @@ class Asked:
 
     @cached_property
     def beginnings(self) -> list[_Beginning]:
-        """Where the positions of logs begin."""
+        """First positions of logs."""
         return [_beginning(log) for log in self.logs]
 
     @cached_property
     def places(self) -> list[tuple[CheckedLog, Place, float]]:
-        """Logs of positions, where these begin, and how far outside the area of the map's CRS that is (degrees)."""
+        """Logs of positions, their first positions, and how far these are outside the area of the map's CRS (°)."""
         frame = self.frame
         return [
             (one.log, one.place, frame.beyond_area_deg(one.place))
@@ -147,7 +147,7 @@ class Asked:
 
     @cached_property
     def times(self) -> list[LookedAt]:
-        """When the logs of runs that are not ingested were recorded, as far as a first look tells."""
+        """When the logs of runs that are not ingested were recorded, by a first look."""
         held = {(record.run, record.path) for record in read_log_records(self.store, damaged=[])}
         due = {log.run for log in self.logs if (log.run, str(log.config.path)) not in held}
         found: list[LookedAt] = []
@@ -166,7 +166,7 @@ class Asked:
         return [*never_meeting(self.survey, self.times), *one_stamp_logs([t.record for t in self.times if t.ends])]
 
     def yields(self, run: str) -> set[str]:
-        """Tables that the logs of a run fill."""
+        """Return the tables that the logs of a run fill."""
         return {table for log in self.logs if log.run == run for table in log.yields}
 
 
@@ -174,12 +174,12 @@ Check: TypeAlias = Callable[[Asked], Iterator[RoadscanError]]
 
 
 def check_map(asked: Asked) -> Iterator[RoadscanError]:
-    """A CRS that is known, projected and not compound, and a geoid where heights need one."""
+    """Check that the CRS is known, projected and not compound, and that there is a geoid where heights need one."""
     yield from _faults(asked.survey.frame)
 
 
 def check_geoids(asked: Asked) -> Iterator[RoadscanError]:
-    """Every geoid grid is there, whoever names it."""
+    """Check that every named geoid grid exists."""
     config = asked.survey.config
     named = [config.map.geoid if config.map.height == "orthometric" else None]
     named += [log.config.geoid if log.config.height != "ellipsoidal" else None for log in asked.logs]
@@ -190,7 +190,7 @@ def check_geoids(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def _uncovered(asked: Asked) -> Iterator[RoadscanError]:
-    """The error of the map's geoid where its grid does not cover the place where a log begins."""
+    """Yield the error of the map's geoid where its grid does not cover the first position of a log."""
     geoid = None if asked.frame is None else asked.frame.geoid
     if geoid is None or geoid.file is None:
         return
@@ -202,21 +202,21 @@ def _uncovered(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_logs(asked: Asked) -> Iterator[RoadscanError]:
-    """Every log is there, can be opened, and is told all that its reader asks for: clock, CRS, sensor, settings."""
+    """Check that every log can be opened, with all statements its reader needs: clock, CRS, sensor, settings."""
     for log in asked.logs:
         if log.error is not None:
             yield log.error
 
 
 def check_positions(asked: Asked) -> Iterator[RoadscanError]:
-    """Every log of positions has one."""
+    """Check that every log of positions has at least one."""
     for one in asked.beginnings:
         if one.error is not None:
             yield one.error
 
 
 def check_kinds(asked: Asked) -> Iterator[RoadscanError]:
-    """A sensor's kind fits what its logs hold."""
+    """Check that each sensor's kind fits the content of its logs."""
     for log in asked.logs:
         sensor = None if log.source is None or log.error is not None else log.source.sensor  # a reader may have told it
         allowed = {kind for table in log.yields for kind in KINDS.get(table, (sensor.kind if sensor else "lidar",))}
@@ -231,7 +231,7 @@ def check_kinds(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_lever_arms(asked: Asked) -> Iterator[RoadscanError]:
-    """Sensors sit on the vehicle."""
+    """Check that lever arms are not longer than a vehicle."""
     most_m = asked.survey.config.checks.lever_arm_max_m
     for name, sensor in asked.survey.rig.sensors.items():
         if max(map(abs, sensor.lever_arm_body_m)) > most_m:
@@ -244,7 +244,7 @@ def check_lever_arms(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_times(asked: Asked) -> Iterator[RoadscanError]:
-    """A log of readings is left that meets the poses of its run, and whose clock did not stand still."""
+    """Check that a log of readings is left that meets the poses of its run, and whose clock did not stand still."""
     found = asked.time_faults
     faulty = {key for fault in found for key in fault.keys}
     readings = [log for log in asked.logs if {*_PLACED, "cloud"} & set(log.yields)]
@@ -258,13 +258,13 @@ def _cloud_of(survey: Survey, attributes: Mapping[str, Any]) -> CloudFrame:
 
 
 def check_datums(asked: Asked) -> Iterator[RoadscanError]:
-    """Positions of every log can be brought into the map."""
+    """Check that positions of every log can be transformed to the map."""
     astray = [log for log, _, beyond_deg in asked.places if beyond_deg > FARTHEST_DEG]  # that is told, and is enough
     for log in asked.logs:
         if asked.frame is None or log.header is None or log in astray:
             continue
         if isinstance(log.config, LogConfig) and not asked.yields(log.run) & {*_PLACED, "cloud"}:
-            continue  # nothing of its run goes to the map
+            continue  # nothing of its run enters the map
         if "cloud" in log.yields:
             cloud = _cloud_of(asked.survey, log.header.attributes)
             faults = (
@@ -292,7 +292,7 @@ VERTICAL_DATUM: Final = Witness(
 
 
 def check_vertical_datums(asked: Asked) -> Iterator[RoadscanError]:
-    """Clouds count their heights from one datum where the map states none."""
+    """Check that clouds have one vertical datum where the map states none."""
     if asked.frame is None or asked.frame.is_local or asked.frame.vertical_crs is not None:
         return
     first: tuple[str, CheckedLog] | None = None
@@ -312,7 +312,7 @@ def check_vertical_datums(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_area(asked: Asked) -> Iterator[RoadscanError]:
-    """Positions lie where the map's CRS is made for."""
+    """Check that positions lie in the area of the map's CRS."""
     for log, place, beyond_deg in asked.places:
         if beyond_deg > FARTHEST_DEG:
             yield CrsError(
@@ -324,7 +324,7 @@ def check_area(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_scale(asked: Asked) -> Iterator[RoadscanError]:
-    """A metre of the map is a metre of the road."""
+    """Check that a metre of the map is a metre of the road."""
     for log, place, beyond_deg in asked.places:
         scale = 1.0 if asked.frame is None or beyond_deg > FARTHEST_DEG else asked.frame.length_scale(place)
         if abs(scale - 1.0) > WORST_SCALE:
@@ -338,7 +338,7 @@ def check_scale(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_poses(asked: Asked) -> Iterator[RoadscanError]:
-    """Each run with readings has poses, or what they are computed from."""
+    """Check that each run with readings has poses, or data from which they are computed."""
     solve = asked.survey.config.navigation.solve
     for run in asked.survey.config.runs:
         yields = asked.yields(run.id)
@@ -353,7 +353,7 @@ def check_poses(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_segmentation(asked: Asked) -> Iterator[RoadscanError]:
-    """The segmentation applies to some sensor: to one with profiles across the road."""
+    """Check that the segmentation applies to at least one sensor with profiles across the road."""
     settings, found = asked.survey.config.segmentation, _tables_of_sensors(asked)
     if settings is None or any(log.format is None for log in asked.logs):
         return
@@ -374,7 +374,7 @@ def check_segmentation(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_products(asked: Asked) -> Iterator[RoadscanError]:
-    """Products are known, and so are their settings; they fit the cells."""
+    """Check that products and their settings are known, and that they fit the cells."""
     survey, stated = asked.survey, asked.survey.config.products
     faults = [
         fault
@@ -401,7 +401,7 @@ def check_surface(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_centre_lines(asked: Asked) -> Iterator[RoadscanError]:
-    """The layer of centre lines can be read and lies on the map."""
+    """Check that the layer of centre lines can be read and lies on the map."""
     frame = asked.frame
     if frame is not None:
         for fault in _faults(lambda: CentreLines.of(asked.survey)):
@@ -413,12 +413,12 @@ def check_centre_lines(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_motion_clocks(asked: Asked) -> Iterator[RoadscanError]:
-    """``[[clocks]]`` names sensors and runs that there are."""
+    """Check that ``[[clocks]]`` names existing sensors and runs."""
     yield from _faults(lambda: check_clocks(asked.survey))
 
 
 def check_passes(asked: Asked) -> Iterator[RoadscanError]:
-    """Passes are stated with a time zone, and end after they start."""
+    """Check that passes have a time zone, and end after they start."""
     for one in asked.survey.config.passes:
         faults = [f for at in (one.start, one.end) if at for f in _faults(lambda at=at: gps_ns_from_utc(at), None)]  # type: ignore[misc]
         yield from faults
@@ -427,7 +427,7 @@ def check_passes(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_store(asked: Asked) -> Iterator[RoadscanError]:
-    """The store can be written, and holds nothing but a survey's."""
+    """Check that the store can be written, and contains only a survey's files."""
     if not asked.store.is_folder:
         yield from _faults(lambda: asked.store.exists("manifest"))
         return
@@ -446,7 +446,7 @@ def check_store(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def _is_foreign(root: Path) -> bool:
-    """Whether a folder holds files, and none of what a store has."""
+    """Return whether a folder contains files, and none of a store."""
     names = {entry.name for entry in root.iterdir()}
     return bool(names) and not names & {"manifest", "tables", "tiles", "products", ".staging"}
 
@@ -474,20 +474,20 @@ CHECKS: Final[tuple[tuple[str, Check], ...]] = (
     ("footprints", check_centre_lines),
     ("surfaces", check_surface),
 )
-"""Checks with the first stage that fails of what they find."""
+"""Checks with the first stage that would fail because of their errors."""
 
 
 @dataclass(frozen=True)
 class Preflight:
-    """What would fail, and what should be known."""
+    """Errors that would end a run, and notes."""
 
     causes: tuple[RoadscanError, ...]
     notes: tuple[str, ...]
     failing: tuple[str, ...] = ()
-    """Logs that would fail while others go on, and why."""
+    """Logs that would fail while others continue, with the reason."""
 
     def begin(self, report: Callable[[str], None]) -> None:
-        """Let a run begin: report the notes; raise the only cause, or one error that lists them all, a line each."""
+        """Report the notes; raise the only error, or one that lists them all, a line each."""
         for note in self.notes:
             report(f"note: {note}")
         if len(self.causes) == 1:
@@ -498,9 +498,7 @@ class Preflight:
 
 
 def preflight(survey: Survey, store: Store, last_stage: str = "", selection: Selection | None = None) -> Preflight:
-    """Check all that can be checked before the logs are read, as far as stages up to `last_stage` (all, where none is
-    named) need it, for some tiles or for all.
-    """
+    """Run all checks that stages up to `last_stage` need (all, where none is named), for some tiles or for all."""
     if selection is not None and not store.exists("manifest/outputs"):
         raise ConfigError("tiles are chosen, and none is computed yet", change="run `roadscan run` first")
     asked = Asked(survey, store)
@@ -513,11 +511,11 @@ def preflight(survey: Survey, store: Store, last_stage: str = "", selection: Sel
 
 
 _NAMED: Final = 3
-"""So many logs with the same fault are named."""
+"""Logs with the same fault that are named."""
 
 
 def _grouped(found: Sequence[RoadscanError]) -> Iterator[RoadscanError]:
-    """One error for each cause: what several logs have in common is said once, with the first of them."""
+    """Yield one error for each cause: a fault of several logs is reported once, with the first of them."""
     by_cause: dict[tuple[str, str, str], list[RoadscanError]] = {}
     for one in found:
         by_cause.setdefault((one.arrived, one.expected, one.change), []).append(one)
@@ -550,7 +548,7 @@ def _notes(asked: Asked) -> Iterator[str]:
 
 
 def _tables_of_sensors(asked: Asked) -> dict[str, set[str]]:
-    """Tables of readings by the sensors of the survey's logs."""
+    """Return the tables of readings by the sensors of the survey's logs."""
     found: dict[str, set[str]] = {}
     for log in asked.logs:
         placed = set(log.yields) & set(_PLACED)
@@ -560,7 +558,7 @@ def _tables_of_sensors(asked: Asked) -> dict[str, set[str]]:
 
 
 def _segmented(asked: Asked) -> set[str]:
-    """Sensors of the survey's logs whose profiles are segmented."""
+    """Return the sensors of the survey's logs whose profiles are segmented."""
     settings = asked.survey.config.segmentation
     if settings is None:
         return set()
@@ -572,17 +570,17 @@ def _segmented(asked: Asked) -> set[str]:
 
 @dataclass(frozen=True)
 class _Beginning:
-    """Where the first block of positions of a log lies."""
+    """First block of positions of a log."""
 
     log: CheckedLog
     place: Place | None = None
     """None for a local frame, and where the log does not say."""
     error: RoadscanError | None = None
-    """Why it has not one position."""
+    """Why it has no position."""
 
 
 def _beginning(log: CheckedLog) -> _Beginning:
-    """Read a log of positions as far as its first rows: it has none only where it ends before them."""
+    """Read a log of positions up to its first rows: it has none only where it ends before them."""
     if log.format is None or log.source is None or log.header is None or not set(_POSITIONS) & set(log.yields):
         return _Beginning(log)
     items = log.format.read(log.source, log.header)
@@ -593,7 +591,7 @@ def _beginning(log: CheckedLog) -> _Beginning:
                 reasons[item.reason] += item.records
             elif isinstance(item, Rows) and item.batch.num_rows:
                 return _Beginning(log, _place_of(item, str(log.header.attributes.get("world_frame", LOCAL_WORLD))))
-    except OSError:  # it was opened just now; who reads it through tells of it
+    except OSError:  # it was opened just now; the full read reports its faults
         return _Beginning(log)
     except RoadscanError as error:
         error.file = error.file or str(log.path)
@@ -611,7 +609,7 @@ def _place_of(rows: Rows, world: str) -> Place | None:
     known = known[~without_fix(known)] if not without_fix(known).all() else known
     if not len(known):
         return None
-    middle = np.median(known, axis=0)  # one wrong pose, be it the first, is not where the drive begins
+    middle = np.median(known, axis=0)  # a single wrong pose, even the first, is not the drive's beginning
     nearest = known[np.argmin(np.linalg.norm(known - middle, axis=1))]
     place: Place = geodetic_from_world(world, nearest[None])[0]
     return place
@@ -627,7 +625,7 @@ def _map_words(asked: Asked) -> str:
 
 
 def _checked(survey: Survey, run: str, config: LogConfig | ControlConfig, moved: dict[str, str]) -> CheckedLog:
-    """Open a log as far as its header."""
+    """Open a log up to its header."""
     path = survey.resolve(config.path)
     if not is_there(path) and (known := moved.get(listed_name(path, survey.folder))) is not None:
         return CheckedLog(run, config, path, format_named(config.format or known))
@@ -652,12 +650,12 @@ def _checked(survey: Survey, run: str, config: LogConfig | ControlConfig, moved:
 
 
 def _is_read_only(folder: Path) -> bool:
-    """Whether the file system takes no files, which the rights of a folder do not say to its administrator."""
+    """Return whether the file system is read-only, which an administrator cannot see from the folder's permissions."""
     return bool(os.statvfs(folder).f_flag & os.ST_RDONLY)
 
 
 def _faults(check: Callable[[], object], file: Path | None = None) -> Iterator[RoadscanError]:
-    """What a function raises on purpose; with the file that is meant, where it does not name one."""
+    """Yield the RoadscanError of a function; with the given file, where it names none."""
     try:
         check()
     except RoadscanError as error:

@@ -1,6 +1,6 @@
-"""Damaged tables of ingested rows: their logs are read again; where a log is gone, what is sound stays.
+"""Repairs damaged tables of ingested rows: their logs are read again; where a log is gone, sound rows are kept.
 
-A log that holds the bytes that it held gives the same rows, and these the same files, so that nothing that was made of
+A log with unchanged bytes gives the same rows, and these give the same files, so that nothing that was made of
 them is stale. What is damaged is never deleted: it is kept below ``damaged/``.
 """
 
@@ -27,18 +27,18 @@ from roadscan.survey.status import find_damage
 
 @dataclass
 class Repair:
-    """What was done, and what is still wrong."""
+    """Results of a repair, and remaining faults."""
 
     lines: list[str] = field(default_factory=list)
-    """What was mended and what is lost, file by file."""
+    """What was repaired and what is lost, file by file."""
     faults: list[str] = field(default_factory=list)
-    """Files that are not whole."""
+    """Files that are still damaged."""
     lost: list[Lost] = field(default_factory=list)
-    """Rows that the store holds no more."""
+    """Rows that the store has lost."""
 
 
 class _LostLogError(RoadscanError):
-    """A log cannot be read again as it was."""
+    """A log cannot be read again unchanged."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ class _Broken:
 
     record: LogRecord
     files: dict[str, DataFile]
-    """Files that are damaged, or that lost rows before, by path, as they were recorded when they were whole."""
+    """Files that are damaged, or that lost rows before, by path, as recorded when they were undamaged."""
     damaged: frozenset[str]
-    """Those of them that are damaged as they are now."""
+    """Those of them that are damaged now."""
 
 
 def repair_store(survey: Survey, store: Store, report: Callable[[int, int], None] = lambda _a, _b: None) -> Repair:
-    """Hold every file of a store against its record, and mend the ingested tables."""
+    """Verify every file of a store against its record, and repair the ingested tables."""
     with store.lock():
         done = Repair()
         repair_records(store, done.lines.append)
@@ -69,7 +69,7 @@ def repair_store(survey: Survey, store: Store, report: Callable[[int, int], None
 
 
 def accept_losses(store: Store) -> None:
-    """Keep that the user goes on without the rows that are lost; they stay listed."""
+    """Record that the user continues without the lost rows; they stay listed."""
     with store.lock():
         write_lost(store, [replace(lost, accepted=True) for lost in read_lost(store)])
 
@@ -105,7 +105,7 @@ def _mend_logs(
 
 
 def _spans(records: Iterable[LogRecord], planned: Iterable[PlannedLog]) -> dict[str, tuple[int, int]]:
-    """First and last epoch (GPS ns) of each run's trajectory logs."""
+    """Return the first and last epoch (GPS ns) of each run's trajectory logs."""
     keys = {log.key for log in planned if log.is_trajectory}
     spans: dict[str, tuple[int, int]] = {}
     for record in records:
@@ -117,7 +117,7 @@ def _spans(records: Iterable[LogRecord], planned: Iterable[PlannedLog]) -> dict[
 
 
 def _log_of(record: LogRecord, planned: Sequence[PlannedLog], unplanned: Sequence[str]) -> PlannedLog:
-    """The log of a record as the survey file lists it.
+    """Return the log of a record as the survey file lists it.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def _log_of(record: LogRecord, planned: Sequence[PlannedLog], unplanned: Sequenc
 
 
 def _check_whole(survey: Survey, store: Store, log: PlannedLog) -> None:
-    """_LostLogError where the log's bytes are not those that were read before."""
+    """Raise _LostLogError where the log's bytes are not those that were read before."""
     path, companions = log.source.path, log.format.companions(log.source.path, log.source.options)
     if not path.exists():
         raise _LostLogError(f"the raw log {log.config.path} is gone")
@@ -153,7 +153,7 @@ def _check_whole(survey: Survey, store: Store, log: PlannedLog) -> None:
 
 
 def _read_again(task: IngestTask, broken: _Broken) -> list[str]:
-    """Read a log and put its files in the place of damaged ones."""
+    """Read a log and replace damaged files by its files."""
     store, record = task.store, broken.record
     with store.scratch() as folder:
         writer, header = read_log(task, folder)
@@ -179,7 +179,7 @@ def _read_again(task: IngestTask, broken: _Broken) -> list[str]:
 def _with_files(
     record: LogRecord, tables: Iterable[str], files: Mapping[str, DataFile]
 ) -> dict[str, tuple[DataFile, ...]]:
-    """Files of a record by table, with others in the place of, or beside, those that it names."""
+    """Return the files of a record by table, with others that replace, or are added to, those that it names."""
     known = {f.path: f for own in record.tables.values() for f in own} | dict(files)
     of = {path: path.split("/")[1] for path in known}
     return {t: tuple(known[path] for path in sorted(known) if of[path] == t) for t in sorted({*tables, *record.tables})}
@@ -203,12 +203,12 @@ def _kept_aside(store: Store, path: str) -> str:
 
 
 def _keep_sound(store: Store, broken: _Broken, why: str, done: Repair) -> list[str]:
-    """Keep what is sound of a log's damaged files; what is not is lost, and listed."""
+    """Keep the sound part of a log's damaged files; the rest is lost, and listed."""
     known = {one.file.path: one for one in done.lost}
     lines: list[str] = []
     files = {f.path: f for own in broken.record.tables.values() for f in own}
     for path, whole in broken.files.items():
-        if path not in broken.damaged:  # told before, and its log is still gone
+        if path not in broken.damaged:  # reported before, and its log is still gone
             continue
         file, before = files[path], known.get(path)
         table = path.split("/")[1]
@@ -233,13 +233,13 @@ def _keep_sound(store: Store, broken: _Broken, why: str, done: Repair) -> list[s
     tables = {t: tuple(files[f.path] for f in own if f.path in files) for t, own in broken.record.tables.items()}
     tables = {table: own for table, own in tables.items() if own}
     if tables != broken.record.tables:
-        write_lost(store, done.lost)  # first: rows that are missing are told of
+        write_lost(store, done.lost)  # first: missing rows are reported
         write_log_record(store, replace(broken.record, tables=tables, rows=_rows(tables)))
     return lines
 
 
 def _mend_trajectories(survey: Survey, store: Store, broken: Sequence[_Broken], done: Repair) -> None:
-    """Compute damaged trajectories again, of the logs that they were made from."""
+    """Compute damaged trajectories again from their logs."""
     if not broken:
         return
     keys = [log.key for log in plan_logs(survey, store)[0]]

@@ -1,4 +1,4 @@
-"""Stages run one after another on a session; what fails is kept and told at the end."""
+"""Runs stages one after another on a session; failures are collected and reported at the end."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from roadscan.surface.tasks.surface_colours import check_cameras
 from roadscan.tiles.tasks.wanted_products import wanted_products
 
 _CLOCK_TICK_NS: Final = 50_000_000
-"""A file's time may lie that much before the clock's."""
+"""Tolerance (ns): a file's time may be this much before the clock's."""
 
 
 def run_stages(session: Session, chosen: Sequence[Stage] | None = None) -> None:
@@ -36,7 +36,7 @@ def run_stages(session: Session, chosen: Sequence[Stage] | None = None) -> None:
         at the end, if any unit failed; all others are finished and kept.
     """
     wanted = stages() if chosen is None else chosen
-    wanted_products(session.survey)  # a wrong name or option is told before a log is read
+    wanted_products(session.survey)  # a wrong name or option is reported before a log is read
     check_cameras(session.survey)
     with session.store.lock():
         for stage in wanted:
@@ -47,7 +47,7 @@ def run_stages(session: Session, chosen: Sequence[Stage] | None = None) -> None:
 
 
 def run_stage(session: Session, stage: Stage) -> None:
-    """Run one stage; where units of an earlier one failed, its own end joins their list instead of hiding it."""
+    """Run one stage. If an earlier stage had failures, append this error to them instead of raising it."""
     session.stage = stage.name
     if session.goes_on is None:
         repair_records(session.store, session.note)
@@ -67,14 +67,14 @@ def run_stage(session: Session, stage: Stage) -> None:
         if damaged := damaged_file(error):
             session.manifest.doubt_files({damaged})  # the next run makes it again
         if not session.failures:
-            with contextlib.suppress(RoadscanError):  # a store that cannot be written is the error itself
+            with contextlib.suppress(RoadscanError):  # a store that cannot be written is raised as it is
                 write_failures(session.store, [{"stage": stage.name, "unit": "as a whole", "reason": str(error)}])
             raise
         session.failed(stage.name, [("as a whole", error)])
 
 
 def _tell_findings(session: Session, stage: Stage) -> None:
-    if type(stage).findings is Stage.findings:  # it asks nobody: no record need be read
+    if type(stage).findings is Stage.findings:  # it queries no stage: no record need be read
         return
     listed = set(known_keys(session.survey, session.store, logs_of(session)))
     records = [r for r in read_log_records(session.store, damaged=[]) if r.key in listed]
@@ -88,7 +88,7 @@ def _removed_words(paths: Sequence[str]) -> str:
 
 
 def close_run(session: Session, done: Sequence[Stage]) -> None:
-    """Keep the list of failures for `roadscan status`, and raise if there are any.
+    """Store the list of failures for `roadscan status`, and raise an error if there are any.
 
     A whole run without failures has a record for every file that is due: what a run before it left without one is
     removed.
@@ -116,7 +116,7 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
 
 
 def _report(session: Session) -> None:
-    """Write the report; what keeps it from being made costs nothing else."""
+    """Write the report; if it fails, nothing else does."""
     from roadscan.report.page import keep_report
 
     try:

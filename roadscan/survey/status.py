@@ -1,4 +1,4 @@
-"""What the store holds, what is stale, what failed; and whether every file is whole."""
+"""Reports what the store contains, what is stale, what failed; and verifies every file."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class Status:
     unused_logs: list[str] = field(default_factory=list)
     """Logs in the store that the survey file no longer lists."""
     readings: dict[str, int] = field(default_factory=dict)
-    """Readings by fate."""
+    """Number of readings by result."""
     stages: dict[str, StageState] = field(default_factory=dict)
-    """What there is and what is to do, by stage; without those of which nothing can be said yet."""
+    """State of each stage, without those of which nothing is known yet."""
     outputs: dict[str, int] = field(default_factory=dict)
     """Finished files by product."""
     ingested: dict[str, int] = field(default_factory=dict)
@@ -52,30 +52,30 @@ class Status:
     failures: list[dict[str, str]] = field(default_factory=list)
     """What failed in the last run."""
     checked: list[str] = field(default_factory=list)
-    """What the checks before a run note of the survey."""
+    """Notes of the checks before a run."""
     damaged: list[str] = field(default_factory=list)
-    """Records of the store that are damaged; the next run mends them."""
+    """Damaged records of the store; the next run repairs them."""
     lost: list[Lost] = field(default_factory=list)
-    """Ingested rows that the store holds no more, and that could not be read again."""
+    """Ingested rows that the store has lost and that could not be read again."""
     findings: list[Finding] = field(default_factory=list)
-    """What the witnesses of the inputs said."""
+    """Findings of the witnesses."""
     note: str = ""
-    """Why nothing can be said of tiles."""
+    """Why nothing is known of tiles."""
     would_fail: list[str] = field(default_factory=list)
-    """Why the next run would fail, as far as that is known before it."""
+    """Why the next run would fail, as far as known."""
     places_nothing: str = ""
-    """Why there are no tiles, and shall be none: no log of the survey holds readings."""
+    """Why there are no tiles, and will be none: no log of the survey has readings."""
 
     @property
     def is_complete(self) -> bool:
-        """True if nothing is missing, stale or failed, and no rows are lost but those that the user gave up."""
+        """Return True if nothing is missing, stale or failed, and the user accepted all lost rows."""
         lost = any(not one.accepted for one in self.lost)
         due = any(state.stale or state.hides_rest for state in self.stages.values())
         return not (due or self.failures or self.damaged or self.note or self.would_fail or lost)
 
     @property
     def notes(self) -> list[str]:
-        """What the user should know, beside what is to do."""
+        """Return what the user should know, beside what is to do."""
         found = [one.line for one in self.findings]
         return [*self.checked, *found, *(note for state in self.stages.values() for note in state.notes)]
 
@@ -87,18 +87,18 @@ class Status:
         return {name: state.stale for name, state in self.stages.items() if state.stale}
 
     def of(self, stage: str) -> StageState:
-        """State of a stage; an empty one where nothing can be said of it yet."""
+        """Return the state of a stage; an empty one where nothing is known of it yet."""
         return self.stages.get(stage, StageState())
 
 
 def survey_status(session: Session) -> Status:
-    """Look at everything the manifest says; reads no readings."""
+    """Return the state of a survey from its manifest; no readings are read."""
     store, damaged = session.store, session.hear_of_damage()
     found = preflight(session.survey, store)
     causes = [*map(str, found.causes), *found.failing]
     status = Status(failures=read_failures(store), would_fail=causes.copy(), checked=list(found.notes))
     planned, unplanned = logs_of(session)
-    unsaid = [u for u in unplanned if not causes]  # else it is said there, once for a cause
+    unsaid = [u for u in unplanned if not causes]  # otherwise reported there, once per cause
     status.failures += [{"stage": "ingest", "unit": u.path, "reason": str(u.error)} for u in unsaid]
     manifest = session.manifest
     records = {r.key: r for r in read_log_records(store, damaged=damaged)}
@@ -124,7 +124,7 @@ def survey_status(session: Session) -> Status:
             status.places_nothing = str(nothing)
             break
         except RoadscanError as error:
-            status.note = str(error)  # a survey may hold tables only: poses without readings, readings without poses
+            status.note = str(error)  # a survey may have tables only: poses without readings, readings without poses
             break
         status.would_fail += [f"{unit}: {reason}" for unit, reason in state.faults]
         status.failures = [one for one in status.failures if (one["unit"], one["reason"]) not in state.faults]
@@ -147,23 +147,23 @@ def _log_state(store: Store, log: PlannedLog, record: LogRecord | None) -> dict[
 
 
 def _unplanned_state(log: UnplannedLog) -> dict[str, Any]:
-    """Of a log that cannot be planned: a file of it is missing, or its settings are wrong."""
+    """Return the entry of a log that cannot be planned: a file of it is missing, or its settings are wrong."""
     unknown = dict.fromkeys(("rows", "rejected", "bytes"), 0)
     return {"run": log.run, "sensor": "", "path": log.path, "format": "", "state": "cannot be read", **unknown}
 
 
 @dataclass
 class Damage:
-    """What is wrong with the files of a store."""
+    """Damage to the files of a store."""
 
     faults: list[str] = field(default_factory=list)
-    """Of records, small tables and outputs, in words."""
+    """Faults of records, small tables and outputs, in words."""
     ingested: dict[str, str] = field(default_factory=dict)
-    """Of files of ingested rows, by their paths relative to the survey's root."""
+    """Faults of files of ingested rows, by their paths relative to the survey's root."""
 
 
 def verify_store(store: Store, report: Callable[[int, int], None] = lambda _a, _b: None) -> list[str]:
-    """Read every file the store should hold and compare it with what was recorded; returns the faults.
+    """Read every file that the store should have and compare it with its record; return the faults.
 
     A product that is not whole counts as stale from then on: the next run makes it again.
     """
@@ -175,7 +175,7 @@ def verify_store(store: Store, report: Callable[[int, int], None] = lambda _a, _
 
 
 def find_damage(store: Store, report: Callable[[int, int], None] = lambda _a, _b: None) -> Damage:
-    """The same, by whoever has the store's lock; what is whole is noted, so that SQL need not read it."""
+    """Return the damage to a store (requires its lock); sound files are noted, so that SQL need not verify them."""
     damaged: list[StoreError] = []
     manifest = Manifest(store, damaged)
     logs = read_log_records(store, damaged=damaged)
@@ -211,7 +211,7 @@ def find_damage(store: Store, report: Callable[[int, int], None] = lambda _a, _b
 
 
 def _copy_faults(store: Store, keys: Sequence[str]) -> list[str]:
-    """Copies of sound log records that differ from them; they are set aside, so that the next run writes them anew."""
+    """Return faults of record copies that differ from sound log records; they are set aside and written again."""
     faults: list[str] = []
     for key in keys:
         copy = copy_path(key)

@@ -1,1 +1,1 @@
-"""Settings: a file a section of the survey file."""
+"""Settings: one file for each section of the survey file."""

@@ -1,1 +1,1 @@
-"""Pictures and videos."""
+"""Formats of pictures and videos."""

@@ -1,4 +1,4 @@
-"""Time stamps in the names of files."""
+"""Reads time stamps from file names."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ _DIRECTIVES: Final = {
     "z": r"(?P<z>Z|[+-]\d\d:?\d\d)",
     "%": "%",
 }
-"""What a directive of `strptime` stands for in a name; %f goes down to nanoseconds."""
+"""Regular expressions of `strptime` directives in a name; %f allows up to nanoseconds."""
 _NEEDED: Final = ("Y", "m", "d", "H", "M", "S")
-_MOST_STARS: Final = 3
+_MOST_STARS: Final = 3  # stars that a pattern may contain
 
 
 @dataclass(frozen=True)
 class NamePattern:
-    """How a stamp stands in the names of files."""
+    """Pattern of the stamp in file names."""
 
     text: str
     expression: re.Pattern[str]
 
     @classmethod
     def of(cls, text: str, file: Path) -> Self:
-        """Read a pattern such as ``"cam_{stamp}.jpg"`` or ``"*_%Y%m%d_%H%M%S.%f.jpg"``.
+        """Parse a pattern such as ``"cam_{stamp}.jpg"`` or ``"*_%Y%m%d_%H%M%S.%f.jpg"``.
 
         Raises
         ------
@@ -71,7 +71,7 @@ class NamePattern:
         return cls(text, re.compile("".join(parts)))
 
     def words(self, names: Sequence[str]) -> list[str | None]:
-        """Stamp in each name as a number or as ISO 8601 text, None where the name does not fit."""
+        """Return the stamp in each name as a number or ISO 8601 text, None where the name does not match."""
         return [self._word(name) for name in names]
 
     def _word(self, name: str) -> str | None:
@@ -85,13 +85,13 @@ class NamePattern:
         return f"{held['Y']}-{held['m']}-{held['d']}T{held['H']}:{held['M']}:{held['S']}{fraction}{held.get('z', '')}"
 
     def clock(self, source: LogSource, word: str) -> Clock:
-        """Clock of the numbers that :meth:`stamps` gives; raises as the clock of a text column does."""
+        """Return the clock of the numbers that :meth:`stamps` returns; errors as for the clock of a text column."""
         if "stamp" in self.expression.groupindex:
             return source.need_clock("unix_utc", unit=likely_unit(np.array([float(word)])))
         return calendar_clock(source.clock, word, source.path, zoned="z" in self.expression.groupindex)
 
     def stamps(self, words: Sequence[str], sieve: Sieve) -> npt.NDArray[np.generic]:
-        """Stamps (n,) in the unit of the clock, int64 where all are whole; faulty ones are dropped from `sieve`."""
+        """Return stamps (n,) in the clock's unit, int64 where all are whole; faulty ones are dropped from `sieve`."""
         if "stamp" not in self.expression.groupindex:
             return calendar_ns(words, sieve, zoned="z" in self.expression.groupindex)
         if all(word.isdigit() and int(word) < 2**63 for word in words):

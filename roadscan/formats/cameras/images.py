@@ -35,13 +35,13 @@ Int64 = npt.NDArray[np.int64]
 FILE: Final = Quantity("file", "text", ("filename", "file_name", "image", "image_file", "name"))
 _TEXTS: Final = (".csv", ".txt", ".tsv")
 _COMPANY: Final = (*_TEXTS, ".json", ".toml", ".yaml", ".yml", ".md", ".xml", ".log", ".gz", ".db", ".ini")
-"""Suffixes of what may lie beside the images of a folder without making it another format's."""
-_SNIFFED: Final = 2_000
-_CHUNK: Final = 4_096
+"""Suffixes of files that may lie beside the images of a folder."""
+_SNIFFED: Final = 2_000  # folder entries that are examined to recognise the format
+_CHUNK: Final = 4_096  # images of a chunk
 _MP4_BRANDS_OF_PICTURES: Final = (b"heic", b"heix", b"mif1", b"msf1", b"avif", b"M4A ", b"crx ")
 _QUICKTIME: Final = (b"moov", b"mdat", b"wide")
-_NAME_MAX: Final = 300
-_LARGEST_STAMP_NS: Final = 1 << 62
+_NAME_MAX: Final = 300  # characters of an image's name that a reject keeps
+_LARGEST_STAMP_NS: Final = 1 << 62  # larger stamps (ns) are refused
 
 
 class ImagesOptions(TextOptions):
@@ -108,14 +108,14 @@ class Images(LogFormat):
             return False
 
     def files(self, path: Path) -> list[Path]:
-        """The video, or the folder's images and the tables beside them."""
+        """Return the video, or the folder's images and the tables beside them."""
         if not path.is_dir():
             return [path]
         tables = [p for p in path.iterdir() if p.suffix.lower() in _TEXTS and p.is_file()]
         return sorted([*_images(path).values(), *tables])
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
-        """The table of stamps, wherever it is."""
+        """Return the table of stamps, wherever it is."""
         stamps = options.stamps if isinstance(options, ImagesOptions) else None
         return [] if stamps is None else [beside(path, stamps)]
 
@@ -148,7 +148,7 @@ class Images(LogFormat):
 
 
 def _is_folder_of_images(path: Path) -> bool:
-    """Only images, with text beside them, and no folders below: those are often another format's."""
+    """Return True if there are only images, with text beside them, and no subfolders (often another format's)."""
     image: Path | None = None
     with os.scandir(path) as entries:
         for entry in itertools.islice(entries, _SNIFFED):
@@ -164,18 +164,18 @@ def _is_folder_of_images(path: Path) -> bool:
 
 
 def _images(folder: Path) -> dict[str, Path]:
-    """Image files by their name relative to the folder, in order of the names."""
+    """Return the image files by their name relative to the folder, in order of the names."""
     found = (p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
     return dict(sorted((p.relative_to(folder).as_posix(), p) for p in found))
 
 
 @dataclass(frozen=True)
 class _StampTable:
-    """The table that names images and their stamps."""
+    """The table of images and their stamps."""
 
     path: Path
     name: str
-    """Its name as rejects list it."""
+    """Its name in rejects."""
     layout: TextLayout
     file_column: str
     stamps: StampColumn
@@ -196,7 +196,7 @@ class _StampTable:
 
     @property
     def kinds(self) -> dict[str, Kind]:
-        """Columns to read, and their kinds."""
+        """Return the columns to read, with their kinds."""
         return {**self.stamps.kinds, self.file_column: "text"}
 
 
@@ -206,7 +206,7 @@ def _table(path: Path, options: ImagesOptions) -> tuple[TextLayout, dict[str, Fo
 
 
 def _only_table(folder: Path, options: ImagesOptions) -> tuple[Path, TextLayout, dict[str, Found]]:
-    """The one table of the folder that names files and times."""
+    """Return the only table of the folder that names files and times."""
     found: list[tuple[Path, TextLayout, dict[str, Found]]] = []
     for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in _TEXTS and p.is_file()):
         try:
@@ -225,7 +225,7 @@ def _only_table(folder: Path, options: ImagesOptions) -> tuple[Path, TextLayout,
 
 
 def _without_stamps(folder: Path) -> str:
-    """What a folder without a table of stamps holds, and what its first image says of its time."""
+    """Return what a folder without a table of stamps contains, and what its first image says about its time."""
     images = _images(folder)
     said = f"the folder holds {counted(len(images), 'image')}, and the images' stamps are not stated"
     first = next(iter(images.values()), None)
@@ -243,17 +243,17 @@ class _Stamped:
     """Images of a block with their stamps."""
 
     records: Int64
-    """(n,) record numbers in the table of stamps, −1 where the stamps stand in names."""
+    """(n,) record numbers in the table of stamps, −1 for stamps in names."""
     offsets: Int64
-    """(n,) byte offsets in that table, −1 without any."""
+    """(n,) byte offsets in that table, −1 for none."""
     names: list[str]
     words: list[str]
-    """Stamps as they are written."""
+    """Stamps as written."""
     epochs: Int64
 
 
 def _listed_images(table: _StampTable, source: LogSource) -> Iterator[Item]:
-    """Images in the order of the table, then those that it does not name."""
+    """Yield images in the order of the table, then those that it does not name."""
     images = _images(source.path)
     left = dict(images)
     reader = EpochReader(table.stamps.clock, table.path)
@@ -292,7 +292,7 @@ def _stamped(block: TextBlock, rows: Int64, names: list[str], words: list[str], 
 def _without_image(
     names: list[str], rows: Int64, images: dict[str, Path], left: dict[str, Path]
 ) -> dict[str, list[int]]:
-    """Rows whose stamp has no image, or one that is stamped already, by reason; the others are taken from `left`."""
+    """Return rows whose image is missing or already stamped, by reason; the others' images are taken from `left`."""
     bad: dict[str, list[int]] = {"the stamp has no image": [], "the image has a stamp already": []}
     for row in rows.tolist():
         if names[row] not in images:
@@ -303,14 +303,14 @@ def _without_image(
 
 
 def _plain(name: str) -> str:
-    """Name of an image as the folder's listing writes it."""
+    """Return an image's name as the folder's listing writes it."""
     return name.strip('"').replace("\\", "/").removeprefix("./")
 
 
 def _pattern(
     source: LogSource, options: ImagesOptions, images: dict[str, Path]
 ) -> tuple[NamePattern, dict[str, str | None]]:
-    """The pattern, and the stamp in each image's name."""
+    """Return the pattern, and the stamp in each image's name."""
     if options.stamps is not None:
         raise ConfigError("options.stamps and options.pattern are both stated", expected="one", file=source.path)
     pattern = NamePattern.of(options.pattern or "", source.path)
@@ -326,7 +326,7 @@ def _pattern(
 
 
 def _named_images(source: LogSource, options: ImagesOptions) -> Iterator[Item]:
-    """Images by the stamps in their names."""
+    """Yield images with the stamps in their names."""
     pattern, words = _pattern(source, options, _images(source.path))
     named = sorted((len(word), word, name) for name, word in words.items() if word)
     reader: EpochReader | None = None
@@ -350,7 +350,7 @@ def _named_images(source: LogSource, options: ImagesOptions) -> Iterator[Item]:
 
 
 def _image_items(stamped: _Stamped, folder: Path) -> Iterator[Item]:
-    """Rows of the images that are complete, in bounded chunks, and rejects of the others."""
+    """Yield rows of the complete images in bounded chunks, and rejects of the others."""
     for start in range(0, len(stamped.names), _CHUNK):
         kept: list[int] = []
         sizes: list[ImageSize] = []
@@ -379,7 +379,7 @@ def _image_items(stamped: _Stamped, folder: Path) -> Iterator[Item]:
 
 
 def _is_video(path: Path) -> bool:
-    """MP4 and its kin, AVI, MKV and WebM, by their first bytes."""
+    """Return True for MP4 and related files, AVI, MKV and WebM, by their first bytes."""
     with path.open("rb") as stream:
         head = stream.read(16)
     if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
@@ -397,11 +397,11 @@ class _VideoLog:
     video: Video
     times: FrameTimes
     epochs: Int64
-    """(n,) GPS time of the frames that are there (ns)."""
+    """(n,) GPS time of the existing frames (ns)."""
 
     @classmethod
     def of(cls, source: LogSource, options: ImagesOptions) -> _VideoLog:
-        """Look into the video and bring its frames to GPS time."""
+        """Examine the video and convert its frame times to GPS time."""
         path = source.path
         if not path.is_file() or not _is_video(path):
             raise FormatError(
@@ -417,7 +417,7 @@ class _VideoLog:
         times = frame_times(video, options.frame_count, constant_rate=constant, path=path)
         first_ns = end_ns - round(times.duration_s * NS_PER_S)
         if clock.system is TimeSystem.GPS_WEEK and first_ns < 0 <= end_ns:
-            first_ns += WEEK_S * NS_PER_S  # the clock's week is the one in which the video began
+            first_ns += WEEK_S * NS_PER_S  # the clock's week is that of the video's start
         try:
             epochs = clock.to_epoch_gps_ns(first_ns + np.rint(times.after_first_s * NS_PER_S).astype(np.int64))
         except TimeSystemError as error:
@@ -428,7 +428,7 @@ class _VideoLog:
 
 @functools.lru_cache(maxsize=4)
 def _look(path: Path, _state: tuple[int, ...]) -> Video:
-    """A video as :func:`look_into` finds it, remembered from `header` to `read`.
+    """Return the video of :func:`look_into`, cached between `header` and `read`.
 
     `_state` is size, times of the last changes of content and inode, and inode: copying keeps the first two.
     """
@@ -436,7 +436,7 @@ def _look(path: Path, _state: tuple[int, ...]) -> Video:
 
 
 def _end(source: LogSource, options: ImagesOptions) -> tuple[int, Clock]:
-    """End stamp in nanoseconds of the clock's own count, and that clock."""
+    """Return the end stamp in nanoseconds of the clock's count, and that clock."""
     end = options.end
     if end is None:
         raise TimeSystemError(
@@ -485,7 +485,7 @@ def _video_header(log: _VideoLog) -> LogHeader:
 
 
 def _frames(log: _VideoLog) -> Iterator[Item]:
-    """Rows of the frames that are there, and rejects of those that are not."""
+    """Yield rows of the existing frames, and rejects of the missing ones."""
     sound = np.flatnonzero(log.times.sound)
     for start in range(0, sound.size, _CHUNK):
         part = sound[start : start + _CHUNK]
@@ -504,7 +504,7 @@ def _frames(log: _VideoLog) -> Iterator[Item]:
 
 
 def _gaps(times: FrameTimes) -> Iterator[Reject]:
-    """Runs of frames that were recorded and are not in the file."""
+    """Yield a reject for each run of recorded frames that are not in the file."""
     edges = np.concatenate([[-1], times.frames, [times.count]])
     for row in np.flatnonzero(np.diff(edges) > 1).tolist():
         first = int(edges[row]) + 1

@@ -1,4 +1,4 @@
-"""When the frames of a video were taken.
+"""Computes when the frames of a video were taken.
 
 A video file keeps no stamps of its own but three properties (the low-cost mobile-mapping paper, *Sensors* 2016,
 16, 367, section 3.2.2): when it was finished, its duration, and its frames per second. So
@@ -30,53 +30,53 @@ Int64 = npt.NDArray[np.int64]
 
 _HEAD: Final = struct.Struct("<4d2q")
 LEAST_FRAME_BYTES: Final = 8
-"""A container spends at least so many bytes on a frame (its size and place in an index)."""
+"""Least bytes of a frame in a container (its size and place in an index)."""
 LARGEST_DECODED_BYTES: Final = 64 << 20
-"""Videos up to this size are decoded to find frames that cannot be."""
-_START_S: Final = 30.0
-_SLOWEST_BYTES_PER_S: Final = 2 << 20
-_LEAST_FPS: Final = 1e-3
-_MOST_FPS: Final = 10_000.0
-_LONGEST_S: Final = 1e7
+"""Videos up to this size are decoded to find damaged frames."""
+_START_S: Final = 30.0  # time for starting the process that reads a video
+_SLOWEST_BYTES_PER_S: Final = 2 << 20  # further time allowed for each so many bytes
+_LEAST_FPS: Final = 1e-3  # lower rates are refused
+_MOST_FPS: Final = 10_000.0  # higher rates are refused
+_LONGEST_S: Final = 1e7  # longer times count as damage
 _OFF_RATE: Final = 0.25
-"""A frame farther than this share of the frames' interval from its place does not keep the frame rate."""
-_FEW: Final = 0.02
+"""A frame farther from its place than this share of the frame interval is off the frame rate."""
+_FEW: Final = 0.02  # largest share of frames off the rate
 
 
 @dataclass(frozen=True)
 class Video:
-    """What a video file holds."""
+    """Contents of a video file."""
 
     fps: float
-    """Frames per second as the container states it."""
+    """Frames per second that the container states."""
     claimed_frames: int
     """Number of frames that the container claims; not trusted."""
     width_px: int
     height_px: int
     times_s: Float64
-    """(n,) times of the frames that are there, in order of time, since the first one that was recorded."""
+    """(n,) times of the existing frames, in order of time, since the first recorded one."""
     decoded: npt.NDArray[np.bool_] | None
     """(n,) whether each frame can be decoded; None where the video is too large to try."""
 
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Frames of a video and their places in it."""
+    """Frames of a video with their numbers and times."""
 
     frames: Int64
-    """(n,) number of each frame that is there, growing."""
+    """(n,) number of each existing frame, increasing."""
     sound: npt.NDArray[np.bool_]
-    """(n,) whether it can be decoded (True where that was not tried)."""
+    """(n,) whether it can be decoded (True where not tried)."""
     after_first_s: Float64
     """(n,) time since the first frame."""
     count: int
-    """Frames that were recorded, those missing included."""
+    """Number of recorded frames, including missing ones."""
     duration_s: float
     """From the first frame to the end of the last."""
 
 
 def look_into(path: Path) -> Video:
-    """Read what a video holds, in a process of its own and in bounded time.
+    """Examine a video file in a separate process and in bounded time.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def _video(reply: bytes, size: int, path: Path) -> Video:
 
 
 def _near(times: Float64, others: Float64, tolerance: float) -> npt.NDArray[np.bool_]:
-    """Which of `times` (n,) have one of `others` (m,), sorted, within the tolerance."""
+    """Return which of `times` (n,) have one of the sorted `others` (m,) within the tolerance."""
     if not others.size:
         return np.zeros(times.size, dtype=bool)
     right = np.clip(np.searchsorted(others, times), 0, others.size - 1)
@@ -135,7 +135,7 @@ def _near(times: Float64, others: Float64, tolerance: float) -> npt.NDArray[np.b
 
 
 def frame_times(video: Video, recorded: int | None, *, constant_rate: bool, path: Path) -> FrameTimes:
-    """Number and time of each frame of a video.
+    """Return number and time of each frame of a video.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def frame_times(video: Video, recorded: int | None, *, constant_rate: bool, path
 
 
 def _on_rate(since_s: Float64, fps: float, path: Path) -> tuple[Int64, npt.NDArray[np.bool_]]:
-    """Number (n,) of the frames by their times since the first, and which of them stand in a place of their own."""
+    """Return the number (n,) of each frame by its time since the first, and whether it is alone at its place."""
     places = since_s * fps
     frames = np.rint(places).astype(np.int64)
     own = np.abs(places - frames) <= _OFF_RATE
@@ -179,7 +179,7 @@ def _on_rate(since_s: Float64, fps: float, path: Path) -> tuple[Int64, npt.NDArr
 
 
 def _count(video: Video, found: int, recorded: int | None, path: Path) -> int:
-    """Frames that were recorded: where they are in doubt, the first one's time would be."""
+    """Return the number of recorded frames, an error where it is uncertain: the first frame's time depends on it."""
     if recorded is not None:
         if not found <= recorded <= _LONGEST_S * min(1.0, video.fps):
             raise ConfigError(

@@ -1,1 +1,1 @@
-"""Formats of points and surfaces that other programs placed."""
+"""Formats of points and surfaces that other programs georeferenced."""

@@ -41,8 +41,8 @@ from roadscan.ingest.reading.records import Sieve, options_of
 
 Float64 = npt.NDArray[np.float64]
 
-_MOST_SCANS: Final = 65_535
-_LONGEST_SCAN_S: Final = 10 * 86_400.0
+_MOST_SCANS: Final = 65_535  # a scan's number has 16 bits
+_LONGEST_SCAN_S: Final = 10 * 86_400.0  # later times of points (s) count as damage
 _COLOURS: Final = {"red": "colorRed", "green": "colorGreen", "blue": "colorBlue"}
 _FURTHER: Final = (
     "cartesianInvalidState", "sphericalInvalidState", "intensity", "isIntensityInvalid", "isColorInvalid", "timeStamp",
@@ -87,7 +87,7 @@ class E57Scans(LogFormat):
             return False
 
     def header(self, source: LogSource) -> LogHeader:
-        """CRS, kind of heights, and the scans."""
+        """Return CRS, kind of heights, and the scans."""
         source.need_file()
         with source.path.open("rb") as stream:
             file, plans = _open(source, stream)
@@ -131,14 +131,14 @@ class E57Scans(LogFormat):
 
 @dataclass(frozen=True)
 class _Plan:
-    """How the points of a scan become rows."""
+    """How the points of a scan are converted to rows."""
 
     scan: Scan
     number: int
     start_gps_ns: int
     """Epoch of the scan's start."""
     stamped: bool
-    """True where the points' own times count."""
+    """True where the points have times."""
     brightness: Brightness | None
     """Scale of the intensity, None where it is not read."""
     colours: dict[str, Brightness]
@@ -186,7 +186,7 @@ def _open(source: LogSource, stream: Any) -> tuple[E57, list[_Plan]]:
 
 
 def _written_crs(written: str) -> pyproj.CRS | None:
-    """The CRS that the file names; None where it names none that PROJ knows."""
+    """Return the CRS that the file names; None where it names none that PROJ knows."""
     try:
         return pyproj.CRS.from_user_input(written) if written else None
     except ProjCrsError:
@@ -194,7 +194,7 @@ def _written_crs(written: str) -> pyproj.CRS | None:
 
 
 def _check_crs(stated: str, written: str, path: Path) -> None:
-    """Refuse a file whose own CRS is another than the stated one; text that PROJ does not know says nothing."""
+    """Refuse a file whose CRS differs from the stated one; text that PROJ does not know is ignored."""
     own = _written_crs(written)
     if own is None or not (own.is_projected or own.is_compound or own.is_geographic):
         return
@@ -210,7 +210,7 @@ def _check_crs(stated: str, written: str, path: Path) -> None:
 
 
 def _start_gps_ns(scan: Scan, number: int, source: LogSource) -> int:
-    """Epoch of a scan's acquisitionStart, corrected by the stated clock."""
+    """Return the epoch of a scan's acquisitionStart, corrected by the stated clock."""
     clock = source.clock or Clock(TimeSystem.GPS)
     if clock.system is not TimeSystem.GPS or clock.unit != "s":
         raise TimeSystemError(
@@ -227,7 +227,7 @@ def _start_gps_ns(scan: Scan, number: int, source: LogSource) -> int:
 
 
 def _scale(scan: Scan, name: str, stated: tuple[float, float] | None) -> Brightness | None:
-    """Scale of intensity or a colour: as stated, by the scan's limits, or by those of an integer field."""
+    """Return the scale of intensity or a colour: as stated, by the scan's limits, or by those of an integer field."""
     if stated is not None:
         return Brightness(*stated)
     limits = scan.limits.get(name)
@@ -241,7 +241,7 @@ def _scale(scan: Scan, name: str, stated: tuple[float, float] | None) -> Brightn
 
 @np.errstate(invalid="ignore", over="ignore")  # damaged numbers are dropped
 def _columns(points: Points, plan: _Plan) -> Columns:
-    """Columns of ``cloud``, (n,) each; points without a place or time are dropped from the sieve."""
+    """Return columns of ``cloud``, (n,) each; points without a position or time are dropped from the sieve."""
     own, sieve = points.columns, points.sieve
     size = points.offsets.size
     xyz = np.einsum("ni,ji->nj", _positions(own, sieve), plan.scan.rotation) + plan.scan.translation_m
@@ -259,7 +259,7 @@ def _columns(points: Points, plan: _Plan) -> Columns:
 
 
 def _positions(own: dict[str, npt.NDArray[Any]], sieve: Sieve) -> Float64:
-    """Positions (n, 3) in the scanner's frame (m)."""
+    """Return positions (n, 3) in the scanner's frame (m)."""
     if all(name in own for name in CARTESIAN):
         state = own.get("cartesianInvalidState")
         xyz = np.stack([own[name].astype(np.float64) for name in CARTESIAN], axis=-1)

@@ -1,4 +1,4 @@
-"""E57 files (ASTM E2807-11): pages with checksums, the XML section, and the packets of the points.
+"""Reads E57 files (ASTM E2807-11): pages with checksums, the XML section, and packets of points.
 
 Read without a library: those there are (libE57Format) give up a file at its first wrong checksum, trust the
 counts of its XML, and crash on some damaged bytes. Here a damaged page costs the points that lie in it.
@@ -27,23 +27,23 @@ Float64 = npt.NDArray[np.float64]
 
 SIGNATURE: Final = b"ASTM-E57"
 NAMESPACE: Final = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"
-XML_BYTES_MAX: Final = 64 << 20
+XML_BYTES_MAX: Final = 64 << 20  # larger XML sections are refused
 CARTESIAN: Final = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL: Final = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
-_MOST_RECORDS: Final = 2**62
+_MOST_RECORDS: Final = 2**62  # larger counts of points are cut to this
 
 _HEADER: Final = struct.Struct("<8sIIQQQQ")
-_CHECKSUM_BYTES: Final = 4
-_PAGE_BYTES: Final = range(64, (1 << 20) + 1, 4)
-_BLOCK_BYTES: Final = 1 << 20
+_CHECKSUM_BYTES: Final = 4  # CRC-32C at the end of a page
+_PAGE_BYTES: Final = range(64, (1 << 20) + 1, 4)  # accepted page sizes
+_BLOCK_BYTES: Final = 1 << 20  # bytes of pages that are read at once
 _SECTION: Final = struct.Struct("<B7xQQQ")
-_SECTION_ID: Final = 1
+_SECTION_ID: Final = 1  # first byte of a section of points (E2807)
 _FILL_POINTS: Final = 8
-"""So many numbers of one bit fill a byte."""
-_INDEX_PACKET, _DATA_PACKET, _EMPTY_PACKET = 0, 1, 2
-_REVERSED_CASTAGNOLI: Final = 0x82F63B78
-_INTEGER_MIN, _INTEGER_MAX = -(2**63), 2**63 - 1
+"""Numbers of one bit in a byte."""
+_INDEX_PACKET, _DATA_PACKET, _EMPTY_PACKET = 0, 1, 2  # types of packets (E2807)
+_REVERSED_CASTAGNOLI: Final = 0x82F63B78  # CRC-32C polynomial, lowest bit first
+_INTEGER_MIN, _INTEGER_MAX = -(2**63), 2**63 - 1  # limits of an integer that states none
 
 
 # --- pages -------------------------------------------------------------------------------------------
@@ -51,7 +51,7 @@ _INTEGER_MIN, _INTEGER_MAX = -(2**63), 2**63 - 1
 
 @functools.cache
 def _crc_table() -> npt.NDArray[np.uint32]:
-    """(65,536,) CRC-32C register after 16 bits of zeros, by its lower half before."""
+    """Return (65,536,) CRC-32C registers after 16 zero bits, by the register's lower half before."""
     table = np.arange(1 << 16, dtype=np.uint32)
     for _ in range(16):
         table = (table >> np.uint32(1)) ^ (np.uint32(_REVERSED_CASTAGNOLI) * (table & np.uint32(1)))
@@ -59,7 +59,7 @@ def _crc_table() -> npt.NDArray[np.uint32]:
 
 
 def page_checksums(pages: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:
-    """CRC-32C (n,) of pages (n, bytes) without their checksums; all pages step by step together."""
+    """Return the CRC-32C (n,) of pages (n, bytes) without their checksums; all pages advance together."""
     table = _crc_table()
     words = np.ascontiguousarray(np.ascontiguousarray(pages).view("<u2").T).astype(np.uint32)
     register = np.full(pages.shape[0], 0xFFFFFFFF, dtype=np.uint32)
@@ -69,7 +69,7 @@ def page_checksums(pages: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:
 
 
 class Pages:
-    """The logical bytes of an E57 file: its pages without their checksums, which are checked."""
+    """The logical bytes of an E57 file: its pages without their checksums, which are verified."""
 
     def __init__(self, stream: BinaryIO, page_bytes: int, verify: bool) -> None:
         self._stream = stream
@@ -79,18 +79,18 @@ class Pages:
         self._per_block = max(_BLOCK_BYTES // page_bytes, 1)
         self._blocks: dict[int, tuple[bytes, npt.NDArray[np.bool_]]] = {}
         self.size = stream.seek(0, 2) // page_bytes * self._payload
-        """Logical bytes of whole pages."""
+        """Number of logical bytes in whole pages."""
 
     def logical(self, physical: int) -> int:
-        """Logical offset of a physical one."""
+        """Return the logical offset of a physical one."""
         return physical // self._page * self._payload + min(physical % self._page, self._payload)
 
     def physical(self, logical: int) -> int:
-        """Physical offset of a logical one."""
+        """Return the physical offset of a logical one."""
         return logical // self._payload * self._page + logical % self._payload
 
     def read(self, at: int, count: int) -> bytes:
-        """Logical bytes [at, at + count), fewer at the end of the file."""
+        """Return logical bytes [at, at + count), fewer at the end of the file."""
         end = min(at + count, self.size)
         block_bytes = self._per_block * self._payload
         parts: list[bytes] = []
@@ -102,7 +102,7 @@ class Pages:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def damaged(self, at: int, count: int) -> list[tuple[int, int]]:
-        """Parts [start, end) of the logical bytes [at, at + count) that lie in pages with a wrong checksum."""
+        """Return the parts [start, end) of logical bytes [at, at + count) in pages with a wrong checksum."""
         found: list[tuple[int, int]] = []
         for page in range(at // self._payload, (at + max(count, 1) - 1) // self._payload + 1):
             block, index = divmod(page, self._per_block)
@@ -131,22 +131,22 @@ class Pages:
 
 @dataclass(frozen=True)
 class Field:
-    """One field of a scan's points, and how its values are packed."""
+    """One field of a scan's points, with the packing of its values."""
 
     name: str
     kind: Literal["float", "integer", "text"]
     bits: int
-    """Bits of a value; 0 for integers of one possible value, and for text."""
+    """Bits of a value; 0 for integers with one possible value, and for text."""
     low: int = 0
     """Value of the raw number 0."""
     span: int = 0
-    """Highest raw number that an integer may have."""
+    """Highest valid raw number of an integer."""
     scale: float = 1.0
     offset: float = 0.0
-    """Value of a scaled integer: integer · scale + offset."""
+    """Offset of a scaled integer: value = integer · scale + offset."""
 
     def values(self, raw: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
-        """Values (n,) of raw numbers (n,), and which of these cannot be."""
+        """Return values (n,) of raw numbers (n,), and which of these are invalid."""
         if self.kind == "float":
             own = raw.astype(np.uint32).view(np.float32) if self.bits == 32 else raw.view(np.float64)
             return own, np.zeros(raw.size, dtype=bool)
@@ -165,21 +165,21 @@ class Scan:
     section: int
     """Physical byte of its points."""
     claimed: int
-    """Points the XML claims, no more than the file has bits."""
+    """Points that the XML claims, limited by the file's bits."""
     fields: tuple[Field, ...]
     rotation: Float64
     """(3, 3) file's frame from scanner's."""
     translation_m: Float64
     """(3,)."""
     start_gps_s: float | None
-    """GPS seconds at which it was started."""
+    """GPS seconds at its start."""
     limits: dict[str, tuple[float, float]]
     """Limits of intensity and colours: intensity, colorRed, colorGreen, colorBlue."""
     fault: str = ""
-    """Why its points cannot be read; "" where they can."""
+    """Reason why its points cannot be read; "" where they can."""
 
     def field(self, name: str) -> Field | None:
-        """Field by name."""
+        """Return a field by name."""
         return next((f for f in self.fields if f.name == name), None)
 
 
@@ -229,7 +229,7 @@ class E57:
             )
         root = _parsed(pages.read(start, xml_bytes), path)
         scans = [_scan(one) for one in _children(_child(root, "data3D"))]
-        room = 8 * pages.size  # a point takes a bit at least
+        room = 8 * pages.size  # a point takes at least a bit
         held = tuple(replace(scan, claimed=min(scan.claimed, room)) for scan in scans)
         return cls(path, pages, _text(root, "coordinateMetadata"), held)
 
@@ -264,7 +264,7 @@ def _text(element: ElementTree.Element | None, *names: str) -> str:
 
 
 def _number(element: ElementTree.Element | None, *names: str) -> float | None:
-    """Number of an element (0 where it is empty, as E57 has it); None where there is no such element."""
+    """Return an element's number (0 where it is empty, by the standard); None where there is no such element."""
     found = _child(element, *names)
     return None if found is None else float(found.text or 0)
 
@@ -303,7 +303,7 @@ def _claim(points: ElementTree.Element) -> int:
 
 
 def _leaves(element: ElementTree.Element | None) -> Iterator[ElementTree.Element]:
-    """Elements without children, in their order: the order of the byte streams."""
+    """Yield elements without children in their order, which is that of the byte streams."""
     stack = _children(element)[::-1]
     while stack:
         one = stack.pop()
@@ -345,7 +345,7 @@ def _whole(text: str | None, *, signed: bool = False) -> int:
 
 
 def _pose(pose: ElementTree.Element | None) -> tuple[Float64, Float64]:
-    """Rotation (3, 3) and translation (3,) of a scan: p_file = R · p_scanner + t (E2807, 8.4.9)."""
+    """Return rotation (3, 3) and translation (3,) of a scan: p_file = R · p_scanner + t (E2807, 8.4.9)."""
     if pose is None:
         return np.eye(3), np.zeros(3)
     shift = np.array([_number(pose, "translation", axis) or 0.0 for axis in "xyz"])
@@ -381,25 +381,25 @@ def _limits(element: ElementTree.Element) -> dict[str, tuple[float, float]]:
 
 @dataclass(frozen=True)
 class Points:
-    """Some points of a scan, one after another."""
+    """Consecutive points of a scan."""
 
     first: int
     """Number of the first in its scan."""
     columns: dict[str, npt.NDArray[Any]]
     """(n,) by field."""
     sieve: Sieve
-    """Points that lie in damaged pages, or have values that their fields cannot have, are dropped from it."""
+    """Sieve from which points in damaged pages, or with values outside their fields' limits, are dropped."""
     offsets: Int64
-    """(n,) byte of the damaged page, −1 for sound points: the values of a point lie in many places."""
+    """(n,) byte of the damaged page; −1 for sound points, whose values lie in several places."""
 
 
 def unpacked(data: bytes | bytearray, first_bit: int, bits: int, count: int) -> npt.NDArray[np.uint64]:
-    """Raw numbers (n,) of `bits` each that follow one another from `first_bit` on, lowest bit first."""
+    """Return numbers (n,) of `bits` each, packed from `first_bit` on, lowest bit first."""
     if bits == 0:
         return np.zeros(count, dtype=np.uint64)
     if first_bit % 8 == 0 and bits in (8, 16, 32, 64):
         return np.frombuffer(data, f"<u{bits // 8}", count, first_bit // 8).astype(np.uint64)
-    if bits > 57:  # a number may reach over nine bytes: two halves
+    if bits > 57:  # a number may span nine bytes: two halves
         starts = first_bit + bits * np.arange(count)
         low = _gathered(data, starts, 32)
         return low | _gathered(data, starts + 32, bits - 32) << np.uint64(32)
@@ -408,31 +408,31 @@ def unpacked(data: bytes | bytearray, first_bit: int, bits: int, count: int) -> 
 
 def _gathered(data: bytes | bytearray, starts: Int64, bits: int) -> npt.NDArray[np.uint64]:
     padded = np.frombuffer(bytes(data) + bytes(8), dtype=np.uint8)
-    words = np.ndarray((padded.size - 7,), "<u8", padded, strides=(1,))  # a word at every byte
+    words = np.ndarray((padded.size - 7,), "<u8", padded, strides=(1,))  # one word per byte
     shifted: npt.NDArray[np.uint64] = words[starts >> 3] >> (starts & 7).astype(np.uint64)
     return shifted & np.uint64((1 << bits) - 1)
 
 
 @dataclass
 class _Stream:
-    """Bytes of one field as its packets bring them."""
+    """Bytes of one field, collected from its packets."""
 
     packed: Field
     data: bytearray = field(default_factory=bytearray)
     first_bit: int = 0
-    """Bits of `data` that are used up."""
+    """Consumed bits of `data`."""
     first: int = 0
     """Number of the next point."""
     damaged: list[tuple[int, int, int]] = field(default_factory=list)
-    """First and last point that lie in a damaged page, and its byte."""
+    """First and last point in a damaged page, and the page's byte."""
 
     @property
     def ready(self) -> int:
-        """Points that are here."""
+        """Return the number of complete points."""
         return (8 * len(self.data) - self.first_bit) // self.packed.bits if self.packed.bits else _MOST_RECORDS
 
     def add(self, data: bytes, bad: Sequence[tuple[int, int, int]]) -> None:
-        """Take bytes; `bad` are parts (start, end) of them in damaged pages, and these pages' bytes."""
+        """Add bytes; `bad` lists the parts (start, end) of them in damaged pages, with these pages' bytes."""
         before = 8 * len(self.data) - self.first_bit
         for start, end, page in bad if self.packed.bits else ():
             first = (before + 8 * start) // self.packed.bits
@@ -441,7 +441,7 @@ class _Stream:
         self.data += data
 
     def take(self, count: int, sieve: Sieve, offsets: Int64) -> npt.NDArray[Any]:
-        """Values of the next `count` points."""
+        """Return the values of the next `count` points."""
         raw = unpacked(self.data, self.first_bit, self.packed.bits, count)
         values, wrong = self.packed.values(raw)
         lost = np.zeros(count, dtype=bool)
@@ -463,7 +463,7 @@ class _Stream:
 
 
 def points_of(file: E57, scan: Scan, names: Sequence[str]) -> Iterator[Points | Reject]:
-    """Stream the fields `names` of a scan's points in batches; what cannot be read as rejects.
+    """Yield the fields `names` of a scan's points in batches; unreadable points are rejects.
 
     Record numbers of the rejects count from the scan's first point.
     """
@@ -483,13 +483,13 @@ def points_of(file: E57, scan: Scan, names: Sequence[str]) -> Iterator[Points | 
 
 
 def _has_places(streams: dict[str, _Stream]) -> bool:
-    """True where a triple of coordinates is complete and takes room in the file."""
+    """Return True where a triple of coordinates is complete and takes space in the file."""
     triples = ([streams.get(name) for name in names] for names in (CARTESIAN, SPHERICAL))
     return any(all(triple) and any(s.packed.bits for s in triple if s) for triple in triples)
 
 
 def _streamed(pages: Pages, scan: Scan, streams: dict[str, _Stream]) -> Generator[Points, None, str]:
-    """Batches of points; returns why they break off, if they do."""
+    """Yield batches of points; return why they end early, if they do."""
     at, end = _section(pages, scan)
     order = [streams.get(f.name) for f in scan.fields]
     done = 0
@@ -509,7 +509,7 @@ def _streamed(pages: Pages, scan: Scan, streams: dict[str, _Stream]) -> Generato
 
 
 def _left_over(pages: Pages, at: int, end: int, order: Sequence[_Stream | None], streams: dict[str, _Stream]) -> str:
-    """Says whether points stand behind all that the XML claims; packed numbers may fill up their last byte."""
+    """Return a message if points follow all those that the XML claims; packed numbers may fill up their last byte."""
     while step := _packet(pages, at, end, order):
         at += step
         if min(s.ready for s in streams.values()) >= _FILL_POINTS:
@@ -525,7 +525,7 @@ def _taken(streams: dict[str, _Stream], first: int, count: int) -> Points:
 
 
 def _section(pages: Pages, scan: Scan) -> tuple[int, int]:
-    """Logical bytes of a scan's first packet and behind its last; (0, 0) where the section is damaged."""
+    """Return the logical bytes of a scan's first packet and after its last; (0, 0) where the section is damaged."""
     at = pages.logical(scan.section)
     head = pages.read(at, _SECTION.size)
     if len(head) < _SECTION.size or pages.damaged(at, _SECTION.size):
@@ -538,7 +538,7 @@ def _section(pages: Pages, scan: Scan) -> tuple[int, int]:
 
 
 def _packet(pages: Pages, at: int, end: int, order: Sequence[_Stream | None]) -> int:
-    """Hand a packet's bytes to the streams; its length, 0 at the end or where its head is damaged."""
+    """Pass a packet's bytes to the streams; return its length, 0 at the end or where its header is damaged."""
     head = pages.read(at, 6)
     if at + 4 > end or len(head) < 4:
         return 0

@@ -42,11 +42,11 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 _OVERFLOW: Final = "a coordinate overflowed to the least or largest whole number: outside the area of the survey"
-_LEAST_RAW: Final = -(2**31)
+_LEAST_RAW: Final = -(2**31)  # least raw coordinate
 _MOST_RAW: Final = 2**31 - 1
-"""Where a coordinate overflowed, its whole number is one of these."""
+"""Greatest raw coordinate; an overflow leaves one of these two."""
 _TOLERANCE_NS: Final = NS_PER_S
-_ADJUSTED_BIT: Final = 0x01
+_ADJUSTED_BIT: Final = 0x01  # bit 0 of the global encoding (LAS 1.4 R15)
 _STORED: Final = frozenset(
     {
         "X", "Y", "Z", "intensity", "return_number", "number_of_returns", "synthetic", "key_point", "withheld",
@@ -54,7 +54,7 @@ _STORED: Final = frozenset(
         "scan_angle_rank", "point_source_id", "gps_time", "red", "green", "blue",
     }
 )  # fmt: skip
-_FLAG_BITS: Final = (
+_FLAG_BITS: Final = (  # bits of the column `flags`
     ("scan_direction_flag", 1),
     ("edge_of_flight_line", 2),
     ("synthetic", 4),
@@ -62,14 +62,14 @@ _FLAG_BITS: Final = (
     ("withheld", 16),
     ("overlap", 32),
 )
-_SCAN_ANGLE_DEG: Final = np.float32(0.006)
+_SCAN_ANGLE_DEG: Final = np.float32(0.006)  # unit of the newer formats (LAS 1.4 R15)
 
 _WITHHELD: Final = "the file marks the point as withheld"
 _NOISE: Final = "the file classifies the point as noise"
-_NOISE_CLASSES: Final = (7,)
+_NOISE_CLASSES: Final = (7,)  # low noise
 _NOISE_CLASSES_NEW: Final = (7, 18)
-"""Low noise; and high noise, which point formats 6 to 10 alone define (LAS 1.4 R15, tables 9 and 17)."""
-_FIRST_NEW_FORMAT: Final = 6
+"""Low noise; and high noise, which only point formats 6 to 10 define (LAS 1.4 R15, tables 9 and 17)."""
+_FIRST_NEW_FORMAT: Final = 6  # newer formats begin here
 
 MARKED_POINTS: Final = Witness(
     "marked_points",
@@ -81,7 +81,7 @@ MARKED_POINTS: Final = Witness(
     told=("rejects", "findings"),
 )
 
-_WEEK: Final = Missing("clock", {"system": "gps_week_seconds", "date": dt.date(2026, 5, 4)})
+_WEEK: Final = Missing("clock", {"system": "gps_week_seconds", "date": dt.date(2026, 5, 4)})  # a proposal
 
 
 class LasOptions(Strict):
@@ -121,7 +121,7 @@ class Las(LogFormat):
             return False
 
     def header(self, source: LogSource) -> LogHeader:
-        """CRS, kind of heights and time system."""
+        """Return CRS, kind of heights and time system."""
         source.need_file()
         with Cloud.open(source.path) as cloud:
             units = _units(source, cloud)
@@ -197,7 +197,7 @@ def _points(
 
 
 def _columns(points: laspy.ScaleAwarePointRecord, names: frozenset[str], units: Float64) -> dict[str, npt.NDArray[Any]]:
-    """Columns of the table ``cloud`` but the epoch, (n,) each."""
+    """Return columns of the table ``cloud`` without the epoch, (n,) each."""
 
     def field(name: str) -> npt.NDArray[Any]:
         return np.asarray(points[name])
@@ -227,7 +227,7 @@ def _columns(points: laspy.ScaleAwarePointRecord, names: frozenset[str], units: 
 
 @dataclass
 class _Times:
-    """Brings gps_time to epochs and holds them against the trajectory."""
+    """Converts gps_time to epochs and checks them against the trajectory."""
 
     stamps: UnorderedStamps
     source: LogSource
@@ -249,7 +249,7 @@ class _Times:
         return cls(UnorderedStamps.of(clock, sample, source.path), source)
 
     def epochs(self, stamps: Float64, sieve: Sieve) -> Int64:
-        """Epochs (n,) of stamps (n,); points without a usable one are dropped from the sieve."""
+        """Return epochs (n,) of stamps (n,); points without a usable stamp are dropped from the sieve."""
         out = self.stamps.epochs(stamps, sieve)
         self._drop_outside(out, sieve)
         return out
@@ -267,7 +267,7 @@ class _Times:
         self._inside += int(sieve.good.sum())
 
     def finish(self) -> None:
-        """Refuse a log of which not one point lies inside the run's trajectory."""
+        """Refuse a log without a single point within the run's trajectory."""
         span = self.source.trajectory_span_gps_ns
         if span is None or self._inside or not self._outside or self._seen_gps_ns is None:
             return
@@ -285,7 +285,7 @@ def _span(span_gps_ns: tuple[int, int]) -> str:
 
 
 def _clock(source: LogSource, head: Head, sample: Float64) -> Clock:
-    """Time system of gps_time: as stated, or by the bit where the stamps agree with it.
+    """Return the time system of gps_time: as stated, or by the bit where the stamps agree with it.
 
     Parameters
     ----------
@@ -337,7 +337,7 @@ def _check_statement(source: LogSource, weekly: bool, sample: Float64) -> None:
 
 
 def _no_seconds_of_week(said: str, expected: str, sample: Float64, source: LogSource) -> TimeSystemError:
-    """Error for stamps said to be seconds of a week, with what they would be as adjusted time."""
+    """Return the error for stamps that cannot be seconds of a week, with their dates as adjusted time."""
     arrived = f"{said}, and stamps such as {float(sample[0]):.3f} lie outside 0…{WEEK_S}"
     try:
         epoch = int(Clock(TimeSystem.GPS_ADJUSTED).to_epoch_gps_ns(sample[:1])[0])

@@ -1,4 +1,4 @@
-"""In which CRS and units the points of a LAS file are: what the file says, held against the survey file."""
+"""Finds CRS and units of a LAS file's points: the file's statements, checked against the survey file."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from roadscan.store.codecs.geo_keys import DIRECTORY, DOUBLES, TEXTS, crs_of_key
 LengthUnit: TypeAlias = Literal["metre", "foot", "us_survey_foot"]
 
 UNIT_M: Final[dict[LengthUnit, float]] = {"metre": 1.0, "foot": 0.3048, "us_survey_foot": 1200 / 3937}
-"""Length of the units that `options.vertical_unit` names."""
+"""Lengths of the units of `options.vertical_unit` (m)."""
 
-_EPSG_UNIT_M: Final = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
+_EPSG_UNIT_M: Final = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # EPSG codes of units, with their lengths (m)
 _PROJECTION: Final = "LASF_Projection"
 _KEY_RECORDS: Final = (DIRECTORY, DOUBLES, TEXTS)
 _WITHOUT_UNIT: Final = range(5_001, 5_300)
-"""Values of GeoTIFF key 4096 that name a vertical datum, as GeoTIFF 1.0 lists them, and no unit of heights."""
-_LINEAR_UNIT_KEY: Final = 3076
-_VERTICAL_CRS_KEY: Final = 4096
-_VERTICAL_UNIT_KEY: Final = 4099
-_SAME_UNIT: Final = 1e-9
+"""Values of GeoTIFF key 4096 (GeoTIFF 1.0) that name a vertical datum without a unit of heights."""
+_LINEAR_UNIT_KEY: Final = 3076  # unit of x and y
+_VERTICAL_CRS_KEY: Final = 4096  # vertical CRS
+_VERTICAL_UNIT_KEY: Final = 4099  # unit of z
+_SAME_UNIT: Final = 1e-9  # largest difference of equal units (m)
 
 _VERTICAL_WKT: Final = re.compile(r"\b(?:VERT_?CS|VERTCRS|VERTICALCRS)\s*[\[(]")
 _UNIT_WKT: Final = re.compile(r'\b(?:LENGTH)?UNIT\s*[\[(]\s*"([^"]*)"')
 _UNIT_WORDS: Final = (("survey", 1200 / 3937), ("metre", 1.0), ("meter", 1.0), ("foot", 0.3048), ("feet", 0.3048))
-"""Words in names of units, and their lengths (m); the first that fits counts."""
+"""Words in names of units, with their lengths (m); the first match counts."""
 _VERTICAL_UNIT: Final = Missing("options.vertical_unit", choices=("metre", "foot", "us_survey_foot"))
 _IGNORED: Final = Missing("options.ignore_file_crs", True)
 
 
 @dataclass(frozen=True)
 class CloudUnits:
-    """What the coordinates are, once the file and the survey file agree."""
+    """The coordinates' CRS and units, after comparing file and survey file."""
 
     crs: str
     """Horizontal CRS, or "local"."""
@@ -52,11 +52,11 @@ class CloudUnits:
     vertical_unit_m: float
     """Length of the unit of z (m)."""
     vertical_crs: str | None = None
-    """Authority code of the vertical CRS of z, where one is named that PROJ knows."""
+    """Authority code of the vertical CRS of z, where one is named and PROJ knows it."""
 
     @classmethod
     def of(cls, source: LogSource, cloud: Cloud, *, ignore_file: bool, vertical_unit: LengthUnit | None) -> Self:
-        """Compare what the file and the survey file say.
+        """Compare the statements of the file and the survey file.
 
         Raises
         ------
@@ -88,14 +88,14 @@ class CloudUnits:
 
 @dataclass(frozen=True)
 class _Written:
-    """What the file itself says."""
+    """Statements of the file."""
 
     crs: pyproj.CRS | None = None
     heights: StatedHeights = NO_HEIGHTS
     linear_unit_m: float | None = None
     """Unit of x and y by a GeoTIFF key."""
     units_m: tuple[tuple[str, float], ...] = ()
-    """Units of z that the file states, each with what states it; one, where the file contradicts itself not."""
+    """Units of z that the file states, with their sources; a single one unless the file contradicts itself."""
 
     @classmethod
     def of(cls, source: LogSource, cloud: Cloud) -> Self:
@@ -140,7 +140,7 @@ def _units_named(heights: StatedHeights) -> Iterator[tuple[str, float]]:
 
 
 def _nested_vertical(wkt: str) -> str:
-    """WKT of a vertical CRS that stands inside a horizontal one, where PROJ leaves it out; "" where there is none."""
+    """Return the WKT of a vertical CRS inside a horizontal one, which PROJ ignores; "" where there is none."""
     found = _VERTICAL_WKT.search(wkt)
     if found is None:
         return ""
@@ -154,7 +154,7 @@ def _nested_vertical(wkt: str) -> str:
 
 
 def _unit_words(wkt: str, heights: StatedHeights) -> Iterator[tuple[str, float]]:
-    """The unit of z by its name, where its factor says another."""
+    """Yield the unit of z by its name, where its factor says another."""
     vertical = _nested_vertical(wkt)
     named = _UNIT_WKT.search(vertical)
     if named is None or heights.unit_m is None:
@@ -252,7 +252,7 @@ def _check_linear_unit(source: LogSource, written: _Written, unit_m: float) -> N
 def _agreed_heights(
     source: LogSource, crs: pyproj.CRS, written: _Written
 ) -> tuple[StatedHeights, tuple[tuple[str, float], ...]]:
-    """Heights by the agreed CRS, or by the file where that says nothing; and the units of z, each with what states it.
+    """Return heights of the agreed CRS, or else of the file; and the units of z, each with its source.
 
     Raises
     ------
@@ -277,7 +277,7 @@ def _agreed_heights(
 def _vertical_unit_m(
     source: LogSource, units: Sequence[tuple[str, float]], vertical_unit: LengthUnit | None, horizontal_unit_m: float
 ) -> float:
-    """Length of the unit of z (m)."""
+    """Return the length of the unit of z (m)."""
     lengths = {round(unit_m / _SAME_UNIT): unit_m for _, unit_m in units}
     stated = UNIT_M[vertical_unit] if vertical_unit else None
     if stated is None and len(lengths) > 1:

@@ -1,6 +1,6 @@
-"""LAS and LAZ files, read in bounded memory even where their headers claim too much.
+"""Reads LAS and LAZ files in bounded memory, even where their headers claim too much.
 
-laspy trusts what a header claims; so the header block and the variable-length records are first held
+laspy trusts what a header claims; so the header block and the variable-length records are first checked
 against the file's size (ASPRS LAS 1.4 R15).
 """
 
@@ -24,25 +24,25 @@ from roadscan.store.codecs.laz import Laz, LazChunks, LazError
 
 Int64 = npt.NDArray[np.int64]
 
-_CHUNK_POINTS: Final = 120_000
-_OLDEST_HEADER_BYTES: Final = 227
-_HEADER_1_4_BYTES: Final = 375
-_RECORD_HEAD: Final = 54
-_LONG_RECORD_HEAD: Final = 60
-_LONGEST_WKT: Final = 1 << 20
-_WKT_RECORD: Final = 2112
+_CHUNK_POINTS: Final = 120_000  # points of a batch
+_OLDEST_HEADER_BYTES: Final = 227  # bytes of a header block of LAS 1.0 to 1.2
+_HEADER_1_4_BYTES: Final = 375  # bytes of a header block of LAS 1.4
+_RECORD_HEAD: Final = 54  # bytes of a variable-length record's header
+_LONG_RECORD_HEAD: Final = 60  # bytes of an extended record's header
+_LONGEST_WKT: Final = 1 << 20  # bytes of WKT that are read
+_WKT_RECORD: Final = 2112  # record id of OGC WKT (LAS 1.4)
 _NO_POINT_BYTES: Final = 64
-"""Behind the headers of an empty file stands less: a table of no chunks."""
+"""Most bytes that may follow the headers of an empty file: a table of no chunks."""
 _MOST_POINTS: Final = 1 << 62
-"""A count is listed as a signed number of 64 bits."""
-_TIME_OFFSET_BIT: Final = 0x40
-_FORMATS_WITH_TIME: Final = frozenset({1, 3, 4, 5, 6, 7, 8, 9, 10})
+"""Limit of counts, which are stored as signed 64-bit numbers."""
+_TIME_OFFSET_BIT: Final = 0x40  # bit of the global encoding in LAS 1.5
+_FORMATS_WITH_TIME: Final = frozenset({1, 3, 4, 5, 6, 7, 8, 9, 10})  # point formats with gps_time
 
 UNREADABLE: Final = (
     laspy.LaspyException, LazError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError,
     OverflowError, MemoryError, AssertionError, struct.error,
 )  # fmt: skip
-"""What laspy and the decompressor raise on damaged bytes."""
+"""Errors of laspy and the decompressor on damaged bytes."""
 
 Points: TypeAlias = tuple[int, laspy.ScaleAwarePointRecord]
 """Number of the first point, and points."""
@@ -50,7 +50,7 @@ Points: TypeAlias = tuple[int, laspy.ScaleAwarePointRecord]
 
 @dataclass(frozen=True)
 class Head:
-    """What the public header block claims, held against the file's size before anything trusts it."""
+    """Claims of the public header block, checked against the file's size before use."""
 
     version: tuple[int, int]
     encoding: int
@@ -59,9 +59,9 @@ class Head:
     offset: int
     record_bytes: int
     claimed: int
-    """Points the header claims."""
+    """Number of points that the header claims."""
     room: int
-    """Points that there is room for in a LAS file."""
+    """Number of points that fit into a LAS file."""
     point_bytes: int
     """Bytes from the first point to the end of the points, compressed or not."""
     laszip: bytes
@@ -71,7 +71,7 @@ class Head:
 
     @property
     def record_bytes_in_file(self) -> int:
-        """Bytes from one point to the next, 0 where compressed."""
+        """Return the bytes from one point to the next, 0 where compressed."""
         return 0 if self.compressed else self.record_bytes
 
     @classmethod
@@ -125,7 +125,7 @@ class Head:
 def _walk_records(
     stream: BinaryIO, head_bytes: int, offset: int, records: int, evlr_at: int, evlrs: int, size: int, path: Path
 ) -> tuple[str | None, bytes]:
-    """Check that all variable-length records lie inside the file; WKT of an extended one, and the LASzip record."""
+    """Check that all variable-length records lie in the file; return an extended one's WKT, and the LASzip record."""
     laszip = b""
     at = head_bytes
     for _ in range(records):
@@ -169,12 +169,12 @@ class Cloud:
     chunks: LazChunks | None
     """Chunks of a LAZ file."""
     count: int
-    """Points that the header claims and the file can hold."""
+    """Number of points that the header claims and the file can contain."""
 
     @classmethod
     @contextmanager
     def open(cls, path: Path) -> Iterator[Cloud]:
-        """Open a file whose header holds what the file can keep."""
+        """Open a file whose header does not claim more than the file can contain."""
         head = Head.read(path)
         if head.point_format not in _FORMATS_WITH_TIME:
             raise FormatError(
@@ -197,7 +197,7 @@ class Cloud:
 
     @property
     def wkt(self) -> str:
-        """WKT of the points' CRS; "" where the file has none."""
+        """Return the WKT of the points' CRS; "" where the file has none."""
         if self.head.wkt:
             return self.head.wkt
         texts = (getattr(r, "string", "") for r in self.reader.header.vlrs if isinstance(r, WktCoordinateSystemVlr))
@@ -205,17 +205,17 @@ class Cloud:
 
     @property
     def names(self) -> frozenset[str]:
-        """Names of the point format's fields."""
+        """Return the names of the point format's fields."""
         return frozenset(self.reader.header.point_format.dimension_names)
 
     def offsets(self, records: Int64) -> Int64:
-        """Byte offset (n,) of points by number (n,), −1 where compressed."""
+        """Return byte offsets (n,) of points by number (n,), −1 where compressed."""
         if self.head.compressed:
             return np.full(records.size, -1)
         return self.head.offset + records * self.head.record_bytes
 
     def batches(self) -> Iterator[Points | Reject]:
-        """Points in file order; what cannot be read as rejects."""
+        """Yield points in file order; unreadable ones as rejects."""
         at = 0
         while at < self.count:
             end, end_of_loss, sound = self._batch(at)
@@ -235,7 +235,7 @@ class Cloud:
             yield Reject("the file holds points that the header does not claim", self.count, offset, held - self.count)
 
     def _held(self) -> int:
-        """Points in the file, as far as its size or its chunks tell; at least those claimed."""
+        """Return the number of points by the file's size or its chunks; at least the claimed number."""
         if not self.head.claimed and self.head.point_bytes > _NO_POINT_BYTES:
             return max(1, 0 if self.head.compressed else self.head.room)
         if not self.head.compressed:
@@ -243,7 +243,7 @@ class Cloud:
         return self.count if self.chunks is None else self.chunks.least
 
     def _batch(self, at: int) -> tuple[int, int, bool]:
-        """End of the batch from point `at` on, end of what is lost if it is damaged, and whether to try it."""
+        """Return the end of the batch from point `at`, the end of the loss if it is damaged, and whether to try it."""
         end = min(at + _CHUNK_POINTS, self.count)
         if self.chunks is None:
             return end, self.count, True
@@ -289,6 +289,6 @@ def _chunks(laz: Laz, stream: BinaryIO, head: Head, path: Path) -> LazChunks:
 
 
 def brief(error: BaseException) -> str:
-    """First line of an error's text."""
+    """Return the first line of an error's text."""
     text = str(error).strip().splitlines()
     return text[0][:200] if text else type(error).__name__

@@ -28,7 +28,7 @@ from roadscan.ingest.reading.records import options_of
 
 Float64 = npt.NDArray[np.float64]
 
-_ROWS_OF_POINTS: Final = 1 << 16
+_ROWS_OF_POINTS: Final = 1 << 16  # points of a chunk of rows
 _ZERO_COLUMNS: Final = {
     "intensity": np.uint16, "classification": np.uint8, "point_source_id": np.uint16, "scan_angle_deg": np.float32,
     "flags": np.uint8, "user_data": np.uint8,
@@ -57,7 +57,7 @@ class OpenCrg(LogFormat):
         return is_crg(path)
 
     def header(self, source: LogSource) -> LogHeader:
-        """CRS, heights and the size of the grid's columns."""
+        """Return CRS, heights and the size of the grid's columns."""
         head = CrgFile.open(source.path).header
         _epoch(source)
         crs = _crs(source)
@@ -74,7 +74,7 @@ class OpenCrg(LogFormat):
         )
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
-        """Stream the nodes row by row; a row with a number that cannot be read keeps its other nodes."""
+        """Yield the nodes row by row; a row with an unreadable number keeps its other nodes."""
         file = CrgFile.open(source.path)
         epoch = _epoch(source)
         reference = np.concatenate([np.empty((0, 3)), *(file.reference_of(block) for block in file.blocks())])
@@ -120,13 +120,13 @@ def _crs(source: LogSource) -> str:
 
 
 def _is_torn(reference: Float64, file: CrgFile) -> bool:
-    """True if the last row has no heading, slope or banking: the file was cut off in it."""
+    """Return True if the last row has no heading, slope or banking: the file was cut off in it."""
     used = [k for k, name in enumerate(("phi", "slope", "banking")) if name in file.header.reference]
     return len(reference) > 2 and bool(np.isnan(reference[-1, used]).any())
 
 
 def _damage(block: CrgBlock, file: CrgFile) -> Iterator[Reject]:
-    """Rows with numbers that cannot be read."""
+    """Yield rejects of rows with unreadable numbers."""
     bad = block.damaged[:, file.header.columns].any(axis=1)
     rows = np.flatnonzero(bad)
     for run in np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1):
@@ -137,7 +137,7 @@ def _damage(block: CrgBlock, file: CrgFile) -> Iterator[Reject]:
 
 
 def _points(block: CrgBlock, file: CrgFile, line: CurvedRegularGrid, epoch: int) -> Iterator[Rows]:
-    """Nodes of a block that have a height."""
+    """Yield the nodes of a block that have a height."""
     heights = block.values[: max(0, line.rows - block.first_row), file.header.columns]
     count = max(1, _ROWS_OF_POINTS // heights.shape[1])
     for start in range(0, len(heights), count):

@@ -1,4 +1,4 @@
-"""OpenCRG: the file format of curved regular grids (ASAM OpenCRG 1.2).
+"""Reads and writes OpenCRG files of curved regular grids (ASAM OpenCRG 1.2).
 
 A text header of blocks (``$ROAD_CRG … $``) ends with a line that begins ``$$``; then follow records, one row of the
 grid after another, each with the channels that ``$KD_DEFINITION`` lists. Four encodings are read and written:
@@ -41,15 +41,15 @@ from roadscan.formats.clouds.opencrg_header import BINARY, FARTHEST, KEYS, LINE_
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
-_BLOCK_VALUES: Final = 1 << 20
+_BLOCK_VALUES: Final = 1 << 20  # numbers of a block of rows
 _LEAST_WAY: Final = 0.01
-"""Two steps have to lead on by this part of one."""
-_NUMERIC: Final = np.isin(np.arange(256), np.frombuffer(b"0123456789+-.eEdD ", np.uint8))
+"""Least progress of two consecutive steps, as a share of one."""
+_NUMERIC: Final = np.isin(np.arange(256), np.frombuffer(b"0123456789+-.eEdD ", np.uint8))  # bytes of numbers
 
 
 @dataclass(frozen=True)
 class MapOffset:
-    """Where a grid's own frame lies on the map: turned about the reference line's start, then shifted."""
+    """Position of a grid's frame on the map: rotation about the reference line's start, then a shift."""
 
     x_m: float = 0.0
     y_m: float = 0.0
@@ -74,7 +74,7 @@ class CurvedRegularGrid:
     x_start_m: float = 0.0
     y_start_m: float = 0.0
     z_start_m: float = 0.0
-    """Height of the reference line at its start."""
+    """Height of the reference line at its start (m)."""
     phi_rad: float | Float64 = 0.0
     """Heading of each step, anticlockwise from x: one, or (rows − 1,)."""
     slope: float | Float64 = 0.0
@@ -82,24 +82,24 @@ class CurvedRegularGrid:
     banking: float | Float64 = 0.0
     """Rise to the left per metre: one, or (rows,)."""
     end_xy_m: tuple[float, float] | None = None
-    """Where the reference line ends; the closing error is spread along it."""
+    """End of the reference line; the closing error is distributed along it."""
     end_z_m: float | None = None
-    """Height at which it ends."""
+    """Height at its end (m)."""
     offset: MapOffset = field(default_factory=MapOffset)
     comments: tuple[str, ...] = ()
     """Lines of the block ``$CT``."""
 
     @property
     def rows(self) -> int:
-        """Rows."""
+        """Number of rows."""
         return int(self.z_m.shape[0])
 
     def reference_line_m(self) -> Float64:
-        """(rows, 3) x, y and height of the reference line: sums of step · (cos φ, sin φ, slope) from its start."""
+        """Return (rows, 3) x, y, height of the reference line: sums of step · (cos φ, sin φ, slope) from its start."""
         steps = np.ones(self.rows - 1)
         xy = vertices((self.x_start_m, self.y_start_m), self.phi_rad * steps, self.u_step_m)
         z = self.z_start_m + np.concatenate([[0.0], np.cumsum(self.u_step_m * self.slope * steps)])
-        # OpenCRG walks forward and blends each vertex with the walk back from the end, by the way already made.
+        # OpenCRG walks forward and blends each vertex with the walk back from the end, by the distance already covered.
         part = 1.0 - np.cumprod(1.0 - np.arange(self.rows) / (self.rows - 1))
         if self.end_xy_m is not None:
             xy = xy + part[:, None] * (np.array(self.end_xy_m) - xy[-1])
@@ -108,7 +108,7 @@ class CurvedRegularGrid:
         return np.column_stack([xy, z])
 
     def xyz(self, rows: slice = slice(None), z_m: Float64 | None = None) -> Float64:
-        """(rows, columns, 3) x, y and height of the nodes on the map, NaN heights in holes.
+        """Return (rows, columns, 3) x, y and height of the nodes on the map, with NaN heights in holes.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class CurvedRegularGrid:
 
 @dataclass(frozen=True)
 class CrgBlock:
-    """Some rows of a file."""
+    """Consecutive rows of a file."""
 
     first_row: int
     values: Float64
@@ -153,12 +153,12 @@ class CrgBlock:
     damaged: Bool
     """(rows, channels) True where a number cannot be read."""
     offset: int
-    """Byte at which the first row stands."""
+    """Byte of the first row."""
 
 
 @dataclass(frozen=True)
 class CrgFile:
-    """An OpenCRG file whose header has been read; rows are read on demand."""
+    """An OpenCRG file with parsed header; rows are read on demand."""
 
     path: Path
     header: CrgHeader
@@ -182,11 +182,11 @@ class CrgFile:
 
     @property
     def record_bytes(self) -> int:
-        """Bytes of a row, 0 in text."""
+        """Return the bytes of a row, 0 in text."""
         return BINARY[self.header.encoding].itemsize * self.header.channels if self.header.encoding in BINARY else 0
 
     def blocks(self) -> Iterator[CrgBlock]:
-        """All rows, in blocks; rows of nothing but NaN at the end are padding, unless the header counts them."""
+        """Yield all rows in blocks; trailing rows of only NaN are padding, unless the header counts them."""
         parts = self._binary() if self.header.encoding in BINARY else self._text()
         claimed = self.header.rows_claimed
         waiting: list[CrgBlock] = []
@@ -205,7 +205,7 @@ class CrgFile:
                 waiting.append(_part(block, slice(end, None), block.offset + end * self.record_bytes))
 
     def grid(self, reference: Float64, z_m: Float64) -> CurvedRegularGrid:
-        """The grid with its channels.
+        """Return the grid with its channels.
 
         Parameters
         ----------
@@ -250,7 +250,7 @@ class CrgFile:
         )  # fmt: skip
 
     def reference_of(self, block: CrgBlock) -> Float64:
-        """(rows, 3) channels phi, slope and banking of a block, NaN where the file has none."""
+        """Return (rows, 3) channels phi, slope and banking of a block, NaN where the file has none."""
         out = np.full((len(block.values), 3), np.nan)
         for k, name in enumerate(("phi", "slope", "banking")):
             if name in self.header.reference:
@@ -276,7 +276,7 @@ class CrgFile:
                 yield CrgBlock(first, values, damaged, self.header.data_offset + first * self.record_bytes)
 
     def left_over(self) -> int:
-        """Bytes of a row that was cut off at the end of a binary file (NaN fill and blank ends are none)."""
+        """Return the bytes of an incomplete last row of a binary file (not counting NaN fill and blank ends)."""
         if self.header.encoding not in BINARY:
             return 0
         rest = (self.size - self.header.data_offset) % self.record_bytes
@@ -318,7 +318,7 @@ def _part(block: CrgBlock, rows: slice, offset: int | None = None) -> CrgBlock:
 
 
 def _text_block(first: int, lines: list[bytes], lines_a_row: int, channels: int, width: int, offset: int) -> CrgBlock:
-    """Numbers of text lines; a row with a line of another length than its numbers need is damaged throughout."""
+    """Return the numbers of text lines; a row with a line of the wrong length is damaged throughout."""
     stripped = [line.rstrip(b"\r\n")[:80].rstrip() for line in lines]
     cells = np.frombuffer(b"".join(line.ljust(80) for line in stripped), f"S{width}").reshape(
         -1, lines_a_row * 80 // width
@@ -342,7 +342,7 @@ def _text_block(first: int, lines: list[bytes], lines_a_row: int, channels: int,
 
 
 def _floats(text: npt.NDArray[np.bytes_]) -> tuple[Float64, Bool]:
-    """Numbers of a table of texts, and where there are none."""
+    """Return the numbers of a table of texts, and where there are none."""
     broken = np.zeros(text.shape, dtype=bool)
     try:
         return text.astype(np.float64), broken
@@ -357,7 +357,7 @@ def _floats(text: npt.NDArray[np.bytes_]) -> tuple[Float64, Bool]:
 
 
 def is_crg(path: Path) -> bool:
-    """True for a file whose beginning is an OpenCRG header; never raises."""
+    """Return True for a file that starts with an OpenCRG header; never raises."""
     try:
         with path.open("rb") as stream:
             start = stream.read(1 << 16).upper()
@@ -410,13 +410,13 @@ def _header_lines(grid: CurvedRegularGrid) -> list[str]:
 
 
 def _even_step(v_m: Float64) -> float | None:
-    """Distance between the columns where it is the same for all."""
+    """Return the distance between the columns where it is constant."""
     step = float(v_m[-1] - v_m[0]) / (v_m.size - 1)
     return step if np.abs(np.diff(v_m) - step).max() < 1e-9 else None
 
 
 def _table(grid: CurvedRegularGrid) -> tuple[list[str], Float64]:
-    """Names of the channels, and their values (rows, channels)."""
+    """Return the names of the channels, and their values (rows, channels)."""
     names = [f"U:reference line u,m,{grid.u_start_m:.6f},{grid.u_step_m:.6f}"]
     columns: list[Float64] = []
     for name, unit, values in (
@@ -443,7 +443,7 @@ def _write_text(stream: BinaryIO, data: Float64, width: int) -> None:
 
 
 def _number(value: float, width: int) -> str:
-    """A number in `width` characters, as precise as they allow."""
+    """Return a number in `width` characters, as precise as they allow."""
     if math.isnan(value):
         return "*missing*".rjust(width)
     best = ""

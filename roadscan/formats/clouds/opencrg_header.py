@@ -1,4 +1,4 @@
-"""The header of OpenCRG files: blocks of text, and what they say of the grid's axes and channels."""
+"""Parses OpenCRG headers: blocks of text that describe the grid's axes and channels."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ Float64 = npt.NDArray[np.float64]
 Encoding = Literal["LRFI", "LDFI", "KRBI", "KDBI"]
 
 BINARY: Final[dict[str, np.dtype[Any]]] = {"KRBI": np.dtype(">f4"), "KDBI": np.dtype(">f8")}
-"""Binary encodings and their numbers."""
+"""Binary encodings with their number types."""
 TEXT_WIDTH: Final = {"LRFI": 10, "LDFI": 20}
-"""Text encodings and the characters of a number."""
+"""Text encodings with the characters of a number."""
 FARTHEST: Final = 1e8
-"""No coordinate or height is beyond this."""
+"""Limit of coordinates and heights."""
 
-_HEADER_BYTES: Final = 8 << 20
-LINE_BYTES: Final = 4096
-_MOST_ROWS: Final = 1 << 31
-_MOST_CHANNELS: Final = 1 << 16
-_DEFAULT_INCREMENT_M: Final = 0.01
+_HEADER_BYTES: Final = 8 << 20  # longest header
+LINE_BYTES: Final = 4096  # longest line of a header
+_MOST_ROWS: Final = 1 << 31  # limit of the claimed rows
+_MOST_CHANNELS: Final = 1 << 16  # most channels
+_DEFAULT_INCREMENT_M: Final = 0.01  # increment where none is stated (OpenCRG's default)
 _REFERENCE: Final = "ROAD_CRG_FILE"
-"""Block that names the file with the data."""
+"""Block that names a separate data file."""
 _MALFORMED_ZERO: Final = re.compile(r"(?<=[0-9.])[+-]E[+-]?0+$")
-"""An exponent of zero behind a sign too many (``2.000000000+e00``): C stops there, and the number is the same."""
+"""A zero exponent after an extra sign (``2.000000000+e00``): C stops reading there, with the same number."""
 
 _HARMLESS_MODS: Final = {"grid_nan_mode", "grid_nan_offset"}
 _SECTION_AT: Final = re.compile(r"long section\s+at\s+v\s*=\s*(\S+)$")
@@ -52,7 +52,7 @@ KEYS: Final = {
 
 @dataclass(frozen=True, eq=False)
 class CrgHeader:
-    """What the header says."""
+    """Parsed content of the header."""
 
     encoding: Encoding
     numbers: dict[str, float]
@@ -60,7 +60,7 @@ class CrgHeader:
     v_m: Float64
     """(columns,) position of each long section, ascending, left positive."""
     columns: npt.NDArray[np.int64]
-    """(columns,) its channel."""
+    """(columns,) channel of each long section."""
     reference: dict[str, int]
     """Channels of phi, slope and banking."""
     channels: int
@@ -98,7 +98,7 @@ class CrgHeader:
 
     @property
     def rows_claimed(self) -> int | None:
-        """Rows that the header's end of u claims, None where it states none."""
+        """Return the rows that the header's end of u claims, None where it states none."""
         n = self.numbers
         return (
             None if "u_end" not in n or "u_step" not in n else round((n["u_end"] - n.get("u", 0.0)) / n["u_step"]) + 1
@@ -106,7 +106,7 @@ class CrgHeader:
 
 
 def _blocks(stream: BinaryIO, path: Path) -> tuple[dict[str, list[str]], int]:
-    """Lines of the header's blocks by name (first of a name only), and where the data begin."""
+    """Return the lines of the header's blocks by name (first of a name only), and the start of the data."""
     blocks: dict[str, list[str]] = {"CT": []}
     name = ""
     taken = 0
@@ -127,7 +127,7 @@ def _blocks(stream: BinaryIO, path: Path) -> tuple[dict[str, list[str]], int]:
             blocks["CT"].append(line)
         elif name and not line.startswith("*") and (content := line.split("!")[0].strip()):
             blocks[name].append(content)
-    if _REFERENCE in blocks:  # such a file may have no data of its own, and no end of its header
+    if _REFERENCE in blocks:  # such a file may have no data, and no end of its header
         return blocks, taken
     raise FormatError(
         "no line that begins '$$' ends the header", expected="an OpenCRG file with its data", file=path, record=0
@@ -135,7 +135,7 @@ def _blocks(stream: BinaryIO, path: Path) -> tuple[dict[str, list[str]], int]:
 
 
 def _refuse_blocks(blocks: dict[str, list[str]], path: Path) -> None:
-    """Refuse files whose nodes do not stand in them as they are."""
+    """Refuse files whose nodes are moved, scaled or stored elsewhere."""
     if _REFERENCE in blocks:
         raise FormatError(
             f"the header only refers to the data file '{''.join(blocks[_REFERENCE])}'",
@@ -144,7 +144,7 @@ def _refuse_blocks(blocks: dict[str, list[str]], path: Path) -> None:
             file=path,
         )
     for key, value in assignments(blocks.get("ROAD_CRG_MODS", []), path).items():
-        # A reference point moves the grid to wherever it is said to lie, 0 included.
+        # A reference point moves the grid to its stated position, including 0.
         idle = value == (1.0 if key.startswith("scale_") else 0.0) and not key.startswith("refpoint_")
         if key not in _HARMLESS_MODS and not idle:
             raise FormatError(
@@ -155,7 +155,7 @@ def _refuse_blocks(blocks: dict[str, list[str]], path: Path) -> None:
             )
     if "KD_DEFINITION" not in blocks:
         raise FormatError("there is no block $KD_DEFINITION", expected="an OpenCRG file", file=path)
-    if "ROAD_CRG" not in blocks:  # its defaults would put the grid elsewhere
+    if "ROAD_CRG" not in blocks:  # its defaults would move the grid
         raise FormatError("there is no block $ROAD_CRG", expected="an OpenCRG file", file=path)
     for line in blocks["ROAD_CRG"]:
         if not line.replace("\t", " ").isprintable():
@@ -168,7 +168,7 @@ def _encoding(definition: list[str], path: Path) -> Encoding:
 
 
 def encoding_named(name: str, file: Path | None = None) -> Encoding:
-    """One of the four encodings, or :class:`FormatError`."""
+    """Return one of the four encodings, or raise :class:`FormatError`."""
     if name not in {*BINARY, *TEXT_WIDTH}:
         raise FormatError(f"the encoding is {name}", expected=" or ".join([*TEXT_WIDTH, *BINARY]), file=file)
     encoding: Any = name
@@ -176,7 +176,7 @@ def encoding_named(name: str, file: Path | None = None) -> Encoding:
 
 
 def assignments(lines: list[str], path: Path) -> dict[str, float]:
-    """Numbers of ``key = value`` lines, keys in lower case; the last of a key stands."""
+    """Return the numbers of ``key = value`` lines, keys in lower case; the last value of a key counts."""
     found: dict[str, float] = {}
     for line in lines:
         key, equals, text = line.partition("=")
@@ -194,7 +194,7 @@ def assignments(lines: list[str], path: Path) -> dict[str, float]:
 
 
 def _u_axis(head: dict[str, float], virtual: list[str], path: Path) -> None:
-    """Start and increment of u: from ``$ROAD_CRG``, else from the virtual channel, else as OpenCRG assumes them."""
+    """Set start and increment of u: from ``$ROAD_CRG``, else from the virtual channel, else OpenCRG's defaults."""
     for line in virtual:
         name, unit, *numbers = [part.strip() for part in line.split(",")] + [""]
         if name.lower() == "reference line u" and unit == "m":
@@ -216,7 +216,7 @@ def _u_axis(head: dict[str, float], virtual: list[str], path: Path) -> None:
 def _channels(
     channels: list[str], head: dict[str, float], path: Path
 ) -> tuple[dict[str, int], Float64, npt.NDArray[np.int64]]:
-    """Channels of the reference line; v and channel of each long section, in the order of v."""
+    """Return the channels of the reference line; and v and channel of each long section, in the order of v."""
     if len(channels) > _MOST_CHANNELS:
         raise FormatError(f"there are {len(channels):,} channels", expected=f"at most {_MOST_CHANNELS:,}", file=path)
     reference: dict[str, int] = {}
@@ -254,7 +254,7 @@ def _channels(
 
 
 def _regular(head: dict[str, float], count: int, path: Path) -> Float64:
-    """(count,) equal steps from the right border to the left, centred where the header names no border."""
+    """Return (count,) equal steps from the right border to the left, centred where the header names no border."""
     step = head.get("v_step")
     if step is None and "v_right" in head and "v_left" in head:
         step = (head["v_left"] - head["v_right"]) / (count - 1)

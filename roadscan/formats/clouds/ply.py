@@ -51,7 +51,7 @@ _SPELLINGS: Final = {
     "blue": ("blue", "diffuseblue", "b"),
     "time": ("gpstime",),
 }
-"""Names of properties by what they hold, in lower case, without underscores and a leading "scalar"."""
+"""Property names by content, in lower case, without underscores and a leading "scalar"."""
 _COLOURS: Final = ("red", "green", "blue")
 
 
@@ -97,7 +97,7 @@ class Ply(LogFormat):
         )
 
     def header(self, source: LogSource) -> LogHeader:
-        """CRS, kind of heights, and which properties are taken."""
+        """Return CRS, kind of heights, and which properties are used."""
         source.need_file()
         plan = _Plan.of(source)
         crs = reference_crs(source)
@@ -132,15 +132,15 @@ class Ply(LogFormat):
 
 @dataclass(frozen=True)
 class _Plan:
-    """How a file's properties become columns."""
+    """How a file's properties are converted to columns."""
 
     header: PlyHeader
     vertex: Element
     taken: dict[str, str]
-    """Property by what it holds (columns of ``cloud``, and "time")."""
+    """Property by its content (columns of ``cloud``, and "time")."""
     unit_m: float
     epoch_gps_ns: int | None
-    """The one epoch of all points; None where each has its own."""
+    """The common epoch of all points; None where each has one."""
     brightness: Brightness | None
     """Scale of the intensity; None where its type has one."""
     options: PlyOptions
@@ -178,7 +178,7 @@ class _Plan:
 
     @property
     def record_bytes(self) -> int:
-        """Bytes from one point to the next, 0 where it varies."""
+        """Return the bytes from one point to the next, 0 where it varies."""
         if self.header.coding == "ascii" or self.vertex.has_lists:
             return 0
         return self.vertex.dtype(self.header.order).itemsize
@@ -228,7 +228,7 @@ def _times(source: LogSource, stamps: npt.NDArray[Any]) -> UnorderedStamps:
 
 
 def _drop_outside_types(points: Vertices, vertex: Element, sieve: Sieve) -> None:
-    """Drop points with a number, written as text, that the property's declared integer type cannot hold."""
+    """Drop points with a number, written as text, that the property's declared integer type cannot represent."""
     types = {p.name: p.type for p in vertex.properties}
     for name, values in points.columns.items():
         if types[name][0] != "f" and values.dtype.kind == "f":
@@ -238,7 +238,7 @@ def _drop_outside_types(points: Vertices, vertex: Element, sieve: Sieve) -> None
 
 
 def _columns(points: Vertices, plan: _Plan, times: UnorderedStamps | None, sieve: Sieve) -> Columns:
-    """Columns of ``cloud``, (n,) each; points whose attributes do not fit are dropped from the sieve."""
+    """Return columns of ``cloud``, (n,) each; points with unfit attributes are dropped from the sieve."""
     own = {what: points.columns[name] for what, name in plan.taken.items()}
     columns: Columns = {}
     for axis, shift in zip("xyz", plan.options.shift, strict=True):
@@ -262,7 +262,7 @@ def _columns(points: Vertices, plan: _Plan, times: UnorderedStamps | None, sieve
 
 
 def _sixteen_bits(values: npt.NDArray[Any], kind: str, scale: Brightness | None) -> npt.NDArray[np.uint16]:
-    """Values (n,) of a property of type `kind` on the scale of 16 bits."""
+    """Return values (n,) of a property of type `kind`, scaled to 16 bits."""
     if scale is not None:
         return scale.sixteen_bits(values)
     if kind == "u2" and values.dtype == np.uint16:

@@ -1,4 +1,4 @@
-"""PLY files (Turk 1994), read in bounded memory whatever their header claims.
+"""Reads PLY files (Turk 1994) in bounded memory, whatever their headers claim.
 
 A header lists elements and their properties; records follow, one element after another, as text or in
 binary of either byte order. Lists have a length a record, so records with lists are read in runs of equal
@@ -25,12 +25,12 @@ from roadscan.ingest.reading.text_table import LINE_BYTES_MAX, TextBlock, TextLa
 Int64 = npt.NDArray[np.int64]
 Coding: TypeAlias = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 
-HEADER_BYTES_MAX: Final = 1 << 16
+HEADER_BYTES_MAX: Final = 1 << 16  # bytes in which the header has to end
 RECORD_BYTES_MAX: Final = 1 << 20
-"""A record whose lists make it longer is taken as damaged."""
+"""Records that their lists make longer count as damaged."""
 
-_BLOCK_BYTES: Final = 4 << 20
-_FIRST_RUN: Final = 16
+_BLOCK_BYTES: Final = 4 << 20  # bytes of a block
+_FIRST_RUN: Final = 16  # records of the first run of equal layout; longer ones follow while layouts agree
 _TYPES: Final = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
@@ -54,7 +54,7 @@ class Property:
 
 @dataclass(frozen=True)
 class Element:
-    """One element: how many records, and what is in each."""
+    """One element: the number of its records, and their properties."""
 
     name: str
     count: int
@@ -62,11 +62,11 @@ class Element:
 
     @property
     def has_lists(self) -> bool:
-        """True where records differ in length."""
+        """Return True where records differ in length."""
         return any(p.count_type for p in self.properties)
 
     def dtype(self, order: str, counts: Sequence[int] = ()) -> np.dtype[Any]:
-        """Layout of a binary record, with the lengths of its lists; ``order`` is "<" or ">"."""
+        """Return the layout of a binary record with the given list lengths; ``order`` is "<" or ">"."""
         lengths = iter(counts)
         fields: list[tuple[Any, ...]] = []
         for p in self.properties:
@@ -80,32 +80,32 @@ class Element:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a PLY file says it holds."""
+    """Parsed content of a PLY header."""
 
     coding: Coding
     elements: tuple[Element, ...]
     body: int
-    """Byte behind the header."""
+    """Byte after the header."""
 
     @property
     def vertex(self) -> Element | None:
-        """The element of the points."""
+        """Return the element of the points."""
         return next((e for e in self.elements if e.name == "vertex"), None)
 
     @property
     def before(self) -> tuple[Element, ...]:
-        """Elements whose records stand before the points."""
+        """Return the elements whose records precede the points."""
         return self.elements[: self.elements.index(self.vertex)] if self.vertex else ()
 
     @property
     def order(self) -> str:
-        """NumPy's sign of the byte order."""
+        """Return NumPy's sign of the byte order."""
         return ">" if self.coding == "binary_big_endian" else "<"
 
 
 @dataclass(frozen=True)
 class Vertices:
-    """Some points, one after another."""
+    """Consecutive points."""
 
     columns: dict[str, npt.NDArray[Any]]
     """(n,) by property."""
@@ -188,7 +188,7 @@ def _with_property(element: Element, words: list[str]) -> Element:
 
 
 def vertices(path: Path, header: PlyHeader, names: Sequence[str]) -> Iterator[Vertices | Reject]:
-    """Stream the points' properties `names` (single values) in batches; what cannot be read as rejects."""
+    """Yield the points' properties `names` (single values) in batches; unreadable points are rejects."""
     vertex = header.vertex
     if vertex is None:
         raise FormatError("the file has no element 'vertex'", expected="points", file=path)
@@ -208,7 +208,7 @@ def vertices(path: Path, header: PlyHeader, names: Sequence[str]) -> Iterator[Ve
 
 
 def _left_over(path: Path, header: PlyHeader, vertex: Element) -> int:
-    """Points behind all that the header claims: lines that are not blank, or whole records of a binary file."""
+    """Return the points after all that the header claims: non-blank lines, or whole records of a binary file."""
     if header.coding == "ascii":
         start = _line_offset(path, header.body, sum(e.count for e in header.elements))
         return 0 if start is None else sum(1 for _ in _lines(path, start))
@@ -221,7 +221,7 @@ def _left_over(path: Path, header: PlyHeader, vertex: Element) -> int:
 
 
 def _lines(path: Path, at: int) -> Iterator[bytes]:
-    """Lines from a byte on that are not blank."""
+    """Yield the non-blank lines from a byte on."""
     with path.open("rb") as stream:
         stream.seek(at)
         while line := stream.readline(LINE_BYTES_MAX):
@@ -247,7 +247,7 @@ def _binary(path: Path, header: PlyHeader, vertex: Element, names: Sequence[str]
 
 
 def _behind(stream: BinaryIO, element: Element, order: str, at: int) -> int | None:
-    """Byte behind an element's records, None where they are damaged or cut off."""
+    """Return the byte after an element's records, None where they are damaged or cut off."""
     if not element.has_lists:
         behind = at + element.count * element.dtype(order).itemsize
         return behind if behind <= stream.seek(0, 2) else None
@@ -261,7 +261,7 @@ def _behind(stream: BinaryIO, element: Element, order: str, at: int) -> int | No
 
 @dataclass(frozen=True)
 class _Run:
-    """Records of one layout, one after another."""
+    """Consecutive records of one layout."""
 
     first: int
     offset: int
@@ -269,7 +269,7 @@ class _Run:
 
 
 def _runs(stream: BinaryIO, element: Element, order: str, at: int) -> Iterator[_Run | Reject]:
-    """Records in runs of equal layout, up to the end of the file or a list that cannot be."""
+    """Yield runs of records of equal layout, up to the end of the file or an impossible list."""
     size = stream.seek(0, 2)
     layout = functools.lru_cache(maxsize=256)(lambda counts: element.dtype(order, counts))
     lists = [p.name for p in element.properties if p.count_type]
@@ -299,7 +299,7 @@ def _runs(stream: BinaryIO, element: Element, order: str, at: int) -> Iterator[_
 
 
 def _counts(block: bytes, at: int, element: Element, order: str) -> tuple[int, ...] | None:
-    """Lengths of the lists of the record at `at`; None where one is negative or too long."""
+    """Return the list lengths of the record at `at`; None where one is negative or too long."""
     end = at + RECORD_BYTES_MAX
     counts: list[int] = []
     for p in element.properties:
@@ -318,7 +318,7 @@ def _counts(block: bytes, at: int, element: Element, order: str) -> tuple[int, .
 
 
 def _batches(runs: Iterator[_Run | Reject], names: Sequence[str]) -> Iterator[Vertices | Reject]:
-    """Points of short runs gathered into batches."""
+    """Yield the points of short runs merged into batches."""
     held: list[_Run] = []
     points = 0
     for run in runs:
@@ -380,7 +380,7 @@ def _split(points: Vertices) -> Iterator[Vertices]:
 
 
 def _line_offset(path: Path, at: int, lines: int) -> int | None:
-    """Byte behind `lines` lines that are not blank, None where the file has fewer."""
+    """Return the byte after `lines` non-blank lines, None where the file has fewer."""
     with path.open("rb") as stream:
         stream.seek(at)
         while lines > 0:
@@ -393,7 +393,7 @@ def _line_offset(path: Path, at: int, lines: int) -> int | None:
 
 
 def _lines_with_lists(path: Path, at: int, vertex: Element, names: Sequence[str]) -> Iterator[Vertices | Reject]:
-    """Points as text with a list among their properties, line by line."""
+    """Yield points as text with a list among their properties, line by line."""
     record = 0
     rows: list[list[float]] = []
     records: list[int] = []
@@ -425,7 +425,7 @@ def _of_lines(rows: list[list[float]], records: list[int], offsets: list[int], n
 
 
 def _values(words: list[bytes], vertex: Element) -> dict[str, float]:
-    """Single values of a line; IndexError or ValueError where it does not fit the properties."""
+    """Return the single values of a line; IndexError or ValueError where it does not fit the properties."""
     values: dict[str, float] = {}
     at = 0
     for p in vertex.properties:

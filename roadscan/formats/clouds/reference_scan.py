@@ -1,6 +1,6 @@
-"""What reference scans of a terrestrial scanner (E57, PLY) have in common: CRS, epochs, rows of the table ``cloud``.
+"""Shared parts of terrestrial reference scans (E57, PLY): CRS, epochs, rows of the table ``cloud``.
 
-A reference scan belongs to no drive: its points are not held against the run's trajectory, and where its
+A reference scan belongs to no drive: its points are not checked against the run's trajectory, and where its
 file says no time, the survey file states the one epoch that all its points get.
 """
 
@@ -31,7 +31,7 @@ Columns = dict[str, npt.NDArray[Any]]
 
 CHUNK_POINTS: Final = 65_536
 """Points of a batch."""
-SIXTEEN_BITS: Final = 65_535
+SIXTEEN_BITS: Final = 65_535  # largest 16-bit value
 
 _MISSING: Final[dict[str, tuple[type[np.generic], int]]] = {
     "intensity": (np.uint16, 0),
@@ -43,7 +43,7 @@ _MISSING: Final[dict[str, tuple[type[np.generic], int]]] = {
     "flags": (np.uint8, 0),
     "user_data": (np.uint8, 0),
 }
-"""Type of columns of ``cloud``, and what stands where a scan records nothing of the kind (class 1: unclassified)."""
+"""Types of columns of ``cloud``, with the value for scans that do not record them (class 1: unclassified)."""
 
 
 class ReferenceOptions(Strict):
@@ -59,7 +59,7 @@ class ReferenceOptions(Strict):
 
 
 def reference_crs(source: LogSource) -> str:
-    """CRS of the points as stated: a projected one, or "local".
+    """Return the stated CRS of the points: a projected one, or "local".
 
     Raises
     ------
@@ -80,7 +80,7 @@ def reference_crs(source: LogSource) -> str:
 
 
 def reference_height(source: LogSource, crs: str, written: pyproj.CRS | None = None) -> HeightKind:
-    """Kind of the points' heights; in a local frame, whose z has none, ellipsoidal where nothing is stated.
+    """Return the kind of the points' heights; ellipsoidal in a local frame, whose z has none, unless stated.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def reference_height(source: LogSource, crs: str, written: pyproj.CRS | None = N
 
 
 def stated_epoch_gps_ns(options: ReferenceOptions, file: Path) -> int | None:
-    """Epoch that the survey file states for all points, if any."""
+    """Return the epoch that the survey file states for all points, if any."""
     if options.epoch is None:
         return None
     epoch = gps_ns_from_utc(options.epoch)
@@ -112,7 +112,7 @@ def stated_epoch_gps_ns(options: ReferenceOptions, file: Path) -> int | None:
 
 
 def no_epoch(arrived: str, file: Path, also: str = "") -> TimeSystemError:
-    """Error for a scan without any time: without one, a point belongs to no run and no pass."""
+    """Return the error for a scan without any time: without one, a point belongs to no run and no pass."""
     return TimeSystemError(
         arrived,
         expected="the instant of the scan" + also,
@@ -123,13 +123,13 @@ def no_epoch(arrived: str, file: Path, also: str = "") -> TimeSystemError:
 
 @dataclass(frozen=True)
 class Brightness:
-    """Recorded values to 16 bits: ⌊(value − low) / (high − low) · 65,535 + ½⌋, cut off at 0 and 65,535."""
+    """Scale of recorded values to 16 bits: ⌊(value − low) / (high − low) · 65,535 + ½⌋, limited to 0 and 65,535."""
 
     low: float
     high: float
 
     def check(self, file: Path) -> Brightness:
-        """Refuse a scale without extent; returns itself."""
+        """Return the scale, or refuse one without extent."""
         if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
             raise ConfigError(
                 f"intensities or colours from {self.low:g} to {self.high:g}",
@@ -140,14 +140,14 @@ class Brightness:
         return self
 
     def sixteen_bits(self, values: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
-        """Values (n,) on the scale of 16 bits; what is no number becomes 0."""
+        """Return values (n,) scaled to 16 bits; NaN becomes 0."""
         with np.errstate(invalid="ignore", over="ignore"):
             scaled = (np.asarray(values, dtype=np.float64) - self.low) * (SIXTEEN_BITS / (self.high - self.low))
         return np.floor(np.clip(np.nan_to_num(scaled, nan=0.0), 0, SIXTEEN_BITS) + 0.5).astype(np.uint16)
 
 
 def whole_numbers(name: str, values: npt.NDArray[Any], column: str, sieve: Sieve) -> npt.NDArray[Any]:
-    """Values (n,) as the whole numbers of a column of ``cloud``; others are dropped from the sieve."""
+    """Return values (n,) as integers of a column of ``cloud``; others are dropped from the sieve."""
     kind = np.dtype(_MISSING[column][0])
     if values.dtype == kind:
         return values
@@ -162,7 +162,7 @@ def whole_numbers(name: str, values: npt.NDArray[Any], column: str, sieve: Sieve
 def cloud_items(
     columns: Columns, sieve: Sieve, records: Int64, offsets: Int64, record_bytes: int = 0
 ) -> Iterator[Item]:
-    """Rejects, then rows of ``cloud``.
+    """Yield rejects, then rows of ``cloud``.
 
     Parameters
     ----------

@@ -30,14 +30,14 @@ from roadscan.ingest.reading.format import NO_LEVER_ARM, Item, LogFormat, LogHea
 from roadscan.ingest.reading.records import Sieve
 
 _COLUMNS: Final = ("x", "y", "z", "intensity", "laser_number", "offset_ns")
-_CHUNK_RETURNS: Final = 1 << 18
-_FARTHEST_M: Final = 10_000.0
-_LONGEST_OFFSET_NS: Final = 1_000_000_000
+_CHUNK_RETURNS: Final = 1 << 18  # returns of a chunk
+_FARTHEST_M: Final = 10_000.0  # farther positions count as damage
+_LONGEST_OFFSET_NS: Final = 1_000_000_000  # larger offsets count as damage
 _SWEEP: Final = re.compile(r"^\d{10,19}\.feather$")
-_EIGHT_TO_SIXTEEN_BITS: Final = 257
+_EIGHT_TO_SIXTEEN_BITS: Final = 257  # scales 255 to 65,535
 _CLOCK: Final = {"system": "unix_gps", "unit": "ns"}
 _UNREADABLE: Final = (pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError, MemoryError)
-"""What Arrow raises on damaged bytes."""
+"""Errors that Arrow raises on damaged bytes."""
 
 
 class Argoverse(LogFormat):
@@ -62,7 +62,7 @@ class Argoverse(LogFormat):
             return False
 
     def files(self, path: Path) -> list[Path]:
-        """The sweeps, in order of time."""
+        """Return the sweeps, in order of time."""
         return sorted(_sweeps(path), key=lambda p: (len(p.name), p.name))
 
     def header(self, source: LogSource) -> LogHeader:
@@ -103,7 +103,7 @@ _EXPECTED: Final = "a Feather file with the columns " + ", ".join(_COLUMNS)
 
 
 def _sweeps(path: Path) -> Iterator[Path]:
-    """Sweep files, in no order."""
+    """Yield the sweep files, in no order."""
     if path.is_file():
         if _SWEEP.match(path.name):
             yield path

@@ -39,16 +39,16 @@ from roadscan.core.strict import Strict
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import Sieve, options_of
 
-RECORD_BYTES: Final = 16
-_CHUNK_RETURNS: Final = 1 << 18
-_FARTHEST_M: Final = 10_000.0
-_SHORTEST_TURN_S: Final = 0.01
-_LONGEST_TURN_S: Final = 1.0
+RECORD_BYTES: Final = 16  # bytes of a return
+_CHUNK_RETURNS: Final = 1 << 18  # returns of a chunk
+_FARTHEST_M: Final = 10_000.0  # farther positions count as damage
+_SHORTEST_TURN_S: Final = 0.01  # shorter turns are refused
+_LONGEST_TURN_S: Final = 1.0  # longer turns are refused
 _SWEEP: Final = re.compile(r"^\d{6,10}\.bin$")
 _CALENDAR: Final = re.compile(r"^(\d{4}-\d\d-\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?\s*$")
-_LARGEST_STAMPS_BYTES: Final = 256 << 20
-_MOST_DAYS: Final = 100_000  # 273 years: beyond them int64 nanoseconds end
-_LONGEST_LOG_NS: Final = 30 * 86_400 * NS_PER_S
+_LARGEST_STAMPS_BYTES: Final = 256 << 20  # larger files of stamps are refused
+_MOST_DAYS: Final = 100_000  # 273 years: near the limit of int64 nanoseconds
+_LONGEST_LOG_NS: Final = 30 * 86_400 * NS_PER_S  # stamps farther than this from the middle one are unlikely
 
 
 class KittiOptions(Strict):
@@ -94,18 +94,18 @@ class Kitti(LogFormat):
             return False
 
     def files(self, path: Path) -> list[Path]:
-        """Sweeps, KITTI's stamps, and CSV files beside them."""
+        """Return the sweeps, KITTI's stamps, and CSV files beside them."""
         texts = [p for pattern in ("timestamps*.txt", "*.csv") for p in _points_folder(path).glob(pattern)]
         texts += [p for p in path.glob("*.csv") if p not in texts]
         return sorted([*_sweeps(path), *texts])
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
-        """The CSV of stamps, wherever it is."""
+        """Return the CSV of stamps, wherever it is."""
         stamps = options.stamps if isinstance(options, KittiOptions) else None
         return [] if stamps is None else [beside(path, stamps)]
 
     def header(self, source: LogSource) -> LogHeader:
-        """Number of sweeps and the period of a turn."""
+        """Return the number of sweeps and the period of a turn."""
         options = options_of(source, KittiOptions)
         if next(_sweeps(source.path), None) is None:
             raise FormatError("the folder holds no sweep", expected="velodyne_points/data/*.bin", file=source.path)
@@ -137,7 +137,7 @@ class _Sweep:
     number: int
 
     def items(self, stamp_gps_ns: int, turn_ns: float) -> Iterator[Item]:
-        """Rows and rejects; `turn_ns` is the signed duration of a turn counter-clockwise, 0 if compensated."""
+        """Yield rows and rejects; `turn_ns` is the signed duration of a counter-clockwise turn, 0 if compensated."""
         size = self.file.stat().st_size
         whole = size // RECORD_BYTES
         for first in range(0, whole, _CHUNK_RETURNS):
@@ -177,11 +177,11 @@ class _Sweep:
 
 
 def _sieve(xyzi: npt.NDArray[np.float32]) -> Sieve:
-    """Sieve of (n, 4) x, y, z, intensity."""
+    """Return the sieve of (n, 4) x, y, z, intensity."""
     xyz, intensity = xyzi[:, :3], xyzi[:, 3]
     sieve = Sieve(len(xyzi))
     sieve.drop((xyz == 0.0).all(axis=1), "0, 0, 0 is no return")
-    with np.errstate(invalid="ignore"):  # comparisons are false for NaN: each says what is right
+    with np.errstate(invalid="ignore"):  # comparisons with NaN are false, so each one states what is valid
         sieve.drop(
             np.asarray(~(np.abs(xyz) <= _FARTHEST_M).all(axis=1)), "the position is not a number or beyond 10 km"
         )
@@ -195,14 +195,14 @@ def _points_folder(path: Path) -> Path:
 
 
 def _sweeps(path: Path) -> Iterator[Path]:
-    """Files of the sweeps, in no order."""
+    """Yield the sweep files, in no order."""
     data = _points_folder(path) / "data"
     if data.is_dir():
         yield from (p for p in data.iterdir() if _SWEEP.match(p.name) and p.is_file())
 
 
 def _stamps(source: LogSource, options: KittiOptions) -> dict[int, int]:
-    """Epoch (GPS ns) by number of the sweep."""
+    """Return the epoch (GPS ns) of each sweep by its number."""
     if options.stamps is not None:
         clock = source.need_clock("unix_utc", unit="s")
         file = beside(source.path, options.stamps)
@@ -219,7 +219,7 @@ def _stamps(source: LogSource, options: KittiOptions) -> dict[int, int]:
         file = _points_folder(source.path) / "timestamps.txt"
         numbers, stamps_ns = _stamps_of_calendar(file)
     stamps = np.array(stamps_ns, dtype=np.int64)
-    # A mistyped stamp costs its sweep; the middle one tells whether the statement is wrong.
+    # A mistyped stamp costs its sweep; the middle one shows whether the statement is wrong.
     likely = np.abs(stamps - np.sort(stamps)[stamps.size // 2]) < _LONGEST_LOG_NS
     try:
         epochs = dataclasses.replace(clock, unit="ns").to_epoch_gps_ns(stamps[likely])
@@ -229,7 +229,7 @@ def _stamps(source: LogSource, options: KittiOptions) -> dict[int, int]:
 
 
 def _stamps_of_csv(file: Path, options: KittiOptions, unit_ns: int) -> tuple[list[int], list[int]]:
-    """Numbers and stamps (ns of the clock's own count); lines that hold none are left out."""
+    """Return numbers and stamps (ns of the clock's count), without lines that have none."""
     rows = _rows(file)
     names = [name.strip() for name in next(rows, [])]
     for wanted in (options.frame_column, options.stamp_column):
@@ -265,7 +265,7 @@ def _rows(file: Path) -> Iterator[list[str]]:
 
 
 def _stamps_of_calendar(file: Path) -> tuple[list[int], list[int]]:
-    """Line k holds the stamp of sweep k as calendar time; ns since 1970 as if there were no leap seconds."""
+    """Return numbers and calendar stamps, one per line; ns since 1970 without leap seconds."""
     numbers: list[int] = []
     stamps_ns: list[int] = []
     for number, line in enumerate(_lines(file, "KITTI's stamps, or options.stamps")):
@@ -313,7 +313,7 @@ def _lines(file: Path, what: str) -> list[str]:
 
 
 def _period_ns(epochs: dict[int, int], options: KittiOptions, path: Path) -> float:
-    """Mean duration of a turn: spacings within 30 % of their median, so that gaps do not count."""
+    """Return the mean duration of a turn: spacings within 30 % of their median, so that gaps do not count."""
     if options.period_s is not None:
         return options.period_s * NS_PER_S
     numbers = np.array(sorted(epochs))

@@ -1,4 +1,4 @@
-"""UDP packets of a network capture (PCAP): what lidar makers' own recorders write.
+"""Reads UDP packets of a network capture (PCAP), as lidar makers' recorders write it.
 
 The file is read a few megabytes at a time. A record that is cut off or that is no record costs itself:
 reading goes on at the next record that looks like one of the sensor's data packets.
@@ -23,20 +23,20 @@ MAGICS: Final = {
     b"\x4d\x3c\xb2\xa1": ("<", 1),
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
-"""Byte order, and ns of a unit of the records' fractional seconds, by the file's first four bytes."""
+"""Byte order, and ns per unit of the records' fractional seconds, by the file's first four bytes."""
 
 _LINK_HEADERS: Final = {0: 4, 1: 14, 101: 0, 113: 16, 228: 0, 276: 20}
 """Bytes before the IP header by link type: BSD loopback, Ethernet, raw IP, Linux cooked, IPv4, Linux cooked 2."""
-_ETHERNET: Final = 1
+_ETHERNET: Final = 1  # link type of Ethernet
 _VLAN_TAGS: Final = (b"\x81\x00", b"\x88\xa8")
-_UDP: Final = 17
+_UDP: Final = 17  # IP protocol number of UDP
 _IPV4_WITHOUT_OPTIONS: Final = b"\x45"
-_MOST_ROUTES: Final = 4096
-_READ_BYTES: Final = 4 << 20
-_LARGEST_RECORD: Final = 262_144
-_RECORD_HEADER: Final = 16
-_FILE_HEADER: Final = 24
-_YEAR_S: Final = 365 * 86_400
+_MOST_ROUTES: Final = 4096  # routes that are remembered
+_READ_BYTES: Final = 4 << 20  # bytes that are read at once
+_LARGEST_RECORD: Final = 262_144  # larger records count as damage (bytes)
+_RECORD_HEADER: Final = 16  # bytes of a record's header
+_FILE_HEADER: Final = 24  # bytes of the file header
+_YEAR_S: Final = 365 * 86_400  # a record whose time differs more from the last one's (s) counts as damage
 
 
 class Datagram(NamedTuple):
@@ -51,7 +51,7 @@ class Datagram(NamedTuple):
     sender: str
     """IP address."""
     port: int
-    """Port it was sent to."""
+    """Port from which it was sent."""
     payload: bytes
 
 
@@ -63,22 +63,22 @@ _Route: TypeAlias = tuple[str, int, int, int]
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which packets of a capture belong to the log."""
+    """Selection of a log's packets in a capture."""
 
     port: int
     """Port of the data packets."""
     data_bytes: int
-    """Length of a sound data packet."""
+    """Length of a sound data packet (bytes)."""
     other_port: int
     """Port of the sensor's other packets."""
     sender: str | None
     """The sensor's IP address; None for any."""
     sole: bool = False
-    """True where no other sensor is expected: packets that look like its own and are not are rejected."""
+    """True where no other sensor is expected: damaged packets that look like its own are rejected."""
 
 
 def datagrams(path: Path, wanted: Wanted) -> Iterator[Datagram | Reject]:
-    """Packets wanted, in file order, and rejects for damaged ones; other traffic is passed over.
+    """Yield the wanted packets in file order, and rejects for damaged ones; other traffic is ignored.
 
     Raises
     ------
@@ -131,12 +131,12 @@ class _Capture:
     tick_ns: int
     link: int
     usual_bytes: int = 0
-    """Captured length of a data packet, once known: the mark at which reading goes on after damage."""
+    """Captured length of a data packet, once known: reading resumes at such a record after damage."""
     _seconds: int = -1
-    """Capture time of the last sound record."""
+    """Capture time of the last sound record (POSIX s)."""
     _buffer: bytes = b""
     _at: int = 0
-    """Place in the buffer."""
+    """Position in the buffer."""
     _base: int = _FILE_HEADER
     """File offset of the buffer."""
 
@@ -164,7 +164,7 @@ class _Capture:
         return cls(stream, order, tick_ns, link)
 
     def records(self) -> Iterator[_Record | Reject]:
-        """All records in file order; bytes that are no record are skipped to the next data packet."""
+        """Yield all records in file order; bytes that are no record are skipped to the next data packet."""
         unpack = struct.Struct(self.order + "IIII").unpack_from
         number = 0
         while self._fill():
@@ -186,7 +186,7 @@ class _Capture:
             number += 1
 
     def _fill(self) -> bool:
-        """Have the next record in the buffer, as far as the file goes; False at the file's end."""
+        """Read the next record into the buffer; return False at the file's end."""
         if len(self._buffer) - self._at < _RECORD_HEADER + _LARGEST_RECORD:
             more = self.stream.read(_READ_BYTES)
             if more:
@@ -195,16 +195,16 @@ class _Capture:
         return self._at < len(self._buffer)
 
     def _drop(self, count: int) -> None:
-        """Forget the buffer's first `count` bytes."""
+        """Discard the buffer's first `count` bytes."""
         self._buffer = self._buffer[count:]
         self._base += count
         self._at -= count
 
     def _resynchronise(self) -> None:
-        """Go to the next record of a data packet, or to the file's end."""
+        """Skip to the next record of a data packet, or to the file's end."""
         self._at += 1
         if not self.usual_bytes:
-            self._at = len(self._buffer)  # no mark is known yet: the buffer is lost
+            self._at = len(self._buffer)  # the usual length is not known yet: the buffer is lost
             return
         lengths = struct.pack(self.order + "II", self.usual_bytes, self.usual_bytes)
         while True:
@@ -227,15 +227,15 @@ class _Capture:
 
 @dataclass
 class _Routes:
-    """Finds UDP payloads in frames; frames that differ in their payload alone are looked at once."""
+    """Finds UDP payloads in frames; frames that only differ in their payload are parsed once."""
 
     link: int
     _known: dict[tuple[int, bytes, bytes, bytes], _Route | None] = field(default_factory=dict)
 
     def of(self, frame: bytes) -> _Route | None:
-        """Route of a frame, None for anything but UDP."""
+        """Return the route of a frame, None for anything but UDP."""
         ip = _LINK_HEADERS[self.link]
-        # Link header and version; protocol; addresses, ports and length: all that decides on the route.
+        # Link header and version; protocol; addresses, ports and length: all that determines the route.
         key = (len(frame), frame[: ip + 1], frame[ip + 9 : ip + 10], frame[ip + 12 : ip + 26])
         if key in self._known:
             return self._known[key]

@@ -42,10 +42,10 @@ AXES: Final = ("x_sensor_m", "y_sensor_m", "z_sensor_m")
 _STAMP: Final = "time"
 _POSE_EPOCH: Final = "pose_epoch_gps_ns"
 _WHOLE: Final = {"intensity": np.uint16, "laser": np.uint8, "sweep": np.int32}
-"""Columns of whole numbers, 0 where they are left out, by their type in the table."""
+"""Types of the integer columns, which are 0 where they are left out."""
 _COLUMNS: Final = (EPOCH, _STAMP, _POSE_EPOCH, *AXES, *_WHOLE)
-_FARTHEST_M: Final = 10_000.0
-_CHUNK_ROWS: Final = 1 << 17
+_FARTHEST_M: Final = 10_000.0  # farther positions count as damage
+_CHUNK_ROWS: Final = 1 << 17  # rows of a chunk
 _SUFFIXES: Final = (".parquet", ".arrow", ".feather", ".ipc")
 
 
@@ -68,13 +68,13 @@ class ReturnsTable(LogFormat):
             return False
 
     def files(self, path: Path) -> list[Path]:
-        """The file, or all Parquet and Arrow files of the folder by name."""
+        """Return the file, or all Parquet and Arrow files of the folder by name."""
         if not path.is_dir():
             return [path]
         return sorted(p for p in path.rglob("*") if p.suffix.lower() in _SUFFIXES and p.is_file())
 
     def header(self, source: LogSource) -> LogHeader:
-        """Columns; all files of a folder must have the same column of time."""
+        """Check the columns; all files of a folder must have the same column of time."""
         files = self.files(source.path)
         schemas = {file: schema for file in files if (schema := _schema_or_none(file)) is not None}
         if not schemas:
@@ -146,7 +146,7 @@ def _stamps(source: LogSource, schema: pa.Schema) -> TableStamps:
 
 
 def _returns(batch: pa.RecordBatch, stamps: TableStamps, epochs: EpochReader, name: str, first: int) -> Iterator[Item]:
-    """Check a batch's rows and bring them to the schema's columns."""
+    """Check a batch's rows and convert them to the schema's columns."""
     sieve = Sieve(batch.num_rows)
     records = first + np.arange(batch.num_rows)
     columns: dict[str, npt.NDArray[np.generic]] = {}

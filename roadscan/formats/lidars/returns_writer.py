@@ -1,4 +1,4 @@
-"""Lidar returns of arrays, written as `returns_table`."""
+"""Writes lidar returns in arrays as `returns_table`."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from roadscan.ingest.array_files import (
 from roadscan.ingest.reading.table_stamps import EPOCH
 
 _FLOAT_M: Final = 1_000.0
-"""Beyond this, single precision holds a position less exactly than 0.06 mm."""
-_GROUP_ROWS: Final = 1 << 17
+"""Farthest position (m) that single precision represents to 0.06 mm."""
+_GROUP_ROWS: Final = 1 << 17  # rows of a row group
 
 
 def write_returns(
@@ -35,7 +35,7 @@ def write_returns(
     sweep: Any = None,
     clock: ClockLike = None,
 ) -> WrittenLog:
-    """Write lidar returns as a Parquet log that `roadscan` reads as `returns_table`; what was written.
+    """Write lidar returns as a Parquet log that `roadscan` reads as `returns_table`; return what was written.
 
     Parameters
     ----------

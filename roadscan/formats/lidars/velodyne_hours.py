@@ -1,4 +1,4 @@
-"""Which hour Velodyne stamps belong to: data packets count microseconds past a UTC hour that they do not name.
+"""Finds the hour of Velodyne stamps: data packets count microseconds past a UTC hour that they do not name.
 
 The first hour comes from a GPRMC sentence or from the survey file. From there on stamps are counted over
 the ends of hours, whether they start again at 3,600 s or a little later (at 3,601 s with a leap second). A gap of
@@ -25,19 +25,19 @@ from roadscan.ingest.reading.format import LogSource
 Bool = npt.NDArray[np.bool_]
 Int64 = npt.NDArray[np.int64]
 
-POSITION_BYTES: Final = 512
-HOUR_S: Final = 3600
-HOUR_US: Final = HOUR_S * 1_000_000
+POSITION_BYTES: Final = 512  # bytes of a position packet
+HOUR_S: Final = 3600  # seconds of an hour
+HOUR_US: Final = HOUR_S * 1_000_000  # microseconds of an hour
 
-_SHORTEST_GAP_S: Final = HOUR_S / 2
-_LARGEST_DISAGREEMENT_S: Final = 5.0
+_SHORTEST_GAP_S: Final = HOUR_S / 2  # with longer gaps, hours cannot be counted
+_LARGEST_DISAGREEMENT_S: Final = 5.0  # largest difference of stamp and sentence
 _LEAP_US: Final = 10_000_000
-"""A single stamp farther than this from both its neighbours is damage."""
-_SOME_PACKETS: Final = 64
+"""A stamp farther than this from both its neighbours is damage."""
+_SOME_PACKETS: Final = 64  # packets whose median delay is taken
 
 
 def unroll(stamps_us: Int64, previous_us: int | None) -> Int64:
-    """Stamps (n,) counted on over the ends of hours: each within half an hour of the one before."""
+    """Return stamps (n,) unrolled over the ends of hours: each within half an hour of the one before."""
     before = [] if previous_us is None else [previous_us]
     joined = np.concatenate([np.array(before, dtype=np.int64), stamps_us])
     hours = np.zeros(joined.size, dtype=np.int64)
@@ -46,7 +46,7 @@ def unroll(stamps_us: Int64, previous_us: int | None) -> Int64:
 
 
 def leaps(stamps_us: Int64, previous_us: int | None) -> Bool:
-    """(n,) stamps that leap out of their order and back: damage.
+    """Return which stamps (n,) leap out of their order and back: damage.
 
     The last stamp is taken as it is; the first of a log is judged by the two after it.
     """
@@ -61,19 +61,19 @@ def leaps(stamps_us: Int64, previous_us: int | None) -> Bool:
     return leaping if previous_us is None else leaping[1:]
 
 
-_DATED: Final = Missing("clock", {"system": "utc_hour", "date": dt.date(2026, 5, 4)})
+_DATED: Final = Missing("clock", {"system": "utc_hour", "date": dt.date(2026, 5, 4)})  # proposal for a clock
 
 
 @dataclass(frozen=True)
 class Fix:
-    """A valid GPRMC sentence with the lidar's own stamp of the same moment."""
+    """A valid GPRMC sentence with the lidar's stamp of the same moment."""
 
     stamp_us: int
     unix_s: float
 
     @classmethod
     def of(cls, packet: Datagram) -> Fix | None:
-        """Time in a position packet (µs at byte 198, sentence at 206), None where it has none."""
+        """Return the time in a position packet (µs at byte 198, sentence at 206), None where it has none."""
         if len(packet.payload) != POSITION_BYTES:
             return None
         stamp_us = int.from_bytes(packet.payload[198:202], "little")
@@ -82,12 +82,12 @@ class Fix:
         return None if unix_s is None or stamp_us > LATEST_STAMP_US else cls(stamp_us, unix_s)
 
     def hour_unix_s(self) -> int:
-        """Start of the hour that the stamp counts from (POSIX s)."""
+        """Return the start of the hour from which the stamp counts (POSIX s)."""
         return hour_near(self.unix_s, self.stamp_us / 1e6)
 
 
 def _unix_of_rmc(sentence: str) -> float | None:
-    """POSIX seconds of a valid RMC sentence (NMEA 0183) with date and status A."""
+    """Return the POSIX seconds of a valid RMC sentence (NMEA 0183) with date and status A."""
     body, star, checksum = sentence.removeprefix("$").partition("*")
     fields = body.split(",")
     if not star or not sentence.startswith("$") or len(fields) < 10 or fields[0][2:] != "RMC" or fields[2] != "A":
@@ -109,28 +109,28 @@ def _unix_of_rmc(sentence: str) -> float | None:
 
 
 def hour_near(unix_s: float, stamp_s: float) -> int:
-    """Start of the hour with which `stamp_s` past it comes nearest to `unix_s` (POSIX s)."""
+    """Return the hour (POSIX s) for which `stamp_s` past it is nearest to `unix_s`."""
     return HOUR_S * round((unix_s - stamp_s) / HOUR_S)
 
 
 @dataclass(frozen=True)
 class Start:
-    """What the beginning of a capture says of its time."""
+    """Time information at the beginning of a capture."""
 
     stamp_us: int
-    """Stamp of the first data packet that is on GPS time."""
+    """Stamp of the first data packet on GPS time."""
     capture_ns: int
-    """Its time by the recording computer's clock, POSIX ns."""
+    """Its capture time by the recording computer's clock, POSIX ns."""
     fix: Fix | None
     """First valid sentence."""
     hours_to_fix: int
-    """Hours from the first data packet's to that of the fix."""
+    """Hours from the first data packet's hour to that of the fix."""
     hours_on: int = 0
-    """Hours from that of the capture's first data packet, where the clock steps in between."""
+    """Hours from the hour of the capture's first data packet, if the clock steps in between."""
 
 
 def first_hour_unix_s(source: LogSource, stated: Literal["capture"] | int | None, start: Start) -> int | None:
-    """Start of the first data packet's hour (POSIX s); None for a free-running clock.
+    """Return the start of the first data packet's hour (POSIX s); None for a free-running clock.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def first_hour_unix_s(source: LogSource, stated: Literal["capture"] | int | None
 
 
 def _stated_hour(path: Path, stated: Literal["capture"] | int | None, start: Start, date: dt.date | None) -> int | None:
-    """The hour by the survey file."""
+    """Return the hour that the survey file states."""
     if stated is None:
         return None
     if stated == "capture":
@@ -196,7 +196,7 @@ def _stated_hour(path: Path, stated: Literal["capture"] | int | None, start: Sta
 
 
 def _heard_hour(path: Path, start: Start, stated: int | None, date: dt.date | None) -> int:
-    """The hour by the sentence, held against the lidar's stamp and the survey file."""
+    """Return the hour of the sentence, checked against the lidar's stamp and the survey file."""
     if start.fix is None:
         raise TimeSystemError("the capture holds no valid GPRMC", file=path)
     heard = start.fix.hour_unix_s()
@@ -223,12 +223,12 @@ def _heard_hour(path: Path, start: Start, stated: int | None, date: dt.date | No
 
 
 def iso(unix_s: float) -> str:
-    """``2026-05-04T09:00:00Z`` of POSIX seconds."""
+    """Return ``2026-05-04T09:00:00Z`` of POSIX seconds."""
     return dt.datetime.fromtimestamp(unix_s, dt.UTC).isoformat().replace("+00:00", "Z")
 
 
 def _early_leaps_ns(first_hour_unix_s: int, stamps_us: Int64, unrolled_us: Int64) -> Int64:
-    """Leap seconds (ns, (n,)) that POSIX time counts too early: an hour that ends with one goes on to 3,601 s."""
+    """Return the leap seconds (ns, (n,)) that POSIX time counts too early: an hour with one ends at 3,601 s."""
     hours_s = first_hour_unix_s + (unrolled_us - stamps_us) // 1_000_000
     within = leap_seconds_at_unix(first_hour_unix_s + unrolled_us // 1_000_000) - leap_seconds_at_unix(hours_s)
     return within * NS_PER_S
@@ -236,15 +236,15 @@ def _early_leaps_ns(first_hour_unix_s: int, stamps_us: Int64, unrolled_us: Int64
 
 @dataclass
 class Hours:
-    """Brings the stamps of a capture to GPS time, chunk by chunk."""
+    """Converts the stamps of a capture to GPS time, chunk by chunk."""
 
     source: LogSource
     first_hour_unix_s: int | None
     """Start of the first data packet's hour; None for a free-running clock."""
     previous_us: int | None = None
-    """Last stamp, counted on from the first hour."""
+    """Last stamp, unrolled from the first hour."""
     capture_set_s: float = 0.0
-    """By how much the capture's clock was set forward on the way."""
+    """Total of forward corrections of the capture's clock (s)."""
     _capture_minus_stamp_s: float | None = None
     _has_sentences: bool = False
     _clock: Clock = field(init=False)
@@ -255,7 +255,7 @@ class Hours:
         self._clock = dataclasses.replace(stated, system=system, unit="ns")
 
     def epochs(self, stamps_us: Int64, capture_ns: Int64) -> Int64:
-        """GPS ns (n,) of stamps (n,), n > 0, in log order."""
+        """Return GPS ns (n,) of stamps (n,), n > 0, in log order."""
         unrolled = unroll(stamps_us, self.previous_us)
         self.previous_us = int(unrolled[-1])
         self._watch_for_gap(unrolled, capture_ns)
@@ -264,7 +264,7 @@ class Hours:
         return epochs if self.first_hour_unix_s is None else epochs - _early_leaps_ns(first_s, stamps_us, unrolled)
 
     def resume(self, expected_us: int) -> None:
-        """Go on with a later part of the capture, from `expected_us` on, counted from the first hour."""
+        """Continue with a later part of the capture, from `expected_us` on, counted from the first hour."""
         self.previous_us = expected_us
         self._capture_minus_stamp_s = None
         self.capture_set_s = 0.0
@@ -286,7 +286,7 @@ class Hours:
             )
 
     def _watch_for_gap(self, unrolled_us: Int64, capture_ns: Int64) -> None:
-        """Without sentences only the capture's clock shows that hours are missing."""
+        """Check for missing hours, which without sentences only the capture's clock shows."""
         apart_s = capture_ns / NS_PER_S - unrolled_us / 1e6
         if self._capture_minus_stamp_s is None:
             self._capture_minus_stamp_s = float(np.median(apart_s[:_SOME_PACKETS]))

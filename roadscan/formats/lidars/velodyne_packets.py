@@ -36,49 +36,49 @@ Float32 = npt.NDArray[np.float32]
 Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 
-DATA_BYTES: Final = 1206
-BLOCKS: Final = 12
-SLOTS: Final = 32
+DATA_BYTES: Final = 1206  # bytes of a data packet
+BLOCKS: Final = 12  # blocks of a packet
+SLOTS: Final = 32  # returns of a block
 
 _BLOCK: Final = np.dtype(
     [("flag", "<u2"), ("azimuth", "<u2"), ("returns", [("distance", "<u2"), ("reflectivity", "u1")], (SLOTS,))]
 )
 PACKET: Final = np.dtype([("blocks", _BLOCK, (BLOCKS,)), ("stamp_us", "<u4"), ("mode", "u1"), ("product", "u1")])
-"""A data packet as NumPy reads it."""
+"""NumPy layout of a data packet."""
 FLAG: Final = b"\xff\xee"
 """First bytes of every block."""
-DUAL: Final = 0x39
+DUAL: Final = 0x39  # mode byte of dual return
 MODES: Final = {0x37: "strongest", 0x38: "last", DUAL: "dual"}
 """Return modes by their byte."""
 LATEST_STAMP_US: Final = 3_660_000_000
-"""Stamps run a little past the hour before they start again; beyond a minute they are wrong."""
+"""Stamps run a little past the hour before they restart; beyond a minute they are wrong."""
 
-_DISTANCE_M: Final = np.float32(0.002)
-_EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)
-_FASTEST_HZ: Final = 25.0
-_SLACK_CENTIDEGREES: Final = 10
+_DISTANCE_M: Final = np.float32(0.002)  # unit of distance
+_EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)  # scales 255 to 65,535
+_FASTEST_HZ: Final = 25.0  # fastest turn that is accepted
+_SLACK_CENTIDEGREES: Final = 10  # tolerance of azimuth steps (0.01°)
 _TURN: Final = 36_000
-"""A turn in 0.01°."""
+"""A full turn in 0.01°."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """What the maker states of a sensor; tables run over the 32 slots of a block."""
+    """The maker's data of a sensor; tables cover the 32 slots of a block."""
 
     name: str
     product: int
     """Product byte of its packets."""
     lasers: int
     cycle_ns: int
-    """From one firing sequence to the next."""
+    """Time from one firing sequence to the next (ns)."""
     firing_ns: int
-    """From one laser to the next."""
+    """Time from one laser to the next (ns)."""
     elevations_deg: tuple[float, ...]
     offsets_mm: tuple[float, ...]
-    """Height of each beam's origin above the sensor's."""
+    """Height of each beam's origin above the sensor's (mm)."""
 
     def slot_times_ns(self, dual: bool) -> Int64:
-        """(12, 32) time of each slot after the packet's first firing."""
+        """Return (12, 32) time of each slot after the packet's first firing."""
         sequences = SLOTS // self.lasers
         block = np.arange(BLOCKS)[:, None] // (2 if dual else 1)
         slot = np.arange(SLOTS)
@@ -86,7 +86,7 @@ class Model:
         return np.asarray(sequence * self.cycle_ns + slot % self.lasers * self.firing_ns, dtype=np.int64)
 
     def slot_lasers(self) -> npt.NDArray[np.uint8]:
-        """(32,) laser of each slot."""
+        """Return (32,) laser of each slot."""
         return (np.arange(SLOTS) % self.lasers).astype(np.uint8)
 
 
@@ -113,7 +113,7 @@ MODELS: Final = (
 
 
 def faults(raw: npt.NDArray[np.void], model: Model, unstated: bool) -> list[tuple[Bool, str]]:
-    """Masks (n,) of damaged packets, each with its reason.
+    """Return masks (n,) of damaged packets, each with its reason.
 
     Parameters
     ----------
@@ -141,12 +141,12 @@ def faults(raw: npt.NDArray[np.void], model: Model, unstated: bool) -> list[tupl
 
 
 def _steps(azimuth: npt.NDArray[np.uint16]) -> Int32:
-    """(n, 11) turn from block to block, 0.01°, within half a turn either way."""
+    """Return (n, 11) turn from block to block, 0.01°, within half a turn either way."""
     return np.asarray(np.mod(np.diff(azimuth.astype(np.int32), axis=1) + _TURN // 2, _TURN) - _TURN // 2)
 
 
 def decode(raw: npt.NDArray[np.void], epochs: Int64, sweeps: Int32, model: Model, dual: bool) -> pa.RecordBatch:
-    """Returns of sound packets.
+    """Return the returns of sound packets.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def decode(raw: npt.NDArray[np.void], epochs: Int64, sweeps: Int32, model: Model
 
 
 def _directions(azimuth: npt.NDArray[np.uint16], times_ns: Int64) -> tuple[Float32, Float32]:
-    """Sine and cosine (n, 12, 32) of each slot's azimuth.
+    """Return sine and cosine (n, 12, 32) of each slot's azimuth.
 
     Parameters
     ----------

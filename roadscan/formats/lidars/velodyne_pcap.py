@@ -61,14 +61,14 @@ from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource
 from roadscan.ingest.reading.records import Sieve, options_of
 
 _CHUNK_PACKETS: Final = 640  # 245,760 slots
-_HEADER_PACKETS: Final = 1_000
-_HEADER_CHUNK: Final = 500
-_HOUR_NS: Final = 3_600 * NS_PER_S
+_HEADER_PACKETS: Final = 1_000  # least data packets of the first look
+_HEADER_CHUNK: Final = 500  # data packets between two evaluations of the first look
+_HOUR_NS: Final = 3_600 * NS_PER_S  # nanoseconds of an hour
 _RECENT_PACKETS: Final = 64
-"""Packets behind which a copy of one arrives, by a mirrored port."""
+"""Packets within which a copy from a mirrored port arrives."""
 _FASTEST_DRIFT: Final = 6e-4
-"""NTP moves a computer's clock by up to 500 ppm, and a quartz drifts by up to 100."""
-_LEAST_DRIFT_S: Final = 0.05
+"""Largest rate between clocks: NTP moves a computer's clock by up to 500 ppm, and a quartz drifts by up to 100."""
+_LEAST_DRIFT_S: Final = 0.05  # smaller gains of the capture's clock are ignored
 _NAMES_IN_RIG_FILES: Final = ("HDL32", "VLP16", "HDL64", "VLP32", "VLS128", "PUCKHIRES")
 _OTHER_PRODUCTS: Final = {0x23: "VLP-32A/B", 0x24: "Puck Hi-Res", 0x28: "VLP-32C", 0x31: "Velarray", 0xA1: "VLS-128"}
 
@@ -93,12 +93,12 @@ TWO_HEADS: Final = Witness(
 )
 
 _ASTRAY_CENTIDEG: Final = 500
-"""A head does not turn so far (0.01°) besides what its rate says: it holds that to some per cent."""
-_MIXED_SHARE: Final = 0.1
+"""Largest deviation of azimuth (0.01°) from the head's rate, which is constant to some per cent."""
+_MIXED_SHARE: Final = 0.1  # share of deviating packets from which two sensors are mixed
 _MIXED_LEAST: Final = 50
-"""Packets that tell it."""
+"""Least packets for that verdict."""
 _TURNED_PAUSE_US: Final = 5_000
-"""Over a longer pause the rate does not say where the azimuth is."""
+"""After longer pauses the rate does not predict the azimuth (µs)."""
 
 
 class VelodyneOptions(Strict):
@@ -151,7 +151,7 @@ class VelodynePcap(LogFormat):
         return start[:4] in {*MAGICS, PCAPNG} and _has_data_packet(start)
 
     def header(self, source: LogSource) -> LogHeader:
-        """Model, return mode, sender and first hour."""
+        """Return model, return mode, sender and first hour."""
         options = options_of(source, VelodyneOptions)
         known = _survey_capture(source.path, options)
         model = _model(source, options, known)
@@ -198,13 +198,13 @@ class VelodynePcap(LogFormat):
 
 
 def _has_hours(source: LogSource) -> bool:
-    """False for a sensor without GPS, whose stamps count from no hour."""
+    """Return False for a sensor without GPS, whose stamps count from no hour."""
     return source.clock is None or source.clock.system is not TimeSystem.FREE
 
 
 @dataclass
 class _Decoder:
-    """Turns data packets into rows; keeps the azimuth and the sweep from chunk to chunk."""
+    """Converts data packets to rows, with azimuth and sweep carried over between chunks."""
 
     model: Model
     options: VelodyneOptions
@@ -216,11 +216,11 @@ class _Decoder:
     _azimuth: int = -1
     _watch: StepWatch = field(default_factory=StepWatch)
     _verdicts: list[Verdict] = field(default_factory=list)
-    """What was found of the capture's parts, once a step of the clock was seen."""
+    """Verdicts on the capture's parts, once the clock stepped."""
     _left_out: Counter[int] = field(default_factory=Counter)
-    """Data packets that were left out, by part."""
+    """Number of data packets that were left out, by part."""
     _part: int = -1
-    """Part of the last packet that was used."""
+    """Part of the last used packet."""
     _stamp_us: int | None = None
     """Last sound stamp."""
     _recent: dict[bytes, int] = field(default_factory=dict)
@@ -229,7 +229,7 @@ class _Decoder:
     _sentences: Sentences = field(default_factory=Sentences)
 
     def items(self, packets: list[Datagram], positions: list[Datagram]) -> Iterator[Item]:
-        """Rows of sound data packets, and rejects for damaged ones; position packets confirm the hour."""
+        """Yield rows of sound data packets, and rejects for damaged ones; position packets confirm the hour."""
         if packets:
             yield from self._returns(packets)
         for packet in positions:
@@ -240,12 +240,12 @@ class _Decoder:
                 self.hours.check(fix, packet.number)
 
     def judge(self) -> None:
-        """Look through the whole capture for steps of the sensor's clock, and judge its parts."""
+        """Search the whole capture for steps of the sensor's clock, and judge its parts."""
         known = _survey_capture(self.source.path, self.options, whole_of=self.sender)
         self._verdicts = judged(known.parts.found, _has_hours(self.source))
 
     def findings(self) -> Iterator[Finding]:
-        """What is doubtful of the capture, once it is read."""
+        """Yield what is doubtful about the capture, once it is read."""
         for number, verdict in enumerate(self._verdicts):
             yield from verdict.findings(self._left_out[number])
         for set_us in self._watch.set_us:
@@ -296,7 +296,7 @@ class _Decoder:
                 yield Rows("returns", batch, first_record=int(numbers[part[0]]))
 
     def _sifted(self, packets: list[Datagram], raw: npt.NDArray[np.void], numbers: npt.NDArray[np.int64]) -> Sieve:
-        """Which packets are sound, stand once, and are of a part of the capture that is on GPS time."""
+        """Return which packets are sound, no copies, and in a part of the capture on GPS time."""
         sieve = Sieve(len(packets))
         for bad, reason in faults(raw, self.model, unstated=self.options.model is not None):
             sieve.drop(bad, reason)
@@ -321,7 +321,7 @@ class _Decoder:
         return sieve
 
     def _judge_on_the_way(self) -> None:
-        """Judge the capture at the first step; packets before it were taken already."""
+        """Judge the capture at the first step; earlier packets were already converted."""
         self.judge()
         if self._verdicts and not self._verdicts[0].kept:
             later = next((v.part for v in self._verdicts if v.part is v.base), self._verdicts[0].part)
@@ -334,19 +334,19 @@ class _Decoder:
             )
 
     def _verdict_of(self, position: Datagram) -> Verdict:
-        """Of the part to which a position packet belongs: the one in which it lies, or the next, by its stamp."""
+        """Return the verdict on a position packet's part: the part around it, or the next, by its stamp."""
         part = int(self._part_of(np.array([position.number]))[0])
         return min(self._verdicts[part : part + 2], key=lambda one: one.part.misses_us(position))
 
     def _part_of(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Part (n,) of the capture in which records lie."""
+        """Return the part (n,) of the capture for each record."""
         firsts = [v.part.first for v in self._verdicts]
         return np.clip(np.searchsorted(firsts, numbers, side="right") - 1, 0, None)
 
     def _epochs(
         self, stamps_us: npt.NDArray[np.int64], capture_ns: npt.NDArray[np.int64], numbers: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.int64]:
-        """GPS ns (n,) of the packets that are used."""
+        """Return GPS ns (n,) of the used packets."""
         if not self._verdicts:
             self.hours.capture_set_s = sum(self._watch.set_us) / 1e6
             return self.hours.epochs(stamps_us, capture_ns)
@@ -361,7 +361,7 @@ class _Decoder:
         return out
 
     def _copies(self, packets: list[Datagram], stamps_us: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """Packets (n,) whose bytes stand just before already; in another hour they may mean another time."""
+        """Return which packets (n,) repeat recent bytes; in another hour equal bytes mean another time."""
         copies = np.zeros(len(packets), dtype=bool)
         if not (stamps_us[1:] > stamps_us[:-1]).all() or packets[0].payload in self._recent:
             seen = self._recent
@@ -372,7 +372,7 @@ class _Decoder:
         return copies
 
     def _sweeps(self, azimuth: npt.NDArray[np.uint16]) -> npt.NDArray[np.int32]:
-        """(n, 12) sweep of each block: one more wherever the azimuth passes 360°."""
+        """Return (n, 12) sweep of each block: incremented wherever the azimuth passes 360°."""
         flat = azimuth.reshape(-1).astype(np.int32)
         before = flat[0] if self._azimuth < 0 else self._azimuth
         sweeps = self._sweep + np.cumsum(np.diff(flat, prepend=before) < -18_000)
@@ -382,7 +382,7 @@ class _Decoder:
 
 @dataclass
 class _Known:
-    """What a first look at the capture tells."""
+    """Results of a first look at the capture."""
 
     senders: Counter[str] = field(default_factory=Counter)
     products: Counter[int] = field(default_factory=Counter)
@@ -390,12 +390,12 @@ class _Known:
     parts: Parts = field(default_factory=Parts)
     turned: int = 0
     astray: int = 0
-    """Packets whose azimuth was compared with that of the packet before, and those that begin elsewhere."""
+    """Packets whose azimuth was compared with that of the packet before, and those that deviate."""
     _before: tuple[int, int, float] | None = None
-    """Stamp (µs), first azimuth (0.01°) and rate (0.01° a µs) of the last packet."""
+    """Stamp (µs), first azimuth (0.01°) and rate (0.01° per µs) of the last packet."""
 
     def take(self, packet: Datagram) -> None:
-        """Learn from a data packet that begins well."""
+        """Update from a data packet with a valid beginning."""
         self.senders[packet.sender] += 1
         self.products[packet.payload[1205]] += 1
         self.modes[packet.payload[1204]] += 1
@@ -404,7 +404,7 @@ class _Known:
         self._turn(packet.payload, stamp_us)
 
     def _turn(self, payload: bytes, stamp_us: int) -> None:
-        """Compare where a packet begins with where the one before it leads."""
+        """Compare the packet's first azimuth with that predicted from the packet before."""
         azimuth = int.from_bytes(payload[2:4], "little")
         if self._before is not None:
             passed_us = stamp_us - self._before[0]
@@ -418,7 +418,7 @@ class _Known:
         self._before = stamp_us, azimuth, ((inside + 18_000) % 36_000 - 18_000) / span_us
 
     def start(self, sentences: bool) -> Start:
-        """Time of the first packet that is on GPS time, and of a sentence that belongs to it."""
+        """Return the time of the first packet on GPS time, and of a matching sentence."""
         found = self.parts.found
         base = reference(found, sentences)
         return Start(base.stamp_us, base.capture_us * 1000, base.fix, base.fix_hours, hours_later(found[0], base))
@@ -438,7 +438,7 @@ def _has_data_packet(start: bytes) -> bool:
 
 
 def _survey_capture(path: Path, options: VelodyneOptions, whole_of: str | None = None) -> _Known:
-    """Look at the first packets, and on to a GPRMC that agrees unless the hour is stated; at all where the clock steps.
+    """Read the first packets, up to a GPRMC that agrees unless the hour is stated; everything if the clock steps.
 
     Parameters
     ----------
@@ -489,13 +489,13 @@ def _survey_capture(path: Path, options: VelodyneOptions, whole_of: str | None =
 
 
 def _begins_well(payload: bytes) -> bool:
-    """True for a data packet with sound first and last flags and a possible stamp."""
+    """Return True for a data packet with sound first and last flags and a possible stamp."""
     stamp_us = int.from_bytes(payload[1200:1204], "little")
     return payload[:2] == FLAG and payload[1100:1102] == FLAG and stamp_us <= LATEST_STAMP_US
 
 
 def _model(source: LogSource, options: VelodyneOptions, known: _Known) -> Model:
-    """Model by the packets' product byte; options and rig file must not contradict it."""
+    """Return the model of the packets' product byte; options and rig file must not contradict it."""
     product = known.products.most_common(1)[0][0]
     written = next((m for m in MODELS if m.product == product), None)
     stated = next((m for m in MODELS if m.name == options.model), None)

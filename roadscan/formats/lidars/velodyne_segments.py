@@ -1,4 +1,4 @@
-"""Parts of a Velodyne capture between steps of the sensor's clock, and which of them are on GPS time.
+"""Divides a Velodyne capture at steps of the sensor's clock, and finds which parts are on GPS time.
 
 The stamps of a sensor that starts anew, or finds its PPS late, step. Three witnesses in the capture show it: the
 recording computer's clock, the GPRMC sentence in the position packets with its PPS byte, and the rate of the packets,
@@ -22,25 +22,25 @@ from roadscan.formats.lidars.velodyne_hours import HOUR_S, HOUR_US, POSITION_BYT
 Int64 = npt.NDArray[np.int64]
 
 STEP_US: Final = 250_000
-"""A recording computer that is busy stamps packets late by less than this."""
+"""Largest delay (µs) with which a busy recording computer stamps packets."""
 _AHEAD_US: Final = 100_000
-"""No packet is captured before it is sent: stamps that get so far ahead of the computer's clock have stepped."""
+"""A stamp this far (µs) ahead of the computer's clock has stepped: no packet is captured before it is sent."""
 _EVEN_US: Final = 20_000
-"""Packets that follow one another within this, or within four usual intervals, are of one clock."""
+"""Packets within this interval (µs), or within four usual ones, are of one clock."""
 _RECENT_CHUNKS: Final = 16
-"""Chunks of 640 packets over which the least delay of the capture counts (some 10 s: no computer buffers longer)."""
-_LEAP_SECOND_US: Final = 1_000_000
+"""Chunks of 640 packets whose least delay counts (some 10 s: no computer buffers longer)."""
+_LEAP_SECOND_US: Final = 1_000_000  # a leap second
 _SET_US: Final = 2_000_000
-"""A busy computer is late by less; a clock that jumps by more was set."""
+"""Longest delay (µs) of a busy computer; a larger jump means that its clock was set."""
 
 SENTENCE_S: Final = 5.0
-"""A stamp farther from its GPRMC contradicts it."""
+"""A stamp farther from its GPRMC contradicts it (s)."""
 _SENTENCE_SCATTER_S: Final = 1.2
-"""A sentence names a second that is up to a second old, and takes 0.2 s to arrive."""
+"""Scatter of sentences (s): one names a second that is up to a second old, and takes 0.2 s to arrive."""
 _NEAR_S: Final = 2.0
-"""A recording computer that keeps UTC is not farther from it than this."""
+"""Largest error of a recording computer that keeps UTC (s)."""
 LOCKED: Final = 2
-"""PPS byte of a sensor that is locked (0: no PPS; 1: trying; 3: error): VLP-16 manual 63-9243, chapter 9."""
+"""PPS byte of a locked sensor (0: no PPS; 1: trying; 3: error): VLP-16 manual 63-9243, chapter 9."""
 
 STEPPED: Final = Witness(
     "lidar_clock_step",
@@ -59,7 +59,7 @@ _AGAIN: Final = "the capture goes back to a time that it holds already"
 
 
 def wrapped(us: int, period: int = HOUR_US) -> int:
-    """Difference of two stamps past the hour, within half an hour either way (µs)."""
+    """Return the difference of two stamps past the hour, within half an hour either way (µs)."""
     return (us + period // 2) % period - period // 2
 
 
@@ -69,7 +69,7 @@ class Step(NamedTuple):
     packet: int
     """Index in its chunk."""
     ahead_us: int
-    """By how much the stamps get ahead of the capture's clock; 0 where both go back."""
+    """Lead that the stamps gain over the capture's clock (µs); 0 where both go back."""
 
 
 @dataclass
@@ -77,19 +77,19 @@ class StepWatch:
     """Finds the data packets at which the stamps step, chunk by chunk."""
 
     set_us: list[int] = field(default_factory=list)
-    """By how much the capture's own clock was set forward (µs), each time that it was while packets went on evenly."""
+    """Forward corrections (µs) of the capture's clock while packets continued evenly."""
     _last: tuple[int, int] | None = None
     """Stamp and capture time (µs) of the last packet."""
     _delay_us: int = 0
-    """Delay of the capture behind the stamps, against that of the first packet."""
+    """Delay of the capture behind the stamps, relative to that of the first packet (µs)."""
     _least_us: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT_CHUNKS))
-    """Least delay in each of the last chunks."""
+    """Least delay in each of the last chunks (µs)."""
     _ends: list[tuple[int, int]] = field(default_factory=list)
-    """Stamp counted on (µs) and least delay (µs) of the first chunk and of the last."""
+    """Unrolled stamp (µs) and least delay (µs) of the first chunk and of the last."""
     _passed_us: int = 0
 
     def steps(self, stamps_us: Int64, capture_us: Int64) -> list[Step]:
-        """Steps among sound packets (n,), n > 0, in the capture's order."""
+        """Return the steps among sound packets (n,), n > 0, in the capture's order."""
         before = [] if self._last is None else [self._last]
         stamps = np.concatenate([np.array([b[0] for b in before], dtype=np.int64), stamps_us])
         captured = np.concatenate([np.array([b[1] for b in before], dtype=np.int64), capture_us])
@@ -107,7 +107,7 @@ class StepWatch:
             start, by_us = k, int(ahead[k])
             if stamps[k] >= HOUR_US and abs(by_us + _LEAP_SECOND_US) <= STEP_US:
                 delays[k:] += by_us  # the hour had 3,601 s
-            elif 0 < passed[k] <= even_us:  # the packets go on evenly: it was the capture's clock
+            elif 0 < passed[k] <= even_us:  # the packets continue evenly: the capture's clock stepped
                 if abs(by_us) > _SET_US:
                     self.set_us.append(int(waited[k] - passed[k]))
                     delays[k:] += by_us
@@ -123,14 +123,14 @@ class StepWatch:
 
     @property
     def drift(self) -> tuple[float, float]:
-        """Gain of the capture's clock on the stamps from the first chunk to the last (s), and its rate (1)."""
+        """Return the gain of the capture's clock over the stamps, first chunk to last (s), and its rate (1)."""
         if len(self._ends) < 2:
             return 0.0, 0.0
         (from_us, first_us), (to_us, last_us) = self._ends
         return (last_us - first_us) / 1e6, (last_us - first_us) / max(1, to_us - from_us)
 
     def _is_step(self, ahead_us: int, passed_us: int, delay_us: int) -> bool:
-        """False where the capture was late, or has caught up."""
+        """Return False where the capture was late, or has caught up."""
         if abs(ahead_us) <= _AHEAD_US:
             return True  # both go back
         if ahead_us < 0:
@@ -143,7 +143,7 @@ class StepWatch:
 
 
 def _wrapped(us: Int64) -> Int64:
-    """Differences (n,) of stamps past the hour, within half an hour either way (µs)."""
+    """Return differences (n,) of stamps past the hour, within half an hour either way (µs)."""
     return us - np.rint(us / HOUR_US).astype(np.int64) * HOUR_US
 
 
@@ -152,25 +152,25 @@ class Part:
     """A part of a capture without a step of the sensor's clock."""
 
     first: int
-    """Number of the record of its first data packet."""
+    """Record number of its first data packet."""
     stamp_us: int
     """Stamp of that packet."""
     capture_us: int
-    """Its time by the capture's clock (POSIX)."""
+    """Its capture time (POSIX, µs)."""
     ahead_us: int
-    """By how much its stamps are ahead of those of the capture's first part, by the capture's clock."""
+    """Lead of its stamps over those of the capture's first part, by the capture's clock (µs)."""
     packets: int = 0
     ends_us: int = 0
     """Capture time of the last packet."""
     fix: Fix | None = None
-    """First valid sentence that does not contradict the stamps, or else the first valid one."""
+    """First valid sentence that agrees with the stamps, or else the first valid one."""
     fix_hours: int = 0
-    """Hours from that of the first packet to that of the fix."""
+    """Hours from the hour of the first packet to that of the fix."""
     sentence_s: float | None = None
-    """By how much the stamps are ahead of GPRMC: the value nearest to zero."""
+    """Lead of the stamps over GPRMC (s): the value nearest to zero."""
     positions: int = 0
     locked: int = 0
-    """Position packets in all, and those whose PPS byte says locked."""
+    """Number of position packets, and of those whose PPS byte says locked."""
 
     @property
     def confirmed(self) -> bool:
@@ -179,7 +179,7 @@ class Part:
 
     @property
     def hour_unix_s(self) -> int | None:
-        """Start of the hour of its first packet (POSIX s), where a sentence that agrees says so."""
+        """Start of the hour of its first packet (POSIX s), by a sentence that agrees; None without one."""
         return self.fix.hour_unix_s() - HOUR_S * self.fix_hours if self.confirmed and self.fix is not None else None
 
     @property
@@ -189,16 +189,16 @@ class Part:
 
     @property
     def near(self) -> bool:
-        """True where its stamps agree with the capture's clock, hours apart."""
+        """True where its stamps agree with the capture's clock, apart from whole hours."""
         return abs(wrapped(self.capture_us - self.stamp_us)) <= _NEAR_S * 1e6
 
     def misses_us(self, position: Datagram) -> int:
-        """By how much the stamp of a position packet is off this part's (µs), by the capture's clock."""
+        """Return how far the stamp of a position packet is off this part's (µs), by the capture's clock."""
         stamp_us = int.from_bytes(position.payload[198:202], "little")
         return abs(wrapped(stamp_us - self.stamp_us - (position.capture_ns // 1000 - self.capture_us)))
 
     def take(self, packet: Datagram, unrolled_us: int, sent_us: int) -> None:
-        """Learn from a position packet.
+        """Update from a position packet.
 
         Parameters
         ----------
@@ -225,29 +225,29 @@ class Parts:
 
     found: list[Part] = field(default_factory=list)
     seen: int = 0
-    """Data packets taken."""
+    """Number of data packets added."""
     _watch: StepWatch = field(default_factory=StepWatch)
     _data: list[tuple[int, int, int]] = field(default_factory=list)
-    """Record number, stamp and capture time (µs) of data packets that wait."""
+    """Record number, stamp and capture time (µs) of pending data packets."""
     _positions: list[tuple[int, Datagram]] = field(default_factory=list)
-    """Position packets that wait, each with how many data packets wait before it."""
+    """Pending position packets, each with the number of pending data packets before it."""
     _previous_us: int | None = None
-    """Last stamp, counted on over hours from the part's first."""
+    """Last stamp, unrolled over hours from the part's first."""
     _before: tuple[Part, int, int, int] | None = None
-    """Last data packet that was taken: part, unrolled stamp, stamp, capture time."""
+    """Last data packet: part, unrolled stamp, stamp, capture time."""
 
     def data(self, number: int, stamp_us: int, capture_us: int) -> None:
-        """Take a data packet."""
+        """Add a data packet."""
         self._data.append((number, stamp_us, capture_us))
         self.seen += 1
 
     def position(self, packet: Datagram) -> None:
-        """Take a position packet."""
+        """Add a position packet."""
         if len(packet.payload) == POSITION_BYTES:
             self._positions.append((len(self._data), packet))
 
     def flush(self, last: bool = False) -> None:
-        """Judge the packets that wait; position packets after the last data packet wait on, unless it is the `last`."""
+        """Judge the pending packets; position packets after the last data packet stay pending, unless `last`."""
         known = [] if self._before is None else [self._before]
         if self._data:
             known += self._divided(np.array(self._data, dtype=np.int64))
@@ -269,7 +269,7 @@ class Parts:
             self._before = known[-1]
 
     def _divided(self, data: Int64) -> list[tuple[Part, int, int, int]]:
-        """Part, unrolled stamp, stamp and capture time of each data packet; damaged ones go by the one before."""
+        """Return part, unrolled stamp, stamp and capture time of each data packet; damaged ones take those before."""
         stamps, captured = data[:, 1], data[:, 2]
         sound = ~leaps(stamps, self._previous_us)
         rows = np.flatnonzero(sound)
@@ -298,15 +298,15 @@ class Parts:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a part of a capture is on GPS time."""
+    """Verdict whether a part of a capture is on GPS time."""
 
     part: Part
     ahead_us: int
-    """By how much its stamps are ahead of those of the reference, by the capture's clock."""
+    """Lead of its stamps over those of the reference, by the capture's clock (µs)."""
     base: Part
     """The reference."""
     reason: str
-    """Why it is left out; "" for a part that is used."""
+    """Reason why it is left out; "" for a part that is used."""
 
     @property
     def kept(self) -> bool:
@@ -315,14 +315,14 @@ class Verdict:
 
     @property
     def start_us(self) -> int:
-        """Where its first stamp is expected, counted on from the hour of the reference's first packet (µs)."""
+        """Expected first stamp, counted from the hour of the reference's first packet (µs)."""
         heard, since = self.part.hour_unix_s, self.base.hour_unix_s
         if heard is not None and since is not None:
             return self.part.stamp_us + (heard - since) * 1_000_000
         return self.base.stamp_us + self.part.capture_us - self.base.capture_us + self.ahead_us
 
     def findings(self, left_out: int) -> list[Finding]:
-        """What is said of the part; nothing of the reference, and of one that goes on as the reference does.
+        """Return findings on the part; none for the reference, and for a part that continues it.
 
         Parameters
         ----------
@@ -341,7 +341,7 @@ class Verdict:
         return [STEPPED.finds("", f"{text}: its {left_out:,} data packets were left out", left_out)]
 
     def _heard(self) -> str:
-        """What GPRMC and PPS say of the part."""
+        """Return in words what GPRMC and PPS say about the part."""
         out = "" if self.part.sentence_s is None else f"; they are {self.part.sentence_s:+.1f} s off GPRMC"
         if self.part.positions:
             out += f"; PPS is locked in {self.part.locked:,} of its {self.part.positions:,} position packets"
@@ -349,7 +349,7 @@ class Verdict:
 
 
 def reference(parts: Sequence[Part], sentences: bool = True) -> Part:
-    """The part on whose clock the capture is: confirmed by GPRMC and PPS, or else by the capture's clock.
+    """Return the part that defines the capture's clock: confirmed by GPRMC and PPS, or else by the capture's clock.
 
     Parameters
     ----------
@@ -368,7 +368,7 @@ def reference(parts: Sequence[Part], sentences: bool = True) -> Part:
 
 
 def judged(parts: Sequence[Part], sentences: bool = True) -> list[Verdict]:
-    """Whether each part is on GPS time, in the capture's order (`sentences` as for :func:`reference`)."""
+    """Return a verdict for each part, in the capture's order (`sentences` as for :func:`reference`)."""
     base = reference(parts, sentences)
     kept = [base]
     verdicts: list[Verdict] = []
@@ -384,7 +384,7 @@ def judged(parts: Sequence[Part], sentences: bool = True) -> list[Verdict]:
 
 
 def _fault(part: Part, base: Part, ahead_us: int, sentences: bool) -> str:
-    """Why a part is not on GPS time; "" where it is."""
+    """Return why a part is not on GPS time; "" where it is."""
     if sentences and part.sentence_s is not None and not part.confirmed:
         return _CONTRADICTS
     if abs(ahead_us) <= STEP_US:
@@ -398,6 +398,6 @@ def _fault(part: Part, base: Part, ahead_us: int, sentences: bool) -> str:
 
 
 def hours_later(first: Part, later: Part) -> int:
-    """Hours from that of the first packet of a capture to that of a later part, by the capture's clock."""
+    """Return the hours from a capture's first packet to a later part, by the capture's clock."""
     past_us = first.capture_us % HOUR_US if later.near else first.stamp_us
     return round((past_us + later.capture_us - first.capture_us - later.stamp_us) / (HOUR_S * 1_000_000))

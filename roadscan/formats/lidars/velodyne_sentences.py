@@ -1,4 +1,4 @@
-"""What the position packets of a Velodyne capture say of its clock: GPRMC against the stamps, and the PPS byte."""
+"""Checks the stamps of a Velodyne capture against its position packets: GPRMC sentences and the PPS byte."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from roadscan.formats.lidars.pcap import Datagram
 from roadscan.formats.lidars.velodyne_hours import POSITION_BYTES, Fix
 from roadscan.formats.lidars.velodyne_segments import LOCKED, SENTENCE_S, wrapped
 
-_MINUTE_US: Final = 60_000_000
-_EARLY_S: Final = -0.5
+_MINUTE_US: Final = 60_000_000  # microseconds of a minute
+_EARLY_S: Final = -0.5  # least lead of a stamp over its sentence
 _LATE_S: Final = 1.0
-"""A sentence names the second before it: the stamp of one that has just arrived lies between these from its time."""
+"""Greatest lead (s): a sentence names the second before it, and has just arrived at its stamp."""
 _DRIFT_S: Final = 0.1
-"""Arrivals of sentences scatter by less, in the least of a minute."""
+"""Scatter of sentences' arrivals (s), in the least of a minute."""
 _LOCKED_SHARE: Final = 0.9
-"""A sensor that is switched on with the capture says in its first seconds that it is not locked yet."""
+"""Least share of locked packets: a sensor that starts with the capture is not locked in its first seconds."""
 _FEWEST: Final = 5
-"""Sentences of a minute that its least counts for."""
+"""Least sentences of a minute for its minimum to count."""
 
 PPS: Final = Witness(
     "lidar_pps",
@@ -42,7 +42,7 @@ SENTENCES: Final = Witness(
 
 @dataclass
 class Sentences:
-    """Counts what the position packets of a capture say."""
+    """Counts the statements of a capture's position packets."""
 
     positions: int = 0
     locked: int = 0
@@ -53,7 +53,7 @@ class Sentences:
     """Least lead of a stamp over its sentence (s), and how many sentences, by minute of the sentence."""
 
     def take(self, packet: Datagram) -> Fix | None:
-        """Count a position packet; its valid sentence."""
+        """Count a position packet; return its valid sentence."""
         if len(packet.payload) != POSITION_BYTES:
             return None
         self.positions += 1
@@ -72,7 +72,7 @@ class Sentences:
         return fix
 
     def findings(self) -> Iterator[Finding]:
-        """What is doubtful of the stamps that were used."""
+        """Yield what is doubtful about the used stamps."""
         if self.locked < _LOCKED_SHARE * self.positions:
             yield PPS.finds(
                 "",

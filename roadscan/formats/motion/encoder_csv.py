@@ -46,18 +46,18 @@ SPEED: Final = Quantity("speed", "speed", ("wheel_speed",), optional=True)
 WHAT: Final = (TICKS, DISTANCE, SPEED)
 WHEEL_COLUMN: Final = "wheel"
 
-SPEED_MAX_M_PER_S: Final = 200.0
-DISTANCE_MAX_M: Final = 1e10
+SPEED_MAX_M_PER_S: Final = 200.0  # faster readings count as damage
+DISTANCE_MAX_M: Final = 1e10  # larger distances count as damage
 TICKS_MAX: Final = float(1 << 53)
-"""Larger counts are not exact in the numbers they are read through."""
-MOST_WHEELS: Final = 64
+"""Largest count that float64 represents exactly."""
+MOST_WHEELS: Final = 64  # wheels of one log
 _WHEEL: Final = re.compile(r"(?:front|rear|f|r)?_?(?:left|right|l|r|inner|outer)|front|rear|wheel_?\d{1,2}|\d{1,2}")
-"""Words in a column's name that tell a wheel; any others are mapped by `wheels`."""
+"""Words in a column's name that identify a wheel; others are mapped by `wheels`."""
 _NOT_ENCODER: Final = (
     "latitude", "longitude", "lat_", "lon_", "easting", "northing", "roll", "heading", "qw", "r11", "gyro", "acc",
     "angular_rate", "specific_force", "delta_angle",
 )  # fmt: skip
-"""Stems of columns that make a table one of poses or of an IMU, whatever else it holds."""
+"""Stems of columns that identify a table of poses or of an IMU, whatever else it contains."""
 
 
 class DirectionOption(Strict):
@@ -103,7 +103,7 @@ class _Wheel:
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one file is read."""
+    """How a file is read."""
 
     layout: TextLayout
     options: EncoderCsvOptions
@@ -125,7 +125,7 @@ class _Total:
     seen: bool = False
 
     def add(self, raw: Float64) -> Float64:
-        """Totals (n,) after each of the raw numbers (n,), all of them finite."""
+        """Return totals (n,) after each of the finite raw numbers (n,)."""
         if self.record == "increment":
             totals = self.total + np.cumsum(raw)
         elif self.counter_bits is None:
@@ -139,7 +139,7 @@ class _Total:
         return totals
 
     def leaps(self, raw: Float64) -> npt.NDArray[np.bool_]:
-        """Which of the raw counts (n,) leap by over a quarter of the counter's range and back: damage.
+        """Return which raw counts (n,) leap by over a quarter of the counter's range and back: damage.
 
         Taken as a count, it would put a whole turn of the counter into all later totals.
         """
@@ -160,7 +160,7 @@ class _Total:
         return self._steps_between(counts[:-1], counts[1:])
 
     def _steps_between(self, before: Float64, after: Float64) -> Float64:
-        """Shortest ways (n,) from one count to the other on the counter's circle."""
+        """Return the shortest differences (n,) from one count to the other on the counter's circle."""
         turn = 2.0 ** (self.counter_bits or 0)
         step: Float64 = np.mod(after - before + turn / 2, turn) - turn / 2
         return step
@@ -218,14 +218,14 @@ class EncoderCsv(LogFormat):
 
 @dataclass
 class _Reader:
-    """Turns the blocks of one log into rows, with each wheel's running totals."""
+    """Converts the blocks of one log to rows, with each wheel's running totals."""
 
     plan: _Plan
     epochs: EpochReader
     totals: dict[tuple[str, str], _Total] = field(default_factory=dict)
 
     def items(self, block: TextBlock) -> Iterator[Item]:
-        """Rows and rejects of a block."""
+        """Yield rows and rejects of a block."""
         lines = Sieve(block.records.size)
         epochs = self.epochs.epochs(self.plan.stamps.stamps(block, lines), lines, block.records)
         signs = self._signs(block, lines)
@@ -235,7 +235,7 @@ class _Reader:
             yield from self._wheel(block, wheel, rows, epochs, signs)
 
     def _parts(self, block: TextBlock, lines: Sieve) -> list[tuple[_Wheel, Int64]]:
-        """Each wheel of the block, with the sound lines that hold it."""
+        """Return each wheel of the block, with the sound lines that contain it."""
         if self.plan.wheel_column is None:
             rows = np.flatnonzero(lines.good)
             return [(wheel, rows) for wheel in self.plan.wheels] if rows.size else []
@@ -251,7 +251,7 @@ class _Reader:
         return [(_Wheel(name, columns), rows) for name, rows in found if rows.size]
 
     def _signs(self, block: TextBlock, lines: Sieve) -> Float64 | None:
-        """+1 forwards, −1 backwards (n,), where a column says so."""
+        """Return +1 forwards, −1 backwards (n,), where a column says so."""
         option = self.plan.options.direction
         if option is None:
             return None
@@ -263,7 +263,7 @@ class _Reader:
     def _wheel(
         self, block: TextBlock, wheel: _Wheel, rows: Int64, epochs: Int64, signs: Float64 | None
     ) -> Iterator[Item]:
-        """Rows and rejects of one wheel in the lines `rows` of a block."""
+        """Yield rows and rejects of one wheel in the lines `rows` of a block."""
         sieve = Sieve(rows.size)
         raw = {q.name: _raw(block, wheel, q, rows) for q in WHAT if q.name in wheel.columns}
         for name, values in raw.items():
@@ -299,7 +299,7 @@ class _Reader:
         return self.totals[key]
 
     def _finished(self, wheel: str, quantity: str, values: Float64, ways: Float64 | float) -> Float64:
-        """Running totals or speeds (n,), forwards positive, of raw values (n,); NaN where there is none."""
+        """Return running totals or speeds (n,), forwards positive, of raw values (n,); NaN where there is none."""
         if quantity == SPEED.name:
             return values * ways
         total = self._total(wheel, quantity)
@@ -307,7 +307,7 @@ class _Reader:
         here = np.flatnonzero(~np.isnan(values))
         if here.size:
             signed = values * ways
-            # A counter is unrolled as it is written, and turned afterwards.
+            # A counter is unrolled as it is written, and its sign is changed afterwards.
             out[here] = total.add(signed[here]) if total.record == "increment" else total.add(values[here]) * ways
         return out
 
@@ -335,7 +335,7 @@ def _raw(block: TextBlock, wheel: _Wheel, quantity: Quantity, rows: Int64) -> Fl
 
 
 def _check(name: str, values: Float64, counter_bits: int | None, sieve: Sieve) -> None:
-    """Drop records with values (n,) that cannot be; a missing one (NaN) is left to the other quantities."""
+    """Drop records with impossible values (n,); a missing one (NaN) is left to the other quantities."""
     limit, unit = {
         "ticks": (TICKS_MAX, "ticks"),
         "distance": (DISTANCE_MAX_M, "m"),
@@ -369,7 +369,7 @@ def _plan(source: LogSource) -> _Plan:
 def _columns(
     names: tuple[str, ...], options: EncoderCsvOptions, file: Path
 ) -> tuple[Found, str | None, tuple[_Wheel, ...]]:
-    """Column of time, of the wheel's name if there is one, and each wheel's columns."""
+    """Return the columns of time and of the wheel's name, if any, and each wheel's columns."""
     check_keys(options.columns, [TIME.name, WHEEL_COLUMN, *(q.name for q in WHAT)], file)
     stated = {name: option for name, option in options.columns.items() if name != WHEEL_COLUMN}
     plain = {TIME.name: 1.0}  # the clock states its unit
@@ -394,7 +394,7 @@ def _columns(
 
 
 def _stated(wheel: str, columns: dict[str, ColumnOption], names: tuple[str, ...], file: Path) -> dict[str, Found]:
-    """Columns of a wheel as `wheels` states them."""
+    """Return the columns of a wheel as `wheels` states them."""
     check_keys(columns, [q.name for q in WHAT], file)
     found = find_columns([q for q in WHAT if q.name in columns], names, columns, file)
     if not found:
@@ -405,7 +405,7 @@ def _stated(wheel: str, columns: dict[str, ColumnOption], names: tuple[str, ...]
 
 
 def _by_wheel(names: tuple[str, ...]) -> dict[str, dict[str, Found]]:
-    """Columns of each wheel whose names say the quantity, the wheel and the unit."""
+    """Return the columns of each wheel whose names say the quantity, the wheel and the unit."""
     wheels: dict[str, dict[str, Found]] = {}
     for column in names:
         for quantity in WHAT:
@@ -418,7 +418,7 @@ def _by_wheel(names: tuple[str, ...]) -> dict[str, dict[str, Found]]:
 
 
 def _wheel_of(quantity: Quantity, column: str) -> tuple[str, str] | None:
-    """Wheel and unit of a column called ``speed_front_left_m_per_s`` or ``front_left_speed_m_per_s``."""
+    """Return wheel and unit of a column called ``speed_front_left_m_per_s`` or ``front_left_speed_m_per_s``."""
     for unit in sorted(UNITS[quantity.dimension], key=len, reverse=True):
         bare = column.removesuffix(f"_{unit}") if unit else column
         if unit and bare == column:
@@ -445,7 +445,7 @@ def _nothing(names: tuple[str, ...], file: Path) -> FormatError:
 def _check_options(
     options: EncoderCsvOptions, wheels: tuple[_Wheel, ...], wheel_column: str | None, file: Path
 ) -> None:
-    """Refuse options that leave open, or contradict, what the numbers are."""
+    """Refuse options that leave the meaning of the numbers open, or contradict it."""
     counted = any(q.name in wheel.columns for wheel in wheels for q in (TICKS, DISTANCE))
     if counted and options.record is None:
         raise ConfigError(

@@ -43,7 +43,7 @@ _AXES: Final = ("x", "y", "z")
 
 
 def _on_axes(stem: str, dimension: Dimension, *also: str) -> tuple[Quantity, ...]:
-    """A quantity on the three axes, with the names its columns are known by."""
+    """Return a quantity on the three axes, with the usual names of its columns."""
     return tuple(Quantity(f"{stem}_{a}", dimension, tuple(f"{name}{a}" for name in also)) for a in _AXES)
 
 
@@ -53,12 +53,12 @@ FORCES: Final = _on_axes("specific_force", "acceleration", "acceleration_", "acc
 VELOCITIES: Final = _on_axes("delta_velocity", "speed", "delta_v_", "dvel_", "dv_")
 TEMPERATURE: Final = Quantity("temperature", "temperature", ("temp",), optional=True)
 
-RATE_MAX_RAD_PER_S: Final = 200.0
-FORCE_MAX_M_PER_S2: Final = 5_000.0
-TEMPERATURE_MIN_DEG_C: Final = -100.0
-TEMPERATURE_MAX_DEG_C: Final = 200.0
+RATE_MAX_RAD_PER_S: Final = 200.0  # larger rates count as damage
+FORCE_MAX_M_PER_S2: Final = 5_000.0  # larger forces count as damage
+TEMPERATURE_MIN_DEG_C: Final = -100.0  # lower temperatures count as damage
+TEMPERATURE_MAX_DEG_C: Final = 200.0  # higher temperatures count as damage
 _NOT_IMU: Final = ("latitude", "longitude", "easting", "northing", "roll", "heading", "qw", "r11")
-"""Stems of columns that make a table one of poses, whatever else it holds."""
+"""Stems of columns that identify a table of poses, whatever else it contains."""
 
 
 class ImuCsvOptions(TextOptions):
@@ -84,14 +84,14 @@ class ImuCsvOptions(TextOptions):
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one file is read."""
+    """How a file is read."""
 
     layout: TextLayout
     columns: dict[str, Found]
     rates: tuple[Quantity, ...]
     forces: tuple[Quantity, ...]
     rate_scale: float
-    """What a rate in radians (a second) is multiplied with: 1, or 1 / interval."""
+    """Factor of a rate in radians (per second): 1, or 1 / interval."""
     force_scale: float
     stamps: StampColumn
     kinds: dict[str, Kind]
@@ -150,7 +150,7 @@ class ImuCsv(LogFormat):
 
 
 def _items(block: TextBlock, plan: _Plan, reader: EpochReader) -> Iterator[Item]:
-    """Rows of the sound samples of a block, then its rejects."""
+    """Yield rows of the sound samples of a block, then its rejects."""
     sieve = Sieve(block.records.size)
     epochs = reader.epochs(plan.stamps.stamps(block, sieve), sieve, block.records)
     columns: dict[str, Float64] = {}
@@ -211,7 +211,7 @@ def _held(
     names: tuple[str, ...],
     stated: Mapping[str, ColumnOption],
 ) -> tuple[Quantity, ...]:
-    """Which of the two the file holds: `increments` where only they are there, or options name them."""
+    """Return which of the two the file has: `increments` where only they are there, or options name them."""
     if any(q.name in stated for q in increments):
         return increments
     everything = [q.name for q in (*plain, *increments)]
@@ -222,7 +222,7 @@ def _held(
 def _find(
     quantities: tuple[Quantity, ...], names: tuple[str, ...], options: ImuCsvOptions, file: Path
 ) -> dict[str, Found]:
-    """Columns of the quantities, with the units that names or options state."""
+    """Return the columns of the quantities, with the units that names or options state."""
     stated = dict(options.columns)
     plain_units: dict[str, float] = {TIME.name: 1.0}  # the clock states it
     groups = {"rate_unit": options.rate_unit, "force_unit": options.force_unit}
@@ -246,7 +246,7 @@ def _find(
 
 
 def _size(unit: str, quantity: Quantity, option: str, file: Path) -> float:
-    """Size of a unit that an option states."""
+    """Return the size of a unit that an option states."""
     units = UNITS[quantity.dimension]
     if unit not in units:
         raise ConfigError(
@@ -273,7 +273,7 @@ def _need_unit(
 
 
 def _check_unit(quantity: str, found: Found, size: float, file: Path) -> None:
-    """Refuse a unit for all three axes that the name of one, or its own option, contradicts."""
+    """Refuse a unit for all three axes that the name of one, or its option, contradicts."""
     if found.scale != size:
         raise ConfigError(
             f"column '{found.column}' ({quantity}) is in {found.unit}, the unit stated for all axes is another",

@@ -40,12 +40,12 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 LATE_NS: Final = 2 * NS_PER_S
-"""Sentences of an epoch may come so much later than others."""
+"""Largest delay of an epoch's sentences relative to others."""
 HELD_MAX: Final = 20_000
-"""So many sentences are held for late ones; more in so short a time are a clock that stands still."""
-SNIFF_BYTES: Final = 1 << 14
+"""Sentences that wait for late ones; more in so short a time mean a clock that stands still."""
+SNIFF_BYTES: Final = 1 << 14  # bytes from which the format is recognised
 MIXED_SENTENCES: Final = 3
-"""So many known sentences with right checksums at the start make a log with binary messages one of NMEA."""
+"""Known sentences with valid checksums that make a log with binary messages an NMEA log."""
 
 SENTENCES_GO_BACK: Final = Witness(
     "nmea_time_goes_back",
@@ -56,7 +56,7 @@ SENTENCES_GO_BACK: Final = Witness(
     told=("rejects", "findings"),
 )
 
-_EPOCH_DAY: Final = dt.date(1970, 1, 1)
+_EPOCH_DAY: Final = dt.date(1970, 1, 1)  # origin of day counts
 _UNKNOWN: Final = np.iinfo(np.int64).min
 
 
@@ -145,7 +145,7 @@ class Nmea(LogFormat):
 
 
 def _sentences(path: Path, limit: int | None = None) -> Iterator[Sentences | Reject]:
-    """All sentences of a log, or of its first `limit` bytes, block by block."""
+    """Yield all sentences of a log, or of its first `limit` bytes, block by block."""
     line = 0
     for offset, data in line_blocks(path, limit=limit):
         if isinstance(data, Reject):
@@ -163,7 +163,7 @@ def _sentences(path: Path, limit: int | None = None) -> Iterator[Sentences | Rej
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one file is read."""
+    """How a file is read."""
 
     options: NmeaOptions
     clock: Clock
@@ -183,13 +183,13 @@ def _plan(source: LogSource) -> _Plan:
         )
     check_geographic(source.need_crs(), source.path)
     if source.geoid is not None:
-        source.geoid.undulation_m([], [])  # says at once where the grid is missing
+        source.geoid.undulation_m([], [])  # reports at once where the grid is missing
     placement = GeodeticPlacement(source.need_crs(), "ellipsoidal", None, source.path)
     return _Plan(options, clock, placement, _first_day(source))
 
 
 def _first_day(source: LogSource) -> int:
-    """Date of the log's first sentence with a time, from its first date and the midnights before that."""
+    """Return the date of the log's first sentence with a time, from its first date and the midnights before that."""
     stated = source.clock.date if source.clock is not None else None
     found = _first_dated_day(source.path)
     if found is None and stated is None and source.defaults.week is not None:
@@ -237,14 +237,14 @@ def _date_of(day: int) -> dt.date:
 
 
 class _Midnights:
-    """Counts the midnights that times of the day pass."""
+    """Counts the midnights between times of the day."""
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
         self._count = 0
 
     def passed(self, times_ns: Int64) -> Int64:
-        """Midnights (n,) since the log's first time; a step of over half a day is one, or one back."""
+        """Return midnights (n,) since the log's first time; a step of over half a day is one, forwards or back."""
         if times_ns.size == 0:
             return times_ns
         before = times_ns[0] if self._last_ns is None else self._last_ns
@@ -255,7 +255,7 @@ class _Midnights:
 
 
 class _Calendar:
-    """Dates of times of the day, and GPS time of sentences."""
+    """Adds dates to times of the day, and converts sentences' times to GPS time."""
 
     def __init__(self, plan: _Plan, file: Path) -> None:
         self._epochs = EpochReader(plan.clock, file)
@@ -266,10 +266,10 @@ class _Calendar:
         self._waiting = Sentences.joined([])
         self._last_ns: int | None = None
         self._back: list[tuple[int, int]] = []
-        """By how much time goes back (ns), and the line at which it does."""
+        """Size of each step back in time (ns), with its line."""
 
     def timed(self, sentences: Sentences) -> tuple[Sentences, Int64, list[Reject]]:
-        """Sentences with their GPS epochs (n,), and those without one as rejects."""
+        """Return sentences with their GPS epochs (n,), and those without one as rejects."""
         before = self._waiting.size
         sentences = Sentences.joined([self._waiting, sentences])
         rows = np.flatnonzero(sentences.times_ns != UNTIMED)
@@ -277,7 +277,7 @@ class _Calendar:
         own = self._own_epochs(sentences.take(rows), sieve)
         untimed = np.flatnonzero(sentences.times_ns == UNTIMED)
         lent, waiting = self._lent_epochs(own, rows, untimed)
-        waiting &= untimed >= before  # none waits through a whole block
+        waiting &= untimed >= before  # none waits for a whole block
         self._waiting = sentences.take(untimed[waiting])
         epochs = np.full(sentences.size, _UNKNOWN, dtype=np.int64)
         epochs[rows], epochs[untimed] = own, lent
@@ -288,18 +288,18 @@ class _Calendar:
         return sentences.take(good), epochs[good], rejects
 
     def finish(self) -> tuple[Sentences, Int64, list[Reject]]:
-        """Sentences that wait for a time in vain."""
+        """Return sentences that no time followed."""
         left, self._waiting = self._waiting, Sentences.joined([])
         rejects = _rejects(left, np.arange(left.size), "the sentence has no time, and none follows to share")
         return Sentences.joined([]), np.empty(0, dtype=np.int64), rejects
 
     def _own_epochs(self, timed: Sentences, sieve: Sieve) -> Int64:
-        """GPS epochs (n,) of sentences that state a time; unknown where dropped."""
+        """Return GPS epochs (n,) of sentences that state a time; undefined where dropped."""
         if timed.size == 0:
             return np.empty(0, dtype=np.int64)
         passed = self._midnights.passed(timed.times_ns)
         days = self._days(timed, passed, sieve) + passed
-        leap = timed.times_ns >= DAY_NS  # 23:59:60 has no count of its own in POSIX time
+        leap = timed.times_ns >= DAY_NS  # 23:59:60 has no separate POSIX time
         unix_ns = days * DAY_NS + timed.times_ns - np.where(leap, NS_PER_S, 0)
         second = unix_ns // NS_PER_S
         real = leap_seconds_at_unix(second + 1) > leap_seconds_at_unix(second)
@@ -315,7 +315,7 @@ class _Calendar:
         return np.where(sieve.good, epochs, _UNKNOWN)
 
     def findings(self) -> Iterator[Finding]:
-        """Whether the times of the log go back."""
+        """Yield a finding if the times of the log go back."""
         if self._back:
             farthest_ns, line = max(self._back)
             yield SENTENCES_GO_BACK.finds(
@@ -326,9 +326,9 @@ class _Calendar:
             )
 
     def _days(self, timed: Sentences, passed: Int64, sieve: Sieve) -> Int64:
-        """Date (n,) of the log's first time as each sentence has it: its epoch's own, or the last before it."""
+        """Return the date (n,) of the log's first time by each sentence's epoch, or by the last date before it."""
         run = _epoch_runs(timed)
-        dated = np.flatnonzero(timed.days != UNDATED)[::-1]  # the first of an epoch stands
+        dated = np.flatnonzero(timed.days != UNDATED)[::-1]  # the first of an epoch counts
         of_run = np.full(run[-1] + 1, UNDATED, dtype=np.int64)
         of_run[run[dated]] = timed.days[dated] - passed[dated]
         known = np.flatnonzero(of_run != UNDATED)
@@ -340,7 +340,7 @@ class _Calendar:
         return np.asarray(before[run])
 
     def _lent_epochs(self, own: Int64, rows: Int64, untimed: Int64) -> tuple[Int64, Bool]:
-        """Epochs (m,) that sentences without a time share, and which of them wait for the next block."""
+        """Return epochs (m,) for sentences without a time, and which of them wait for the next block."""
         if self._after:
             at = np.searchsorted(rows, untimed)
             return np.append(own, _UNKNOWN)[at], at == rows.size
@@ -351,7 +351,7 @@ class _Calendar:
 
 
 def _epoch_runs(timed: Sentences) -> Int64:
-    """Number (n,) of the epoch each sentence stands in: of one time of the day, and of one date as a kind states it.
+    """Return the number (n,) of each sentence's epoch: sentences of one time of the day, and of one date.
 
     Where one kind states two dates at the same time of the day, a day or more is missing from the log; its
     epochs then begin where the kind that came first comes again.
@@ -367,7 +367,7 @@ def _epoch_runs(timed: Sentences) -> Int64:
 
 
 def _single(sieve: Sieve, sentences: Sentences) -> list[Reject]:
-    """A reject for each sentence that was dropped: their lines are not neighbours."""
+    """Return a reject for each dropped sentence: their lines are not adjacent."""
     index = np.arange(sentences.size, dtype=np.int64)
     out: list[Reject] = []
     for reject in sieve.rejects(index, index):
@@ -384,7 +384,7 @@ def _rejects(sentences: Sentences, rows: Int64, reason: str) -> list[Reject]:
 
 @dataclass(frozen=True)
 class _Merged:
-    """Epochs put together from their sentences."""
+    """Epochs merged from their sentences."""
 
     lines: Int64
     offsets: Int64
@@ -393,19 +393,19 @@ class _Merged:
     """(len(VALUES), n)."""
 
     def value(self, name: str) -> Float64:
-        """A value by its name in :data:`VALUES`, (n,)."""
+        """Return a value (n,) by its name in :data:`VALUES`."""
         return np.asarray(self.values[VALUES.index(name)])
 
 
 class _Epochs:
-    """Puts the sentences of each epoch together, also where they come late or in another block."""
+    """Merges the sentences of each epoch, even if they come late or in another block."""
 
     def __init__(self) -> None:
         self._held = Sentences.joined([])
         self._held_epochs = np.empty(0, dtype=np.int64)
 
     def merged(self, sentences: Sentences, epochs: Int64, *, last: bool) -> tuple[_Merged, list[Reject]]:
-        """Epochs that no further sentence can belong to, and second sentences of one kind as rejects."""
+        """Return the complete epochs, and second sentences of one kind as rejects."""
         sentences = Sentences.joined([self._held, sentences])
         epochs = np.concatenate([self._held_epochs, epochs])
         open_ = np.zeros(epochs.size, dtype=bool)
@@ -424,7 +424,7 @@ def _merge(sentences: Sentences, epochs: Int64) -> tuple[_Merged, list[Reject]]:
     group = np.cumsum(new) - 1
     values = np.full((len(VALUES), int(new.sum())), np.nan)
     for stated, out in zip(sentences.values, values, strict=True):
-        rows = np.flatnonzero(~np.isnan(stated) & ~twice)[::-1]  # the first kind stands
+        rows = np.flatnonzero(~np.isnan(stated) & ~twice)[::-1]  # the first kind counts
         out[group[rows]] = stated[rows]
     rejects: list[Reject] = []
     for kind, name in enumerate(KINDS):
@@ -437,7 +437,7 @@ def _merge(sentences: Sentences, epochs: Int64) -> tuple[_Merged, list[Reject]]:
 
 
 class _Solutions:
-    """Turns epochs into rows of `gnss`."""
+    """Converts epochs to rows of `gnss`."""
 
     def __init__(self, source: LogSource, plan: _Plan) -> None:
         self._source = source
@@ -448,7 +448,7 @@ class _Solutions:
     def items(
         self, epochs: _Epochs, sentences: Sentences, times: Int64, rejects: list[Reject], *, last: bool = False
     ) -> Iterator[Item]:
-        """Rows of the epochs that are whole, and rejects."""
+        """Yield rows of the complete epochs, and rejects."""
         merged, more = epochs.merged(sentences, times, last=last)
         yield from few_rejects(rejects + more)
         if merged.epochs.size == 0:
@@ -463,7 +463,7 @@ class _Solutions:
         )
 
     def _ellipsoidal_height(self, merged: _Merged, located: Bool, sieve: Sieve) -> Float64:
-        """Ellipsoidal heights (n,); epochs whose height has no known zero are dropped."""
+        """Return ellipsoidal heights (n,); epochs whose height has no known zero are dropped."""
         altitude = merged.value("altitude_m")
         if self._ellipsoidal:
             return altitude
@@ -479,7 +479,7 @@ class _Solutions:
         return height
 
     def _covered(self, geoid: Geoid, wanted: Bool, merged: _Merged, located: Bool, sieve: Sieve) -> Int64:
-        """Those of the `wanted` epochs that the geoid's grid covers; the others are dropped."""
+        """Return those of the `wanted` epochs that the geoid's grid covers; the others are dropped."""
         rows = np.flatnonzero(wanted)
         part = Sieve(rows.size)
         failed = drop_failing(part, lambda some: geoid.undulation_m(*_degrees(merged, rows[some])))
@@ -491,7 +491,7 @@ class _Solutions:
         return rows[part.good]
 
     def _without_zero(self, unknown: Bool, merged: _Merged, located: Bool, sieve: Sieve) -> None:
-        """No geoid separation: a fault of the log, unless other epochs have one."""
+        """Drop epochs without a geoid separation; raise an error for the log if no epoch has one."""
         if not self._any_height and unknown.sum() == located.sum():
             raise CrsError(
                 "GGA states no geoid separation, so what its altitude counts from is not known",
@@ -508,12 +508,12 @@ class _Solutions:
 
 
 def _degrees(merged: _Merged, rows: Int64) -> tuple[Float64, Float64]:
-    """Longitudes and latitudes (degrees) of some epochs."""
+    """Return longitudes and latitudes (degrees) of some epochs."""
     return merged.value("longitude_deg")[rows], merged.value("latitude_deg")[rows]
 
 
 def _columns(merged: _Merged) -> dict[str, Float64]:
-    """Columns of `gnss` beside epoch, position and quality."""
+    """Return columns of `gnss` other than epoch, position and quality."""
     computed = ("latitude_deg", "longitude_deg", "altitude_m", "quality")
     columns = {name: merged.value(name) for name in VALUES if name not in computed}
     speed, course = columns["speed_m_per_s"], np.radians(columns["course_deg"])

@@ -1,4 +1,4 @@
-"""NMEA 0183 sentences: found in text, checked, and their fields brought to numbers.
+"""Finds NMEA 0183 sentences in text, checks them, and converts their fields to numbers.
 
 A sentence starts at a ``$`` wherever it stands in a line, so that what a logger puts before it does
 not matter, and ends with ``*`` and the exclusive or of the bytes between in two hexadecimal digits.
@@ -27,10 +27,10 @@ Int64 = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 
-DAY_NS: Final = 86_400 * NS_PER_S
-UNTIMED: Final = -1
+DAY_NS: Final = 86_400 * NS_PER_S  # nanoseconds of a day
+UNTIMED: Final = -1  # time of sentences that state none
 UNDATED: Final = np.iinfo(np.int64).min
-METRES_PER_S_IN_KNOT: Final = 1852 / 3600
+METRES_PER_S_IN_KNOT: Final = 1852 / 3600  # a knot is 1,852 m per hour
 
 KINDS: Final = ("GGA", "RMC", "VTG", "ASHR", "HDT", "GST", "ZDA")
 """Sentences that are used, by the last letters of their address. Where two state one quantity of an epoch, the
@@ -41,7 +41,7 @@ VALUES: Final = (
     "sigma_north_m", "sigma_east_m", "sigma_down_m", "covariance_ne_m2", "course_deg", "speed_m_per_s",
     "heading_deg", "roll_deg", "pitch_deg", "sigma_heading_deg", "sigma_roll_deg", "sigma_pitch_deg",
 )  # fmt: skip
-"""What sentences state; `quality` is a number of :data:`QUALITIES`."""
+"""Values that sentences state; `quality` is an index of :data:`QUALITIES`."""
 
 GGA_QUALITY: Final = {
     0: "none",
@@ -58,12 +58,12 @@ GGA_QUALITY: Final = {
 """Quality of GGA by its number; 9 is NovAtel's for SBAS."""
 
 BINARY_SHARE: Final = 4
-"""A stretch between two sentences is binary where one of so many bytes, or more, is neither text nor blank."""
+"""A stretch between two sentences is binary where at least one byte in this many is neither text nor blank."""
 
 _ADDRESS: Final = re.compile(rb"\$(?:P[A-Z0-9]{2,6}|[A-Z]{2}[A-Z0-9]{3}),")
-_IS_BINARY: Final[Bool] = np.isin(np.arange(256), [*range(32, 127), *b"\t\r\n"], invert=True)
+_IS_BINARY: Final[Bool] = np.isin(np.arange(256), [*range(32, 127), *b"\t\r\n"], invert=True)  # by byte value
 _DOLLAR, _STAR, _COMMA, _FEED = (ord(c) for c in "$*,\n")
-_HEX: Final[npt.NDArray[np.int16]] = np.full(256, -1, dtype=np.int16)
+_HEX: Final[npt.NDArray[np.int16]] = np.full(256, -1, dtype=np.int16)  # digit of each letter, −1 for others
 for _digit, _letters in enumerate(zip("0123456789ABCDEF", "0123456789abcdef", strict=True)):
     _HEX[[ord(letter) for letter in _letters]] = _digit
 
@@ -77,7 +77,7 @@ class Sentences:
     offsets: Int64
     """(n,) byte of the ``$``."""
     kinds: Int64
-    """(n,) numbers of :data:`KINDS`."""
+    """(n,) indices of :data:`KINDS`."""
     times_ns: Int64
     """(n,) UTC time of the day (ns), `UNTIMED` for kinds that state none; a leap second is at 86,400 s."""
     days: Int64
@@ -91,7 +91,7 @@ class Sentences:
         return int(self.lines.size)
 
     def take(self, rows: Int64 | Bool) -> Sentences:
-        """Some of the sentences."""
+        """Return some of the sentences."""
         return Sentences(
             self.lines[rows],
             self.offsets[rows],
@@ -103,7 +103,7 @@ class Sentences:
 
     @classmethod
     def joined(cls, parts: list[Sentences]) -> Sentences:
-        """Several pieces as one."""
+        """Return several pieces as one."""
         if not parts:
             empty = np.empty(0, dtype=np.int64)
             return cls(empty, empty, empty, empty, empty, np.empty((len(VALUES), 0)))
@@ -119,18 +119,18 @@ class Sentences:
 
 @dataclass(frozen=True)
 class Found:
-    """Sentences of a block of text whose checksum is right."""
+    """Sentences of a block of text with valid checksums."""
 
     starts: Int64
     """(n,) byte of the ``$``."""
     ends: Int64
     """(n,) byte of the ``*``."""
     faulty: list[tuple[int, str]]
-    """Byte of each ``$`` whose sentence is damaged, and what is wrong with it."""
+    """Byte of each ``$`` whose sentence is damaged, and its fault."""
 
 
 def find_sentences(data: bytes) -> Found:
-    """Find all sentences of a block of whole lines and check them."""
+    """Find and check all sentences of a block of whole lines."""
     letters = np.frombuffer(data, dtype=np.uint8)
     starts = np.flatnonzero(letters == _DOLLAR)
     ends = _next(np.flatnonzero((letters == _FEED) | (letters == _DOLLAR)), starts + 1, letters.size)
@@ -148,17 +148,17 @@ def find_sentences(data: bytes) -> Found:
 
 
 def _next(marks: Int64, positions: Int64, none: int) -> Int64:
-    """The first of `marks` at or behind each position, `none` where there is none."""
+    """Return the first of `marks` at or after each position, `none` where there is none."""
     return np.append(marks, none)[np.searchsorted(marks, positions)]
 
 
 def is_address(data: bytes, dollar: int) -> bool:
-    """True if the ``$`` at byte `dollar` opens a sentence, and is not any byte of binary data."""
+    """Return True if the ``$`` at byte `dollar` opens a sentence, rather than being part of binary data."""
     return _ADDRESS.match(data, dollar) is not None
 
 
 def kinds_of(data: bytes, starts: Int64, ends: Int64) -> Int64:
-    """Number in :data:`KINDS` of each sentence, −1 for others."""
+    """Return the index in :data:`KINDS` of each sentence, −1 for others."""
     letters = np.frombuffer(data, dtype=np.uint8)
     out = np.full(starts.size, -1, dtype=np.int64)
     long = np.flatnonzero(ends - starts > 7)
@@ -178,7 +178,7 @@ def kinds_of(data: bytes, starts: Int64, ends: Int64) -> Int64:
 
 
 def parse_sentences(data: bytes, first_line: int, offset: int) -> tuple[Sentences, list[Reject], int]:
-    """Sound sentences of a block of whole lines, what is damaged in it, and how many lines it has.
+    """Return sound sentences of a block of whole lines, rejects of damaged ones, and its number of lines.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def parse_sentences(data: bytes, first_line: int, offset: int) -> tuple[Sentence
 
 
 def _stretches_as_one(data: bytes, found: Found, rejects: list[Reject]) -> list[Reject]:
-    """One reject for each stretch of binary data between sentences; damaged sentences in it keep their own."""
+    """Return one reject for each stretch of binary data between sentences; damaged sentences in it keep theirs."""
     if not rejects:
         return rejects
     letters = np.frombuffer(data, dtype=np.uint8)
@@ -234,7 +234,7 @@ def _stretches_as_one(data: bytes, found: Found, rejects: list[Reject]) -> list[
 
 
 def _lines_without(letters: Bytes, feeds: Int64, lines: int) -> list[Reject]:
-    """Lines that are neither blank nor hold a sentence, runs of them together."""
+    """Return rejects of lines that are neither blank nor contain a sentence, one for each run of them."""
     if np.unique(np.searchsorted(feeds, np.flatnonzero(letters == _DOLLAR))).size == lines:
         return []
     starts = np.concatenate([[0], feeds + 1])[:lines]
@@ -276,19 +276,19 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Form:
-    """How one kind of sentence is laid out."""
+    """Layout of one kind of sentence."""
 
     fields: tuple[str, ...]
-    """Names of the fields behind the address; a later edition may add more."""
+    """Names of the fields after the address; a later edition may add more."""
     needed: int
-    """So many of them have to be there."""
+    """Least number of fields."""
     texts: tuple[str, ...]
-    """Those that hold letters."""
+    """Fields of letters."""
     used: Callable[[_Fields], dict[str, Float64]]
-    """Gives the values of sound sentences, and drops others."""
+    """Returns the values of sound sentences, and drops others."""
 
     def parse(self, data: bytes, starts: Int64, ends: Int64, count: int) -> tuple[_Part, list[tuple[int, str]]]:
-        """Values of sentences with `count` fields, and damaged rows with the reason."""
+        """Return values of sentences with `count` fields, and damaged rows with the reason."""
         if count < self.needed:
             reason = f"the sentence has {count} fields, expected {self.needed}"
             return _nothing(), [(row, reason) for row in range(starts.size)]
@@ -332,7 +332,7 @@ def _nothing() -> _Part:
 
 
 class _Fields:
-    """Fields of sentences of one kind; time and date are kept here."""
+    """Fields of sentences of one kind, with their times and dates."""
 
     def __init__(self, block: TextBlock, sieve: Sieve) -> None:
         self._block = block
@@ -341,13 +341,13 @@ class _Fields:
         self.days = np.full(block.records.size, UNDATED, dtype=np.int64)
 
     def number(self, name: str) -> Float64:
-        """Field as a number (n,), NaN where empty or not there."""
+        """Return a field as numbers (n,), NaN where empty or absent."""
         if name in self._block.columns:
             return self._block.number(name)
         return np.full(self._block.records.size, np.nan)
 
     def among(self, name: str, *letters: str) -> list[Bool]:
-        """For each of `letters`, the mask (n,) of sentences with it; others than these and none are dropped."""
+        """Return for each of `letters` the mask (n,) of sentences with it; other letters are dropped."""
         if name not in self._block.columns:
             return [np.zeros(self._block.records.size, dtype=bool) for _ in letters]
         words = pc.utf8_upper(pc.utf8_trim_whitespace(self._block.columns[name]))
@@ -356,12 +356,12 @@ class _Fields:
         return known
 
     def require(self, name: str, values: Float64, low: float, high: float, unit: str) -> None:
-        """Drop sentences with a value outside [low, high]; missing ones are let pass."""
+        """Drop sentences with a value outside [low, high]; missing values pass."""
         outside = ~(np.isnan(values) | ((values >= low) & (values <= high)))
         self.sieve.drop(outside, f"{name} is outside {low:g} to {high:g} {unit}")
 
     def take_time(self) -> None:
-        """Time of the day, hhmmss.sss; a sentence without one is dropped."""
+        """Read the time of the day, hhmmss.sss; a sentence without one is dropped."""
         given = self.number("time")
         self.sieve.drop(np.isnan(given), "the sentence states no time")
         hour, minute, second = np.floor(given / 1e4), np.floor(given / 100) % 100, given % 100
@@ -372,7 +372,7 @@ class _Fields:
         self.times_ns = ns.astype(np.int64)
 
     def take_date(self, day: Float64, month: Float64, year: Float64) -> None:
-        """Date; a sentence with one that cannot be is dropped, one without stays undated."""
+        """Read the date; a sentence with an impossible one is dropped, one without stays undated."""
         given = ~(np.isnan(day) | np.isnan(month) | np.isnan(year))
         possible = given & (month >= 1) & (month <= 12) & (day >= 1) & (day <= 31) & (year >= 1980) & (year < 2080)
         d, m, y = (np.where(possible, v, fill).astype(np.int64) for v, fill in ((day, 1), (month, 1), (year, 1980)))
@@ -383,7 +383,7 @@ class _Fields:
         self.days = np.where(possible, days.astype(np.int64), UNDATED)
 
     def signed(self, name: str, degrees: float, letters: tuple[str, str]) -> Float64:
-        """Latitude or longitude (degrees, (n,)) of dddmm.mmmm and a letter."""
+        """Return latitude or longitude (degrees, (n,)) of dddmm.mmmm and a letter."""
         given = self.number(name)
         minutes = given % 100
         self.sieve.drop((given < 0) | (minutes >= 60), f"{name} is not degrees and minutes")

@@ -48,8 +48,8 @@ _TIME_SYSTEMS: Final = {
     "UTC": (TimeSystem.UNIX_UTC, 0),
     "JST": (TimeSystem.UNIX_UTC, 9 * 3600),
 }
-"""Scale of the calendar by the header's word, and how far it is ahead of that scale (s)."""
-_Q: Final = {1: "fixed", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp", 7: "dead_reckoning"}
+"""Scale of the calendar by the header's word, and its lead over that scale (s)."""
+_Q: Final = {1: "fixed", 2: "float", 3: "sbas", 4: "dgps", 5: "single", 6: "ppp", 7: "dead_reckoning"}  # column Q
 _FIRST_COLUMNS: Final[dict[str, Solution]] = {
     "latitude(deg)": "lat/lon/height",
     "latitude(d'\")": "lat/lon/height",
@@ -61,7 +61,7 @@ _NAN: Final = float("nan")
 
 
 class BasePosition(Strict):
-    """Where a base station stands, in the datum of the log's crs."""
+    """Position of a base station, in the datum of the log's crs."""
 
     latitude_deg: float
     """Latitude (degrees)."""
@@ -141,26 +141,26 @@ class RtklibPos(LogFormat):
 
 @dataclass(frozen=True)
 class _Header:
-    """What the header lines say."""
+    """Content of the header lines."""
 
     time: str
     """GPST, UTC or JST."""
     solution: Solution
     columns: tuple[str, ...]
-    """Names behind the time, without their units."""
+    """Names after the time, without their units."""
     sexagesimal: bool
-    """Latitude and longitude are degrees, minutes, seconds in fields of their own."""
+    """Latitude and longitude are degrees, minutes, seconds in separate fields."""
     separator: str
     datum: str
     height: str
-    """ "ellipsoidal", "geodetic" or "" where it is not said."""
+    """"ellipsoidal", "geodetic" or "" where it is not said."""
     base: tuple[float, ...]
     """Words of the base station's position, as many as there are."""
 
 
 @dataclass
 class _LaterHeaders:
-    """Headers of solutions that were appended to the first; the lines of each are judged one after another."""
+    """Headers of solutions that were appended to the first; the lines of each are judged one by one."""
 
     first: _Header
     other: str = (
@@ -168,14 +168,14 @@ class _LaterHeaders:
         "or base station"
     )
     _same: dict[str, bool] = field(default_factory=dict)
-    """Whether the last header agrees, by what its lines are of."""
+    """Whether the last header agrees, by the subject of its lines."""
 
     def row(self, fields: Sequence[str]) -> bool | None:
-        """Rows are never headers: those are comments."""
+        """Return None: rows are never headers, which are comments."""
         return None
 
     def comment(self, line: str) -> bool | None:
-        """Whether rows behind this line are of the first header; None for a line that says nothing of that."""
+        """Return whether rows after this line match the first header; None for a line that says nothing about it."""
         said = _said_of_position(line)
         if any(name in line for name in _FIRST_COLUMNS):
             self._same["columns"] = self._has_columns(line)
@@ -197,7 +197,7 @@ class _LaterHeaders:
 
 
 def _said_of_position(text: str) -> tuple[str, str] | None:
-    """Datum and kind of height that a header line states."""
+    """Return the datum and kind of height that a header line states."""
     said = re.search(r"lat/lon/height=(\w+)/(\w+)", text)
     return (said[1], said[2]) if said else None
 
@@ -219,7 +219,7 @@ def _header(path: Path) -> _Header:
 
 
 def _columns_of(line: str, path: Path | None) -> _Header:
-    """What the line of column names says."""
+    """Return the header's content from the line of column names."""
     first = next(name for name in _FIRST_COLUMNS if name in line)
     behind = line[line.index(first) + len(first) :][:1]
     separator = behind if behind and behind in _SEPARATORS else " "
@@ -250,7 +250,7 @@ def _header_lines(head: bytes) -> Iterator[str]:
 
 
 def _own_header_lines(head: bytes, columns: str) -> Iterator[str]:
-    """Header lines above the first record: those of files appended behind it say nothing of it."""
+    """Yield header lines above the first record: those of appended files do not apply to it."""
     is_behind = False
     for line in head.decode("utf-8", errors="replace").splitlines():
         is_behind |= line == columns
@@ -261,7 +261,7 @@ def _own_header_lines(head: bytes, columns: str) -> Iterator[str]:
 
 
 def _column_line(head: bytes) -> str | None:
-    """The header line that names the columns, None where there is none."""
+    """Return the header line with the column names, None where there is none."""
     return next((line for line in _header_lines(head) if any(name in line for name in _FIRST_COLUMNS)), None)
 
 
@@ -279,7 +279,7 @@ def _base_words(head: bytes, separator: str) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one file is read."""
+    """How a file is read."""
 
     header: _Header
     layout: TextLayout
@@ -290,7 +290,7 @@ class _Plan:
     """(3,) base station, for baselines that become geocentric."""
 
     def stamps(self, block: TextBlock, sieve: Sieve) -> Int64:
-        """Nanoseconds (n,) from 1970 on the clock's scale; faulty ones are dropped."""
+        """Return nanoseconds (n,) from 1970 on the clock's scale; faulty stamps are dropped."""
         ahead_ns = _TIME_SYSTEMS[self.header.time][1] * NS_PER_S
         if "tow" in self.kinds:
             return _of_week(block.number("week"), block.number("tow"), sieve) - ahead_ns
@@ -301,7 +301,7 @@ class _Plan:
         return _of_calendar(pc.replace_substring(times, "/", "-").to_pylist(), sieve) - ahead_ns
 
     def position(self, block: TextBlock, sieve: Sieve) -> Float64:
-        """Positions (3, n) in the units of the placement."""
+        """Return positions (3, n) in the units of the placement."""
         if self.header.solution == "x/y/z-ecef":
             return np.stack([block.number(f"{a}-ecef") for a in "xyz"])
         if self.header.solution == "e/n/u-baseline":
@@ -309,7 +309,7 @@ class _Plan:
             if self.base_world_m is None:
                 return enu
             ned = np.stack([enu[1], enu[0], -enu[2]])
-            with np.errstate(invalid="ignore", over="ignore"):  # damaged records, dropped when they are placed
+            with np.errstate(invalid="ignore", over="ignore"):  # damaged records are dropped when they are placed
                 return np.asarray(self.base_world_m[:, None] + self._ned_from_base().T @ ned)
         if self.header.sexagesimal:
             latitude, longitude = (_sexagesimal(block, name, sieve) for name in ("latitude", "longitude"))
@@ -318,12 +318,12 @@ class _Plan:
         return np.stack([np.radians(longitude), np.radians(latitude), block.number("height")])
 
     def _ned_from_base(self) -> Float64:
-        """(3, 3) north-east-down from geocentric axes at the base station."""
+        """Return (3, 3) north-east-down from geocentric axes at the base station."""
         base = self.base_world_m
         return np.eye(3) if base is None else ned_from_ecef(self.placement.world, base[:, None])[0]
 
     def columns(self, block: TextBlock, position: Float64, sieve: Sieve) -> dict[str, Float64]:
-        """Further columns of `gnss`, (n,)."""
+        """Return further columns of `gnss`, (n,)."""
         names = set(self.kinds)
         found: dict[str, Float64] = {}
         for ours, theirs in (("satellites", "ns"), ("age_s", "age"), ("ratio", "ratio")):
@@ -342,7 +342,7 @@ def _plan(source: LogSource) -> _Plan:
 
 
 def _layout(path: Path, header: _Header) -> tuple[TextLayout, dict[str, Kind]]:
-    """Names and kinds of the fields of a line, as the first lines bear them out."""
+    """Return names and kinds of a line's fields, verified with the first lines."""
     fields = [part for name in header.columns for part in _parts(name, header)]
     day: dict[str, Kind] = {"date": "text", "time": "text"} if header.separator == " " else {"datetime": "text"}
     week: dict[str, Kind] = {"week": "number", "tow": "number"}
@@ -373,7 +373,7 @@ def _needed(header: _Header) -> tuple[str, ...]:
 
 
 def _parts(name: str, header: _Header) -> list[str]:
-    """Fields of a column: three for an angle in degrees, minutes and seconds."""
+    """Return the fields of a column: three for an angle in degrees, minutes and seconds."""
     if header.sexagesimal and name in ("latitude", "longitude"):
         return [f"{name}_{part}" for part in ("degrees", "minutes", "seconds")]
     return [name]
@@ -398,7 +398,7 @@ def _clock(source: LogSource, header: _Header) -> Clock:
 
 
 def _placement(source: LogSource, header: _Header) -> tuple[Placement, Float64 | None]:
-    """Placement of the positions, and the base station (3,) of baselines that become geocentric."""
+    """Return the placement of positions, and the base station (3,) of baselines that become geocentric."""
     if header.solution == "lat/lon/height":
         return _geodetic_placement(source, header), None
     if header.solution == "x/y/z-ecef":
@@ -433,7 +433,7 @@ def _geodetic_placement(source: LogSource, header: _Header) -> GeodeticPlacement
 
 
 def _base(source: LogSource, header: _Header) -> Float64:
-    """Longitude, latitude (degrees), ellipsoidal height (m) of the base station."""
+    """Return longitude, latitude (degrees), ellipsoidal height (m) of the base station."""
     stated = options_of(source, RtklibPosOptions).base
     if stated is not None:
         return np.array([stated.longitude_deg, stated.latitude_deg, stated.height_m])
@@ -470,7 +470,7 @@ def _of_calendar(words: list[str], sieve: Sieve) -> Int64:
 
 
 def _sexagesimal(block: TextBlock, name: str, sieve: Sieve) -> Float64:
-    """Degrees (n,); the sign of the degrees holds for all, and minus zero has one."""
+    """Return degrees (n,); the sign of the degrees applies to all parts, including minus zero."""
     degrees, minutes, seconds = (block.number(f"{name}_{part}") for part in ("degrees", "minutes", "seconds"))
     sieve.require(f"{name}'s minutes", minutes, 0, 60, "minutes")
     sieve.require(f"{name}'s seconds", seconds, 0, 60, "seconds")
@@ -487,7 +487,7 @@ def _quality(block: TextBlock, sieve: Sieve) -> Int64:
 
 
 def _roots(block: TextBlock, columns: Mapping[str, str], sieve: Sieve) -> dict[str, Float64]:
-    """Signed square roots of variances and covariances (n,) by what they are of."""
+    """Return signed square roots of variances and covariances (n,) by their quantity."""
     found = {key: block.number(name) for key, name in columns.items()}
     for key, values in found.items():
         with np.errstate(invalid="ignore"):
@@ -497,14 +497,14 @@ def _roots(block: TextBlock, columns: Mapping[str, str], sieve: Sieve) -> dict[s
 
 
 def _pick(names: set[str], **wanted: tuple[str, ...]) -> dict[str, str]:
-    """The first of each quantity's names that the file has."""
+    """Return the first of each quantity's names that the file has."""
     found = {key: next((one for one in known if one in names), None) for key, known in wanted.items()}
     return {key: name for key, name in found.items() if name is not None}
 
 
 def _level_columns(block: TextBlock, names: set[str], sieve: Sieve) -> dict[str, Float64]:
-    """σ, covariances and velocity that are east, north, up in the file."""
-    # RTKLIB heads the last column of degrees-minutes-seconds files sdue, although it holds un.
+    """Return σ, covariances and velocity that are east, north, up in the file."""
+    # RTKLIB names the last column of degrees-minutes-seconds files sdue, although it contains un.
     last = ("sdun", "sdnu", "sdue") if "sdeu" in names else ("sdun", "sdnu")
     columns = _pick(names, n=("sdn",), e=("sde",), u=("sdu",), ne=("sdne", "sden"), eu=("sdeu", "sdue"), un=last)
     columns |= _pick(names, vn=("sdvn",), ve=("sdve",), vu=("sdvu",))
@@ -527,7 +527,7 @@ def _level_columns(block: TextBlock, names: set[str], sieve: Sieve) -> dict[str,
 def _geocentric_columns(
     block: TextBlock, names: set[str], world: str, position: Float64, sieve: Sieve
 ) -> dict[str, Float64]:
-    """σ, covariances and velocity that are geocentric in the file, turned into the local level."""
+    """Return σ, covariances and velocity that are geocentric in the file, rotated into the local level."""
     sieve.require("distance from the Earth's centre", _length(position), 6.2e6, 6.5e6, "m")
     rotation = ned_from_ecef(world, np.where(sieve.good, position, np.array([[6.4e6], [0.0], [0.0]])))
     out: dict[str, Float64] = {}
@@ -551,7 +551,7 @@ def _geocentric_columns(
 
 
 def _covariance(block: TextBlock, names: set[str], prefix: str, sieve: Sieve) -> Float64 | None:
-    """(n, 3, 3) covariance matrices of the columns sdx … sdzx, None where they are not all there."""
+    """Return (n, 3, 3) covariance matrices of the columns sdx … sdzx, None where one is missing."""
     keys = ("x", "y", "z", "xy", "yz", "zx")
     if not {prefix + key for key in keys} <= names:
         return None
@@ -561,7 +561,7 @@ def _covariance(block: TextBlock, names: set[str], prefix: str, sieve: Sieve) ->
 
 
 def _root(variance: Float64) -> Float64:
-    """Square root; rounding of the file's digits may leave a variance just below zero."""
+    """Return the square root; rounding in the file may leave a variance just below zero."""
     return np.sqrt(np.maximum(variance, 0.0))
 
 

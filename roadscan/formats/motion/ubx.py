@@ -33,16 +33,16 @@ SOLUTION: Final = np.dtype(
         ("rest", "V20"), ("checksum", "u1", 2),
     ]
 )  # fmt: skip
-"""NAV-PVT as u-blox's interface descriptions state it (UBX-18010854, 5.14.19), with the checksum of its frame."""
+"""NAV-PVT in u-blox's interface description (UBX-18010854, 5.14.19), with the checksum of its frame."""
 _DATED: Final = 0b011
 """Bits of `valid`: date and time of day are known."""
-_FIXED_OK: Final = 1
+_FIXED_OK: Final = 1  # bit of `flags`: the fix is valid
 _FIX_KINDS: Final = {1: "dead_reckoning", 2: "none", 3: "single", 4: "single", 0: "none", 5: "none"}
-"""Quality by `fix`: a fix in the plane has no height, and one of time alone no place."""
-_CARRIER: Final = {1: "float", 2: "fixed"}
-_UNIX_DAY: Final = dt.date(1970, 1, 1).toordinal()
-_SNIFF_BYTES: Final = 1 << 16
-_BLOCK_BYTES: Final = 4 << 20
+"""Quality by `fix`: a 2D fix has no height, and a time-only fix no position."""
+_CARRIER: Final = {1: "float", 2: "fixed"}  # quality by the carrier solution in `flags`
+_UNIX_DAY: Final = dt.date(1970, 1, 1).toordinal()  # ordinal of 1970-01-01
+_SNIFF_BYTES: Final = 1 << 16  # bytes from which the format is recognised
+_BLOCK_BYTES: Final = 4 << 20  # bytes that are read at once
 _NMEA: Final = re.compile(rb"\$G[A-Z]GGA,")
 
 
@@ -105,7 +105,7 @@ class Ubx(LogFormat):
 
 
 def _blocks(path: Path) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.void]]]:
-    """Byte offsets (n,) and frames (n,) of the NAV-PVT of a file, block by block; a frame that is cut off is left."""
+    """Yield byte offsets (n,) and frames (n,) of a file's NAV-PVT, block by block; a cut-off frame is ignored."""
     with path.open("rb") as stream:
         held, at = b"", 0
         while block := stream.read(_BLOCK_BYTES):
@@ -118,7 +118,7 @@ def _blocks(path: Path) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.
 
 
 def _starts(content: bytes) -> npt.NDArray[np.int64]:
-    """Where whole NAV-PVT begin."""
+    """Return the starts of whole NAV-PVT frames."""
     found = (one.start() for one in re.finditer(re.escape(HEADER), content))
     return np.array([at for at in found if at + SOLUTION.itemsize <= len(content)], dtype=np.int64)
 
@@ -129,7 +129,7 @@ def _frames(content: bytes, starts: npt.NDArray[np.int64]) -> npt.NDArray[np.voi
 
 
 def _sound(frames: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
-    """Which frames (n,) have the checksum of their bytes (Fletcher's, of 8 bits; from the class on)."""
+    """Return which frames (n,) have a valid checksum (8-bit Fletcher, from the class on)."""
     covered = frames.view(np.uint8).reshape(frames.size, SOLUTION.itemsize)[:, 2:-2].astype(np.int64)
     weights = np.arange(covered.shape[1], 0, -1)
     first, second = covered.sum(axis=1) % 256, (covered @ weights) % 256
@@ -137,7 +137,7 @@ def _sound(frames: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
 
 
 def _unix_ns(frames: npt.NDArray[np.void], sieve: Sieve) -> npt.NDArray[np.int64]:
-    """UTC since 1970 (ns); a date that there is not is dropped."""
+    """Return UTC since 1970 (ns); records with an impossible date are dropped."""
     days = np.zeros(frames.size, np.int64)
     dates = np.stack([frames[name] for name in ("year", "month", "day")], axis=-1)
     for date in np.unique(dates, axis=0):
@@ -151,13 +151,13 @@ def _unix_ns(frames: npt.NDArray[np.void], sieve: Sieve) -> npt.NDArray[np.int64
 
 
 def _position(frames: npt.NDArray[np.void]) -> npt.NDArray[np.float64]:
-    """(3, n) longitude and latitude (rad), ellipsoidal height (m)."""
+    """Return (3, n) longitude and latitude (rad), ellipsoidal height (m)."""
     degrees = [np.radians(frames[name] * 1e-7) for name in ("longitude", "latitude")]
     return np.stack([*degrees, frames["height_mm"] * 1e-3])
 
 
 def _quality(frames: npt.NDArray[np.void]) -> npt.NDArray[np.int64]:
-    """(n,) numbers of `QUALITIES`."""
+    """Return (n,) indices of `QUALITIES`."""
     by_fix = np.array([QUALITIES.index(_FIX_KINDS.get(fix, "none")) for fix in range(256)])
     quality = by_fix[frames["fix"]]
     placed = (quality != NO_POSITION) & ((frames["flags"] & _FIXED_OK) > 0)

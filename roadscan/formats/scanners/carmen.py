@@ -82,21 +82,21 @@ _OTHER_NAME: Final = re.compile(
 _OLD_ANGLES_DEG: Final = {
     180: (-90.0, 1.0), 181: (-90.0, 1.0), 360: (-90.0, 0.5), 361: (-90.0, 0.5), 400: (-50.0, 0.25), 401: (-50.0, 0.25),
 }  # fmt: skip
-"""First angle and step (degrees) by readings of messages that do not state them."""
+"""First angle and step (degrees) of messages without angles, by number of readings."""
 OLD_MAXIMUM_M: Final = 80.0
-"""Maximum range that CARMEN takes for messages that do not state it; the LMS writes 81.83 to 81.91 for its codes."""
+"""Maximum range that CARMEN assumes for messages that state none; the LMS writes 81.83 to 81.91 for its codes."""
 OLD_CAP_M: Final = 50.0
-"""Some loggers wrote exactly this for "no return"."""
+"""Range (m) that some loggers wrote for "no return"."""
 
-_LARGEST_RAW: Final = 65_535
+_LARGEST_RAW: Final = 65_535  # largest raw range
 _SAME_POSE: Final = 1e-4
-"""Poses of scanner and robot that differ by less (m, rad) are one."""
+"""Poses of scanner and robot that differ by less (m, rad) count as equal."""
 _CONFIG_WORDS: Final = 9
 """Words up to the count of readings in RAWLASER and ROBOTLASER."""
-_TAIL_WORDS: Final = 3
-_ODOM_WORDS: Final = 10
-_MOST_READINGS: Final = 20_000
-_FARTHEST_M: Final = 1e5
+_TAIL_WORDS: Final = 3  # words after each message: stamp, host, time
+_ODOM_WORDS: Final = 10  # words of ODOM
+_MOST_READINGS: Final = 20_000  # larger counts of readings are no counts
+_FARTHEST_M: Final = 1e5  # farther ranges do not determine the step (m)
 _NO_MESSAGE: Final = "the line begins with no message of CARMEN"
 
 
@@ -198,7 +198,7 @@ class Carmen(LogFormat):
 
 @dataclass(frozen=True)
 class _Shape:
-    """Which word of a scan's message is what."""
+    """Position of each item among the words of a scan's message."""
 
     name: str
     words: int
@@ -207,7 +207,7 @@ class _Shape:
 
     @classmethod
     def of(cls, line: bytes) -> _Shape | None:
-        """Shape of a line; None where it is no whole message of a scan."""
+        """Return the shape of a line; None where it is no whole message of a scan."""
         name = line.split(None, 1)[0] if line.strip() else b""
         if _SCAN_NAME.fullmatch(name) is None:
             return None
@@ -219,7 +219,7 @@ class _Shape:
         return shape if readings > 0 and remissions >= 0 and len(words) in shape._lengths() else None
 
     def _lengths(self) -> tuple[int, ...]:
-        """Numbers of words that such a message may have."""
+        """Possible numbers of words of the message."""
         if _is_old(self.name):
             return (2 + self.readings + (6 if self.name[0] in "FR" else 0) + _TAIL_WORDS,)
         end = _CONFIG_WORDS + self.readings + 1 + self.remissions
@@ -237,21 +237,21 @@ class _Shape:
 
     @property
     def count_at(self) -> int:
-        """Word with the count of readings."""
+        """Index of the count of readings."""
         return 1 if self.is_old else _CONFIG_WORDS - 1
 
     @property
     def ranges(self) -> slice:
-        """Words with the ranges."""
+        """Words of the ranges."""
         return slice(self.count_at + 1, self.count_at + 1 + self.readings)
 
     @property
     def bright(self) -> slice:
-        """Words with the remissions."""
+        """Words of the remissions."""
         return slice(self.ranges.stop + 1, self.ranges.stop + 1 + self.remissions)
 
     def pose_at(self, pose: Pose) -> int:
-        """First word of a pose."""
+        """Return the index of a pose's first word."""
         laser = self.ranges.stop if self.is_old else self.bright.stop
         return int(laser) + (3 if pose == "robot" else 0)
 
@@ -261,13 +261,13 @@ def _is_old(name: str) -> bool:
 
 
 def _whole(words: list[bytes], at: int) -> int:
-    """A count, −1 where there is none."""
+    """Return a count, −1 where there is none."""
     word = words[at] if 0 <= at < len(words) else b""
     return int(word) if word.isdigit() and len(word) < 6 and int(word) <= _MOST_READINGS else -1
 
 
 def numbers_of(lines: list[bytes], words: int) -> Float64:
-    """Numbers of lines with equally many words, (n, words); NaN for a word that is none.
+    """Return the numbers of lines with equally many words, (n, words); NaN for a word that is none.
 
     Parameters
     ----------
@@ -294,7 +294,7 @@ def numbers_of(lines: list[bytes], words: int) -> Float64:
                     out[:, int(name)] = table.column(name).to_numpy()
                 return out
         except pa.ArrowInvalid:
-            pass  # word by word then
+            pass  # one by one then
     for row, line in enumerate(lines):
         out[row] = [math.nan if k in text else _number(word) for k, word in enumerate(line.split())]
     return out
@@ -309,20 +309,20 @@ def _number(word: bytes) -> float:
 
 @dataclass(frozen=True)
 class _Block:
-    """Lines of a block by what they are."""
+    """Lines of a block by kind."""
 
     scans: list[tuple[int, bytes]]
-    """Number of the line in the block, and the line without blanks around it."""
+    """Index of the line in the block, and the line without surrounding blanks."""
     odometry: list[tuple[int, bytes]]
     unknown: list[int]
     starts: Int64
     """(n,) byte of the block at which each line starts."""
     names: Counter[str]
-    """How many of each scan's message there are."""
+    """Number of each scan's message."""
 
 
 def _sorted_lines(data: bytes, message: str | None) -> _Block:
-    """Lines of a block: scans of the wanted message (all where None), odometry, and what is neither."""
+    """Return the lines of a block: scans of the wanted message (all where None), odometry, and unknown ones."""
     lines = data.split(b"\n")
     if lines[-1] == b"":
         lines.pop()
@@ -332,7 +332,7 @@ def _sorted_lines(data: bytes, message: str | None) -> _Block:
         line = raw.strip()
         if not line:
             continue
-        hides_lines = b"\r" in line  # a comment or message passed over could hold others, which only returns divide
+        hides_lines = b"\r" in line  # a comment passed over could hold messages, which only returns divide
         if line.startswith(b"#"):
             if hides_lines:
                 block.unknown.append(number)
@@ -360,29 +360,29 @@ class _Head:
     lines: list[bytes]
     """Whole messages of that shape."""
     numbers: Float64
-    """(n, words)."""
+    """(n, words) numbers of the lines."""
     has_odometry: bool
     params: dict[str, str]
-    """Parameters about lasers."""
+    """Parameters of lasers."""
     messages: dict[str, int]
-    """Scans' messages in the log's beginning."""
+    """Messages of scans in the log's beginning, with their counts."""
 
     def pose(self, pose: Pose) -> Float64:
-        """(n, 3) x, y, θ."""
+        """Return (n, 3) x, y, θ."""
         at = self.shape.pose_at(pose)
         return self.numbers[:, at : at + 3]
 
     def poses_differ(self) -> bool:
-        """True if scanner and robot are not posed alike."""
+        """Return True if the poses of scanner and robot differ."""
         if not self.shape.has_pose:
             return False
-        with np.errstate(invalid="ignore", over="ignore"):  # a damaged scan says nothing of the others
+        with np.errstate(invalid="ignore", over="ignore"):  # a damaged scan is no evidence about the others
             apart = self.pose("laser") - self.pose("robot")
             apart[:, 2] = (apart[:, 2] + np.pi) % (2 * np.pi) - np.pi
         return bool(np.nanmax(np.abs(apart), initial=0.0) > _SAME_POSE)
 
     def mounting(self, pose: Pose) -> dict[str, Any] | None:
-        """How the scanner is mounted on what is posed: upright, and where the poses of both say; None without them."""
+        """Return the scanner's mounting on the posed body: upright, at the offset of both poses; None without poses."""
         if pose == "laser":
             return {"axes": "urf", "lever_arm_body_m": NO_LEVER_ARM}
         if pose != "robot":
@@ -397,7 +397,7 @@ class _Head:
         }
 
     def said(self) -> dict[str, Any]:
-        """What the reader of the log record may want to know."""
+        """Return facts for the reader of the log record."""
         found: dict[str, Any] = {"messages_at_start": self.messages, "laser_params": self.params}
         if self.shape.has_pose:
             laser, robot = self.pose("laser")[0], self.pose("robot")[0]
@@ -411,7 +411,7 @@ class _Head:
 
 
 def _head(source: LogSource, options: CarmenOptions) -> _Head:
-    """The first block with whole scans.
+    """Return the first block with whole scans.
 
     Raises
     ------
@@ -467,16 +467,16 @@ class _Plan:
     step_rad: float
     range_step_m: float
     rounds: bool
-    """True where ranges are rounded to the step as stated."""
+    """True where ranges are rounded to the stated step."""
     pose: Pose
 
     def as_json(self) -> dict[str, Any]:
-        """JSON values for the log record."""
+        """Return JSON values for the log record."""
         return dict(vars(self)) | {"shape": dict(vars(self.shape))}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> _Plan:
-        """Back from JSON values."""
+        """Return the plan of such JSON values."""
         return cls(**{**values, "shape": _Shape(**values["shape"])})
 
 
@@ -508,7 +508,7 @@ def _angles(source: LogSource, options: CarmenOptions, head: _Head) -> tuple[flo
 
 
 def _range_step(source: LogSource, options: CarmenOptions, head: _Head) -> float:
-    """The decimal place of the log's finest range that is a return (m), 0.01 or finer."""
+    """Return the last decimal place of the log's finest range that is a return (m), 0.01 or finer."""
     none = _no_return(head.numbers, head.shape, options.max_range_m)
     words = {word for line, out in zip(head.lines, none, strict=True)
              for word, skip in zip(line.split()[head.shape.ranges], out, strict=True) if not skip}  # fmt: skip
@@ -557,7 +557,7 @@ def _chosen_pose(source: LogSource, options: CarmenOptions, head: _Head) -> Pose
 
 
 def _no_return(numbers: Float64, shape: _Shape, stated_m: float | None) -> Bool:
-    """(n, readings) True where a range says that nothing came back."""
+    """Return (n, readings) True where a range means no return."""
     ranges = numbers[:, shape.ranges]
     with np.errstate(invalid="ignore"):
         if stated_m is not None:
@@ -571,7 +571,7 @@ def _no_return(numbers: Float64, shape: _Shape, stated_m: float | None) -> Bool:
 
 
 class _Reader:
-    """Turns blocks of lines into rows; keeps count of the lines."""
+    """Converts blocks of lines to rows, and counts the lines."""
 
     def __init__(self, source: LogSource, options: CarmenOptions, plan: _Plan) -> None:
         clock = source.need_clock("unix_utc")
@@ -582,7 +582,7 @@ class _Reader:
         self._line = 0
 
     def items(self, offset: int, data: bytes | Reject) -> Iterator[Item]:
-        """Rows of a block of whole lines, and a reject for each damaged one."""
+        """Yield rows of a block of whole lines, and a reject for each damaged one."""
         first = self._line
         if isinstance(data, Reject):
             self._line += 1
@@ -642,7 +642,7 @@ class _Reader:
                                         offsets[kept])  # fmt: skip
 
     def _check_config(self, numbers: Float64, sieve: Sieve) -> None:
-        """Drop scans of other angles than the log's first, and those without a maximum."""
+        """Drop scans whose angles differ from the log's first, and those without a maximum."""
         shape = self._plan.shape
         with np.errstate(invalid="ignore"):
             if self._options.first_angle_deg is None:
@@ -655,11 +655,11 @@ class _Reader:
         sieve.drop(other, f"the line does not hold {shape.remissions} remissions")
 
     def _ranges(self, numbers: Float64, sieve: Sieve) -> npt.NDArray[np.uint16]:
-        """Raw ranges (n, readings); scans with one that cannot be stored are dropped."""
+        """Return raw ranges (n, readings); scans with one that cannot be stored are dropped."""
         none = _no_return(numbers, self._plan.shape, self._options.max_range_m)
         metres = numbers[:, self._plan.shape.ranges]
         sieve.drop(_any(np.isnan(metres)), "a range is missing or not a number")
-        with np.errstate(over="ignore", invalid="ignore"):  # ranges beyond all numbers are dropped
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite ranges are dropped
             steps = np.where(none | np.isnan(metres), 0.0, metres) / self._plan.range_step_m
             raw = np.rint(steps)
             fine = _any(np.abs(steps - raw) > 1e-3)
@@ -672,7 +672,7 @@ class _Reader:
         return np.clip(raw, 0, _LARGEST_RAW).astype(np.uint16)
 
     def _intensities(self, numbers: Float64, sieve: Sieve) -> npt.NDArray[np.uint8] | None:
-        """Intensities (n, readings); scans with one beyond 8 bits are dropped."""
+        """Return intensities (n, readings); scans with one beyond 8 bits are dropped."""
         shape = self._plan.shape
         if shape.remissions != shape.readings:
             return None
@@ -686,7 +686,7 @@ class _Reader:
         yield from self._trajectory(numbers[:, 1:4], numbers[:, -_TAIL_WORDS], records, offsets)
 
     def _trajectory(self, poses: Float64, stamps: Float64, records: Int64, offsets: Int64) -> Iterator[Item]:
-        """Rows of poses x, y, θ (n, 3)."""
+        """Yield rows of poses x, y, θ (n, 3)."""
         x, y, theta = poses.T
         sieve = Sieve(records.size)
         sieve.require("θ", theta, -1e4, 1e4, "rad")
@@ -705,7 +705,7 @@ class _Reader:
 
 
 def _any(found: Bool) -> Bool:
-    """(n,) True for the rows of (n, m) that hold a True."""
+    """Return True (n,) for the rows of (n, m) with a True."""
     return np.asarray(found.any(axis=1), dtype=np.bool_)
 
 

@@ -1,4 +1,4 @@
-"""Profiles of arrays, written as `scans`: heights become whole numbers of a quantum."""
+"""Writes profiles in arrays as `scans`: heights become integers in units of a quantum."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from roadscan.ingest.array_files import (
 )
 
 STEPS: Final = 65_534
-"""Steps between the lowest and the highest raw value that is a reading: 1 and 65,535."""
+"""Steps between the lowest and the highest raw value of a reading: 1 and 65,535."""
 
-_ACROSS_TOLERANCE_M: Final = 1e-5
+_ACROSS_TOLERANCE_M: Final = 1e-5  # largest deviation from even spacing
 _FINEST_M: Final = 1e-6
-"""Readings are placed in whole numbers of 10 µm: a finer quantum than this says nothing."""
-_GROUP_READINGS: Final = 1 << 20
+"""Finest quantum (m): readings are placed in multiples of 10 µm."""
+_GROUP_READINGS: Final = 1 << 20  # readings of a row group
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ class WrittenProfiles(WrittenLog):
     """Profiles that were written."""
 
     geometry: ScanGeometry
-    """Where the readings lie; hand it on as `quantum` to write more files of the same log."""
+    """Geometry of the readings; pass it as `quantum` to write more files of the same log."""
     quantum_m: float
     """Height of one raw unit (m)."""
     largest_error_m: float
-    """Largest difference between a height and what was written for it (m): half a quantum at most."""
+    """Largest difference between a height and its written value (m): at most half a quantum."""
     missing: int
     """Readings that are NaN, written as no return."""
 
@@ -59,7 +59,7 @@ def write_profiles(
     sensor_height_m: float = 0.0,
     quantum: float | ScanGeometry | None = None,
 ) -> WrittenProfiles:
-    """Write a profiler's readings as a Parquet log that `roadscan` reads as `scans`; what was written, and its error.
+    """Write a profiler's readings as a Parquet log that `roadscan` reads as `scans`; return what was written.
 
     A reading lies in the sensor's y-z plane: y is its position across (positive to the right where the rig file
     states no other axes than ``frd``), z points down, away from its height.
@@ -110,7 +110,7 @@ def write_profiles(
 
 
 def _span(heights: Float64, sensor_height_m: float) -> tuple[float, float]:
-    """Least and greatest range (m) of the readings."""
+    """Return the least and greatest range (m) of the readings."""
     if np.isinf(heights).any():
         raise ConfigError("heights_m holds an infinite height", expected="metres, or NaN for no reading")
     if np.isnan(heights).all():
@@ -137,7 +137,7 @@ def _geometry(across: Float64, span: tuple[float, float], quantum: float | ScanG
     if not (math.isfinite(unit) and unit > 0):
         raise ConfigError(f"quantum is {unit:g} m", expected="a height above 0")
     middle = round((nearest + farthest) / 2 / unit)
-    offset = (middle - (STEPS // 2 + 1)) * unit  # room on both sides, for more files of the log
+    offset = (middle - (STEPS // 2 + 1)) * unit  # leaves room on both sides for more files of the log
     found = ScanGeometry(
         kind="cartesian", readings=across.size, first=first, step=step, range_offset_m=offset, range_step_m=unit
     )
@@ -146,7 +146,7 @@ def _geometry(across: Float64, span: tuple[float, float], quantum: float | ScanG
 
 
 def _even(across: Float64) -> tuple[float, float]:
-    """First position and step of evenly spaced positions (m)."""
+    """Return the first position and the step of evenly spaced positions (m)."""
     if across.ndim != 1 or across.size < 2 or not np.isfinite(across).all():
         raise ConfigError(f"across_m has the shape {across.shape}", expected="(m,), two or more positions in metres")
     first, step = float(across[0]), float(across[-1] - across[0]) / (across.size - 1)
@@ -161,7 +161,7 @@ def _even(across: Float64) -> tuple[float, float]:
 
 
 def _fitting_quantum(span_m: float) -> float:
-    """Finest 1, 2 or 5 times a power of ten of which two less than the steps there are hold a span."""
+    """Return the finest 1, 2 or 5 times a power of ten that covers a span with two steps to spare."""
     least = max(span_m / (STEPS - 2), _FINEST_M)
     power = math.floor(math.log10(least))
     tens = (float(f"{digit}e{power + more}") for more in (0, 1) for digit in (1, 2, 5))

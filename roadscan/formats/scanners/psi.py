@@ -50,17 +50,17 @@ UInt16 = npt.NDArray[np.uint16]
 Int64 = npt.NDArray[np.int64]
 
 STATEMENT_KEY: Final = "roadscan_psi"
-"""Key of the metadata (a JSON object) under which a file states what the draft leaves open."""
+"""Metadata key of a JSON object in which a file states what the draft leaves open."""
 ROW_EPOCHS_KEY: Final = "row_epochs_ns"
-"""Key of the metadata with each row's time since the file's stamp (ns), in order of travel."""
+"""Metadata key of each row's time since the file's stamp (ns), in order of travel."""
 
-SPEED_UNITS_M_PER_S: Final = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
+SPEED_UNITS_M_PER_S: Final = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}  # m/s in each unit
 
-_CHUNK_BYTES: Final = 8 << 20
+_CHUNK_BYTES: Final = 8 << 20  # bytes of a chunk of rows
 _SAME_SIZE: Final = 1e-4
-"""Relative difference at which two resolutions count as one."""
-_LONGEST_FILE_S: Final = 3600.0
-_TOP: Final = 1 << 16
+"""Relative difference up to which two resolutions count as equal."""
+_LONGEST_FILE_S: Final = 3600.0  # longest time of a file's rows
+_TOP: Final = 1 << 16  # heights become ranges below this raw value
 
 LengthUnit = Literal["m", "mm", "cm", "km", "ft", "ft_us"]
 
@@ -116,13 +116,13 @@ class Psi(LogFormat):
             return False
 
     def files(self, path: Path) -> list[Path]:
-        """The file, or all ``.psi`` files of the folder by name."""
+        """Return the file, or all ``.psi`` files of the folder by name."""
         if not path.is_dir():
             return [path]
         return sorted(p for p in path.rglob("*") if p.suffix.lower() == ".psi" and p.is_file())
 
     def header(self, source: LogSource) -> LogHeader:
-        """Geometry and statements; most of a folder's files must agree in their geometry."""
+        """Return geometry and statements; most of a folder's files must agree in their geometry."""
         series = _Series.of(self.files(source.path), source)
         clock = _clock(source, series.statement)
         return LogHeader(
@@ -160,17 +160,17 @@ class _Piece:
     name: str
     """Path below the log, '' for the log itself."""
     stated: PsiStatement
-    """What its metadata state."""
+    """Statements of its metadata."""
     has_row_epochs: bool
 
     def lost(self, reason: str) -> Reject:
-        """All rows of the file."""
+        """Return a reject of all rows of the file."""
         return Reject(reason, 0, self.surface.offset, self.surface.rows, self.name)
 
 
 @dataclass(frozen=True)
 class _Series:
-    """The files of a log in order, and what is the same for all of them."""
+    """The files of a log in order, with their common properties."""
 
     files: list[_Piece]
     rejects: list[Reject]
@@ -180,7 +180,7 @@ class _Series:
 
     @classmethod
     def of(cls, paths: list[Path], source: LogSource) -> Self:
-        """Open all files; those that cannot be read, or are unlike the others, become rejects."""
+        """Open all files; those that cannot be read, or that differ from the others, become rejects."""
         options = options_of(source, PsiOptions)
         pieces, rejects = _opened(paths, source)
         common = Counter(p.stated for p in pieces).most_common(1)[0][0]
@@ -203,7 +203,7 @@ class _Series:
 
 
 def statement_text(statement: PsiStatement, row_epochs_ns: Int64) -> str:
-    """Metadata that state what the draft leaves open.
+    """Return metadata text that states what the draft leaves open.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def statement_text(statement: PsiStatement, row_epochs_ns: Int64) -> str:
 
 
 def _opened(paths: list[Path], source: LogSource) -> tuple[list[_Piece], list[Reject]]:
-    """Sound files in the order of their serial numbers, and why others are not."""
+    """Return the sound files in the order of their serial numbers, and rejects of the others."""
     pieces: list[_Piece] = []
     rejects: list[Reject] = []
     first: FormatError | ConfigError | None = None
@@ -236,7 +236,7 @@ def _opened(paths: list[Path], source: LogSource) -> tuple[list[_Piece], list[Re
 
 
 def _notes(file: PsiFile) -> dict[str, Any]:
-    """The metadata where they are a JSON object, else nothing."""
+    """Return the metadata where they are a JSON object, else nothing."""
     text = file.metadata()
     if STATEMENT_KEY not in text:
         return {}
@@ -253,7 +253,7 @@ def _stated_by(notes: dict[str, Any], path: Path) -> PsiStatement:
 
 
 def _merged(options: PsiOptions, stated: PsiStatement, source: LogSource) -> PsiStatement:
-    """What options and files state together."""
+    """Return the combined statements of options and files."""
     values: dict[str, Any] = {}
     for name in PsiStatement.model_fields:
         ours, theirs = getattr(options, name), getattr(stated, name)
@@ -298,7 +298,7 @@ def _clock(source: LogSource, statement: PsiStatement) -> Clock:
 
 
 def _geometry(piece: _Piece, statement: PsiStatement) -> ScanGeometry:
-    """Geometry of a file's profiles."""
+    """Return the geometry of a file's profiles."""
     head, unit = piece.file.header, UNITS["length"][statement.length_unit or "m"]
     columns = piece.surface.columns
     sizes = {"longitudinal": head.longitudinal3d, "transverse": head.transverse3d, "vertical": head.vertical3d}
@@ -322,7 +322,7 @@ def _geometry(piece: _Piece, statement: PsiStatement) -> ScanGeometry:
 
 
 def _profiles(piece: _Piece, epoch_gps_ns: int, series: _Series) -> Iterator[Item]:
-    """Rows of one file."""
+    """Yield the rows of one file."""
     try:
         epochs = epoch_gps_ns + _row_epochs(piece, series)
         surface = piece.file.surface3d()
@@ -354,7 +354,7 @@ def _profiles(piece: _Piece, epoch_gps_ns: int, series: _Series) -> Iterator[Ite
 
 
 def _row_epochs(piece: _Piece, series: _Series) -> Int64:
-    """(rows,) time of each row, in order of travel, since the file's stamp (ns)."""
+    """Return (rows,) time of each row, in order of travel, since the file's stamp (ns)."""
     rows = piece.surface.rows
     if piece.has_row_epochs:
         listed = _notes(piece.file)[ROW_EPOCHS_KEY]
@@ -379,7 +379,7 @@ def _row_epochs(piece: _Piece, series: _Series) -> Int64:
 
 
 def _ranges(surface: UInt16, series: _Series) -> UInt16:
-    """Raw values that grow with range, 0 for no return."""
+    """Return raw values that grow with range, 0 for no return."""
     lost = surface == 0
     for code in series.options.no_return:
         lost |= surface == code
@@ -389,7 +389,7 @@ def _ranges(surface: UInt16, series: _Series) -> UInt16:
 
 
 def _registered(file: PsiFile, shape: tuple[int, ...]) -> UInt8:
-    """Intensity of every reading, (rows, columns); :class:`FormatError` where the 2D image is on another grid."""
+    """Return intensities (rows, columns) of all readings; :class:`FormatError` if the 2D image has another grid."""
     head, section = file.header, file.image_section
     if section is None:
         raise FormatError("there is no 2D image")
@@ -414,7 +414,7 @@ def _registered(file: PsiFile, shape: tuple[int, ...]) -> UInt8:
 
 
 def _multiple(surface: int, image: int, surface_step: float, image_step: float) -> tuple[int, int] | None:
-    """How many image pixels lie to how many readings along one axis: (k, 1) or (1, k); None if neither."""
+    """Return how many image pixels cover how many readings along one axis: (k, 1) or (1, k); None if neither."""
     if not (math.isfinite(image_step) and image_step > 0):
         return None
     for fine, coarse in ((image, surface), (surface, image)):
@@ -427,5 +427,5 @@ def _multiple(surface: int, image: int, surface_step: float, image_step: float) 
 
 
 def _fixed(values: npt.NDArray[Any]) -> pa.Array:
-    """(n, readings) values as a fixed-size list."""
+    """Return (n, readings) values as a fixed-size list."""
     return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(values).ravel()), values.shape[1])

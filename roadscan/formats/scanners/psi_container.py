@@ -38,9 +38,9 @@ UInt8 = npt.NDArray[np.uint8]
 UInt16 = npt.NDArray[np.uint16]
 
 INFLATION_FACTOR: Final = 100
-"""A compressed image may be this many times larger than the bytes it is stored in …"""
+"""A compressed image may be this many times larger than its stored bytes …"""
 INFLATION_FREE_BYTES: Final = 64 << 20
-"""… plus this: an image of nothing but missing readings shrinks a thousandfold."""
+"""… plus this: an image of only missing readings shrinks a thousandfold."""
 
 _MAGIC: Final = re.compile(rb"psi\d\.\d\d")
 _TRAILER: Final = b"@@@@"
@@ -59,12 +59,12 @@ _LAYOUT: Final = np.dtype(
     ]
 )  # fmt: skip
 HEADER_BYTES: Final = _LAYOUT.itemsize
-"""545."""
+"""545 bytes."""
 
 _TEXTS: Final = (
     "version", "software_version", "state", "route", "date", "time", "vehicle", "operator", "contractor", "sensor",
 )  # fmt: skip
-"""Texts of :class:`PsiHeader`, of the same names in the layout."""
+"""Text fields of :class:`PsiHeader`, which have the same names in the layout."""
 _NUMBERS: Final = {
     name: name.removesuffix("_deg")
     for name in (
@@ -73,7 +73,7 @@ _NUMBERS: Final = {
         "speed", "timestamp",
     )
 }  # fmt: skip
-"""Numbers of :class:`PsiHeader` and their names in the layout."""
+"""Numeric fields of :class:`PsiHeader` with their names in the layout."""
 
 Order = Literal["row", "column"]
 Codec = Literal["raw", "zip", "jpeg", "png"]
@@ -103,7 +103,7 @@ _TITLES: Final = {
 
 @dataclass(frozen=True)
 class PsiHeader:
-    """What the header says, in the file's own units (the draft states only degrees for angles)."""
+    """Content of the header in the file's units (the draft states only degrees for angles)."""
 
     version: str = "1.00"
     """Version of the format, d.dd."""
@@ -165,7 +165,7 @@ class PsiContainer:
 
 @dataclass(frozen=True)
 class PsiSection:
-    """One image of a file: where its bytes stand and what they are."""
+    """One image of a file: its place, layout and encoding."""
 
     name: Literal["2D", "3D"]
     offset: int
@@ -194,13 +194,13 @@ class PsiSection:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes from one row to the next in the file, 0 where rows do not stand there one after another."""
+        """Bytes from one row to the next in the file, 0 where rows are not contiguous."""
         return self.columns * self.pixel_bytes if self.codec == 0 and self.order == 0 else 0
 
 
 @dataclass(frozen=True)
 class PsiFile:
-    """A PSI file whose header has been checked against the file's size; images are decoded on demand."""
+    """A PSI file whose header was checked against the file's size; images are decoded on demand."""
 
     path: Path
     header: PsiHeader
@@ -257,17 +257,17 @@ class PsiFile:
         )
 
     def image2d(self) -> UInt8 | None:
-        """(rows, columns) uint8, None where there is none; :class:`FormatError` if it cannot be decoded."""
+        """Return (rows, columns) uint8, None where there is none; :class:`FormatError` if it cannot be decoded."""
         section = self.image_section
         return None if section is None else self._decoded(section).astype(np.uint8, copy=False)
 
     def surface3d(self) -> UInt16 | None:
-        """(rows, columns) uint16, None where there is none; :class:`FormatError` if it cannot be decoded."""
+        """Return (rows, columns) uint16, None where there is none; :class:`FormatError` if it cannot be decoded."""
         section = self.surface_section
         return None if section is None else self._decoded(section).astype(np.uint16, copy=False)
 
     def metadata(self) -> str:
-        """The metadata text (UTF-8; other bytes as Latin-1)."""
+        """Return the metadata text (UTF-8; other bytes as Latin-1)."""
         data = self._bytes(self.metadata_offset, self.metadata_size).rstrip(b"\0")
         try:
             return data.decode("utf-8")
@@ -294,7 +294,7 @@ class PsiFile:
 
 
 def is_psi(path: Path) -> bool:
-    """True for a file that begins as PSI files do; never raises."""
+    """Return True for a file that begins as PSI files do; never raises."""
     try:
         with path.open("rb") as stream:
             return _MAGIC.match(stream.read(8)) is not None
@@ -311,7 +311,7 @@ def write_psi(
     order: Order = "row",
     jpeg_quality: int = 95,
 ) -> None:
-    """Write a PSI file; "zip" is a zlib stream, and only ``jpeg`` loses anything.
+    """Write a PSI file; "zip" is a zlib stream, and only ``jpeg`` is lossy.
 
     Raises
     ------
@@ -392,7 +392,7 @@ def _section(raw: Any, name: Literal["2D", "3D"], offset: int, path: Path) -> Ps
 
 
 def _decode(section: PsiSection, data: bytes) -> npt.NDArray[Any]:
-    """Pixels in the order of storage."""
+    """Return pixels in the order of storage."""
     kind = np.dtype(np.uint8) if section.name == "2D" else np.dtype("<u2")
     if section.codec == _Codec2D.RAW:
         return np.frombuffer(data, kind).reshape(section.stored_shape)
@@ -414,7 +414,7 @@ def _decode(section: PsiSection, data: bytes) -> npt.NDArray[Any]:
 
 
 def _unzipped(data: bytes, size: int) -> bytes:
-    """Exactly `size` bytes of a zlib or gzip stream, or of a PKZIP archive of one member."""
+    """Return exactly `size` bytes of a zlib or gzip stream, or of a PKZIP archive of one member."""
     try:
         if data[:2] == b"PK":
             out = _from_archive(data, size)

@@ -45,10 +45,10 @@ from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.table_stamps import EPOCH, column_stamps, refuse_clock
 
 GEOMETRY_KEY: Final = "roadscan.scan_geometry"
-"""Key of the schema metadata that holds the geometry as JSON."""
+"""Key of the schema metadata with the geometry as JSON."""
 
 _STAMP: Final = "time"
-_CHUNK_BYTES: Final = 8 << 20
+_CHUNK_BYTES: Final = 8 << 20  # bytes of a chunk of rows
 _COLUMNS: Final = (EPOCH, _STAMP, "range", "intensity", "encoder_ticks")
 _SUFFIXES: Final = (".parquet", ".arrow", ".feather", ".ipc")
 
@@ -86,13 +86,13 @@ class Scans(LogFormat):
             return False
 
     def files(self, path: Path) -> list[Path]:
-        """The file, or all Parquet and Arrow files of the folder by name."""
+        """Return the file, or all Parquet and Arrow files of the folder by name."""
         if not path.is_dir():
             return [path]
         return sorted(p for p in path.rglob("*") if p.suffix.lower() in _SUFFIXES and p.is_file())
 
     def header(self, source: LogSource) -> LogHeader:
-        """Geometry and time column; all files of a folder must agree."""
+        """Return geometry and time column; all files of a folder must agree."""
         files = self.files(source.path)
         schemas = [(file, schema) for file in files if (schema := _schema_or_none(file)) is not None]
         if not schemas:
@@ -125,7 +125,7 @@ class Scans(LogFormat):
                     yield Reject(part.reason, first, -1, max(part.records, 1), name)
 
     def ending(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
-        """Epochs of the last profiles, after one of the first, from which the GPS week is counted."""
+        """Yield the epochs of the last profiles, after one of the first, from which the GPS week is counted."""
         files = self.files(source.path)
         epochs = EpochReader(_clock(source, files), source.path)
         try:
@@ -197,7 +197,7 @@ def _check_columns(schema: pa.Schema, file: Path) -> None:
 
 
 def _clock(source: LogSource, files: list[Path]) -> Clock:
-    """Clock of the stamps, by the first file that can be read."""
+    """Return the clock of the stamps, by the first readable file."""
     schema = next((schema for file in files if (schema := _schema_or_none(file)) is not None), None)
     stamped = schema is not None and EPOCH not in schema.names
     return (source.any_clock if stamped else None) or Clock(TimeSystem.GPS, unit="ns")
@@ -211,7 +211,7 @@ def _check_clock(source: LogSource, schema: pa.Schema) -> None:
 
 
 def _geometry(source: LogSource, schemas: list[tuple[Path, pa.Schema]]) -> ScanGeometry:
-    """The one geometry that options and files state."""
+    """Return the one geometry that options and files state."""
     options = options_of(source, ScansOptions)
     stated: list[tuple[str | Path, ScanGeometry]] = []
     if options.scan_geometry is not None:
@@ -251,7 +251,7 @@ def _json(text: bytes, file: Path) -> dict[str, Any]:
 
 
 def _profiles(batch: pa.RecordBatch, readings: int, epochs: EpochReader, name: str, first: int) -> Iterator[Item]:
-    """Check a batch's rows and bring them to the schema's columns."""
+    """Check a batch's rows and convert them to the schema's columns."""
     lists = [n for n in ("range", "intensity") if n in batch.schema.names]
     sieve = Sieve(batch.num_rows)
     for column in lists:
@@ -275,6 +275,6 @@ def _profiles(batch: pa.RecordBatch, readings: int, epochs: EpochReader, name: s
 
 
 def _fixed(column: pa.Array, readings: int) -> pa.Array:
-    """Lists of `readings` values as a fixed-size list; a null reading is 0, no return."""
+    """Return lists of `readings` values as a fixed-size list; a null reading is 0, no return."""
     values = column.flatten()
     return pa.FixedSizeListArray.from_arrays(values.fill_null(0) if values.null_count else values, readings)

@@ -79,20 +79,20 @@ READ: Final = (ALL_VALUES, SUBRANGE, VALUES_AND_REMISSION)
 """Commands whose values are read."""
 FIELDS_DEG: Final = {181: (180, 1.0), 361: (180, 0.5), 721: (180, 0.25), 101: (100, 1.0), 201: (100, 0.5),
                      401: (100, 0.25)}  # fmt: skip
-"""Field and resolution (degrees) by readings a complete scan: the settings that the family offers."""
-STEP_M: Final = {"cm": 0.01, "mm": 0.001}
+"""Field and resolution (degrees) by readings of a complete scan: the settings that the family offers."""
+STEP_M: Final = {"cm": 0.01, "mm": 0.001}  # metres in each unit
 
 _CODES: Final = 9
-"""The highest nine values are no ranges: too far, channel, noise, overflow, dazzled, invalid (listing, page 124)."""
-_ERROR_LEVEL: Final = 3
-_IMPLAUSIBLE: Final = 0x40
-_SNIFFED_BYTES: Final = 1 << 16
+"""Highest values that are no ranges: too far, channel, noise, overflow, dazzled, invalid (listing, page 124)."""
+_ERROR_LEVEL: Final = 3  # status levels from this on are errors
+_IMPLAUSIBLE: Final = 0x40  # status bit of implausible values
+_SNIFFED_BYTES: Final = 1 << 16  # bytes from which the format is recognised
 _SEARCHED_BYTES: Final = 16 << 20
-"""A log without a telegram of measured values in so many bytes is none."""
-_MOST_LAYOUTS: Final = 32
-_BATCH_READINGS: Final = 1 << 21
-_LARGEST_STAMPS_BYTES: Final = 1 << 28
-_ACK_BYTES: Final = 8
+"""A log without a telegram of measured values in its first bytes, this many, is refused."""
+_MOST_LAYOUTS: Final = 32  # usual layouts of a piece that are read
+_BATCH_READINGS: Final = 1 << 21  # readings of a batch
+_LARGEST_STAMPS_BYTES: Final = 1 << 28  # larger CSV files of stamps are refused
+_ACK_BYTES: Final = 8  # shorter gaps may be a scanner's answer
 
 _BY_RATE: Final = (Missing("options.first_stamp_s"), Missing("options.scans_per_s"))
 
@@ -165,12 +165,12 @@ class SickLms(LogFormat):
         return bool(_Fields.of(Piece(data, 0, starts, ends)).fit().any())
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
-        """The CSV of stamps."""
+        """Return the CSV of stamps."""
         stamps = options.stamps if isinstance(options, SickLmsOptions) else None
         return [] if stamps is None else [beside(path, stamps)]
 
     def header(self, source: LogSource) -> LogHeader:
-        """Field, resolution, unit and framing, from the first telegrams with measured values."""
+        """Return field, resolution, unit and framing, from the first telegrams with measured values."""
         options = options_of(source, SickLmsOptions)
         _check_time(source, options)
         for piece in read_pieces(source.path):
@@ -187,7 +187,7 @@ class SickLms(LogFormat):
         )
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
-        """Stream scans, a row for each turn of the mirror."""
+        """Yield scans, one row for each turn of the mirror."""
         options = options_of(source, SickLmsOptions)
         reader = _Reader(source, options, _Layout(**header.attributes["layout"]))
         for piece in read_pieces(source.path):
@@ -200,7 +200,7 @@ class SickLms(LogFormat):
 
 @dataclass(frozen=True)
 class _Fields:
-    """What the telegrams of a piece say of themselves, (n,) each."""
+    """Fields of a piece's telegrams, (n,) each."""
 
     command: Int64
     payload: Int64
@@ -210,17 +210,17 @@ class _Fields:
     quarter: Int64
     """First angle of a partial scan in quarters of a degree, −1 for complete ones."""
     first: Int64
-    """Number of the first value in the complete scan, from 0."""
+    """Index of the first value in the complete scan."""
     values_at: Int64
     """Byte of the piece at which the values start."""
     remissions: Int64
-    """How many; 0 for commands without."""
+    """Number of remissions; 0 for commands without."""
     first_remission: Int64
     status: Int64
 
     @classmethod
     def of(cls, piece: Piece) -> _Fields:
-        """Take the fields out of the bytes; what they are worth :meth:`fit` says."""
+        """Read the fields from the bytes; :meth:`fit` checks them."""
         command = piece.commands().astype(np.int64)
         is_part, is_bright = command == SUBRANGE, command == VALUES_AND_REMISSION
         word_at = piece.starts + np.where(is_part, 9, 5)
@@ -242,7 +242,7 @@ class _Fields:
         )
 
     def fit(self) -> Bool:
-        """(n,) True for telegrams of measured values whose counts agree with their length."""
+        """Return (n,) True for telegrams of measured values whose counts agree with their length."""
         is_part, is_bright = self.command == SUBRANGE, self.command == VALUES_AND_REMISSION
         needed = 4 + 2 * self.count + np.where(is_part, 4, 0) + np.where(is_bright, 6 + self.remissions, 0)
         known = np.isin(self.command, READ) & (self.count > 0) & (self.unit < len(UNITS))
@@ -254,7 +254,7 @@ class _Fields:
 
 @dataclass(frozen=True)
 class _Layout:
-    """How the scans of a log become rows."""
+    """How the scans of a log are converted to rows."""
 
     unit: str
     readings: int
@@ -266,7 +266,7 @@ class _Layout:
     """Length of the log's usual telegram."""
 
     def entries(self, command: int, count: int, first: int, quarter: int) -> Int64 | None:
-        """Places (count,) of a telegram's values in the complete field; None where they do not fit it."""
+        """Return the places (count,) of a telegram's values in the complete field; None where they do not fit."""
         start, step = first, 1
         if quarter >= 0:
             begin, stride = quarter * 0.25 / self.resolution_deg, 1.0 / self.resolution_deg
@@ -308,11 +308,11 @@ def _header(
 def _field(
     source: LogSource, options: SickLmsOptions, count: int, command: int, quarters: Int64 | None
 ) -> tuple[float, float]:
-    """Field and resolution (degrees): as stated, or as the count of readings says."""
+    """Return field and resolution (degrees): as stated, or by the count of readings."""
     field_deg, resolution_deg = options.field_deg, options.resolution_deg
     if command != SUBRANGE:
         known = FIELDS_DEG.get(count)
-        if quarters is not None:  # every turn measures each degree; its quarter says which turns there are
+        if quarters is not None:  # every turn measures each degree; its quarter shows which turns exist
             whole = {181: 180, 180: 180, 101: 100, 100: 100}.get(count)
             step = 0.25 if (quarters % 2 == 1).any() else 0.5
             known = None if whole is None else (whole, step)
@@ -340,7 +340,7 @@ def _field(
 
 
 def _check_time(source: LogSource, options: SickLmsOptions) -> None:
-    """Exactly one source of stamps has to be stated, and a clock."""
+    """Check that exactly one source of stamps is stated, and a clock."""
     by_rate = options.first_stamp_s is not None or options.scans_per_s is not None
     sources = {"stamps": options.stamps is not None, "stamped": options.stamped, "first_stamp_s, scans_per_s": by_rate}
     stated = [name for name, is_stated in sources.items() if is_stated]
@@ -360,7 +360,7 @@ def _check_time(source: LogSource, options: SickLmsOptions) -> None:
 
 
 def _check_framing(source: LogSource, options: SickLmsOptions, piece: Piece) -> None:
-    """Refuse bare telegrams read as stamped, and the other way round."""
+    """Refuse bare telegrams that are read as stamped, and the reverse."""
     gaps = piece.starts[1:] - piece.ends[:-1]
     if gaps.size == 0:
         return
@@ -385,11 +385,11 @@ def _check_framing(source: LogSource, options: SickLmsOptions, piece: Piece) -> 
 
 
 class _Stamps(ABC):
-    """Where the stamps of the scans come from."""
+    """Source of the scans' stamps."""
 
     @abstractmethod
     def of(self, piece: Piece, scans: Int64, gaps: Int64) -> tuple[Int64, Bool]:
-        """Stamps (n,) of a piece's telegrams in the clock's unit, and which are missing.
+        """Return stamps (n,) of a piece's telegrams in the clock's unit, and which are missing.
 
         Parameters
         ----------
@@ -398,7 +398,7 @@ class _Stamps(ABC):
         """
 
     def finish(self, scans: int) -> None:  # noqa: B027 — most have nothing to check
-        """Check what is left over when the log has ended with `scans` scans."""
+        """Check that the log's number of `scans` matches the stamps."""
 
 
 class _Rate(_Stamps):
@@ -422,7 +422,7 @@ class _InLog(_Stamps):
 
 
 class _Csv(_Stamps):
-    """A CSV beside the log, by the scans' order or by their telegrams' first byte; ns of the clock's own count."""
+    """A CSV beside the log, by the scans' order or their telegrams' first byte; ns of the clock's count."""
 
     def __init__(self, file: Path, options: SickLmsOptions, unit_ns: int) -> None:
         self._file = file
@@ -448,7 +448,7 @@ class _Csv(_Stamps):
 
 
 def _read_stamps(file: Path, options: SickLmsOptions, unit_ns: int) -> tuple[Int64 | None, Int64]:
-    """Offsets (n,), ascending, where there are any, and stamps (n,) in ns."""
+    """Return offsets (n,), ascending, if there are any, and stamps (n,) in ns."""
     wanted = [options.stamp_column] + ([] if options.offset_column is None else [options.offset_column])
     stamps: list[int] = []
     offsets: list[int] = []
@@ -482,7 +482,7 @@ def _read_stamps(file: Path, options: SickLmsOptions, unit_ns: int) -> tuple[Int
 
 
 def _stamp_ns(row: list[str], place: int, unit_ns: int, file: Path, number: int) -> int:
-    """A number of a CSV; one that is none would shift all that follow, so it is a fault of the file."""
+    """Return a number of a CSV; an invalid one would shift all that follow, so it is a fault of the file."""
     try:
         value = Decimal(row[place].strip()) * unit_ns
         if abs(value) < 2**62:
@@ -498,7 +498,7 @@ def _stamp_ns(row: list[str], place: int, unit_ns: int, file: Path, number: int)
 
 
 class _Reader:
-    """Turns telegrams into rows; keeps from piece to piece how far the log is."""
+    """Converts telegrams to rows; counts the log's telegrams from piece to piece."""
 
     def __init__(self, source: LogSource, options: SickLmsOptions, layout: _Layout) -> None:
         clock = source.need_clock("unix_utc")
@@ -518,7 +518,7 @@ class _Reader:
         self._scans = 0
 
     def items(self, piece: Piece) -> Iterator[Item]:
-        """Rows of a piece's sound scans; rejects for what lies between them and for what is none."""
+        """Yield rows of a piece's sound scans, and rejects of other telegrams and of damage between them."""
         n = piece.starts.size
         if n == 0:
             return
@@ -537,7 +537,7 @@ class _Reader:
         yield from self._read(piece, fields, scans, records, gaps)
 
     def rest(self, size: int) -> Iterator[Item]:
-        """The damage at the log's end, `size` bytes from its start."""
+        """Yield the damage at the log's end, `size` bytes from its start."""
         left = self._between(size - self._end)
         if left > 0:
             lost = self._damage(self._end, left, self._records)
@@ -546,11 +546,11 @@ class _Reader:
         self._stamps.finish(self._scans)
 
     def _between(self, gap: int) -> int:
-        """Bytes of a gap that are no stamp."""
+        """Return the bytes of a gap that are no stamp."""
         return gap - STAMP_BYTES if self._stamped and gap >= STAMP_BYTES else gap
 
     def _lost(self, piece: Piece, gaps: Int64) -> Int64:
-        """(n,) telegrams that the damage before each one may have cost."""
+        """Return (n,) telegrams that may be lost in the damage before each one."""
         stretch = gaps - np.where((gaps >= STAMP_BYTES) & self._stamped, STAMP_BYTES, 0)
         others = np.concatenate([[0], np.cumsum(~np.isin(piece.data, ACKNOWLEDGES))])
         begins = np.maximum(piece.starts - gaps, 0)
@@ -564,7 +564,7 @@ class _Reader:
 
     def _read(self, piece: Piece, fields: _Fields, scans: Int64, records: Int64, gaps: Int64) -> Iterator[Item]:
         sieve = Sieve(records.size)
-        sieve.good &= fields.command >= 0  # a host's requests are nobody's loss
+        sieve.good &= fields.command >= 0  # a host's requests are no loss
         self._drop_others(fields, sieve)
         layouts = self._layouts(fields, sieve)
         stamps, missing = self._stamps.of(piece, scans, gaps)
@@ -581,7 +581,7 @@ class _Reader:
                            first_offset=piece.offset + int(piece.starts[part[0]]))  # fmt: skip
 
     def _drop_others(self, fields: _Fields, sieve: Sieve) -> None:
-        """Drop what holds no measured values of one scan, and what the scanner itself doubts."""
+        """Drop telegrams without measured values of one scan, and those that the scanner marks as faulty."""
         for command in np.unique(fields.command[sieve.good]).tolist():
             if command in (MEAN_VALUES, MEAN_SUBRANGE):
                 sieve.drop(fields.command == command, f"telegram 0x{command:02X}: means over several scans")
@@ -594,7 +594,7 @@ class _Reader:
         sieve.drop((fields.status & _IMPLAUSIBLE) != 0, "the scanner calls the values implausible")
 
     def _layouts(self, fields: _Fields, sieve: Sieve) -> list[tuple[Int64, Int64]]:
-        """Sound telegrams by their layout: rows, and places of their values in the complete field."""
+        """Return sound telegrams by layout: rows, and places of their values in the complete field."""
         rows = np.flatnonzero(sieve.good)
         if rows.size == 0:
             return []
@@ -618,7 +618,7 @@ class _Reader:
         return found
 
     def _batch(self, piece: Piece, fields: _Fields, rows: Int64, entries: Int64, epochs: Int64) -> pa.RecordBatch:
-        """Rows of telegrams (k,) of one layout: one for each turn in which their values were measured."""
+        """Return the rows of telegrams (k,) of one layout: one for each turn in which their values were measured."""
         readings, turns = self._layout.readings, self._layout.turns
         values = _gathered(piece.data, fields.values_at[rows], 2 * entries.size).view("<u2")
         kept = self._ranges(values)
@@ -643,7 +643,7 @@ class _Reader:
         return pa.RecordBatch.from_pydict(columns)
 
     def _ranges(self, values: UInt16) -> UInt16:
-        """Ranges of values, 0 where a code says that there is none."""
+        """Return the ranges of values, 0 where a code means none."""
         bits = self._bits or 13
         if self._bits is None and (values >> np.uint16(bits)).any():
             odd = int(values[(values >> np.uint16(bits)) != 0][0])
@@ -660,7 +660,7 @@ class _Reader:
 
 
 def _gathered(data: UInt8, at: Int64, size: int) -> UInt8:
-    """(k, size) bytes from each of the places `at` (k,) on; they have to lie inside."""
+    """Return (k, size) bytes from each of the places `at` (k,) on; they have to lie inside."""
     if size == 0 or data.size < size:
         return np.zeros((at.size, size), dtype=np.uint8)
     return np.ascontiguousarray(np.lib.stride_tricks.sliding_window_view(data, size)[at])

@@ -32,55 +32,55 @@ UInt8 = npt.NDArray[np.uint8]
 UInt16 = npt.NDArray[np.uint16]
 Int64 = npt.NDArray[np.int64]
 
-STX: Final = 0x02
-FROM_SCANNER: Final = 0x80
-FROM_HOST: Final = 0x00
+STX: Final = 0x02  # first byte of a telegram
+FROM_SCANNER: Final = 0x80  # address of a scanner's telegrams
+FROM_HOST: Final = 0x00  # address of a host's telegrams
 ACKNOWLEDGES: Final = (0x06, 0x15)
 """ACK and NAK: a scanner sends one before it answers a host."""
 
 OVERHEAD_BYTES: Final = 6
-"""STX, address, length and CRC."""
+"""Bytes of STX, address, length and CRC."""
 LONGEST_PAYLOAD: Final = 1_500
-"""The longest telegram of the family, 721 values, has 1,446 bytes between length and CRC; 401 values have 806."""
+"""Longest payload (bytes): the family's largest, 721 values, has 1,446 between length and CRC; 401 values have 806."""
 LONGEST_REQUEST: Final = 64
-"""What a host says is shorter (field contours, which no log of a drive holds, are left out)."""
-STAMP_BYTES: Final = 8
+"""Longest request of a host (bytes); field contours, which no log of a drive has, are longer."""
+STAMP_BYTES: Final = 8  # bytes of a stamp before a telegram
 
-ALL_VALUES: Final = 0xB0
-MEAN_VALUES: Final = 0xB6
-SUBRANGE: Final = 0xB7
-MEAN_SUBRANGE: Final = 0xBF
-VALUES_AND_REMISSION: Final = 0xC4
+ALL_VALUES: Final = 0xB0  # command of complete scans
+MEAN_VALUES: Final = 0xB6  # command of means over several scans
+SUBRANGE: Final = 0xB7  # command of partial scans
+MEAN_SUBRANGE: Final = 0xBF  # command of means of partial scans
+VALUES_AND_REMISSION: Final = 0xC4  # command of scans with remission
 MEASURED: Final = (ALL_VALUES, MEAN_VALUES, SUBRANGE, MEAN_SUBRANGE, VALUES_AND_REMISSION)
-"""Commands of telegrams that hold a scan, in whatever form."""
+"""Commands of telegrams with a scan of any kind."""
 
 Unit = Literal["cm", "mm"]
 UNITS: Final[tuple[Unit, ...]] = ("cm", "mm")
 """Unit by bits 14 and 15 of the count word; the other two values are reserved."""
-COUNT_MASK: Final = 0x3FF
+COUNT_MASK: Final = 0x3FF  # bits of the count word with the count
 PARTIAL_BIT: Final = 13
-"""Bit of the count word that marks a partial scan: one turn of an interlaced one."""
+"""Bit of the count word that marks a partial scan: one turn of an interlaced scan."""
 QUARTER_BIT: Final = 11
-"""First of two bits with the partial scan's first angle, in quarters of a degree."""
+"""First of two bits with the first angle of a partial scan, in quarters of a degree."""
 
-_PIECE_BYTES: Final = 1 << 20
+_PIECE_BYTES: Final = 1 << 20  # bytes of a log that are read at once
 _CARRIED_BEFORE: Final = 16
-"""Bytes before a telegram that are seen together with it: a stamp, acknowledges."""
-_POLYNOMIAL: Final = 0x8005
+"""Bytes before a telegram that are read with it: a stamp, acknowledges."""
+_POLYNOMIAL: Final = 0x8005  # SICK's CRC-16 without its highest term
 _LARGEST_BLOCK: Final = 1 << 10
-"""Bytes of a block of 1 MB, over whose blocks the checksums go side by side."""
+"""Largest block (bytes) for checksums of 1 MB, whose blocks are processed in parallel."""
 
 
 # --- checksum --------------------------------------------------------------------------------------
 
 
 def _shifted(remainder: UInt16) -> UInt16:
-    """Remainder (n,) times x."""
+    """Return the remainder (n,) times x."""
     return (remainder << np.uint16(1)) ^ (np.uint16(_POLYNOMIAL) * (remainder >> np.uint16(15)))
 
 
 def _powers(count: int) -> UInt16:
-    """(count,) x⁰, x¹, … ."""
+    """Return (count,) x⁰, x¹, … ."""
     out = np.empty(count, dtype=np.uint16)
     power = np.ones(1, dtype=np.uint16)
     for k in range(count):
@@ -89,11 +89,11 @@ def _powers(count: int) -> UInt16:
     return out
 
 
-_POWERS: Final = _powers(max(_LARGEST_BLOCK, LONGEST_PAYLOAD + OVERHEAD_BYTES) + 1)
+_POWERS: Final = _powers(max(_LARGEST_BLOCK, LONGEST_PAYLOAD + OVERHEAD_BYTES) + 1)  # x to each power
 
 
 def _times(a: UInt16, b: UInt16) -> UInt16:
-    """Products of remainders, element by element."""
+    """Return the products of remainders, element by element."""
     out = np.zeros(np.broadcast(a, b).shape, dtype=np.uint16)
     for bit in range(15, -1, -1):
         out = _shifted(out) ^ (a * ((b >> np.uint16(bit)) & np.uint16(1)))
@@ -102,14 +102,14 @@ def _times(a: UInt16, b: UInt16) -> UInt16:
 
 @functools.cache
 def _over_block(block: int) -> tuple[list[int], list[int]]:
-    """Each value of a remainder's low byte and of its high byte, times x to the power of a block's bytes."""
+    """Return each value of a remainder's low byte and high byte, times x to the power of a block's bytes."""
     values = np.arange(256, dtype=np.uint16)
     low, high = (_times(part, _POWERS[block : block + 1]) for part in (values, values << np.uint16(8)))
     return low.tolist(), high.tolist()
 
 
 def _block_of(count: int) -> int:
-    """Bytes of a block for a buffer of `count`: about its square root, so that a short one takes few steps."""
+    """Return the block length for a buffer of `count` bytes: about its square root, for few steps."""
     block = 1 << 5
     while block < _LARGEST_BLOCK and block * block < count:
         block <<= 1
@@ -117,7 +117,7 @@ def _block_of(count: int) -> int:
 
 
 class Checksums:
-    """CRCs of any pieces of a buffer, from one run over it.
+    """CRCs of any pieces of a buffer, from one pass over it.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class Checksums:
         flat = inputs.reshape(-1)
         flat[: data.size] = data
         flat[1 : data.size + 1] ^= data.astype(np.uint16) << np.uint16(8)
-        # Column by column all blocks advance at once, each from 0; what stands before a block is added below.
+        # All blocks advance together by one column at a time, each from 0; the bytes before a block are added below.
         columns = np.ascontiguousarray(inputs.T)
         state = np.zeros(rows, dtype=np.uint16)
         for k in range(block):
@@ -147,7 +147,7 @@ class Checksums:
         self._before = np.array(before, dtype=np.uint16)
 
     def of(self, starts: Int64, ends: Int64) -> UInt16:
-        """CRC (k,) of the bytes from `starts` (k,) up to `ends` (k,), each at most the longest telegram long."""
+        """Return the CRC (k,) of the bytes from `starts` (k,) to `ends` (k,), no farther apart than a telegram."""
         lengths = ends - starts
         head = _shifted(self._running(starts))
         inside = starts > 0
@@ -155,7 +155,7 @@ class Checksums:
         return self._running(ends) ^ _times(head, _POWERS[lengths - 1])
 
     def _running(self, counts: Int64) -> UInt16:
-        """Remainder (k,) after the buffer's first `counts` (k,) bytes."""
+        """Return the remainder (k,) after the buffer's first `counts` (k,) bytes."""
         row, column = np.divmod(counts - 1, self._block)
         out: UInt16 = self._within[column, row] ^ _times(self._before[row], _POWERS[column + 1])
         out[counts == 0] = 0
@@ -163,7 +163,7 @@ class Checksums:
 
 
 def checksum(data: bytes) -> int:
-    """SICK's CRC-16 of some bytes."""
+    """Return SICK's CRC-16 of some bytes."""
     remainder = before = 0
     for byte in data:
         remainder = (remainder << 1) ^ (0x18005 if remainder & 0x8000 else 0)
@@ -173,7 +173,7 @@ def checksum(data: bytes) -> int:
 
 
 def checksum_of_rows(rows: UInt8) -> UInt16:
-    """CRC (n,) of each row of (n, bytes)."""
+    """Return the CRC (n,) of each row of (n, bytes)."""
     state = np.zeros(rows.shape[0], dtype=np.uint16)
     before = np.zeros(rows.shape[0], dtype=np.uint16)
     for column in rows.T.astype(np.uint16):
@@ -187,7 +187,7 @@ def checksum_of_rows(rows: UInt8) -> UInt16:
 
 @dataclass(frozen=True)
 class Piece:
-    """A piece of a log and the telegrams that end in it."""
+    """A piece of a log with the telegrams that end in it."""
 
     data: UInt8
     offset: int
@@ -195,21 +195,21 @@ class Piece:
     starts: Int64
     """(n,) first byte of each telegram in `data`, ascending; telegrams do not overlap."""
     ends: Int64
-    """(n,) byte behind each telegram."""
+    """(n,) byte after each telegram."""
 
     def commands(self) -> UInt8:
-        """(n,) command byte of each telegram."""
+        """Return the command byte (n,) of each telegram."""
         return self.data[self.starts + 4]
 
     def words(self, at: Int64) -> Int64:
-        """(n,) 16-bit numbers at the bytes `at` (n,) of the data; 0 beyond its end."""
+        """Return 16-bit numbers (n,) at the bytes `at` (n,) of the data; 0 beyond its end."""
         low, high = (np.where(at + k < self.data.size, self.data[np.minimum(at + k, self.data.size - 1)], 0)
                      for k in (0, 1))  # fmt: skip
         return low.astype(np.int64) | high.astype(np.int64) << 8
 
 
 def find_telegrams(data: UInt8, *, is_end: bool) -> tuple[Int64, Int64, int]:
-    """Telegrams with a valid CRC, in order and without overlap: the first that starts wins.
+    """Return telegrams with a valid CRC, in order and without overlap: the first that starts wins.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def find_telegrams(data: UInt8, *, is_end: bool) -> tuple[Int64, Int64, int]:
     done = int(ends[-1]) if ends.size else 0
     if is_end:
         return starts, ends, data.size
-    # A header may be false; the telegrams behind it wait until that is known.
+    # A header may be false; the telegrams after it wait until that is known.
     open_at = int(unfinished[unfinished >= done][0]) if (unfinished >= done).any() else data.size - 3
     earlier = starts < open_at
     starts, ends = starts[earlier], ends[earlier]
@@ -239,7 +239,7 @@ def find_telegrams(data: UInt8, *, is_end: bool) -> tuple[Int64, Int64, int]:
 
 
 def _candidates(data: UInt8, *, is_end: bool) -> tuple[Int64, Int64, Int64]:
-    """Starts and ends of what may be telegrams, and starts of what would end behind the data."""
+    """Return starts and ends of possible telegrams, and starts of those that would end after the data."""
     none = np.zeros(0, dtype=np.int64)
     if data.size < OVERHEAD_BYTES + 1:
         return none, none, none
@@ -254,7 +254,7 @@ def _candidates(data: UInt8, *, is_end: bool) -> tuple[Int64, Int64, Int64]:
 
 
 def _without_overlap(starts: Int64, ends: Int64) -> Int64:
-    """Indices of telegrams that do not start inside an earlier chosen one."""
+    """Return the indices of telegrams that do not start inside an earlier chosen one."""
     if (starts[1:] >= ends[:-1]).all():
         return np.arange(starts.size)
     chosen, free_from = [], 0
@@ -266,7 +266,7 @@ def _without_overlap(starts: Int64, ends: Int64) -> Int64:
 
 
 def read_pieces(path: Path) -> Iterator[Piece]:
-    """The telegrams of a log, about 1 MB at a time.
+    """Yield the pieces of a log with their telegrams, about 1 MB at a time.
 
     Raises
     ------
@@ -302,7 +302,7 @@ def encode_scans(
     quarter: int | None = None,
     status: int = 0x10,
 ) -> UInt8:
-    """Telegrams of measured values, one a scan.
+    """Return telegrams of measured values, one per scan.
 
     Parameters
     ----------

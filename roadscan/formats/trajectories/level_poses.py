@@ -1,4 +1,4 @@
-"""Poses with roll, pitch and heading in named columns: what text and Parquet logs of them share."""
+"""Shared parts of text and Parquet logs of poses with roll, pitch and heading in named columns."""
 
 from __future__ import annotations
 
@@ -50,20 +50,20 @@ VELOCITIES: Final = (
 
 
 def position_of(crs: str) -> tuple[Quantity, ...]:
-    """The three quantities of a position in a CRS, two horizontal ones first."""
+    """Return the three quantities of a position in a CRS, two horizontal ones first."""
     if crs == LOCAL_WORLD:
         return LOCAL
     return GRID if crs_from_text(crs).is_projected else GEODETIC
 
 
 def pose_quantities(crs: str) -> tuple[Quantity, ...]:
-    """All quantities of a pose in a CRS but its time: position, attitude, their σ, and velocity."""
+    """Return all quantities of a pose in a CRS except its time: position, attitude, their σ, and velocity."""
     return (*position_of(crs), *ATTITUDE, *SIGMAS, *ANGLE_SIGMAS, *VELOCITIES)
 
 
 @dataclass(frozen=True)
 class Records:
-    """Where the records of a block stand in their log."""
+    """Places of a block's records in their log."""
 
     numbers: Int64
     """(n,) record numbers."""
@@ -76,7 +76,7 @@ class Records:
 def level_poses(
     records: Records, crs: str, columns: Mapping[str, Found], number: Callable[[str], Float64], sieve: Sieve
 ) -> RawPoses:
-    """Poses of a block; a record whose attitude cannot be is dropped from `sieve`.
+    """Return the poses of a block; a record with an impossible attitude is dropped from `sieve`.
 
     Parameters
     ----------

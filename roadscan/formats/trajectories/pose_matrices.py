@@ -40,7 +40,7 @@ Float64 = npt.NDArray[np.float64]
 MATRIX: Final = tuple(f"r{row}{column}" for row in "123" for column in "123")
 TRANSLATION: Final = ("t1", "t2", "t3")
 STAMPS: Final = ("unix_utc_s", "time_s", "time", "timestamp", "timestamp_s", "timestamp_us", "timestamp_ns", "stamp")
-"""Names under which the column of time stamps is found by itself."""
+"""Names by which the column of time stamps is found."""
 
 ORTHONORMAL_TOLERANCE: Final = 1e-3
 """Largest element of R · Rᵀ − 1 of a rotation; six printed digits stay below 1e-5."""
@@ -58,7 +58,7 @@ class PoseMatricesOptions(TextOptions):
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one file is read."""
+    """How a file is read."""
 
     layout: TextLayout
     stamp: str
@@ -135,7 +135,7 @@ def _plan(source: LogSource) -> _Plan:
 
 
 def _attitude(block: TextBlock, sieve: Sieve) -> Float64:
-    """World-from-sensor quaternions (4, n); what is no rotation is dropped."""
+    """Return world-from-sensor quaternions (4, n); records without a rotation are dropped."""
     matrix = np.stack([block.number(name) for name in MATRIX], axis=-1).reshape(-1, 3, 3)
     with np.errstate(over="ignore", invalid="ignore"):
         sieve.drop(~np.all(np.isfinite(matrix), axis=(1, 2)), "matrix is missing an element, or one is not a number")

@@ -44,7 +44,7 @@ Int64 = npt.NDArray[np.int64]
 QUATERNION: Final = ("qw", "qx", "qy", "qz")
 TRANSLATION: Final = ("tx", "ty", "tz")
 STAMPS: Final = ("timestamp_ns", "timestamp_us", "timestamp_s", "timestamp", "time_s", "time", "stamp")
-"""Names under which the column of time stamps is found by itself."""
+"""Names by which the column of time stamps is found."""
 
 TUM_NAMES: Final = ("time", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 AV2_NAME: Final = "city_SE3_egovehicle.feather"
@@ -52,7 +52,7 @@ AV2_COLUMNS: Final = ("timestamp_ns", *QUATERNION, "tx_m", "ty_m", "tz_m")
 AV2_AXES: Final = "flu"
 """Argoverse 2 documents its ego-vehicle frame as x forward, y left, z up."""
 
-BATCH_ROWS: Final = 65_536
+BATCH_ROWS: Final = 65_536  # rows of a batch
 
 
 class PoseQuaternionsOptions(TextOptions):
@@ -112,7 +112,7 @@ class PoseQuaternions(LogFormat):
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one file is read."""
+    """How a file is read."""
 
     table: _Table
     columns: dict[str, str]
@@ -142,7 +142,7 @@ def _plan(source: LogSource) -> _Plan:
 
 
 def _columns(names: tuple[str, ...], options: PoseQuaternionsOptions, file: Path) -> tuple[dict[str, str], Found]:
-    """Column of each part of a pose, and the stamp's with the unit in its name."""
+    """Return the column of each part of a pose, and the stamp's with the unit in its name."""
     check_keys(options.columns, ("stamp", *QUATERNION, *TRANSLATION), file)
     stamp = stamp_column(options.columns.get("stamp"), names, STAMPS, file)
     found = {"stamp": stamp.column}
@@ -157,7 +157,7 @@ def _columns(names: tuple[str, ...], options: PoseQuaternionsOptions, file: Path
 
 @dataclass(frozen=True)
 class _Block:
-    """Poses of some records."""
+    """Poses of consecutive records."""
 
     records: Int64
     offsets: Int64
@@ -170,21 +170,21 @@ class _Block:
 
 
 class _Table(ABC):
-    """A file with named columns, whatever holds it."""
+    """A file with named columns in any of the containers."""
 
     names: tuple[str, ...]
 
     @abstractmethod
     def looks_like_poses(self) -> bool:
-        """True if no column holds words, and numbers without names look like poses."""
+        """Return True if no column contains words, and numbers without names look like poses."""
 
     @abstractmethod
     def stamp_unit(self, stamp: Found) -> str:
-        """Unit that the stamps seem to be in, to be proposed."""
+        """Return the likely unit of the stamps, for a proposal."""
 
     @abstractmethod
     def blocks(self, columns: Mapping[str, str], unit: str) -> Iterator[_Block | Reject]:
-        """Stream the columns of stamp (in `unit`), quaternion and translation."""
+        """Yield the columns of stamp (in `unit`), quaternion and translation."""
 
 
 class _Text(_Table):
@@ -264,7 +264,7 @@ class _Columnar(_Table):
 
 
 def _open(path: Path, options: TextOptions) -> _Table:
-    """Open the file, whichever of the three containers it is."""
+    """Open a file of any of the three containers."""
     try:
         with path.open("rb") as stream:
             magic = stream.read(6)

@@ -113,7 +113,7 @@ class Pospac(LogFormat):
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one file is read."""
+    """How a file is read."""
 
     layout: TextLayout
     kinds: dict[str, Kind]
@@ -160,6 +160,6 @@ def _placement(source: LogSource, options: PospacOptions) -> Placement:
 
 
 def _enu_from_sensor(roll_rad: Float64, pitch_rad: Float64, heading_rad: Float64) -> Float64:
-    """(4, n) east-north-up from sensor: Rx(−roll) · Ry(−pitch) · Rz(−heading)."""
+    """Return (4, n) east-north-up from sensor: Rx(−roll) · Ry(−pitch) · Rz(−heading)."""
     about_x, about_y = quaternion_about("x", -roll_rad), quaternion_about("y", -pitch_rad)
     return quaternion_product(quaternion_product(about_x, about_y), quaternion_about("z", -heading_rad))

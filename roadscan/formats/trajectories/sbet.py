@@ -32,14 +32,14 @@ from roadscan.ingest.reading.text_table import head_of
 
 Float64 = npt.NDArray[np.float64]
 
-FIELDS: Final = 17
-RECORD_BYTES: Final = 8 * FIELDS
+FIELDS: Final = 17  # doubles of a record
+RECORD_BYTES: Final = 8 * FIELDS  # bytes of a record
 CHUNK_RECORDS: Final = 16_384
-"""Records read at once: their columns stay in the processor's cache."""
+"""Records read at once, whose columns fit into the processor's cache."""
 
 # Field numbers of a record. Accelerations (11–13) and rates (14–16) are not used.
 TIME, LATITUDE, LONGITUDE, HEIGHT, ROLL, PITCH, PLATFORM_HEADING, WANDER = 0, 1, 2, 3, 7, 8, 9, 10
-VELOCITY: Final = (4, 5, 6)
+VELOCITY: Final = (4, 5, 6)  # x, y, z in the wander frame
 _USED: Final = [TIME, LATITUDE, LONGITUDE, HEIGHT, ROLL, PITCH, PLATFORM_HEADING, WANDER, *VELOCITY]
 
 _LIMITS: Final = np.array(
@@ -90,7 +90,7 @@ class Sbet(LogFormat):
         if records.size == 0:
             return False
         size = np.abs(records)
-        # Other binary data read as doubles is full of numbers next to nothing, or not finite.
+        # Other binary data read as doubles has many numbers next to zero, or not finite.
         ordinary = np.all(np.isfinite(size)) and np.all((size == 0) | (size > 1e-30)) and np.all(size <= _LIMITS)
         somewhere = np.all(np.any(size[:, [LATITUDE, LONGITUDE]] > 0, axis=1))
         time = records[:, TIME]
@@ -98,7 +98,7 @@ class Sbet(LogFormat):
         return bool(ordinary and somewhere and growing and records[0, HEIGHT] > HEIGHT_MIN_M)
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
-        """The SMRMSG file, where one is named."""
+        """Return the SMRMSG file, where one is named."""
         named = options.accuracy if isinstance(options, SbetOptions) else None
         return [] if named is None else [beside(path, named)]
 
@@ -120,7 +120,7 @@ class Sbet(LogFormat):
         yield from _items(source, _accuracy(source), _chunks(source.path))
 
     def ending(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
-        """Poses of the first chunk of records, from which the GPS week is counted, and of the last."""
+        """Yield poses of the first chunk of records, from which the GPS week is counted, and of the last."""
         records = source.path.stat().st_size // RECORD_BYTES
         last = _chunks(source.path, max(0, records - CHUNK_RECORDS))
         return _items(source, None, itertools.chain(itertools.islice(_chunks(source.path), 1), last))
@@ -159,7 +159,7 @@ def _items(
 
 
 def _level_velocity(wander_rad: Float64, x: Float64, y: Float64, z: Float64) -> Float64:
-    """(3, n) north, east, down of velocities along the axes of the wander frame: x, y to the left of it, z up."""
+    """Return (3, n) north, east, down of velocities in the wander frame: x forward, y to its left, z up."""
     with np.errstate(invalid="ignore", over="ignore"):  # infinities of damaged records
         cosine, sine = np.cos(wander_rad), np.sin(wander_rad)
         return np.stack([cosine * x - sine * y, -sine * x - cosine * y, -z])
@@ -179,7 +179,7 @@ def _accuracy(source: LogSource) -> CarriedAccuracy | None:
 
 
 def _check_accuracy(source: LogSource) -> None:
-    """Refuse an accuracy file that is none, or that is of another time than the poses."""
+    """Refuse a file that is no accuracy file, or that is of another time than the poses."""
     named = options_of(source, SbetOptions).accuracy
     if named is None:
         return
@@ -201,9 +201,9 @@ def _check_accuracy(source: LogSource) -> None:
 
 
 def _ends(path: Path, record_bytes: int) -> tuple[float, float] | None:
-    """First and last stamp (s) of a file of records, None where these do not tell: it is packed, or damaged."""
+    """Return the first and last stamp (s) of a file of records, None where it is compressed or damaged."""
     if not path.is_file() or path.stat().st_size < record_bytes:
-        return None  # who reads it tells of that
+        return None  # the reader reports it
     with path.open("rb") as stream:
         if stream.read(8) != head_of(path, 8):
             return None
@@ -219,7 +219,7 @@ def _stamp(stream: BinaryIO, offset: int) -> float:
 
 
 def _first_second(path: Path, clock: Clock) -> float | None:
-    """First stamp (s), None where it cannot be seconds of a week."""
+    """Return the first stamp (s), None where it cannot be seconds of a week."""
     with path.open("rb") as stream:
         head = stream.read(8)
     if len(head) < 8:
@@ -243,8 +243,8 @@ def _placement(source: LogSource) -> GeodeticPlacement:
 
 
 def _chunks(path: Path, first: int = 0) -> Iterator[tuple[int, Float64 | Reject]]:
-    """Used fields (8, n) of chunks of records from record `first` on, each with the number of its first record."""
-    buffer = np.empty((CHUNK_RECORDS, FIELDS), dtype="<f8")  # read into again and again: fresh pages cost time
+    """Yield used fields (8, n) of chunks of records from record `first` on, with the number of the first record."""
+    buffer = np.empty((CHUNK_RECORDS, FIELDS), dtype="<f8")  # reused, because fresh pages cost time
     with path.open("rb") as stream:
         stream.seek(first * RECORD_BYTES)
         while size := stream.readinto(buffer.data.cast("B")):

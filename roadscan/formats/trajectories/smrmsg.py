@@ -23,9 +23,9 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-FIELDS: Final = 10
-RECORD_BYTES: Final = 8 * FIELDS
-CLOCK_EXAMPLE: Final[dict[str, Any]] = {"system": "gps_week_seconds", "week": 2405}
+FIELDS: Final = 10  # doubles of a record
+RECORD_BYTES: Final = 8 * FIELDS  # bytes of a record
+CLOCK_EXAMPLE: Final[dict[str, Any]] = {"system": "gps_week_seconds", "week": 2405}  # in errors
 
 SIGMAS: Final = {
     "sigma_north_m": 1.0,
@@ -38,17 +38,17 @@ SIGMAS: Final = {
     "sigma_pitch_deg": 1 / 60,
     "sigma_heading_deg": 1 / 60,
 }
-"""Columns in the order of a record's fields behind the time, and their size in the column's unit: arc minutes
-become degrees."""
+"""Columns in the order of a record's fields after the time, with their size in the column's unit: arc minutes become
+degrees."""
 CARRIED: Final = tuple(name for name in SIGMAS if "velocity" not in name)
-"""Those that a pose has a column for."""
+"""The σ for which a pose has a column."""
 
 GAP_INTERVALS: Final = 2.5
-"""Between records more than so many usual intervals apart σ is not known: one lost record is bridged, two are not."""
+"""σ is unknown between records more than this many usual intervals apart: one lost record is bridged, two are not."""
 USUAL_RECORDS: Final = 1_000
-"""The usual interval is the median one of so many first records."""
+"""First records whose median interval is the usual one."""
 
-_LIMITS: Final = np.array([SIGMA_MAX_M] * 6 + [SIGMA_MAX_DEG * 60] * 3)
+_LIMITS: Final = np.array([SIGMA_MAX_M] * 6 + [SIGMA_MAX_DEG * 60] * 3)  # largest σ in the file's units (m, m/s, ′)
 
 
 class Smrmsg(LogFormat):
@@ -79,7 +79,7 @@ class Smrmsg(LogFormat):
         if records.size == 0 or not np.all(np.isfinite(records)):
             return False
         time, sigmas = records[:, 0], records[:, 1:]
-        # Other binary data read as doubles is full of numbers next to nothing.
+        # Other binary data read as doubles has many numbers next to zero.
         ordinary = np.all((sigmas == 0) | (sigmas > 1e-9)) and np.all(sigmas <= _LIMITS) and np.all(sigmas >= 0)
         known = np.all(sigmas[:, :3] > 0)  # no solution is without error
         growing = np.all(time[1:] > time[:-1]) and time[0] >= 0 and time[-1] <= 2 * WEEK_S
@@ -104,7 +104,7 @@ class Smrmsg(LogFormat):
 
 @dataclass(frozen=True)
 class AccuracyBlock:
-    """Sound records, one after another."""
+    """Consecutive sound records."""
 
     records: Int64
     """(n,) record numbers."""
@@ -115,7 +115,7 @@ class AccuracyBlock:
 
 
 def accuracy_blocks(path: Path, clock: Clock, near_s: float | None = None) -> Iterator[AccuracyBlock | Reject]:
-    """Stream an SMRMSG file.
+    """Yield the records of an SMRMSG file in blocks.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def accuracy_blocks(path: Path, clock: Clock, near_s: float | None = None) -> It
 
 
 def _block(fields: Float64, first: int, reader: EpochReader) -> Iterator[AccuracyBlock | Reject]:
-    """Sound records of the fields (10, n), then the rejects."""
+    """Yield the sound records of the fields (10, n), then the rejects."""
     records = np.arange(first, first + fields.shape[1], dtype=np.int64)
     sieve = Sieve(records.size)
     with np.errstate(over="ignore", invalid="ignore"):  # damaged records, dropped below
@@ -167,8 +167,8 @@ def _block(fields: Float64, first: int, reader: EpochReader) -> Iterator[Accurac
 class CarriedAccuracy:
     """The σ of an SMRMSG file at the epochs of the poses it belongs to.
 
-    Both files are read side by side, in order of time: only the records about the poses at hand are
-    held. Between two records σ is linear in time; there is none beyond the file's span, and in a gap,
+    Both files are read side by side, in order of time: only the records about the current poses are
+    in memory. Between two records σ is linear in time; there is none beyond the file's span, and in a gap,
     where two records are more than 2.5 usual intervals apart (:data:`GAP_INTERVALS`; the usual interval is the
     median of the file's first 1,000).
 
@@ -194,7 +194,7 @@ class CarriedAccuracy:
         self._first_reject = ""
 
     def at(self, epochs: Int64) -> dict[str, Float64]:
-        """σ by column name (:data:`CARRIED`), (n,) with NaN beyond the file's span and in its gaps, at epochs (n,)."""
+        """Return σ by column name (:data:`CARRIED`), (n,), NaN outside the file's span and in gaps, at epochs (n,)."""
         if self._gap_ns is None:
             self._gap_ns = self._measured_gap_ns()
         self._advance(int(epochs.min()), int(epochs.max()))
@@ -214,7 +214,7 @@ class CarriedAccuracy:
         return out
 
     def rejects(self) -> Iterator[Reject]:
-        """Damaged records met since the last call."""
+        """Yield the damaged records read since the last call."""
         yield from self._rejects
         self._rejects = []
 
@@ -245,7 +245,7 @@ class CarriedAccuracy:
             )
 
     def _next(self) -> AccuracyBlock | None:
-        """The next sound records, None at the file's end; rejects are kept."""
+        """Return the next sound records, None at the file's end; rejects are stored."""
         while not self._ended:
             block = next(self._blocks, None)
             if isinstance(block, Reject):
@@ -257,7 +257,7 @@ class CarriedAccuracy:
         return None
 
     def _advance(self, first: int, last: int) -> None:
-        """Hold the records about the span of epochs, with one on either side."""
+        """Read the records about the span of epochs, with one on either side."""
         while (not self._epochs.size or self._epochs[-1] < last) and (block := self._next()) is not None:
             self._hold(block)
             self._forget(first)
@@ -272,7 +272,7 @@ class CarriedAccuracy:
             self._epochs, self._sigmas = self._epochs[order], self._sigmas[:, order]
 
     def _measured_gap_ns(self) -> float:
-        """Time between two records from which on they have a gap between them, from the file's first records."""
+        """Return the time between two records from which they have a gap between them, by the file's first records."""
         while self._epochs.size < USUAL_RECORDS and (block := self._next()) is not None:
             self._hold(block)
         intervals = np.diff(self._epochs[:USUAL_RECORDS])
@@ -280,7 +280,7 @@ class CarriedAccuracy:
         return GAP_INTERVALS * float(np.median(intervals)) if intervals.size else np.inf
 
     def _in_gap(self, epochs: Int64, gap_ns: float) -> Bool:
-        """Epochs (n,) that lie in a gap, and on no record."""
+        """Return which epochs (n,) lie in a gap, and on no record."""
         if self._epochs.size < 2:
             return np.zeros(epochs.size, dtype=bool)
         behind = np.clip(np.searchsorted(self._epochs, epochs), 1, self._epochs.size - 1)
@@ -288,6 +288,6 @@ class CarriedAccuracy:
         return np.asarray((after - before > gap_ns) & (epochs != after) & (epochs != before))
 
     def _forget(self, first: int) -> None:
-        """Let go of the records long before `first`; poses may be a little out of order."""
+        """Discard the records long before `first`; poses may be a little out of order."""
         start = max(int(np.searchsorted(self._epochs, first - LEAP_NS)) - 1, 0)
         self._epochs, self._sigmas = self._epochs[start:], self._sigmas[:, start:]

@@ -46,7 +46,7 @@ class TrajectoryCsvOptions(TextOptions):
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one file is read."""
+    """How a file is read."""
 
     layout: TextLayout
     columns: dict[str, Found]

@@ -34,13 +34,13 @@ from roadscan.ingest.reading.stamps import TIME
 from roadscan.ingest.reading.table_stamps import EPOCH, TableStamps, need_type
 
 FRAME_KEY: Final = "roadscan.trajectory"
-"""Key of the schema metadata that holds the frame of the poses as JSON."""
+"""Key of the schema metadata with the frame of the poses as JSON."""
 
-BATCH_ROWS: Final = 65_536
+BATCH_ROWS: Final = 65_536  # rows of a batch
 
 
 class TrajectoryFrame(Strict):
-    """What the positions and headings of a file are, as its own metadata states them."""
+    """Frame of a file's positions and headings, as its metadata states it."""
 
     crs: str | None = None
     """CRS of the positions, or "local"."""
@@ -127,11 +127,11 @@ class _Numbers:
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one file is read."""
+    """How a file is read."""
 
     table: ColumnTable
     columns: dict[str, Found]
-    """Column of each quantity but the time."""
+    """Column of each quantity except the time."""
     crs: str
     stamps: TableStamps
     placement: Placement
@@ -169,7 +169,7 @@ def _frame(schema: pa.Schema, file: Path) -> TrajectoryFrame:
 
 
 def _agreed(source: LogSource, own: TrajectoryFrame) -> LogSource:
-    """The log as file and survey file together state it."""
+    """Return the log as file and survey file together state it."""
     if own.crs is not None and source.crs is not None and not _is_same(own.crs, source.crs):
         raise CrsError(
             f"the survey file says the positions are in {source.crs}, the file says {own.crs[:80]}",

@@ -1,4 +1,4 @@
-"""Trajectories of arrays, written as `trajectory_table`."""
+"""Writes trajectories in arrays as `trajectory_table`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from roadscan.ingest.reading.table_stamps import EPOCH
 ECEF: Final = tuple(Quantity(a, "length", (f"ecef_{a}", f"{a}_ecef")) for a in "xyz")
 QUATERNION: Final = tuple(Quantity(f"q{a}", "count") for a in "wxyz")
 
-_LENGTH_TOLERANCE: Final = 1e-3
+_LENGTH_TOLERANCE: Final = 1e-3  # largest deviation of a quaternion's length from 1
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Quaternions:
-    """What the columns qw, qx, qy, qz turn: vectors of the vehicle's axes into those of a frame."""
+    """Meaning of the columns qw, qx, qy, qz: they rotate vectors of the vehicle's axes into those of a frame."""
 
     frame: Literal["level", "world"]
     """level: north, east, down at the position (north as `heading` says); world: the axes of the CRS itself, for
@@ -66,7 +66,7 @@ def write_trajectory(
     columns: Mapping[str, Any] | None = None,
     quaternions: Quaternions | None = None,
 ) -> WrittenLog:
-    """Write poses as a Parquet log that `roadscan` reads as `trajectory_table`; what was written.
+    """Write poses as a Parquet log that `roadscan` reads as `trajectory_table`; return what was written.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def _is_geocentric(crs: str) -> bool:
 
 
 def _geographic_text(crs: str) -> str:
-    """The geographic CRS of a geocentric one, which `trajectory_table` can state."""
+    """Return the geographic CRS of a geocentric one, which `trajectory_table` can state."""
     geographic = geographic_of(world_frame_of(crs))
     authority = geographic.to_authority(min_confidence=90)
     return ":".join(authority) if authority else str(geographic.to_wkt())
@@ -143,7 +143,7 @@ def _need_all(values: Float64, column: str) -> None:
 
 
 def _geodetic(values: Mapping[str, Float64], crs: str) -> dict[str, Float64]:
-    """Longitude, latitude (rad) and height (m) of geocentric positions."""
+    """Return longitude, latitude (rad) and height (m) of geocentric positions."""
     degrees = geodetic_from_world(world_frame_of(crs), np.stack([values[q.name] for q in ECEF], axis=-1))
     longitude, latitude = np.radians(degrees[:, :2].T)
     return {"longitude": longitude, "latitude": latitude, "height": degrees[:, 2]}
@@ -152,7 +152,7 @@ def _geodetic(values: Mapping[str, Float64], crs: str) -> dict[str, Float64]:
 def _rph(
     values: Mapping[str, Float64], about: Quaternions, crs: str, placed: Mapping[str, Float64]
 ) -> dict[str, Float64]:
-    """Roll, pitch and heading (rad) of quaternions."""
+    """Return roll, pitch and heading (rad) of quaternions."""
     quaternion = np.stack([values[q.name] for q in QUATERNION], axis=-1)
     wrong = np.abs(np.linalg.norm(quaternion, axis=-1) - 1) > _LENGTH_TOLERANCE
     if wrong.any():
@@ -168,7 +168,7 @@ def _rph(
 
 
 def _level_from_world(crs: str, placed: Mapping[str, Float64]) -> Float64:
-    """(n, 3, 3) or (3, 3) north-east-down from the axes of the CRS."""
+    """Return (n, 3, 3) or (3, 3) north-east-down from the axes of the CRS."""
     if crs == LOCAL_WORLD:
         return ENU_FROM_NED.T
     if "longitude" not in placed or not _is_geocentric(crs):

@@ -1,1 +1,1 @@
-"""Control points and lines of roads."""
+"""Formats of control points and lines of roads."""

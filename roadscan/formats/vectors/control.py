@@ -1,4 +1,4 @@
-"""Control points as files write them, turned into rows of the `control_points` table.
+"""Converts control points of files to rows of the `control_points` table.
 
 The CRS and the kind of the heights are stated by the survey file. Heights change between
 ellipsoidal and orthometric only by a named geoid.
@@ -45,18 +45,18 @@ CONTROL_SIGMA: Final = Witness(
     does="a σ of zero counts as not stated; any other is used as stated, and named",
     told=("findings",),
 )
-SIGMA_MAX_M: Final = 1_000.0
+SIGMA_MAX_M: Final = 1_000.0  # larger σ count as damage
 _COARSE_SIGMA_M: Final = 0.5
-"""Points known no better than this hold no drive, as those of hand-held receivers; 0.5 mm given as metres are such."""
+"""σ (m) of a point that is too coarse for a drive, as from hand-held receivers, or from 0.5 mm given as metres."""
 _FINE_SIGMA_M: Final = 5e-5
-"""Precise levelling reaches 0.2 mm over a kilometre; no point of a road is known better than this."""
+"""Least credible σ (m) of a road point: precise levelling reaches 0.2 mm over a kilometre."""
 NO_TEXT: Final = "\ufffd"
-"""Stands for bytes that could not be decoded."""
+"""Replaces bytes that could not be decoded."""
 
 
 @dataclass(frozen=True)
 class ControlFrame:
-    """Frame of a control file's coordinates, and the way from there into the survey's map."""
+    """Frame of a control file's coordinates, and its transformation to the survey's map."""
 
     crs: str
     kind: CrsKind
@@ -69,7 +69,7 @@ class ControlFrame:
 
     @classmethod
     def of(cls, source: LogSource) -> ControlFrame:
-        """Frame that the survey states for a control file.
+        """Return the frame that the survey states for a control file.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class ControlFrame:
         height = source.any_height or "ellipsoidal" if crs == LOCAL_WORLD else height_in(source, crs)
         geoid = source.geoid
         if height == "orthometric" and geoid is None and source.map.height == "orthometric":
-            geoid = source.map.geoid  # both heights stand on the survey's own geoid
+            geoid = source.map.geoid  # both heights refer to the survey's geoid
         if crs == LOCAL_WORLD:
             return cls(crs, "local", 1.0, height, None, source.map, source.path)
         if height == "orthometric" and geoid is None:
@@ -108,7 +108,7 @@ class ControlFrame:
         return cls(crs, kind, scale, height, own_geoid, source.map, source.path)
 
     def check(self, coordinates: Float64, sieve: Sieve) -> None:
-        """Drop points whose coordinates (3, n) are missing or absurd."""
+        """Drop points with missing or impossible coordinates (3, n)."""
         first, second, height = coordinates
         if self.kind == "geographic":
             sieve.require("longitude", first, -360.0, 360.0, "°")
@@ -119,7 +119,7 @@ class ControlFrame:
         sieve.require("height", height, HEIGHT_MIN_M, HEIGHT_MAX_M, "m")
 
     def to_map(self, coordinates: Float64) -> Float64:
-        """Easting, northing, height (3, n) in the map, metres.
+        """Return easting, northing, height (3, n) in the map, metres.
 
         Parameters
         ----------
@@ -167,7 +167,7 @@ class RawControl:
 
 
 class ControlReader:
-    """Turns the blocks of one file into rows of `control_points` and rejects."""
+    """Converts the blocks of one file to rows of `control_points` and rejects."""
 
     def __init__(self, frame: ControlFrame) -> None:
         self._frame = frame
@@ -176,7 +176,7 @@ class ControlReader:
         self._sigmas: dict[str, list[Float64]] = {"horizontal position": [], "height": []}
 
     def items(self, raw: RawControl) -> Iterator[Item]:
-        """Rows of the sound points of a block, then its rejects.
+        """Yield rows of a block's sound points, then its rejects.
 
         Raises
         ------
@@ -204,7 +204,7 @@ class ControlReader:
         yield from sieve.rejects(raw.records, raw.offsets)
 
     def findings(self) -> Iterator[Finding]:
-        """What the σ of all points that were read say, once the file is at its end."""
+        """Yield findings on the σ of all points, once the file is read."""
         for name, blocks in self._sigmas.items():
             stated = np.concatenate([np.empty(0), *blocks])
             for wrong, words in (
@@ -235,7 +235,7 @@ class ControlReader:
         sieve.drop(repeated, "a point of this name came before")
 
     def _placed(self, raw: RawControl, sieve: Sieve) -> Float64 | None:
-        """Map coordinates (3, n), zero where the point is dropped; None where none is left."""
+        """Return map coordinates (3, n), zero where the point is dropped; None where none is left."""
 
         def attempt(rows: Int64) -> Float64:
             return self._frame.to_map(raw.coordinates[:, rows])
@@ -279,7 +279,7 @@ class ControlReader:
 
 
 def _stated(sigma_m: Float64) -> pa.Array:
-    """The σ of a column (n,), null where none is stated: nothing is known exactly, so 0 states none."""
+    """Return the σ of a column (n,), null where none is stated: nothing is known exactly, so 0 states none."""
     return pa.array(np.where(sigma_m == 0.0, np.nan, sigma_m), from_pandas=True)
 
 
@@ -289,7 +289,7 @@ def _span(sigma_m: Float64) -> str:
 
 
 def need_role(column: bool, role: Role | None, file: Path) -> None:
-    """Refuse a file that says nowhere whether its points are control or check points."""
+    """Refuse a file that does not say whether its points are control or check points."""
     if not column and role is None:
         raise ConfigError(
             "nothing says whether the points are ground control or check points",

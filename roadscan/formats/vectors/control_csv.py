@@ -49,10 +49,10 @@ SIGMAS: Final = (
 )
 PNEZD: Final = ["point", "northing", "easting", "elevation_m", "description"]
 PENZD: Final = ["point", "easting", "northing", "elevation_m", "description"]
-"""The customary columns of surveyors' files, which no line names. The unit of heights is a proposal for the user."""
+"""Customary columns of surveyors' files without a line of names. The unit of heights is a proposal for the user."""
 _EASTINGS_M: Final = (1e5, 1e6)
-"""Eastings of UTM and of most national grids; northings are beyond, from 9 km off the equator on."""
-_LEAST_GRID_M: Final = 1e3
+"""Eastings of UTM and most national grids; northings are outside, beyond 9 km from the equator."""
+_LEAST_GRID_M: Final = 1e3  # smaller numbers are no grid coordinates
 _NOT_CONTROL: Final = ("roll", "pitch", "heading", "qw", "r11", "gpstime", "timestamp")
 
 
@@ -69,7 +69,7 @@ class ControlCsvOptions(TextOptions):
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one file is read."""
+    """How a file is read."""
 
     layout: TextLayout
     columns: dict[str, Found]
@@ -148,7 +148,7 @@ def _plan(source: LogSource) -> _Plan:
 
 
 def _nameless(first: Sequence[str]) -> list[str] | None:
-    """Names of the columns of a surveyors' file whose first line is a point; [] where their order is not clear.
+    """Return column names of a surveyors' file whose first line is a point; [] where their order is unclear.
 
     None of any other file. A point is a name, two lengths of a grid, a height, and words or nothing.
     """
@@ -166,7 +166,7 @@ def _nameless(first: Sequence[str]) -> list[str] | None:
 
 
 def _number(word: str) -> float:
-    """A number as it is written, NaN for other words."""
+    """Return a number as written, NaN for other words."""
     try:
         return float(word)
     except ValueError:
@@ -174,7 +174,7 @@ def _number(word: str) -> float:
 
 
 def units_of(frame: ControlFrame) -> dict[str, float]:
-    """Size (rad, m) of the units that the CRS itself fixes, by quantity."""
+    """Return the size (rad, m) of the units that the CRS itself fixes, by quantity."""
     if frame.kind == "local":
         return {"easting": 1.0, "northing": 1.0, "height": 1.0}
     axes = crs_from_text(frame.crs).axis_info

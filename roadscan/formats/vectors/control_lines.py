@@ -134,7 +134,7 @@ def _item(line: _Line, frame: ControlFrame) -> Item:
 
 
 def _why_not(line: _Line) -> str:
-    """Why a line is none; "" where it is one."""
+    """Return why a line is invalid; "" for a valid one."""
     sigmas = np.array([line.sigma_horizontal_m, line.sigma_height_m])
     tests = (
         (line.coordinates.shape[1] < 2, "the line has fewer than two vertices"),
@@ -154,7 +154,7 @@ def _lines(source: LogSource, frame: ControlFrame, options: ControlLinesOptions)
 
 
 def _of_layer(source: LogSource, frame: ControlFrame, options: ControlLinesOptions) -> Iterator[_Line | Reject]:
-    """Lines of a layer; parts of a feature are lines of one name."""
+    """Yield lines of a layer; parts of a feature are lines of one name."""
     with gdal_faults(source.path, "a layer of lines"):
         layer = chosen_layer(layer_names(source.path), options.layer, source.path)
         info = layer_info(source.path, layer)
@@ -185,7 +185,7 @@ def _of_layer(source: LogSource, frame: ControlFrame, options: ControlLinesOptio
 
 
 def _of_text(source: LogSource, frame: ControlFrame, options: ControlLinesOptions) -> Iterator[_Line | Reject]:
-    """Lines of text rows, in the order in which their names first come."""
+    """Yield lines of text rows, in the order in which their names first occur."""
     layout = text_layout(source.path, options)
     position = {"local": (*LOCAL, LOCAL_HEIGHT), "projected": (*GRID, HEIGHT), "geographic": (*GEODETIC, HEIGHT)}
     *place, height = position[frame.kind]

@@ -108,7 +108,7 @@ class ControlVector(LogFormat):
 
 @dataclass(frozen=True)
 class _Plan:
-    """How one layer is read."""
+    """How a layer is read."""
 
     layer: str
     attributes: tuple[str, ...]
@@ -153,7 +153,7 @@ def _plan(source: LogSource) -> _Plan:
 
 
 def check_crs(found: str | None, frame: ControlFrame, file: Path) -> None:
-    """Refuse a layer whose own CRS is another than the stated one."""
+    """Refuse a layer whose CRS differs from the stated one."""
     if found is None:
         return
     own = crs_from_text(found)
@@ -200,7 +200,7 @@ def _raw(batch: pa.RecordBatch, plan: _Plan, first: int) -> RawControl:
 
 
 def _points(batch: pa.RecordBatch, geometry: str) -> Float64:
-    """x, y, z (3, n) of the point geometries, NaN for anything else and for a missing z."""
+    """Return x, y, z (3, n) of the point geometries, NaN for anything else and for a missing z."""
     shapes = shapes_of(batch, geometry)
     is_place = (shapely.get_type_id(shapes) == shapely.GeometryType.POINT) & ~shapely.is_empty(shapes)
     points = shapes.copy()

@@ -1,4 +1,4 @@
-"""Layers of polygons: any that GDAL reads (shapefile, GeoPackage, GeoJSON), brought into the survey's map."""
+"""Reads layers of polygons (any that GDAL reads: shapefile, GeoPackage, GeoJSON) into the survey's map."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _EXPECTED: Final = "a layer of polygons"
 
 
 def check_polygons(path: Path, stated_crs: str | None, frame: MapFrame) -> None:
-    """Open a layer of polygons and hold its CRS against the stated one; its features are not read.
+    """Check a layer of polygons and its CRS against the stated one; its features are not read.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def check_polygons(path: Path, stated_crs: str | None, frame: MapFrame) -> None:
 
 
 def read_polygons(path: Path, stated_crs: str | None, frame: MapFrame) -> shapely.Geometry:
-    """The union of a layer's polygons on the map (m).
+    """Return the union of a layer's polygons on the map (m).
 
     Raises
     ------

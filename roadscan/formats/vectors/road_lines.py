@@ -59,11 +59,11 @@ Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 _EXPECTED: Final = "a layer of lines"
-_SHAPE_CODE: Final = 9994
-_SHAPE_LINES: Final = frozenset({3, 13, 23})
+_SHAPE_CODE: Final = 9994  # magic number of a shapefile
+_SHAPE_LINES: Final = frozenset({3, 13, 23})  # shape types of lines
 _SIDECARS: Final = (".shx", ".dbf", ".prj", ".cpg")
-_WIDEST_M: Final = 500.0
-_MOST_LANES: Final = 100
+_WIDEST_M: Final = 500.0  # larger widths are refused
+_MOST_LANES: Final = 100  # larger numbers of lanes are ignored
 _KNOWN_IDS: Final = ("LINEARID", "TLID", "id", "line_id")
 _KNOWN_NAMES: Final = ("FULLNAME", "name", "NAME")
 _KNOWN_CLASSES: Final = ("MTFCC", "class", "CLASS", "highway")
@@ -72,7 +72,7 @@ _KNOWN_LANES: Final = ("lanes", "LANES")
 
 @dataclass(frozen=True)
 class RoadClass:
-    """What a class of roads is, and how wide such a road commonly is."""
+    """A class of roads and its common width."""
 
     title: str
     lanes: int
@@ -81,7 +81,7 @@ class RoadClass:
 
     @property
     def width_m(self) -> float:
-        """Lanes and shoulders together (m)."""
+        """Width of lanes and shoulders together (m)."""
         return round(self.lanes * self.lane_m + self.shoulders_m, 3)
 
 
@@ -175,11 +175,11 @@ class RoadLines(LogFormat):
         return _is_line_shapefile(head) or (is_json and features and has_lines and b'"Point"' not in head)
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
-        """The files beside a shapefile that hold its attributes and CRS."""
+        """Return the files beside a shapefile with its attributes and CRS."""
         return sidecars(path)
 
     def header(self, source: LogSource) -> LogHeader:
-        """Layer, CRS and where the widths come from."""
+        """Return layer, CRS and the source of the widths."""
         layer = LineLayer.of(source.path, options_of(source, RoadLinesOptions), source.crs, source.defaults.crs)
         _place(layer, source)
         columns = {name: column for name, column in layer.columns.items() if column is not None}
@@ -202,7 +202,7 @@ def _place(layer: LineLayer, source: LogSource) -> Place:
 
 
 def sidecars(path: Path) -> list[Path]:
-    """Files that belong to a shapefile, beside it; none for other files."""
+    """Return the files that belong to a shapefile; none for other files."""
     if path.suffix.lower() != ".shp":
         return []
     beside = {p.suffix.lower(): p for p in sorted(path.parent.glob(f"{_literal(path.stem)}.*"))}
@@ -223,7 +223,7 @@ def _is_line_shapefile(head: bytes) -> bool:
 
 
 def _is_zipped_shapefile(path: Path) -> bool:
-    """True for an archive whose first shapefile holds lines. Never raises."""
+    """Return True for an archive whose first shapefile has lines. Never raises."""
     try:
         with zipfile.ZipFile(path) as archive:
             shapes = [name for name in archive.namelist()[:1000] if name.lower().endswith(".shp")]
@@ -240,7 +240,7 @@ def _is_zipped_shapefile(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class LineLayer:
-    """A layer of lines, its attributes found."""
+    """A layer of lines with its attributes."""
 
     path: Path
     name: str
@@ -256,7 +256,7 @@ class LineLayer:
     def of(
         cls, path: Path, options: RoadLinesOptions, stated_crs: str | None, default_crs: str | None = None
     ) -> LineLayer:
-        """Open a layer and hold it against what is stated.
+        """Open a layer and check it against what is stated.
 
         Raises
         ------
@@ -288,7 +288,7 @@ class LineLayer:
 
     @property
     def says_widths(self) -> bool:
-        """True where an attribute leads to widths."""
+        """Return True where an attribute leads to widths."""
         return any(self.columns[name] is not None for name in ("width", "lanes", "class"))
 
 
@@ -305,7 +305,7 @@ def _attribute(stated: str | None, known: tuple[str, ...], names: tuple[str, ...
 
 
 def layer_crs(found: str | None, stated: str | None, path: Path) -> str:
-    """CRS of a layer: its own, or the stated one; the two have to agree."""
+    """Return the CRS of a layer: its own, or the stated one; the two have to agree."""
     if found is None:
         if stated is None:
             raise CrsError(
@@ -339,11 +339,11 @@ def _same(one: pyproj.CRS, other: pyproj.CRS) -> bool:
 # --- into the map ------------------------------------------------------------------------------------
 
 Place = Callable[[Float64], Float64]
-"""Brings coordinates (n, 2) of a layer to easting and northing in the map (m); not finite where that cannot be."""
+"""Transforms coordinates (n, 2) of a layer to easting and northing in the map (m); not finite where impossible."""
 
 
 def place_in_map(crs: str, frame: MapFrame, path: Path) -> Place:
-    """How a layer's coordinates become map coordinates; heights do not count.
+    """Return the transformation of a layer's coordinates to the map; heights are ignored.
 
     Raises
     ------
@@ -385,7 +385,7 @@ def place_in_map(crs: str, frame: MapFrame, path: Path) -> Place:
 
 @dataclass(frozen=True)
 class Lines:
-    """Some lines, in the map."""
+    """Lines in the map."""
 
     records: npt.NDArray[np.int64]
     """(n,) number of each line's feature."""
@@ -404,7 +404,7 @@ class Lines:
 
 
 def read_lines(layer: LineLayer, place: Place, *, need_widths: bool = True) -> Iterator[Lines | Reject]:
-    """Stream a layer's lines in the map; features without a line are rejected.
+    """Yield a layer's lines in the map; features without a line are rejected.
 
     Parameters
     ----------
@@ -457,7 +457,7 @@ def _lines(
 
 
 def _shapes(batch: pa.RecordBatch, layer: LineLayer, sieve: Sieve) -> npt.NDArray[np.object_]:
-    """Geometries (n,) of the features, empty where there is no line."""
+    """Return geometries (n,) of the features, empty where there is no line."""
     shapes = shapely.force_2d(shapes_of(batch, layer.geometry))
     kinds = shapely.get_type_id(shapes)
     lines = np.isin(kinds, (shapely.GeometryType.LINESTRING, shapely.GeometryType.MULTILINESTRING))
@@ -468,7 +468,7 @@ def _shapes(batch: pa.RecordBatch, layer: LineLayer, sieve: Sieve) -> npt.NDArra
 
 
 def _placed(parts: npt.NDArray[np.object_], place: Place) -> tuple[npt.NDArray[np.object_], Bool]:
-    """Lines (m,) in the map, and which of them have a place there."""
+    """Return lines (m,) in the map, and which of them could be transformed."""
     xy, line = shapely.get_coordinates(parts, return_index=True)
     sound = np.ones(parts.size, dtype=bool)
     if not parts.size:
@@ -517,7 +517,7 @@ class _Words:
 
 
 def _widths(words: _Words, options: RoadLinesOptions) -> tuple[Float64, list[str | None], Bool]:
-    """Width (n,) of each feature's road (m), NaN where unknown, what it comes from, and whether it cannot be one."""
+    """Return width (n,) of each feature's road (m), NaN where unknown, its source, and whether it is impossible."""
     stated = words.widths * UNITS["length"][options.width_unit]
     odd = (stated < 0) | (stated > _WIDEST_M)
     out = np.full(stated.size, np.nan)
@@ -536,7 +536,7 @@ def _widths(words: _Words, options: RoadLinesOptions) -> tuple[Float64, list[str
 
 
 def class_width_m(kind: str, options: RoadLinesOptions) -> float | None:
-    """Width (m) of the roads of a class, None where it is not known."""
+    """Return the width (m) of the roads of a class, None where it is unknown."""
     if kind in options.class_widths_m:
         return options.class_widths_m[kind]
     known = TIGER_ROADS.get(kind)

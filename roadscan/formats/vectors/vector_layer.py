@@ -1,4 +1,4 @@
-"""Vector layers as GDAL reads them: what formats of points and of lines have in common."""
+"""Shared parts of the formats of points and lines: vector layers as GDAL reads them."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ import shapely
 from roadscan.core.errors import ConfigError, FormatError, Missing, RoadscanError, nearest
 from roadscan.ingest.reading.format import Reject
 
-BATCH_FEATURES: Final = 4_096
-_LARGEST_JSON: Final = 16 << 20
+BATCH_FEATURES: Final = 4_096  # features of a batch
+_LARGEST_JSON: Final = 16 << 20  # larger GeoJSON files are not searched for unread features
 LINE_KINDS: Final = frozenset({"LINESTRING", "MULTILINESTRING", "COMPOUNDCURVE", "MULTICURVE", "CURVE"})
-"""Geometry types of GeoPackage layers that hold lines."""
+"""Geometry types of GeoPackage layers with lines."""
 
 _SQLITE: Final = b"SQLite format 3\x00"
 _GEOPACKAGE_IDS: Final = (b"GPKG", b"GP10", b"GP11")
 
 
 def is_geopackage(head: bytes) -> bool:
-    """True for the first bytes of a GeoPackage."""
+    """Return True for the first bytes of a GeoPackage."""
     return head.startswith(_SQLITE) and head[68:72] in _GEOPACKAGE_IDS
 
 
 def geopackage_kinds(path: Path) -> frozenset[str]:
-    """Geometry types of a GeoPackage's layers, in capitals; empty where its tables cannot be read. Never raises."""
+    """Return the geometry types of a GeoPackage's layers, in capitals; empty where unreadable. Never raises."""
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
             rows = base.execute("SELECT geometry_type_name FROM gpkg_geometry_columns LIMIT 1000").fetchall()
@@ -46,13 +46,13 @@ def geopackage_kinds(path: Path) -> frozenset[str]:
 
 
 def gdal_name(path: Path) -> str:
-    """Name under which GDAL opens a file, a zipped one too."""
+    """Return the name with which GDAL opens a file, even a zipped one."""
     return f"/vsizip/{path}" if path.suffix.lower() == ".zip" else str(path)
 
 
 @contextmanager
 def gdal_faults(path: Path, expected: str = "GeoJSON or GeoPackage points") -> Iterator[None]:
-    """GDAL's complaints about the file as a FormatError; its warnings are not ours."""
+    """Raise GDAL's errors about the file as FormatError, and suppress its warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -66,21 +66,21 @@ def gdal_faults(path: Path, expected: str = "GeoJSON or GeoPackage points") -> I
 
 
 def layer_names(path: Path) -> list[str]:
-    """Names of a file's layers; to be asked inside :func:`gdal_faults`."""
+    """Return the names of a file's layers; call it inside :func:`gdal_faults`."""
     import pyogrio  # slow to import
 
     return [str(layer[0]) for layer in pyogrio.list_layers(gdal_name(path))]
 
 
 def layer_info(path: Path, layer: str | None = None) -> dict[str, Any]:
-    """What GDAL says of a layer (by default the first); to be asked inside :func:`gdal_faults`."""
+    """Return GDAL's information on a layer (by default the first); call it inside :func:`gdal_faults`."""
     import pyogrio  # slow to import
 
     return dict(pyogrio.read_info(gdal_name(path), layer=layer))
 
 
 def chosen_layer(layers: list[str], stated: str | None, file: Path) -> str:
-    """Name of the layer to read: the stated one, or the only one.
+    """Return the name of the layer to read: the stated one, or the only one.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def chosen_layer(layers: list[str], stated: str | None, file: Path) -> str:
 def feature_batches(
     path: Path, layer: str, expected: str = "GeoJSON or GeoPackage points", **asked: Any
 ) -> Iterator[pa.RecordBatch]:
-    """Features of a layer with their geometry as WKB; `asked` goes to GDAL."""
+    """Yield the features of a layer with their geometry as WKB; `asked` is passed to GDAL."""
     import pyogrio  # slow to import
 
     with ExitStack() as stack:
@@ -126,7 +126,7 @@ def feature_batches(
 
 
 def shapes_of(batch: pa.RecordBatch, geometry: str) -> npt.NDArray[np.object_]:
-    """Geometries (n,) of features, None where there is no sound one; `geometry` names their column, "" the default."""
+    """Return geometries (n,) of features, None where invalid; `geometry` names their column, "" the default."""
     name = geometry if geometry and geometry in batch.schema.names else "wkb_geometry"
     with np.errstate(invalid="ignore"):  # coordinates that are no numbers
         shapes = shapely.from_wkb(batch.column(name).to_numpy(zero_copy_only=False), on_invalid="ignore")
@@ -134,7 +134,7 @@ def shapes_of(batch: pa.RecordBatch, geometry: str) -> npt.NDArray[np.object_]:
 
 
 def check_archive(path: Path) -> None:
-    """Refuse a ZIP archive with a member whose checksum is wrong: GDAL does not look at it.
+    """Refuse a ZIP archive with a member whose checksum is wrong, because GDAL does not check it.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def check_archive(path: Path) -> None:
 
 
 def unread_features(path: Path, read: int) -> Iterator[Reject]:
-    """A reject for features that a file lists and GDAL passed over without a word.
+    """Yield a reject for features that a file lists and GDAL silently skipped.
 
     GDAL leaves out members of a GeoJSON file whose type is not "Feature" (only files up to 16 MB are looked at), and
     features of a shapefile that its attribute table does not count or marks as deleted.
@@ -183,18 +183,18 @@ def _listed_features(path: Path) -> int:
 
 
 def _shx_features(size: int) -> int:
-    """Features in a shapefile's index: 8 bytes each behind 100."""
+    """Return the features in a shapefile's index: 8 bytes each after 100."""
     return max(0, size - 100) // 8
 
 
 def flat_crs(crs: pyproj.CRS) -> pyproj.CRS:
-    """The horizontal part of a CRS."""
+    """Return the horizontal part of a CRS."""
     horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
     return horizontal.to_2d() if horizontal.is_geographic or horizontal.is_projected else horizontal
 
 
 def attribute_values(batch: pa.RecordBatch, name: str) -> list[Any]:
-    """Values of an attribute; text as bytes, since GDAL does not check that it is UTF-8.
+    """Return the values of an attribute; text as bytes, because GDAL does not check that it is UTF-8.
 
     Raises
     ------
@@ -211,14 +211,14 @@ def attribute_values(batch: pa.RecordBatch, name: str) -> list[Any]:
 
 
 def word_of(value: Any) -> str:
-    """Text of an attribute, "" where it is missing; U+FFFD stands for bytes that are no text."""
+    """Return the text of an attribute, "" where missing; U+FFFD replaces bytes that are no text."""
     if value is None:
         return ""
     return (value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)).strip()
 
 
 def number_of(value: Any) -> float:
-    """Number of an attribute, NaN where it is missing or none."""
+    """Return the number of an attribute, NaN where it is missing or none."""
     try:
         return float(value)
     except (TypeError, ValueError):

@@ -1,1 +1,1 @@
-"""Clocks of logs from pairs of stamps: lines through them, and corrections."""
+"""Estimates the clocks of logs from pairs of stamps: line fits and corrections."""

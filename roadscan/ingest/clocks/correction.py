@@ -1,4 +1,4 @@
-"""What an estimate says of a sensor's clock, and how epochs are corrected by it."""
+"""The estimated error of a sensor's clock, and the correction of epochs by it."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ class ClockCorrection:
     offset_s: float
     """Added at the reference (s)."""
     drift: float
-    """Added a second from there on (s/s)."""
+    """Rate of the correction (s/s)."""
     reference_gps_ns: int
-    """Epoch of the sensor's own, uncorrected clock at which the offset holds."""
+    """Uncorrected epoch of the sensor's clock at which the offset applies."""
     sigma_offset_s: float = 0.0
     """1 σ of the offset (s)."""
     sigma_drift: float = 0.0
     """1 σ of the drift (s/s)."""
     correlation: float = 0.0
-    """Between the two."""
+    """Correlation of offset and drift."""
     first_gps_ns: int = 0
-    """First epoch (uncorrected) of the span that it was found from; it is applied outside, too."""
+    """First epoch (uncorrected) of the data behind the estimate; the correction is applied outside, too."""
     last_gps_ns: int = 0
-    """Last epoch of that span."""
+    """Last epoch of these data."""
 
     def applied(self, epochs_gps_ns: Int64) -> Int64:
-        """Corrected epochs (n,) of epochs (n,), GPS ns."""
+        """Return the corrected epochs (n,) of epochs (n,), GPS ns."""
         if self.drift == 0.0:
             return epochs_gps_ns + round(self.offset_s * NS_PER_S)
         elapsed_ns = (epochs_gps_ns - self.reference_gps_ns).astype(np.float64)
@@ -44,7 +44,7 @@ class ClockCorrection:
         return corrected
 
     def sigma_s(self, epochs_gps_ns: Int64) -> Float64:
-        """1 σ (n,) of the corrected epochs (s): it grows away from the reference."""
+        """Return 1 σ (n,) of the corrected epochs (s): it grows with the distance from the reference."""
         elapsed_s = (epochs_gps_ns - self.reference_gps_ns).astype(np.float64) / NS_PER_S
         covariance = self.correlation * self.sigma_offset_s * self.sigma_drift
         variance = self.sigma_offset_s**2 + 2 * covariance * elapsed_s + (self.sigma_drift * elapsed_s) ** 2
@@ -54,25 +54,25 @@ class ClockCorrection:
 
 @dataclass(frozen=True)
 class Residuals:
-    """What an estimate leaves: one a pair of stamps, or a window of motion."""
+    """Residuals of an estimate: one for each pair of stamps, or window of motion."""
 
     epochs_gps_ns: Int64
-    """(m,) epoch of the pair, or the middle of the window, by the sensor's own, uncorrected clock."""
+    """(m,) uncorrected epoch of the pair, or of the middle of the window, on the sensor's clock."""
     residual_s: Float64
     """(m,) observed − fitted correction (s)."""
     sigma_s: Float64
-    """(m,) 1 σ of it, as the noise of the pair or window says (s)."""
+    """(m,) 1 σ of the residual, from the noise of the pair or window (s)."""
     used: Bool
     """(m,) False for outliers, and for windows without motion."""
 
     @property
     def weights(self) -> Float64:
-        """(m,) share in the estimate: information 1/σ² over that of all that are used; 0 where not used."""
+        """Return each residual's share (m,) of the information 1/σ² of all used ones; 0 where not used."""
         information = np.where(self.used, 1.0 / np.square(self.sigma_s), 0.0)
         total = information.sum()
         return information / total if total > 0.0 else information
 
     @property
     def rms_s(self) -> float:
-        """Weighted RMS of the residuals that are used (s)."""
+        """Return the weighted RMS of the used residuals (s)."""
         return float(np.sqrt(np.sum(self.weights * np.square(np.where(self.used, self.residual_s, 0.0)))))

@@ -1,4 +1,4 @@
-"""Straight lines through differences of two clocks: robust, with honest σ."""
+"""Robust fit of straight lines to the differences of two clocks."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]
 
 _OUTLIER: Final = 4.0
-"""Beyond so many σ a difference is an outlier."""
+"""Differences beyond this many σ are outliers."""
 _FEW: Final = 4
-"""Of fewer differences none can be told to be an outlier."""
+"""With at most this many differences no outlier can be identified."""
 _SLOPES_OF: Final = 400
-"""Differences that the first guess of the rate is made from: it looks at all pairs of them."""
-_ROUNDS: Final = 30
+"""Differences used for the first estimate of the rate, which compares all pairs of them."""
+_ROUNDS: Final = 30  # most iterations of outlier rejection
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,15 @@ class Line:
     used: Bool
     """(m,) False for outliers."""
     scale: float
-    """Factor that the stated σ were multiplied by, 1 or more: the scatter about the line asked for it."""
+    """Factor applied to the stated σ, at least 1, because of the scatter about the line."""
 
     def at(self, x_s: Float64) -> Float64:
-        """Difference (n,) that the line gives at times (n,)."""
+        """Return the difference (n,) of the line at times (n,)."""
         return self.offset_s + self.drift * (x_s - self.reference_s)
 
 
 def robust_line(x_s: Float64, y_s: Float64, sigma_s: Float64, drift: Drift) -> Line:
-    """Weighted least squares without outliers.
+    """Fit a line by weighted least squares without outliers.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def robust_line(x_s: Float64, y_s: Float64, sigma_s: Float64, drift: Drift) -> L
 
 
 def _first_slope(x_s: Float64, y_s: Float64, sigma_s: Float64, drift: Drift) -> float:
-    """Repeated median of the slopes between the better differences."""
+    """Return the repeated median of the slopes between the better differences."""
     better = np.flatnonzero(sigma_s <= 3.0 * np.median(sigma_s))
     chosen = better[np.linspace(0, better.size - 1, min(better.size, _SLOPES_OF)).astype(np.int64)]
     x, y = x_s[chosen], y_s[chosen]
@@ -84,7 +84,7 @@ def _first_slope(x_s: Float64, y_s: Float64, sigma_s: Float64, drift: Drift) -> 
 
 
 def _near(level_s: Float64, sigma_s: Float64) -> Bool:
-    """(m,) differences that lie near the median of all."""
+    """Return which differences (m,) are near the median of all."""
     away = np.abs(level_s - np.median(level_s))
     spread = SIGMA_OF_MAD * float(np.median(away))
     return np.asarray(away <= np.maximum(_OUTLIER * sigma_s, _OUTLIER * spread))
@@ -99,7 +99,7 @@ def _fitted(x_s: Float64, y_s: Float64, sigma_s: Float64, used: Bool, drift: Dri
     prior = 1.0 / USUAL_DRIFT**2 if drift == "auto" else 0.0
     free = drift != "none" and information + prior > 0.0
     scale, slope = 1.0, 0.0
-    for _ in range(2):  # the scatter says how far the data count against the prior
+    for _ in range(2):  # the scatter sets the weight of the data against the prior
         held = information / scale**2 + prior
         slope = float(weight @ ((x_s - reference) * (y_s - offset)) / scale**2 / held) if free else 0.0
         left = y_s - offset - slope * (x_s - reference)

@@ -1,4 +1,4 @@
-"""The clock of a log from pairs of (stamp, GPS time), or from arrivals at a host that are never early."""
+"""Estimates a log's clock from pairs of (stamp, GPS time), or from arrivals at a host, which are never early."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Bool = npt.NDArray[np.bool_]
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_WINDOWS: Final = (8, 64)
-_IN_A_WINDOW: Final = 20
-_REPLICATES: Final = 200
-_SEED: Final = 1999
+_WINDOWS: Final = (8, 64)  # fewest and most windows into which arrivals are divided
+_IN_A_WINDOW: Final = 20  # arrivals per window within these limits
+_REPLICATES: Final = 200  # simulated delay series from which σ is estimated
+_SEED: Final = 1999  # fixed seed, so that equal input gives equal σ
 
 
 @dataclass(frozen=True)
@@ -28,34 +28,34 @@ class Pairs:
     """Instants on two clocks."""
 
     stamp_ns: Int64
-    """(m,) by the log's clock, in nanoseconds of its own count."""
+    """(m,) stamp of the log's clock, in nanoseconds of its count."""
     nominal_gps_ns: Int64
-    """(m,) what the log's time system alone makes of it."""
+    """(m,) GPS time of the stamp by the log's time system alone."""
     time_gps_ns: Int64
-    """(m,) GPS time; of arrivals, less the least latency."""
+    """(m,) GPS time; for arrivals, minus the least latency."""
     sigma_s: Float64
-    """(m,) 1 σ; of arrivals the smallest error that is believed."""
+    """(m,) 1 σ; for arrivals, the smallest error that is assumed."""
 
 
 @dataclass(frozen=True)
 class PairFit:
-    """What pairs say of a log's clock."""
+    """Estimate of a log's clock from pairs."""
 
     offset_s: float
     """Added to the stamp (s); whole nanoseconds where a double holds them."""
     drift: float
     """s/s"""
     reference_s: float
-    """Stamp at which the offset holds (s of the log's own count)."""
+    """Stamp at which the offset holds (s of the log's count)."""
     correction: ClockCorrection
-    """The same for the epochs that the time system alone makes of the stamps."""
+    """The same as a correction of epochs that the time system alone gives for the stamps."""
     residuals: Residuals
     scale: float
-    """Factor that the stated σ were multiplied by."""
+    """Factor applied to the stated σ."""
 
 
 def clock_from_pairs(pairs: Pairs, drift: Drift) -> PairFit:
-    """Offset from one pair, a robust line through several."""
+    """Return the offset from one pair, or a robust line through several."""
     x_s, y_s, zero_ns = _differences(pairs)
     line = robust_line(x_s, y_s, pairs.sigma_s, drift)
     residuals = Residuals(pairs.nominal_gps_ns, y_s - line.at(x_s), pairs.sigma_s, line.used)
@@ -63,7 +63,7 @@ def clock_from_pairs(pairs: Pairs, drift: Drift) -> PairFit:
 
 
 def clock_from_arrivals(pairs: Pairs, drift: Drift) -> PairFit:
-    """The highest line below all differences: arrivals are late by what varies, never early.
+    """Return the highest line below all differences: arrivals have varying delays, but are never early.
 
     Of all lines below them it is the one with the least sum of differences, an edge of the lower convex hull (Moon,
     Skelly and Towsley 1999, "Estimation and removal of clock skew from network delay measurements"; for exponential
@@ -88,7 +88,7 @@ def clock_from_arrivals(pairs: Pairs, drift: Drift) -> PairFit:
 
 
 def lower_hull(x: Float64, y: Float64) -> Int64:
-    """Points of the lower convex hull, by growing x.
+    """Return the points of the lower convex hull, by increasing x.
 
     A point above the chord of its neighbours is on no lower hull: all such points are taken away at once, again and
     again until none is left.
@@ -107,7 +107,7 @@ def lower_hull(x: Float64, y: Float64) -> Int64:
 
 
 def _differences(pairs: Pairs) -> tuple[Float64, Float64, int]:
-    """Stamps since the first (s), GPS time − nominal time since the first one's (s), and the first one's (ns)."""
+    """Return stamps since the first (s), GPS minus nominal time relative to the first (s), and the first one's (ns)."""
     x_s = (pairs.stamp_ns - pairs.stamp_ns[0]).astype(np.float64) / NS_PER_S
     apart = pairs.time_gps_ns - pairs.nominal_gps_ns
     zero_ns = int(np.median(apart))
@@ -115,7 +115,7 @@ def _differences(pairs: Pairs) -> tuple[Float64, Float64, int]:
 
 
 def _below(x_s: Float64, y_s: Float64, windows: int, level: bool) -> tuple[float, float, float, float, Int64]:
-    """Line below all points at their mean x: offset, slope, their σ, and the lowest point of each window."""
+    """Return the line below all points at their mean x: offset, slope, their σ, and each window's lowest point."""
     middle = float(x_s.mean())
     offset, slope = _supporting(x_s, y_s, middle, level)
     delay = y_s - offset - slope * (x_s - middle)
@@ -137,7 +137,7 @@ def _below(x_s: Float64, y_s: Float64, windows: int, level: bool) -> tuple[float
 
 
 def _supporting(x_s: Float64, y_s: Float64, middle_s: float, level: bool) -> tuple[float, float]:
-    """Highest line at `middle_s` that lies below all points: its value there, and its slope."""
+    """Return the value at `middle_s` and the slope of the highest line that lies below all points."""
     if level:
         return float(y_s.min()), 0.0
     hull = lower_hull(x_s, y_s)

@@ -1,4 +1,4 @@
-"""Pairs of stamps of the survey file: read, fitted, and put into the clock of their log."""
+"""Reads the survey file's pairs of stamps, fits them, and applies them to the clock of their log."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from roadscan.store.store import file_digest
 Int64 = npt.NDArray[np.int64]
 
 _WEEK_NS: Final = WEEK_S * NS_PER_S
-_MOST_NS: Final = 1 << 61
+_MOST_NS: Final = 1 << 61  # larger values are refused: sums of two such still fit into 64 bits
 _DELIMITERS: Final = ",;\t"
 
 Written = int | float | str | dt.datetime
@@ -33,7 +33,7 @@ Written = int | float | str | dt.datetime
 
 @dataclass(frozen=True)
 class LogPairs:
-    """Pairs of one log with what they say."""
+    """Pairs of one log, with the fitted clock."""
 
     fit: PairFit
     faults: tuple[str, ...]
@@ -41,7 +41,7 @@ class LogPairs:
 
 
 def log_clock(survey: Survey, log: LogConfig) -> Clock | None:
-    """Clock of a log as the survey file states it, with what its pairs of stamps say; None where none is stated.
+    """Return a log's clock as stated, corrected by its pairs of stamps; None where none is stated.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def log_clock(survey: Survey, log: LogConfig) -> Clock | None:
 
 
 def log_pairs(survey: Survey, log: LogConfig) -> LogPairs | None:
-    """Pairs of a log and the line through them; None where the survey file gives none."""
+    """Return the pairs of a log and the line through them; None where the survey file gives none."""
     if log.clock is None or log.clock.pairs is None:
         return None
     table = log.clock.pairs.table
@@ -74,7 +74,7 @@ def log_pairs(survey: Survey, log: LogConfig) -> LogPairs | None:
 
 @functools.lru_cache(maxsize=64)
 def _fitted(clock_json: str, path: Path | None, _content: str) -> LogPairs:
-    """Fit of a clock's pairs, remembered from one stage to the next for as long as the table's content stays."""
+    """Return the fit of a clock's pairs, cached while the table's content is unchanged."""
     clock = ClockConfig.model_validate_json(clock_json)
     if clock.pairs is None:
         raise ConfigError("the clock has no pairs")
@@ -90,7 +90,7 @@ def _typed(evidence: PairEvidence) -> Iterator[tuple[int, Written, Written, floa
 
 
 def _listed(path: Path) -> Iterator[tuple[int, Written, Written, float | None]]:
-    """Records of a text table with a line of names: stamp, time and, if it has one, sigma_s."""
+    """Yield the records of a text table with a header: stamp, time and, if present, sigma_s."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -131,7 +131,7 @@ def _pairs(
     rows: Iterator[tuple[int, Written, Written, float | None]],
     path: Path | None,
 ) -> tuple[Pairs, list[str]]:
-    """Pairs on GPS time; a record that cannot be read is named, and the others are kept."""
+    """Return pairs on GPS time, and a message for each record that cannot be read."""
     stamps, times, sigmas, faults = [], [], [], []
     first_error: RoadscanError | None = None
     stated = clock.clock()
@@ -149,13 +149,13 @@ def _pairs(
         stamps.append(nanoseconds)
         sigmas.append(sigma or evidence.sigma_s)
     if first_error is not None and (path is None or not stamps):
-        raise first_error  # what was typed is to be corrected; a damaged line of a file costs itself
+        raise first_error  # typed values have to be corrected; a damaged line of a file only loses that line
     if not stamps:
         raise FormatError("the table holds no pair", expected="at least one", file=path)
     time_gps = _whole_weeks(np.array(times, dtype=np.int64), evidence)
     stamp_ns = np.array(stamps, dtype=np.int64)
     own, nominal = replace(stated, unit="ns").counted_ns(stamp_ns)
-    if stated.system is TimeSystem.GPS_WEEK:  # the week is the one that comes nearest: a log may have begun before
+    if stated.system is TimeSystem.GPS_WEEK:  # the nearest week is taken: a log may have begun in the week before
         weeks = np.rint((time_gps - nominal) / _WEEK_NS).astype(np.int64)
         own, nominal = own + weeks * _WEEK_NS, nominal + weeks * _WEEK_NS
     latency_ns = round(evidence.least_latency_s * NS_PER_S)
@@ -163,7 +163,7 @@ def _pairs(
 
 
 def _stamp_ns(clock: Clock, written: Written) -> int:
-    """Nanoseconds of the clock's own count."""
+    """Return a stamp in nanoseconds of the clock's count."""
     number = _number_ns(written, UNIT_NS[clock.unit])
     if number is not None:
         return number
@@ -181,7 +181,7 @@ def _stamp_ns(clock: Clock, written: Written) -> int:
 
 
 def _time_ns(evidence: PairEvidence, written: Written) -> int:
-    """GPS time in nanoseconds; for seconds of the week, in the week or on the date that is stated."""
+    """Return GPS time in nanoseconds; seconds of the week count in the stated week, or on the stated date."""
     word = written.isoformat() if isinstance(written, dt.datetime) else str(written)
     number = _number_ns(written, UNIT_NS[evidence.unit])
     if number is not None:
@@ -214,7 +214,7 @@ def _gps_ns(clock: Clock, nanoseconds: int) -> int:
 
 
 def _whole_weeks(times: Int64, evidence: PairEvidence) -> Int64:
-    """Seconds of the week growing over a week's end: each less than half a week from the one before."""
+    """Return seconds of the week unrolled over the week's end: each less than half a week from the one before."""
     if evidence.system is not TimeSystem.GPS_WEEK:
         return times
     back = np.concatenate([[0], np.cumsum(np.rint(np.diff(times) / _WEEK_NS))]).astype(np.int64)
@@ -222,7 +222,7 @@ def _whole_weeks(times: Int64, evidence: PairEvidence) -> Int64:
 
 
 def _number_ns(written: Written, unit_ns: int) -> int | None:
-    """A number in nanoseconds, exactly as it is written; None for what is no number."""
+    """Return a number in nanoseconds, exactly as written; None for text that is no number."""
     if isinstance(written, dt.datetime):
         return None
     try:

@@ -1,1 +1,1 @@
-"""Looking into files before a survey exists: what each is, holds and lacks; the first survey file."""
+"""Inspects files before a survey exists: what each contains and lacks; and writes the first survey file."""

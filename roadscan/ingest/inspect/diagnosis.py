@@ -1,4 +1,4 @@
-"""Why no raw format claims a file or folder: what it is instead, and what the nearest format misses in it.
+"""Diagnoses why no raw format claims a file or folder: what it is instead, and what the nearest format misses in it.
 
 `roadscan inspect`, `init` and `run` give the same answer, the one that is found first: it cannot be opened, it is
 empty, its compression is damaged, its end is missing, its columns lack names or units, its name promises a format
@@ -24,7 +24,7 @@ from roadscan.ingest.reading.format import LogFormat, log_formats
 from roadscan.ingest.reading.text_table import TextOptions, first_words, text_layout
 
 UNPACKED_BYTES: Final = 16 << 20
-"""Of a compressed file so much is unpacked to see what is inside."""
+"""Bytes of a compressed file that are unpacked to look inside."""
 
 _KNOWN_OTHERS: Final = {
     "picture": (
@@ -45,22 +45,22 @@ _KNOWN_OTHERS: Final = {
         "compute them with RTKLIB (convbin, rnx2rtkp) as .pos, or let the receiver write NMEA",
     ),
 }
-"""By a word of the kind of a file that is no log: why not, what a log would be, and what to do."""
+"""By a word of the kind of another file: why it is no log, what a log would be, and what to do."""
 
-_TRIALS: Final = 15
-_ITEMS: Final = 20
+_TRIALS: Final = 15  # most times that one reader is tried with assumed settings
+_ITEMS: Final = 20  # items that are read to see whether a format makes sense of a file
 _SENSE: Final = 10
-"""A format makes sense of a file where so many rows stand against one fault."""
-_CHUNK_BYTES: Final = 1 << 20
+"""Rows per fault from which a format makes sense of a file."""
+_CHUNK_BYTES: Final = 1 << 20  # bytes that are decompressed at a time
 
 
 def formats_of(path: Path) -> list[LogFormat]:
-    """Formats whose content test the file or folder passes."""
+    """Return the formats whose content test the file or folder passes."""
     return [f for f in log_formats().values() if _sniffs(f, path)]
 
 
 def claimed_format(path: Path) -> LogFormat:
-    """The one format whose content test a log passes.
+    """Return the one format whose content test a log passes.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def claimed_format(path: Path) -> LogFormat:
 
 
 def cannot_be_opened(path: Path) -> FormatError | None:
-    """Error for what does not exist, is empty, or is not to be opened by this user; None for everything else."""
+    """Return the error for a path that is missing, empty or not readable by this user; None otherwise."""
     try:
         if not path.exists():
             return FormatError("the log does not exist", change="check its path in the survey file", file=path)
@@ -107,7 +107,7 @@ def cannot_be_opened(path: Path) -> FormatError | None:
 
 
 def is_there(path: Path) -> bool:
-    """True if something lies there, though it may be out of this user's reach."""
+    """Return True if the path exists, even if this user may not access it."""
     try:
         return path.exists()
     except OSError:
@@ -115,7 +115,7 @@ def is_there(path: Path) -> bool:
 
 
 def diagnose(path: Path, stated: Stated | None = None) -> FormatError:
-    """Why no format claims a log; the nearest format, where there is one, is what the error misses as `format`.
+    """Return why no format claims a log; the error lists the nearest format, if any, as missing `format`.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def diagnose(path: Path, stated: Stated | None = None) -> FormatError:
 
 
 def specific_fault(path: Path, stated: Stated | None = None) -> FormatError | None:
-    """What keeps a log from being claimed by a format; None where it is simply of another kind."""
+    """Return the fault that keeps a format from claiming a log; None where it is of another kind."""
     cannot = cannot_be_opened(path)
     if cannot is not None or path.is_dir():
         return cannot
@@ -151,7 +151,7 @@ def specific_fault(path: Path, stated: Stated | None = None) -> FormatError | No
 def try_open(
     candidate: LogFormat, path: Path, stated: Stated, trials: int | None = None
 ) -> tuple[OpenedLog | None, str]:
-    """The log opened as a format, or None and why not."""
+    """Return the log opened as a format, or None and the reason."""
     try:
         return (open_log(candidate, path, stated, trials) if trials else open_log(candidate, path, stated)), ""
     except RoadscanError as error:
@@ -161,12 +161,12 @@ def try_open(
 
 
 def unpack(path: Path, wrapper: str, target: Path, limit: int) -> str:
-    """Unpack up to `limit` bytes of a compressed file; what went wrong, "" for nothing."""
+    """Unpack up to `limit` bytes of a compressed file; return the error in words, "" for none."""
     written = 0
     with target.open("wb") as out:
         try:
             with open_wrapped(path, wrapper) as stream:
-                read = getattr(stream, "read1", stream.read)  # gives what stands before the damage, too
+                read = getattr(stream, "read1", stream.read)  # also yields the bytes before the damage
                 while written < limit and (chunk := read(_CHUNK_BYTES)):
                     out.write(chunk)
                     written += len(chunk)
@@ -177,7 +177,7 @@ def unpack(path: Path, wrapper: str, target: Path, limit: int) -> str:
 
 
 def _packed(path: Path, stated: Stated) -> FormatError | None:
-    """What is inside a compressed file: a log that is read unpacked only, or what is wrong with it."""
+    """Return what a compressed file contains: a log that must be unpacked first, or what is wrong with it."""
     wrapper = wrapper_of(path)
     if not wrapper:
         return None
@@ -207,7 +207,7 @@ def _cut(path: Path, stated: Stated) -> FormatError | None:
 
 
 def _columns(path: Path, stated: Stated) -> FormatError | None:
-    """What the columns of a text lack to be of the format that they come nearest to."""
+    """Return what the columns of a text lack to match the nearest format."""
     try:
         _, names = first_words(path, TextOptions())
         text_layout(path, TextOptions())
@@ -237,13 +237,13 @@ def _columns(path: Path, stated: Stated) -> FormatError | None:
 
 
 def _of_text(error: RoadscanError, path: Path) -> FormatError:
-    """What has to be stated before a text can be read at all, and the format with it."""
+    """Return the settings that must be stated before a text can be read at all, with its format."""
     change = f'{error.change}, and format = "…" for this log (`roadscan formats` lists them)'
     return FormatError(error.arrived, expected=error.expected, change=change, file=path)
 
 
 def _refused(nearest: LogFormat, path: Path, stated: Stated) -> FormatError:
-    """What the reader says of a text that has all columns of its format, and that its content test does not claim."""
+    """Return the reader's error for a text with all columns of its format that fails the content test."""
     opened, refusal = try_open(nearest, path, stated, _TRIALS)
     said = f", and its reader says: {refusal.removeprefix(f'{path.resolve()}: ')}" if opened is None else ""
     return FormatError(
@@ -276,7 +276,7 @@ def _lacking(like: Likeness, nearest: LogFormat, path: Path) -> FormatError:
 
 
 def _named(path: Path, stated: Stated) -> FormatError | None:
-    """What a reader says of a file whose name promises its format."""
+    """Return the reader's error for a file whose name indicates its format."""
     for candidate in log_formats().values():
         if path.suffix.lower() in candidate.suffixes:
             opened, refusal = try_open(candidate, path, stated, _TRIALS)
@@ -299,7 +299,7 @@ def _sensible(path: Path, stated: Stated) -> FormatError | None:
 
 
 def _sensible_elsewhere(path: Path, stated: Stated) -> FormatError | None:
-    """What a reader that makes sense of a file says of the CRS and heights that are stated for it."""
+    """Return the error of a format that reads the file's records, about the stated CRS and heights."""
     if stated.crs is None and stated.height is None:
         return None
     for name in _sensible_formats(path, replace(stated, crs=None, height=None)):
@@ -316,7 +316,7 @@ def _sensible_elsewhere(path: Path, stated: Stated) -> FormatError | None:
 
 
 def _sensible_formats(path: Path, stated: Stated) -> Iterator[str]:
-    """Formats that make sense of nearly all of the file's first records, though its content does not announce them."""
+    """Yield formats that can read nearly all of a file's first records although its content does not announce them."""
     for candidate in log_formats().values():
         opened, _ = try_open(candidate, path, stated, _TRIALS)
         if opened is None:

@@ -1,4 +1,4 @@
-"""What a file is, told by its first bytes: for files that no raw format claims.
+"""Identifies files that no raw format claims, by their first bytes.
 
 roadscan's own products and settings files are read through; of other files the words are those a person would
 use ("a PNG picture, 640 × 480"). Nothing here trusts a size that a file claims, and nothing raises.
@@ -28,11 +28,11 @@ from roadscan.core.survey import Survey
 from roadscan.ingest.reading.text_table import first_fields, sniff_layout
 from roadscan.store.schema import schema_names, table_schema
 
-HEAD_BYTES: Final = 4096
-_MEMBERS_SHOWN: Final = 8
-_MOST_MEMBERS: Final = 100_000
-_LINES_BYTES: Final = 1 << 22
-_LONGEST_NAME: Final = 40
+HEAD_BYTES: Final = 4096  # bytes at a file's start by which it is identified
+_MEMBERS_SHOWN: Final = 8  # members of an archive, or layers, that are listed
+_MOST_MEMBERS: Final = 100_000  # more members are not counted
+_LINES_BYTES: Final = 1 << 22  # bytes at a text's start in which lines are counted
+_LONGEST_NAME: Final = 40  # a longer column name indicates prose instead of a table
 
 _MAGICS: Final[tuple[tuple[int, bytes, str], ...]] = (
     (0, b"\x89PNG\r\n\x1a\n", "a PNG picture"),
@@ -83,10 +83,10 @@ _MAGICS: Final[tuple[tuple[int, bytes, str], ...]] = (
 )
 
 _XML_BYTES: Final = 2048
-"""The root element of an XML document stands in so many bytes."""
-_TAIL_BYTES: Final = (1 << 16) + 22
+"""Bytes in which the root element of an XML document has to occur."""
+_TAIL_BYTES: Final = (1 << 16) + 22  # a zip's longest comment and its end record (bytes)
 _ENDS: Final = ((b"PAR1", b"PAR1", 4), (b"ARROW1", b"ARROW1", 6), (b"PK\x03\x04", b"PK\x05\x06", _TAIL_BYTES))
-"""First bytes, what the end of such a file holds, and within how many bytes (a zip's comment may follow it)."""
+"""First bytes of a file kind, the bytes that must end it, and within how many bytes (a zip comment may follow)."""
 _LEAST: Final = ((b"LASF", 227), (b"ASTM-E57", 48))
 """First bytes of files, and the size of their headers (LAS 1.4 R15, table 1; ASTM E2807-11, table 1)."""
 _CAPTURES: Final = {
@@ -95,8 +95,8 @@ _CAPTURES: Final = {
     b"\xa1\xb2\xc3\xd4": ">",
     b"\xa1\xb2\x3c\x4d": ">",
 }
-"""First bytes of network captures, and their order of bytes (libpcap)."""
-_CAPTURE_HEADER, _PACKET_HEADER = 24, 16
+"""First bytes of network captures, with their byte order (libpcap)."""
+_CAPTURE_HEADER, _PACKET_HEADER = 24, 16  # bytes (libpcap)
 _WRAPPERS: Final = {
     "gzip": b"\x1f\x8b",
     "bzip2": b"BZh",
@@ -104,27 +104,27 @@ _WRAPPERS: Final = {
     "Zstandard": b"\x28\xb5\x2f\xfd",
 }
 UNPACKING_ERRORS: Final = (EOFError, OSError, zlib.error, lzma.LZMAError, ValueError, pa.ArrowException)
-"""What decompression raises on damaged bytes."""
+"""Errors that decompression raises on damaged bytes."""
 
 
 @dataclass(frozen=True)
 class FileKind:
-    """What a file is."""
+    """Kind of a file."""
 
     words: str
-    """As a person would say it."""
+    """Its kind in a person's words."""
     details: dict[str, str] = field(default_factory=dict)
-    """What is known beyond that, by short names."""
+    """Further details, by short names."""
     faults: tuple[str, ...] = ()
     """What is wrong with it."""
     readable: bool = False
-    """True for roadscan's own products, tables and settings files that were read through."""
+    """True for roadscan's own products, tables and settings files that could be read."""
     role: str = ""
     """survey, rig, scene, product, archive, or empty."""
 
 
 def wrapper_of(path: Path) -> str:
-    """Name of the compression that wraps a single file, "" for none."""
+    """Return the compression of a single compressed file, "" for none."""
     head = head_of(path)
     return next((name for name, magic in _WRAPPERS.items() if head.startswith(magic)), "")
 
@@ -141,7 +141,7 @@ def open_wrapped(path: Path, wrapper: str) -> IO[bytes]:
 
 
 def head_of(path: Path) -> bytes:
-    """First bytes of a file; nothing where it cannot be read."""
+    """Return the first bytes of a file; nothing where it cannot be read."""
     try:
         with path.open("rb") as stream:
             return stream.read(HEAD_BYTES)
@@ -150,8 +150,8 @@ def head_of(path: Path) -> bytes:
 
 
 def is_cut_off(path: Path) -> bool:
-    """True for a Parquet or Arrow file, or a zip archive, without its end, which says what it holds; and for a file of
-    a known kind that ends inside its header, or a capture that ends inside its first packet.
+    """Return True for a Parquet, Arrow or zip file without its end, where the index stands; and for a file of a known
+    kind that ends inside its header, or a capture that ends inside its first packet.
     """
     try:
         with path.open("rb") as stream:
@@ -168,7 +168,7 @@ def is_cut_off(path: Path) -> bool:
 
 
 def _ends_in_a_packet(head: bytes, size: int) -> bool:
-    """Whether a network capture has not one whole packet, though one was begun."""
+    """Return whether a network capture ends inside its first packet."""
     order = _CAPTURES.get(head[:4])
     if order is None or size <= _CAPTURE_HEADER:
         return order is not None and size < _CAPTURE_HEADER
@@ -179,7 +179,7 @@ def _ends_in_a_packet(head: bytes, size: int) -> bool:
 
 
 def kind_of(path: Path) -> FileKind:
-    """What a file is, by its bytes. Never raises."""
+    """Return the kind of a file by its bytes. Never raises."""
     try:
         with path.open("rb") as stream:
             head = stream.read(HEAD_BYTES)
@@ -243,7 +243,7 @@ def _png_size(path: Path) -> tuple[int, int] | None:
 
 
 def _jpeg_size(path: Path) -> tuple[int, int] | None:
-    """Width and height in the first start-of-frame marker (ITU-T T.81, B.2.2)."""
+    """Return width and height of the first start-of-frame marker (ITU-T T.81, B.2.2)."""
     with path.open("rb") as stream:
         data = stream.read(1 << 20)
     at = 2
@@ -288,7 +288,7 @@ def _tar_without_magic(path: Path) -> bool:
 
 
 def _is_of(table: str, names: list[str]) -> bool:
-    """True if a file with columns of these `names` has all of a table, or all that is always there and no other."""
+    """Return True if columns of these `names` are all of a table's, or all required ones and no unknown one."""
     columns = table_schema(table).columns
     whole, needed = {c.name for c in columns}, {c.name for c in columns if not c.nullable}
     return whole <= set(names) or needed <= set(names) <= whole
@@ -364,7 +364,7 @@ _LOOKS: Final[dict[str, Callable[[Path, str], FileKind]]] = {
     "shapefile": _vector,
     "NumPy": _numpy,
 }
-"""What is looked into, by a word of the kind."""
+"""Functions that look into a file, by a word of its kind."""
 
 
 # --- text -------------------------------------------------------------------------------------------
@@ -419,7 +419,7 @@ def _count_lines(path: Path) -> tuple[int, bool]:
 
 
 def _settings(path: Path) -> FileKind:
-    """A survey, rig or scene file, checked through its model."""
+    """Return the kind of a survey, rig or scene file, validated by its model."""
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""The cell size that `roadscan init` proposes, from how densely the sensors of a drive read the road."""
+"""Proposes the cell size for `roadscan init`, from how densely the sensors of a drive sample the road."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from roadscan.ingest.inspect.first_survey import FoundFolder, FoundLog, FoundRun
 from roadscan.ingest.inspect.log_figures import TableFigures
 
 EDGES_M: Final = (0.005, 0.01, 0.02, 0.025, 0.05, 0.1, 0.2, 0.25, 0.5, 1.0)
-"""Edges that are proposed: all divide a tile of 10 m into an even number of cells."""
+"""Proposed edges: all divide a tile of 10 m into a whole number of cells."""
 
 _TOLERANCE: Final = 0.9
-"""An edge is taken that is so much shorter: speed and share of near returns are no better known."""
+"""An edge is accepted down to this share of the wanted one: speed and share of near returns are no better known."""
 _SPEED_M_PER_S: Final = 10.0
-"""Where no log of the run tells how fast it was driven."""
-_STANDING_M_PER_S: Final = 0.5
+"""Assumed speed where no log of the run shows it (m/s)."""
+_STANDING_M_PER_S: Final = 0.5  # slower motion counts as standing
 _HEIGHT_M: Final = 2.0
 """Height of a rotating sensor over the road; `init` does not know its lever arm."""
-_NEAR_SHARE: Final = 0.25
+_NEAR_SHARE: Final = 0.25  # share of the returns that lie within `_NEAR_M` across the road
 _NEAR_M: Final = 20.0
-"""Of the returns of a lidar on a roof, so many lie on the ground within 10 m on either side: a VLP-16 at 2 m, whose
-lasers point from −15° to 15°, has 27 % there."""
+"""Width of ground (m) across which near returns count: 27 % of a VLP-16's, at 2 m on a roof with lasers from −15° to
+15°, lie within 10 m on either side."""
 
 
 def cell_edge_m(across_m: float, along_m: float) -> float:
-    """Smallest of :data:`EDGES_M` (m) whose cells hold enough readings that lie so far apart, one or more each way.
+    """Return the smallest of :data:`EDGES_M` (m) whose cells contain enough readings, at least one each way.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def cell_edge_m(across_m: float, along_m: float) -> float:
 
 
 def cell_lines(found: FoundFolder) -> Iterator[str]:
-    """Lines of a first survey file that propose a cell size; none where the default suits, or nothing is known."""
+    """Yield lines of a first survey file that propose a cell size; none if the default suits, or nothing is known."""
     edges = [(edge, log.path.name) for run in found.runs for log in run.logs if (edge := _edge_m(log, run)) is not None]
     if not edges:
         return
@@ -54,7 +54,7 @@ def cell_lines(found: FoundFolder) -> Iterator[str]:
 
 
 def _edge_m(log: FoundLog, run: FoundRun) -> float | None:
-    """Edge for the readings of one log; None where it holds none, or does not tell how many a second."""
+    """Return the edge for the readings of one log; None where it has none, or their rate is unknown."""
     tables, speed = log.report.figures.tables, _speed_m_per_s(run)
     if "scans" in tables:
         return _of_scans(tables["scans"], log, speed)
@@ -73,7 +73,7 @@ def _of_scans(table: TableFigures, log: FoundLog, speed: float) -> float | None:
 
 
 def _of_area(area_m2: float) -> float:
-    """Edge for readings that have so much ground each."""
+    """Return the edge for readings that each cover this much ground."""
     return cell_edge_m(math.sqrt(area_m2), math.sqrt(area_m2))
 
 
@@ -82,7 +82,7 @@ def _rate_hz(table: TableFigures) -> float | None:
 
 
 def _speed_m_per_s(run: FoundRun) -> float:
-    """Mean speed of a run by its poses or positions; a usual one where none tell it."""
+    """Return a run's mean speed from its poses or positions; a usual speed where it has none."""
     for log in run.logs:
         for table in log.report.figures.tables.values():
             if table.path_m > 0 and table.epochs is not None and table.epochs.span_s > 0:

@@ -1,6 +1,6 @@
-"""A first survey from a folder of logs: which logs there are, which belong to one drive, which sensors wrote them.
+"""Builds a first survey from a folder of logs: which logs there are, which form a drive, which sensors wrote them.
 
-Every file is told by its content and looked into as `roadscan inspect` does. What the logs say is filled in; what
+Every file is identified by its content and inspected as `roadscan inspect` does. What the logs say is filled in; what
 they do not say becomes a question of the written file (:mod:`roadscan.ingest.inspect.first_survey_text`), never a
 guess.
 """
@@ -30,22 +30,22 @@ from roadscan.ingest.reading.format import LogFormat
 Int64 = npt.NDArray[np.int64]
 
 WHOLE_BYTES: Final = 1 << 28
-"""A log up to this size is read to its end, so that its time span is known; of others only the beginning."""
+"""Logs up to this size are read to their end, so that their time span is known; of others only the beginning."""
 
-_SAMPLED: Final = 40
+_SAMPLED: Final = 40  # files of a folder that are checked for being logs by themselves
 _MOSTLY: Final = 0.5
-"""Companions of one mission share more than this of their time; those of missions one after another do not."""
+"""Least share of common time of companions of one mission; missions one after another have less."""
 _DIGITS: Final = re.compile(r"\d+")
 _NOT_IN_A_NAME: Final = re.compile(r"[^A-Za-z0-9_.-]+")
-_NAME_LENGTH: Final = 64
+_NAME_LENGTH: Final = 64  # longest sensor name that is proposed (characters)
 
 
 @dataclass
 class FoundLog:
-    """A log that roadscan can read, once all is stated."""
+    """A log that roadscan can read once everything it needs is stated."""
 
     path: Path
-    """File or folder, absolute."""
+    """Absolute path of the file or folder."""
     inspection: Inspection
     sensor: str = ""
     """Name of the sensor of the rig that wrote it; "" for none."""
@@ -54,19 +54,19 @@ class FoundLog:
 
     @property
     def report(self) -> LogReport:
-        """What was read."""
+        """What was read of it."""
         if self.inspection.log is None:
             raise ConfigError("the log was not read", file=self.path)
         return self.inspection.log
 
     @property
     def format(self) -> LogFormat:
-        """Its format."""
+        """Format of the log."""
         return self.report.opened.format
 
     @property
     def needs(self) -> list[Need]:
-        """What the survey file has to state, but for the sensor, which has its name already."""
+        """Return what the survey file has to state, except the sensor, whose name is known."""
         needs = [need for need in self.report.opened.needs if need.key != "sensor"]
         keys = {need.key for need in needs}
         if self.is_control:
@@ -76,12 +76,12 @@ class FoundLog:
 
     @property
     def is_assumed(self) -> bool:
-        """True if settings were assumed that decide on more than its time: what the log says of itself may change."""
+        """Return True if settings other than its time were assumed: what is known of the log may change."""
         return any(need.key.startswith("options.") and not need.is_of_time for need in self.report.opened.needs)
 
     @property
     def sensor_kind(self) -> SensorKind | None:
-        """Kind of the sensor that wrote it."""
+        """Return the kind of the sensor that wrote it."""
         return sensor_kind(self.format)
 
     @property
@@ -101,7 +101,7 @@ class FoundLog:
 
     @property
     def is_reference(self) -> bool:
-        """True for a cloud without times of its own: a scan of a place, not of a drive."""
+        """Return True for a cloud without times, such as a scan of a place instead of a drive."""
         return "cloud" in self.format.yields and self.report.is_time_assumed and self.report.time is None
 
     @property
@@ -120,7 +120,7 @@ class FoundRun:
 
 @dataclass
 class FoundFolder:
-    """All that lies in a folder of logs."""
+    """Contents of a folder of logs."""
 
     folder: Path
     runs: list[FoundRun] = field(default_factory=list)
@@ -129,44 +129,44 @@ class FoundFolder:
     lines: list[Path] = field(default_factory=list)
     """Vector layers with lines: perhaps centre lines."""
     settings: list[tuple[Path, FileKind]] = field(default_factory=list)
-    """Survey, rig and scene files that are there already."""
+    """Existing survey, rig and scene files."""
     unknown: list[tuple[Path, str]] = field(default_factory=list)
-    """Files that were not understood, and what they seem to be."""
+    """Files that were not identified, and what they seem to be."""
 
     @property
     def logs(self) -> list[FoundLog]:
-        """Logs of all runs."""
+        """Return the logs of all runs."""
         return [log for run in self.runs for log in run.logs]
 
     @property
     def pairs(self) -> list[tuple[FoundLog, FoundLog, str]]:
-        """Logs that belong to another one: the other, the log, and the setting of the other that names it."""
+        """Return logs that belong to another one: the other, the log, and the setting of the other that names it."""
         return [(log, one, setting) for log in self.logs for setting, one in log.companions.items()]
 
     @property
     def further(self) -> list[FoundRun]:
-        """What belongs to no run, grouped by what it is."""
+        """Return what belongs to no run, grouped by kind."""
         groups = (FoundRun("(control)", self.control), FoundRun("(reference)", self.references))
         return [group for group in groups if group.logs]
 
     @property
     def sensors(self) -> dict[str, FoundLog]:
-        """One log of each sensor, by the sensor's name."""
+        """Return one log of each sensor, by the sensor's name."""
         return {log.sensor: log for log in reversed(self.logs) if log.sensor}
 
 
 def need_folder(folder: Path) -> None:
-    """ConfigError where `folder` is none."""
+    """Raise ConfigError unless `folder` is a folder."""
     if not folder.is_dir():
         raise ConfigError("there is no such folder", expected="a folder of logs", file=folder)
 
 
 def find_logs(folder: Path, progress: Progress = lambda rows, share: None) -> FoundFolder:
-    """Look through a folder, recursively, and order what is found.
+    """Search a folder recursively for logs, and group them into runs.
 
     Parameters
     ----------
-    progress : hears of each log how far it is read.
+    progress : receives how far each log is read.
 
     Raises
     ------
@@ -185,7 +185,7 @@ def find_logs(folder: Path, progress: Progress = lambda rows, share: None) -> Fo
 
 
 def _pair(logs: list[FoundLog], folder: Path) -> list[FoundLog]:
-    """Give each log that accompanies another to the one it fits best; those that are left, in their order."""
+    """Assign each companion log to the log it fits best; return the other logs, in their order."""
     pairs = [
         (score, log, main, log.format.accompanies[main.format.name])
         for log in logs
@@ -201,7 +201,7 @@ def _pair(logs: list[FoundLog], folder: Path) -> list[FoundLog]:
 
 
 def _closeness(log: FoundLog, main: FoundLog, folder: Path) -> tuple[bool, int, int, float] | None:
-    """How well a companion fits a log: most of their time in common, folders, words of the names, share of time.
+    """Return how well a companion fits a log: mostly common time, folders, words of the names, share of time.
 
     None where their times are apart, or cannot be compared.
     """
@@ -216,7 +216,7 @@ def _closeness(log: FoundLog, main: FoundLog, folder: Path) -> tuple[bool, int, 
 
 
 def _candidates(folder: Path, taken: frozenset[Path] = frozenset()) -> Iterator[Path]:
-    """Folder logs and files, in order of name; stores, products' folders and hidden ones are left out.
+    """Yield folder logs and files in order of name, without stores, folders of products and hidden ones.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def _candidates(folder: Path, taken: frozenset[Path] = frozenset()) -> Iterator[
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What lies in a folder, by name; nothing where it may not be read."""
+    """Return what a folder contains, by name; nothing where it may not be read."""
     try:
         return sorted(folder.iterdir())
     except OSError:
@@ -249,9 +249,9 @@ def _is_store(folder: Path) -> bool:
 
 
 def _taken_by_folder_log(folder: Path) -> frozenset[Path]:
-    """Files of the folder log that the folder is; empty if it is none.
+    """Return the files of the folder log that the folder is; empty if it is none.
 
-    A folder is a log if a format claims it and its files are no logs by themselves, or are parts of one: of the
+    A folder is a log if a format claims it and its files are no separate logs, or are parts of one: of the
     same format, in one folder, with names that differ in digits only.
     """
     for log_format in formats_of(folder):
@@ -266,7 +266,7 @@ def _taken_by_folder_log(folder: Path) -> frozenset[Path]:
 
 
 def _holds_logs(folder: Path, own: Set[Path]) -> bool:
-    """True if a deeper folder claims to be a log too, and holds all files of this one: it is the log then."""
+    """Return True if a deeper folder also claims to be a log and contains all files of this one: then it is the log."""
     below = [child for child in _entries(folder) if child.is_dir() and not child.is_symlink()]
     return any(formats_of(child) and all(child in path.parents for path in own) for child in below)
 
@@ -306,9 +306,9 @@ def _sort_in(path: Path, found: FoundFolder, logs: list[FoundLog], progress: Pro
 
 
 def _runs(logs: list[FoundLog], folder: Path) -> list[FoundRun]:
-    """Runs: one a trajectory, or, without any, one a folder; every other log joins the run it fits best.
+    """Return the runs: one for each trajectory, or else for each folder; every other log joins the run it fits best.
 
-    A log that has neither time, folder nor a word of its name in common with any trajectory makes a run of its own.
+    A log that has neither time, folder nor a word of its name in common with any trajectory makes a separate run.
     """
     seeds = [log for log in logs if log.is_trajectory]
     if not seeds:
@@ -347,7 +347,7 @@ def _run_ids(seeds: list[FoundLog], folder: Path) -> list[str]:
 
 
 def _fit(log: FoundLog, seed: FoundLog, folder: Path) -> tuple[int, int, int, int]:
-    """How well a log fits a trajectory: time apart (−1), unknown (0) or overlapping; folders and words in common.
+    """Return how well a log fits a trajectory: time apart (−1), unknown (0) or overlapping; common folders and words.
 
     A log whose time is apart fits nothing: the rest counts 0 then.
     """
@@ -362,12 +362,12 @@ def _fit(log: FoundLog, seed: FoundLog, folder: Path) -> tuple[int, int, int, in
 
 
 def _home(log: FoundLog, folder: Path) -> Path:
-    """Folder that the log lies in; the folder looked through where it is the log itself."""
+    """Return the folder that contains the log; the searched folder where it is the log itself."""
     return folder if log.path == folder else log.path.parent
 
 
 def overlaps(one: LogReport, other: LogReport) -> bool | None:
-    """Whether two logs overlap in time; None where their times cannot be compared."""
+    """Return whether two logs overlap in time; None where their times cannot be compared."""
     spans = _common_scale(one, other)
     if spans is None:
         return None
@@ -377,7 +377,7 @@ def overlaps(one: LogReport, other: LogReport) -> bool | None:
 
 
 def shared_time(one: LogReport, other: LogReport) -> float:
-    """Share of two logs' time, from the first to the last epoch of both, that both have; 0 where it is unknown."""
+    """Return the share of common time in two logs' time, from the first to the last epoch of both; 0 if unknown."""
     spans = _common_scale(one, other)
     if spans is None:
         return 0.0
@@ -387,7 +387,7 @@ def shared_time(one: LogReport, other: LogReport) -> float:
 
 
 def _common_scale(one: LogReport, other: LogReport) -> tuple[str, list[int], list[int]] | None:
-    """The scale of two logs' time and their spans on it; None where they have none in common.
+    """Return the common time scale of two logs and their spans on it; None where they have none.
 
     Seconds of the week are compared with GPS time by its own seconds of the week.
     """
@@ -400,7 +400,7 @@ def _common_scale(one: LogReport, other: LogReport) -> tuple[str, list[int], lis
         a = [t % week_ns for t in a]
         b = [t % week_ns for t in b]
         if a[1] < a[0] or b[1] < b[0]:
-            return None  # a week ends inside
+            return None  # a week ends within the span
     elif kind_a != kind_b:
         return None
     return kind_a, a, b
@@ -426,7 +426,7 @@ def _stamps(first: int, last: int) -> Int64:
 
 
 def _name_sensors(run: FoundRun) -> None:
-    """Name the sensors of a run by its files, without what is only a number or names the drive."""
+    """Name the sensors of a run by its files, without parts that are only a number or name the drive."""
     of_drive = {word for log in run.logs if log.is_trajectory for word in _words(log.stem)} | set(_words(run.id))
     named: dict[str, list[FoundLog]] = {}
     for log in run.logs:
@@ -441,7 +441,7 @@ def _name_sensors(run: FoundRun) -> None:
 
 
 def _one_sensor_each(logs: list[FoundLog]) -> list[list[FoundLog]]:
-    """Logs of one name, cut where they overlap or are of other formats: one sensor does not write two at a time."""
+    """Return logs of one name, split where they overlap or differ in format: a sensor writes one log at a time."""
     groups: list[list[FoundLog]] = []
     for log in logs:
         for group in groups:
@@ -462,7 +462,7 @@ def _sound_name(text: str) -> str:
 
 
 def _fresh(text: str, known: set[str]) -> str:
-    """A name made of `text` that is not known yet; it is known then."""
+    """Return an unused name made of `text`, and mark it as used."""
     name = _sound_name(text) or "run"
     numbers = itertools.count(2)
     fresh = name

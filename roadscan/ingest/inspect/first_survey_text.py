@@ -1,4 +1,4 @@
-"""Writes a first ``SURVEY.toml`` and ``RIG.toml`` from what was found in a folder of logs.
+"""Writes a first ``SURVEY.toml`` and ``RIG.toml`` from the logs that were found in a folder.
 
 What the logs say stands there as a setting. What has to be stated and is not known stands there as a question: a
 line that begins with ``#?`` and holds the setting with ???? for the unknown. Such a file is valid TOML, and
@@ -35,8 +35,8 @@ from roadscan.ingest.reading.format import LogFormat
 Float64 = npt.NDArray[np.float64]
 
 RIG_NAME: Final = "RIG.toml"
-_WIDTH: Final = 110
-_MOST_UNKNOWN: Final = 200
+_WIDTH: Final = 110  # characters of a comment line
+_MOST_UNKNOWN: Final = 200  # unidentified files that are listed
 _READS: Final = ("profiler", "lidar", "camera")
 _SYSTEMS: Final = (
     "gps (seconds since 1980-01-06), gps_week_seconds (with week or date),",
@@ -44,23 +44,23 @@ _SYSTEMS: Final = (
     "utc_hour (with date), free (with a measured offset_s). unit: s, ms, us or ns.",
 )
 _TURNED: Final = (*_READS, "imu")
-"""Kinds of sensors whose axes matter."""
+"""Kinds of sensors whose axes have to be stated."""
 
 
 @dataclass(frozen=True)
 class FirstSurvey:
-    """What was written."""
+    """The files that were written."""
 
     survey_file: Path
     rig_file: Path | None
     """None where no log needs a sensor."""
     questions: int
-    """Lines that wait for their author, in both files."""
+    """Lines in both files that the user has to complete."""
     found: FoundFolder
 
 
 def refuse_to_overwrite(survey_file: Path) -> None:
-    """Raise :class:`ConfigError` if the survey file, or a rig file beside it, is there already."""
+    """Raise :class:`ConfigError` if the survey file, or a rig file beside it, already exists."""
     for file in (survey_file, survey_file.parent / RIG_NAME):
         if file.exists():
             raise ConfigError(
@@ -215,14 +215,14 @@ def _needs(log: FoundLog, run: FoundRun) -> Iterator[str]:
 
 
 def _alternatives(need: Need) -> Iterator[str]:
-    """What may stand in place of a question, as comments."""
+    """Yield the alternatives to a question, as comments."""
     for lines in need.alternatives:
         yield "# or, in its place:"
         yield from (f"# {line}" for line in lines)
 
 
 def _hint(need: Need, log: FoundLog, run: FoundRun) -> str:
-    """What other logs of the run, or the stamps themselves, say about a missing clock."""
+    """Return what other logs of the run, or the stamps themselves, suggest for a missing clock."""
     time = log.report.time
     if need.key != "clock" or time is None:
         return ""
@@ -332,7 +332,7 @@ def _mounting(kind: str, log: FoundLog) -> Iterator[str]:
 
 
 def _axes(log_format: LogFormat) -> Iterator[str]:
-    """The question how a sensor's axes point, with how to choose and what is usual."""
+    """Yield the question of how a sensor's axes point, with instructions and usual answers."""
     usual = log_format.usual_axes
     yield _question(f"axes = {toml(next(iter(usual), '????'))}")
     letters = ", ".join(f"{word[0]}({word[1:]})" for word in DIRECTIONS.values())
@@ -370,7 +370,7 @@ def _extents(report: LogReport) -> list[Extent]:
 
 
 def _degrees(report: LogReport) -> tuple[Float64, Float64] | None:
-    """Longitude, latitude of the south-west and the north-east corner."""
+    """Return longitude and latitude of the south-west and the north-east corner."""
     for extent in _extents(report):
         if extent.degrees_low is not None and extent.degrees_high is not None:
             return extent.degrees_low, extent.degrees_high
@@ -378,13 +378,13 @@ def _degrees(report: LogReport) -> tuple[Float64, Float64] | None:
 
 
 def _projected(report: LogReport) -> str | None:
-    """Projected CRS of the log's own points, where its file states one."""
+    """Return the projected CRS of the log's points, where its file states one."""
     frames = [extent.frame for extent in _extents(report) if extent.frame != LOCAL_WORLD]
     return next((frame for frame in frames if crs_from_text(frame).is_projected), None)
 
 
 def _utm_zone(frame: str, degrees: tuple[Float64, Float64]) -> tuple[str, str] | None:
-    """Code and name of the UTM zone, in the datum of `frame`, that holds the middle of the extent."""
+    """Return code and name of the UTM zone, in the datum of `frame`, that contains the middle of the extent."""
     datum = crs_from_text(frame).geodetic_crs
     middle = (degrees[0] + degrees[1]) / 2
     area = AreaOfInterest(*np.repeat([middle], 2, axis=0).ravel().tolist())
@@ -403,7 +403,7 @@ def _question(line: str) -> str:
 
 
 def _remark(text: str) -> Iterator[str]:
-    """Comment lines of at most `_WIDTH` characters."""
+    """Yield comment lines of at most `_WIDTH` characters."""
     line = "#"
     for word in text.split():
         if len(line) + 1 + len(word) > _WIDTH and line != "#":
@@ -416,6 +416,6 @@ def _remark(text: str) -> Iterator[str]:
 def _path(path: Path, folder: Path) -> str:
     try:
         shown = os.path.relpath(path, folder)
-    except ValueError:  # another drive
+    except ValueError:  # on another drive
         shown = str(path)
     return toml(Path(shown).as_posix())

@@ -1,8 +1,8 @@
-"""Inspect: what any file is, what it holds, its time span and extent, and what is wrong with it.
+"""Inspects any file: what it is, what it contains, its time span and extent, and what is wrong with it.
 
 A file that a raw format claims is read through that format's reader, as ingest would, and its figures are taken
 while it streams by. What the file does not say and nobody stated (a GPS week, a CRS) is assumed for looking only,
-and listed. Other files are told by their first bytes. Hostile files end in a message, never in a crash.
+and listed. Other files are identified by their first bytes. Hostile files end in a message, never in a crash.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from roadscan.ingest.reading.format import Item, LogFormat, Rows, format_named
 from roadscan.ingest.reading.future_times import FutureTimes
 
 QUICK_VALUES: Final = 1_000_000
-"""Readings after which a quick look stops."""
-QUICK_ITEMS: Final = 2_000
+"""Readings after which a quick inspection stops."""
+QUICK_ITEMS: Final = 2_000  # items after which a quick inspection stops
 UNPACKED_BYTES_MAX: Final = 4 << 30
-"""A compressed file is unpacked so far for a look."""
-QUICK_UNPACKED_BYTES: Final = 64 << 20
+"""Most bytes that a compressed file is unpacked to."""
+QUICK_UNPACKED_BYTES: Final = 64 << 20  # most bytes that a quick inspection unpacks
 
-_MOST_WRAPPERS: Final = 3
+_MOST_WRAPPERS: Final = 3  # most nested compressions
 _EARLIEST_S: Final = 475_000_000  # 1995
 _LATEST_S: Final = 2_524_000_000  # 2060
 
 _EMPTY: Final[tuple[Any, ...]] = (None, "", [], {})
 
 Progress = Callable[[int, float | None], None]
-"""Hears rows read so far, and the share of the file where it is known."""
+"""Receives the rows read so far, and the share of the file where it is known."""
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,16 @@ class TimeSpan:
     assumed: Clock | None = None
     """Clock that was assumed: then only the raw stamps are known."""
     is_past_the_hour: bool = False
-    """The reader asks for `utc_hour`: stamps count from an hour that is not known."""
+    """The reader asks for `utc_hour`: stamps count from an unknown hour."""
 
     @property
     def duration_s(self) -> float:
-        """From first to last (s)."""
+        """Time from first to last epoch (s)."""
         return (self.last_gps_ns - self.first_gps_ns) / NS_PER_S
 
     @property
     def raw(self) -> tuple[float, ...] | None:
-        """First and last stamp in the unit that was assumed; None where the time is known."""
+        """Return the first and last stamp in the assumed unit; None where the time is known."""
         if self.assumed is None:
             return None
         stamps_ns = raw_stamps_ns(self.assumed, np.array([self.first_gps_ns, self.last_gps_ns])).tolist()
@@ -72,7 +72,7 @@ class TimeSpan:
         return tuple(ns / unit_ns if ns % unit_ns else ns // unit_ns for ns in stamps_ns)
 
     def would_be(self) -> dict[str, str]:
-        """What the first stamp would be in each time system that gives a date between 1995 and 2060."""
+        """Return the first stamp in each time system that gives a date between 1995 and 2060."""
         if self.assumed is None or self.is_past_the_hour:
             return {}
         seconds = raw_stamps_ns(self.assumed, np.array([self.first_gps_ns])) / NS_PER_S
@@ -96,7 +96,7 @@ class TimeSpan:
 
 @dataclass
 class LogReport:
-    """A log that was read, as stated or provisionally."""
+    """A log that was read, with stated or assumed settings."""
 
     opened: OpenedLog
     figures: LogFigures
@@ -110,7 +110,7 @@ class LogReport:
 
     @property
     def time(self) -> TimeSpan | None:
-        """Its time span; None where it holds no epochs, or none of its own."""
+        """Its time span; None where it has no epochs."""
         span = self.figures.span_gps_ns
         if span is None:
             return None
@@ -121,7 +121,7 @@ class LogReport:
 
     @property
     def header(self) -> dict[str, Any]:
-        """Attributes that the log itself, or the user, states; what was assumed is left out."""
+        """Attributes that the log, or the user, states, without assumed ones."""
         assumed = {need.key.removeprefix("options.") for need in self.opened.needs}
         hidden = {
             "clock": {"time_system"},
@@ -135,39 +135,39 @@ class LogReport:
 
 @dataclass
 class Inspection:
-    """All that is known of a file or folder."""
+    """Everything known about a file or folder."""
 
     path: Path
     what: str = ""
     bytes: int = 0
     files: int = 1
     wrappers: tuple[str, ...] = ()
-    """Compressions around it, the outermost first."""
+    """Nested compressions, the outermost first."""
     formats: tuple[str, ...] = ()
     """Raw formats whose content test it passes."""
     nearest: tuple[str, ...] = ()
-    """Raw formats that would read it although its content does not announce them."""
+    """Raw formats that could read it although its content does not announce them."""
     kind: FileKind | None = None
-    """What its bytes say, where no raw format claims it."""
+    """Kind of the file by its bytes, where no raw format claims it."""
     log: LogReport | None = None
     error: str = ""
     """Why it cannot be read."""
     refusals: dict[str, str] = field(default_factory=dict)
-    """What the readers of other candidates said."""
+    """Errors of the other candidates' readers."""
 
     @property
     def readable(self) -> bool:
-        """True if roadscan reads it: a log (once all is stated), a product, or a settings file."""
+        """True if roadscan can read it: a log (once everything is stated), a product, or a settings file."""
         return not self.error and (self.log is not None or (self.kind is not None and self.kind.readable))
 
     @property
     def faults(self) -> list[Fault]:
-        """All that is wrong with it."""
+        """Return all faults."""
         found = [] if self.kind is None else [Fault(text, 1) for text in self.kind.faults]
         return found + (self.log.figures.faults if self.log is not None else [])
 
     def as_json(self) -> dict[str, Any]:
-        """The same as JSON values."""
+        """Return the same as JSON values."""
         return {
             "path": str(self.path),
             "what": self.what,
@@ -192,7 +192,7 @@ def inspect(
     quick: bool = False,
     progress: Progress = lambda rows, share: None,
 ) -> Inspection:
-    """Look into a file or folder.
+    """Inspect a file or folder.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def inspect(
 def read_figures(
     opened: OpenedLog, *, quick: bool = False, progress: Progress = lambda rows, share: None
 ) -> tuple[LogReport, str]:
-    """Read an opened log and take its figures; the report, and why reading ended early ("" if it did not)."""
+    """Read an opened log and its figures; return the report, and why reading ended early ("" if it did not)."""
     source = opened.source
     future = FutureTimes.of(source, opened.header)
     report = LogReport(opened, LogFigures(opened.header, source.map, source.crs, future))
@@ -234,7 +234,7 @@ def read_figures(
 
 
 def _share_read(item: Item, size: int) -> float | None:
-    """Share of a log of `size` bytes that was read with an item; None where its place is not known."""
+    """Return the share of a log of `size` bytes that was read with an item; None where its place is unknown."""
     if isinstance(item, Finding) or item.file:
         return None
     offset = item.first_offset if isinstance(item, Rows) else item.offset
@@ -299,7 +299,7 @@ def _look(
 def _look_inside(
     found: Inspection, wrapper: str, stated: Stated, quick: bool, progress: Progress, scratch: Path
 ) -> Inspection:
-    """Unpack a compressed file as far as a look needs it, and look at what is inside."""
+    """Unpack a compressed file as far as an inspection needs it, and inspect its content."""
     depth = len(list(scratch.iterdir()))
     inside = scratch / str(depth) / (found.path.stem or "unpacked")
     inside.parent.mkdir()
@@ -342,7 +342,7 @@ def _look_at_unknown(found: Inspection, stated: Stated) -> Inspection:
         found.error, found.kind = first, dataclasses.replace(found.kind, faults=tuple(rest))
         return found
     if is_cut_off(path):
-        found.kind = dataclasses.replace(found.kind, faults=())  # they say it in the words of a library
+        found.kind = dataclasses.replace(found.kind, faults=())  # the message is the library's
     error = diagnose(path, stated)
     found.error = str(error)
     found.nearest = tuple(name for one in error.asks_for("format") for name in one.choices or (one.proposed,))
@@ -350,7 +350,7 @@ def _look_at_unknown(found: Inspection, stated: Stated) -> Inspection:
 
 
 def _size(log_format: LogFormat | None, path: Path) -> tuple[int, int]:
-    """Bytes and number of the files that make up the log."""
+    """Return bytes and number of the log's files."""
     if log_format is None:
         files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
     else:

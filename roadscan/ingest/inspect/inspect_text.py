@@ -1,4 +1,4 @@
-"""An inspection as text for people: coloured on a terminal, plain in a pipe."""
+"""Prints an inspection as text: coloured on a terminal, plain in a pipe."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from roadscan.ingest.inspect.log_figures import ColumnFigures, Extent, Fault, Ta
 from roadscan.ingest.inspect.provisional import OpenedLog
 from roadscan.ingest.reading.columns import UNITS
 
-_LABEL: Final = 9
-_PLAIN_WIDTH: Final = 110
-_MOST_FAULTS: Final = 25
-_LONG_VALUE: Final = 100
+_LABEL: Final = 9  # characters of the column of labels
+_PLAIN_WIDTH: Final = 110  # least width (characters) where the output is no terminal
+_MOST_FAULTS: Final = 25  # faults that are printed
+_LONG_VALUE: Final = 100  # longer values are cut (characters)
 
 Line = tuple[str, str, str]
 """Label, text and style of a line."""
@@ -143,7 +143,7 @@ def _extent(extent: Extent, table: TableFigures, opened: OpenedLog) -> Iterator[
 
 
 def _names_say_units(opened: OpenedLog) -> bool:
-    """Whether the names of the columns of places end with units, as easting_m does."""
+    """Return whether the names of the coordinate columns end with units, as easting_m does."""
     columns = opened.header.attributes.get("columns", {})
     own = [columns[name] for name in ("easting", "northing", "height") if name in columns]
     return bool(own) and all(name.rpartition("_")[2].lower() in UNITS["length"] for name in own)
@@ -162,7 +162,7 @@ def _readings(table: TableFigures) -> Iterator[str]:
 
 
 def _columns(table: TableFigures) -> Iterator[str]:
-    """Ranges of what is not shown as extent already."""
+    """Yield the ranges of columns that are not part of the extent."""
     for name, column in table.columns.items():
         if (
             name.endswith(("_world_m", "epoch_gps_ns"))
@@ -224,7 +224,7 @@ def _short(value: object) -> str:
 
 
 def _folded(text: str, width: int) -> Iterator[str]:
-    """Lines of at most `width` characters, broken between words; a line's own indent is kept."""
+    """Yield lines of at most `width` characters, broken between words, with the indent of their text line."""
     for paragraph in text.splitlines() or [""]:
         indent = paragraph[: len(paragraph) - len(paragraph.lstrip())]
         line = ""

@@ -1,4 +1,4 @@
-"""Figures of a log while it streams by: counts, epochs, columns' ranges, extent. Memory does not grow with the log.
+"""Computes figures of a log while it streams: counts, epochs, ranges of columns, extent. Memory stays constant.
 
 What can be wrong is judged here too: epochs that go back, epochs twice, gaps, rates that change, positions that
 leap. Records are counted from 0 among the rows that were read; where the format numbers its records, the number
@@ -29,26 +29,26 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 LEAP_SPEED_M_PER_S: Final = FASTEST_M_PER_S
-"""A position that asks for more than this of a survey vehicle leaps."""
+"""A position leaps where a survey vehicle would have to drive faster than this (m/s)."""
 LEAP_M: Final = 1.0
-"""Shorter steps are noise, whatever the speed."""
+"""Shorter steps count as noise at any speed (m)."""
 GAP_PERIODS: Final = 2.5
-"""A step longer than so many usual ones is a gap."""
+"""Steps longer than this many usual ones are gaps."""
 COVERAGE_GAP_S: Final = 1
-"""Tables with many readings an instant have a gap where a whole second, at least, holds none."""
+"""In tables with many readings per instant, whole seconds without one, at least this many, are a gap."""
 
-_WINDOW: Final = 64
-_RATE_CHANGE: Final = 1.3
-_MOST_REASONS: Final = 200
-_MOST_SECONDS: Final = 2_000_000
-_SAMPLE: Final = 2_000
-_STEP_BINS: Final = 4_000
-_BINS_PER_DECADE: Final = 200
+_WINDOW: Final = 64  # steps whose median gives one value of the rate
+_RATE_CHANGE: Final = 1.3  # ratio of two rates from which a change is reported
+_MOST_REASONS: Final = 200  # reject reasons that are counted separately
+_MOST_SECONDS: Final = 2_000_000  # seconds with readings that are remembered, to find gaps
+_SAMPLE: Final = 2_000  # positions of a block that are transformed for the extent
+_STEP_BINS: Final = 4_000  # bins of the histogram of steps, logarithmic from 1 ns
+_BINS_PER_DECADE: Final = 200  # bins for each factor of ten in the step
 
 
 @dataclass
 class Fault:
-    """Something that is wrong, counted."""
+    """Counted fault of a log."""
 
     what: str
     count: int
@@ -57,7 +57,7 @@ class Fault:
     offset: int = -1
     """Byte offset of the first, −1 where there is none."""
     file: str = ""
-    """File of the first, relative to the log."""
+    """File of the first fault, relative to the log."""
 
 
 @dataclass
@@ -71,7 +71,7 @@ class ColumnFigures:
     missing: int = 0
 
     def take(self, array: pa.Array) -> None:
-        """Widen the range by an array of numbers."""
+        """Extend the range by an array of numbers."""
         self.missing += array.null_count
         values = array.drop_null().to_numpy(zero_copy_only=False)
         if values.dtype.kind == "f":
@@ -90,7 +90,7 @@ class Epochs:
 
     def __init__(self, *, unique: bool) -> None:
         self.unique = unique
-        """Each epoch stands once (poses, profiles), as the table's order says; else many readings an instant."""
+        """Each epoch occurs once (poses, profiles), as the table's order says; else many readings share an instant."""
         self.count = 0
         self.min_ns = self.max_ns = self._last_ns = 0
         self.back = Fault("epochs go back", 0)
@@ -99,13 +99,13 @@ class Epochs:
         """Longest gaps: (length in s, epoch at which it starts)."""
         self.gap_count = 0
         self.rates: list[tuple[int, float]] = []
-        """Record and rate (1/s) wherever the rate changes, the first included."""
+        """Record and rate (1/s) where the rate changes, including the first."""
         self._steps = np.zeros(_STEP_BINS, dtype=np.int64)
         self._seconds: set[int] | None = set()
         self._carried: Int64 = np.empty(0, dtype=np.int64)
 
     def take(self, epochs: Int64, first_record: int, place: tuple[str, int]) -> None:
-        """Take a block of epochs (n,), n > 0.
+        """Add a block of epochs (n,), n > 0.
 
         Parameters
         ----------
@@ -131,12 +131,12 @@ class Epochs:
 
     @property
     def span_s(self) -> float:
-        """From the first to the last epoch (s)."""
+        """Time from the first to the last epoch (s)."""
         return (self.max_ns - self.min_ns) / NS_PER_S
 
     @property
     def period_s(self) -> float | None:
-        """Usual step: the median of those that go on (s)."""
+        """Usual step: the median of the forward steps (s)."""
         total = int(self._steps.sum())
         if not total:
             return None
@@ -145,7 +145,7 @@ class Epochs:
 
     @property
     def rate_hz(self) -> float | None:
-        """Records a second over the whole span."""
+        """Records per second over the whole span."""
         return (self.count - 1) / self.span_s if self.span_s > 0 else None
 
     def finish(self) -> None:
@@ -193,7 +193,7 @@ class Epochs:
 
 
 class Extent:
-    """Where positions lie: a box in the log's own metres, and longitude and latitude where its CRS is known."""
+    """Extent of positions: a box in the log's coordinates (m), and longitude and latitude where its CRS is known."""
 
     def __init__(self, frame: str) -> None:
         self.frame = frame
@@ -203,7 +203,7 @@ class Extent:
         self.degrees_high: Float64 | None = None
 
     def take(self, own_m: Float64, degrees: Float64 | None) -> None:
-        """Widen by positions (n, 3) in metres and, of some of them, longitude, latitude (k, 2)."""
+        """Extend by positions (n, 3) in metres and longitude, latitude (k, 2) of some of them."""
         finite = own_m[np.isfinite(own_m).all(axis=1)]
         if finite.size:
             self.low = _least(self.low, finite.min(axis=0))
@@ -225,7 +225,7 @@ class Readings:
     range_max_m: float | None = None
 
     def take(self, ranges_m: Float64, total: int) -> None:
-        """Take a block: ranges (k,) of the readings that are returns, of `total` readings."""
+        """Add a block: ranges (k,) of the readings that are returns, out of `total` readings."""
         self.total += total
         self.no_return += total - ranges_m.size
         if ranges_m.size:
@@ -235,7 +235,7 @@ class Readings:
 
 
 class TableFigures:
-    """Figures of the rows that a log yields for one table."""
+    """Figures of a log's rows for one table."""
 
     def __init__(self, schema: TableSchema, header: LogHeader, map_frame: MapFrame | None, crs: str | None) -> None:
         self.name = schema.name
@@ -248,7 +248,7 @@ class TableFigures:
         self.extent: Extent | None = None
         self.readings: Readings | None = None
         self.path_m = 0.0
-        """Length of the way that the positions make (m)."""
+        """Length of the path through the positions (m)."""
         self.leaps = Fault(f"positions leap (more than {LEAP_SPEED_M_PER_S:g} m/s and {LEAP_M:g} m at once)", 0)
         self._schema = schema
         self._header = header
@@ -256,7 +256,7 @@ class TableFigures:
         self._last: tuple[int, Float64] | None = None
 
     def take(self, item: Rows, batch: pa.RecordBatch) -> None:
-        """Take rows that fit the schema."""
+        """Add rows that fit the schema."""
         if not batch.num_rows:
             return
         place = (item.file, item.first_offset)
@@ -273,7 +273,7 @@ class TableFigures:
         self.rows += batch.num_rows
 
     def faults(self) -> list[Fault]:
-        """What is wrong with these rows."""
+        """Return what is wrong with these rows."""
         found = [self.leaps]
         if self.epochs is not None:
             self.epochs.finish()
@@ -363,7 +363,7 @@ class LogFigures:
         self.rejects: dict[str, Fault] = {}
         """Lost records by reason."""
         self.findings: list[Finding] = []
-        """What the reader doubts."""
+        """The reader's findings."""
         self.rows = 0
         self.items = 0
         self._header = header
@@ -372,7 +372,7 @@ class LogFigures:
         self._future = future
 
     def take(self, item: Item) -> None:
-        """Take what a reader yields next."""
+        """Add an item of the reader."""
         self.items += 1
         if isinstance(item, Reject):
             self._lose(item.reason, item.records, item.record, item.offset, item.file)
@@ -402,24 +402,24 @@ class LogFigures:
 
     @property
     def values(self) -> int:
-        """Single readings so far, for the bound of a quick look."""
+        """Return the number of single values so far, which limits a quick inspection."""
         return sum(max(t.rows, t.readings.total if t.readings else 0) for t in self.tables.values())
 
     @property
     def rejected(self) -> int:
-        """Records that were lost."""
+        """Return the number of lost records."""
         return sum(fault.count for fault in self.rejects.values())
 
     @property
     def faults(self) -> list[Fault]:
-        """All that is wrong: lost records first, the most frequent reason first."""
+        """Return all faults: lost records first, the most frequent reason first."""
         lost = sorted(self.rejects.values(), key=lambda f: -f.count)
         doubts = [Fault(one.text, max(one.left_out, 1)) for one in self.findings]
         return lost + doubts + [f for table in self.tables.values() for f in table.faults()]
 
     @property
     def span_gps_ns(self) -> tuple[int, int] | None:
-        """First and last epoch over all tables."""
+        """Return the first and last epoch of all tables."""
         spans = [t.epochs for t in self.tables.values() if t.epochs is not None and t.epochs.count]
         return (min(e.min_ns for e in spans), max(e.max_ns for e in spans)) if spans else None
 
@@ -435,12 +435,12 @@ _POSITION_COLUMNS: Final = (
     ("x_m", "y_m", "z_m"),
     ("easting_m", "northing_m", "height_m"),
 )
-"""Columns that hold positions: in a world frame, in the cloud's CRS, in the map."""
+"""Columns of positions: in a world frame, in the cloud's CRS, in the map."""
 
 
 @dataclass
 class _DegreesOf:
-    """Turns positions into longitude and latitude, where their frame is tied to the Earth."""
+    """Converts positions to longitude and latitude, where their frame is tied to the Earth."""
 
     header: LogHeader
     map: MapFrame | None
@@ -448,7 +448,7 @@ class _DegreesOf:
     _failed: bool = field(default=False, init=False)
 
     def frame(self, names: tuple[str, ...]) -> str:
-        """Frame of the positions in these columns."""
+        """Return the frame of the positions in these columns."""
         if names[0] == "x_world_m":
             return str(self.header.attributes.get("world_frame", LOCAL_WORLD))
         if names[0] == "x_m":
@@ -456,7 +456,7 @@ class _DegreesOf:
         return LOCAL_WORLD if self.map is None or self.map.crs is None else self.map.crs
 
     def of(self, names: tuple[str, ...], own_m: Float64) -> Float64 | None:
-        """Longitude, latitude (k, 2) of positions (k, 3); None in a local frame."""
+        """Return longitude and latitude (k, 2) of positions (k, 3); None in a local frame."""
         frame = self.frame(names)
         if frame == LOCAL_WORLD or self._failed:
             return None
@@ -468,12 +468,12 @@ class _DegreesOf:
             to_degrees = pyproj.Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True)
             return np.stack(to_degrees.transform(*(own_m[:, :2] / unit_m).T), axis=-1)
         except (RoadscanError, pyproj.exceptions.ProjError):
-            self._failed = True  # the extent in metres still stands
+            self._failed = True  # the extent in metres remains valid
             return None
 
 
 def _telling(positions: Float64) -> Int64:
-    """Rows that tell the extent of a block of positions (n, 3): its outermost ones, and a sample."""
+    """Return rows that determine the extent of positions (n, 3): the outermost ones, and a sample."""
     step = max(1, len(positions) // _SAMPLE)
     outermost = [positions.argmin(axis=0), positions.argmax(axis=0), np.arange(0, len(positions), step)]
     return np.unique(np.concatenate(outermost))

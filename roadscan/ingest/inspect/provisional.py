@@ -1,4 +1,4 @@
-"""Open a log of which not everything is stated, to look into it.
+"""Opens a log with assumed settings, for inspection only.
 
 A reader refuses a log whose time system, CRS or settings are not stated, and says so. For looking, and only
 for looking, :func:`open_log` then tries what fits the refusal: clocks that show the stamps as they are, a CRS
@@ -52,22 +52,22 @@ SENSOR_KINDS: Final[dict[str, SensorKind]] = {
 """Kind of the sensor that fills a table; other tables come from no sensor of the rig."""
 
 LOOKING_MAP_CRS: Final = "EPSG:3395"
-"""Map that points in degrees are shown through; they are turned back into degrees."""
+"""Map to which positions in degrees are projected for inspection; they are converted back to degrees."""
 
 _LOOKING_WEEK: Final = 1024
-"""GPS week that seconds of an unknown week are looked at in: the days before and after it are possible times, too."""
+"""Assumed GPS week for seconds of an unknown week: the days before and after it are valid times, too."""
 
-MOST_TRIALS: Final = 120
-_MOST_REJECTS: Final = 50
-_ANY_DATUM_ERROR_M: Final = 1e9
+MOST_TRIALS: Final = 120  # most times that a reader is asked
+_MOST_REJECTS: Final = 50  # rejects after which the search for a first row ends
+_ANY_DATUM_ERROR_M: Final = 1e9  # accepts any change of datum (m)
 _CRS_CHOICES: Final = ("EPSG:4979", "local", "EPSG:4978")
 _NEVER_KNOWN: Final = {"week": UNKNOWN, "date": UNKNOWN_DATE, "offset_s": UNKNOWN}
-"""What an error's example of a clock says, and only the user can."""
+"""Placeholders for the parts of an error's example clock that only the user knows."""
 
 
 @dataclass(frozen=True)
 class Stated:
-    """What the user, or a trial, states of a log."""
+    """Settings of a log that the user, or a trial, states."""
 
     clock: Clock | None = None
     crs: str | None = None
@@ -77,7 +77,7 @@ class Stated:
     sensor: Sensor | None = None
 
     def source(self, path: Path, log_format: LogFormat) -> LogSource:
-        """The log as these statements describe it."""
+        """Return the log as these settings describe it."""
         return LogSource(
             path=path.resolve(),
             options=log_format.options.parse(self.options, file=path),
@@ -99,32 +99,32 @@ class Need:
     line: str
     """The line as TOML, with ???? for what is not known."""
     reason: str
-    """What the reader said."""
+    """The reader's error."""
     is_of_time: bool = False
     """The log's time depends on it."""
     is_generic: bool = False
-    """The reader says no more than that nothing is stated."""
+    """The reader only says that nothing is stated."""
     alternatives: tuple[tuple[str, ...], ...] = ()
-    """Other lines, any one group of which may stand in place of this line."""
+    """Alternative groups of lines; any one group may replace this line."""
 
 
 @dataclass(frozen=True)
 class OpenedLog:
-    """A log whose reader accepted it, as stated or provisionally."""
+    """A log that its reader accepted with stated or assumed settings."""
 
     format: LogFormat
     source: LogSource
     header: LogHeader
     needs: tuple[Need, ...]
-    """What was assumed; empty where all that is needed is stated."""
+    """Assumed settings; empty where everything necessary is stated."""
 
     def needs_key(self, key: str) -> bool:
-        """True if `key` was assumed."""
+        """Return True if `key` was assumed."""
         return any(need.key == key for need in self.needs)
 
 
 def parse_clock(text: str) -> Clock:
-    """Clock as typed: ``gps_week_seconds,week=2405``, or a TOML table ``{ system = "gps", unit = "ms" }``."""
+    """Parse a clock: ``gps_week_seconds,week=2405``, or a TOML table ``{ system = "gps", unit = "ms" }``."""
     words = text.strip()
     if not words.startswith("{"):
         system, *rest = (part.strip() for part in words.removeprefix("system=").split(","))
@@ -140,7 +140,7 @@ def parse_clock(text: str) -> Clock:
 
 
 def parse_option(text: str) -> tuple[str, Any]:
-    """Setting as typed, ``key=value``: the value as TOML, or as text where it is none."""
+    """Parse a setting ``key=value``: the value as TOML, or as text where it is none."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise ConfigError(f"the option '{text}' has no value", expected="key=value, such as axes=flu")
@@ -151,7 +151,7 @@ def parse_option(text: str) -> tuple[str, Any]:
 
 
 def raw_stamps_ns(clock: Clock, epochs_gps_ns: Int64) -> Int64:
-    """Stamps (n,), in nanoseconds of the log's own count, of epochs (n,) that `clock` made of them."""
+    """Return stamps (n,), in nanoseconds of the log's count, of epochs (n,) that `clock` computed from them."""
     ns = np.asarray(epochs_gps_ns, dtype=np.int64)
     shift_s = {
         TimeSystem.GPS_WEEK: WEEK_S * (clock.week or 0),
@@ -165,7 +165,7 @@ def raw_stamps_ns(clock: Clock, epochs_gps_ns: Int64) -> Int64:
 
 
 def open_log(log_format: LogFormat, path: Path, stated: Stated, trials: int = MOST_TRIALS) -> OpenedLog:
-    """Open a log as stated; where that is not enough, provisionally.
+    """Open a log as stated; where that is not enough, with assumed settings.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def _clock(system: TimeSystem, unit: str, week: int | None) -> Clock:
 
 
 class _Search:
-    """Depth first: each refusal is answered with what may mend it."""
+    """Depth-first search: each error is answered with settings that may resolve it."""
 
     def __init__(self, log_format: LogFormat, path: Path, stated: Stated, trials: int) -> None:
         self._format = log_format
@@ -202,12 +202,12 @@ class _Search:
         self._seen: set[Hashable] = set()
         self.first_error: RoadscanError | None = None
         self.unanswered: RoadscanError | None = None
-        """The first refusal that nothing that may be assumed answers, where time and CRS are as stated."""
+        """The first error that no assumption resolves while time and CRS are as stated."""
         self.fault: FormatError | None = None
-        """What is wrong with the file itself, whatever is stated."""
+        """The error of the file itself, whatever is stated."""
 
     def run(self, trial: Stated, asked: dict[Dimension, RoadscanError]) -> OpenedLog | None:
-        """The log opened with `trial`, or with what its refusals lead to; None where nothing does.
+        """Return the log opened with `trial`, or with settings that its errors lead to; None where nothing works.
 
         Parameters
         ----------
@@ -243,7 +243,7 @@ class _Search:
         return None
 
     def _look(self, trial: Stated) -> tuple[LogSource, LogHeader]:
-        """What the reader makes of the log, its first rows included. Raises the reader's refusal."""
+        """Return source and header after reading the log's first rows; raises the reader's error."""
         source = trial.source(self._path, self._format)
         header = self._format.header(source)
         _taste(self._format.read(source, header))
@@ -262,7 +262,7 @@ class _Search:
         return OpenedLog(self._format, source, header, tuple(self._needs(least, asked, reasons)))
 
     def _least(self, trial: Stated) -> tuple[Stated, dict[str, RoadscanError]]:
-        """A fitting trial with no more than the reader asks for, and its refusal for each setting."""
+        """Return a working trial with only the settings that the reader needs, and the error for each setting."""
         own = [name for name in trial.options if name not in self._stated.options]
         least = dataclasses.replace(trial, options=dict(self._stated.options))
         reasons: dict[str, RoadscanError] = {}
@@ -275,7 +275,7 @@ class _Search:
         return (least if without.crs == least.crs or self._refusal(without) is not None else without), reasons
 
     def _changes(self, trial: Stated, error: RoadscanError) -> Iterator[tuple[Dimension, Stated]]:
-        """Trials that the refusal asks for; an error of the time system, or the CRS, asks for it by its kind."""
+        """Yield trials that the error asks for; the class of an error of time or CRS says which is missing."""
         yield from (("sensor", changed) for changed in self._sensors(trial, error))
         first = isinstance(error, TimeSystemError)
         if not first:
@@ -306,7 +306,7 @@ class _Search:
         unit = proposed.get("unit")
         units = sorted(UNIT_NS, key=lambda u: (u != unit, -UNIT_NS[u]))
         systems = [TimeSystem.FREE, *(s for s in TimeSystem if s == proposed.get("system")), *TimeSystem]
-        if proposed.get("system") == TimeSystem.GPS_WEEK:  # only as such are stamps counted on over the week's end
+        if proposed.get("system") == TimeSystem.GPS_WEEK:  # only these stamps are unrolled over the week's end
             yield dataclasses.replace(trial, clock=Clock(TimeSystem.GPS_WEEK, week=_LOOKING_WEEK))
         for system in dict.fromkeys(systems):
             if system is not TimeSystem.UTC_HOUR:
@@ -335,13 +335,13 @@ class _Search:
             if name not in self._stated.options and name in self._format.options.model_fields:
                 proposed = () if one.proposed is None else (one.proposed,)
                 values = [*proposed, *one.choices, *option_choices(self._format, name)]
-                for value in {repr(value): value for value in values}.values():  # lists have no hash
+                for value in {repr(value): value for value in values}.values():  # lists are not hashable
                     yield dataclasses.replace(trial, options=trial.options | {name: value})
 
     def _needs(
         self, trial: Stated, asked: dict[Dimension, RoadscanError], reasons: dict[str, RoadscanError]
     ) -> Iterator[Need]:
-        """What `trial` assumes: the refusals that asked for it, those for settings by the setting's name."""
+        """Yield what `trial` assumes: the errors that asked for it; those for options by the option's name."""
         fallback = self.first_error or FormatError("not stated")
         if trial.clock != self._stated.clock:
             without = dataclasses.replace(trial, clock=self._stated.clock)
@@ -373,7 +373,7 @@ class _Search:
                 yield need
 
     def _refusal_of_file(self, trial: Stated, reasons: dict[str, RoadscanError]) -> RoadscanError | None:
-        """What the reader says of the CRS that the file itself names, where a setting is assumed beside a CRS: the
+        """Return the reader's error about the CRS in the file itself where an option is assumed beside a CRS, since the
         user states nothing that could contradict the file.
         """
         names = [name for name, error in reasons.items() if isinstance(error, CrsError)]
@@ -383,7 +383,7 @@ class _Search:
         return self._refusal(dataclasses.replace(trial, crs=self._stated.crs, options=kept))
 
     def _option_need(self, name: str, error: RoadscanError, trial: Stated) -> tuple[Need, set[str]]:
-        """The line for a setting, and all settings that it answers for: those that exclude each other are one need."""
+        """Return the line for an option, and all options that it answers: mutually exclusive ones are one need."""
         is_of_time = isinstance(error, TimeSystemError)
         single = [group for group in error.missing if len(group) == 1]
         names = _options_of(error)
@@ -402,12 +402,12 @@ class _Search:
 
 
 def sensor_kind(log_format: LogFormat) -> SensorKind | None:
-    """Kind of the sensor that writes logs of this format; None where it is no sensor of the rig."""
+    """Return the kind of the sensor that writes logs of this format; None where it is no sensor of the rig."""
     return next((SENSOR_KINDS[table] for table in log_format.yields if table in SENSOR_KINDS), None)
 
 
 def option_choices(log_format: LogFormat, name: str) -> list[Any]:
-    """Values that a setting without default may take, as far as its type says; axes by their name."""
+    """Return values for an option without default, as far as its type lists them; axes by their name."""
     field_info = log_format.options.model_fields.get(name)
     if field_info is None:
         return []
@@ -423,14 +423,14 @@ def _literals(annotation: Any) -> Iterator[Any]:
 
 
 def _taste(items: Iterator[Item]) -> None:
-    """Read on to the first rows: some faults of a log as a whole show only there."""
+    """Read up to the first rows: some faults of a whole log only show there."""
     for number, item in enumerate(items):
         if isinstance(item, Rows) or number >= _MOST_REJECTS:
             return
 
 
 def _map_for(crs: str | None) -> MapFrame:
-    """A map for logs whose readers bring what they read into one."""
+    """Return a map for readers that transform positions into one."""
     if crs == LOCAL_WORLD:
         return MapFrame(crs=None, local_name="looking")
     known = None if crs is None else crs_from_text(crs)
@@ -451,10 +451,10 @@ def _proposed_clock(error: RoadscanError) -> dict[str, Any]:
 
 
 def _clock_line(error: RoadscanError, fitting: Clock | None, is_generic: bool) -> str:
-    """The clock that the reader proposes, in the unit that fitted, with ???? for what is not known."""
+    """Return the clock that the reader proposes, in the unit that fitted, with ???? for what is not known."""
     clock = _proposed_clock(error)
     if not clock or (is_generic and fitting is not None and fitting.system is TimeSystem.FREE):
-        clock = clock | {"system": "????"}  # the reader's example, and no more
+        clock = clock | {"system": "????"}  # only the reader's example
     unit = "s" if fitting is None else fitting.unit
     if "unit" in clock or unit != "s":
         clock["unit"] = unit

@@ -1,1 +1,1 @@
-"""What readers of formats share: records, stamps, columns, tables in text, poses, GNSS solutions."""
+"""Shared parts of the readers of formats: records, stamps, columns, tables in text, poses, GNSS solutions."""

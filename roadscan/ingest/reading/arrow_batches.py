@@ -1,6 +1,6 @@
-"""Record batches of Arrow IPC files (Feather): mapped, and held against the list in the file's footer.
+"""Reads record batches of mapped Arrow IPC files (Feather), and checks them against the list in the file's footer.
 
-Arrow reads what the footer lists. A damaged or truncated list would leave out readings without a word.
+Arrow reads what the footer lists. A damaged or truncated list would silently leave out readings.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from pathlib import Path
 import pyarrow as pa
 
 _FIRST_MESSAGE = 8
-"""Byte behind the file's mark."""
+"""Byte of the first message, after the file's magic number."""
 _MESSAGES = 16
-"""Messages that are looked at before their pages are given back."""
+"""Messages that are read before their pages are released."""
 
 
 class MappedBatches:
@@ -36,12 +36,12 @@ class MappedBatches:
         self.reader = pa.ipc.open_file(pa.BufferReader(pa.py_buffer(self._pages)), options=chosen)
 
     def release(self) -> None:
-        """Give the pages read so far back; views stay good, a page that is asked for again is mapped again."""
+        """Release the pages read so far; views stay valid, because a page is mapped again when it is accessed."""
         _give_back(self._pages)
 
 
 def unlisted_batches(path: Path, listed: int) -> int:
-    """How many record batches stand in the file beyond the `listed` ones of its footer; bodies are not read."""
+    """Return how many record batches of the file its footer does not list, beyond `listed`; bodies are not read."""
     found = 0
     try:
         pages = _mapped(path)
@@ -63,11 +63,11 @@ def _mapped(path: Path) -> mmap.mmap:
 
 
 def _give_back(pages: mmap.mmap) -> None:
-    """Let go of the pages touched so far: else the process would seem to hold all of the log that it has passed."""
+    """Release the pages touched so far: else the process would seem to occupy all of the log that it has read."""
     if hasattr(mmap, "MADV_DONTNEED"):
         pages.madvise(mmap.MADV_DONTNEED)
 
 
 def unlisted_reason(count: int) -> str:
-    """Reason of the reject for them."""
+    """Return the reason of the reject for them."""
     return f"{count} record batches stand in the file, but not in its footer"

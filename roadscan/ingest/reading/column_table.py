@@ -1,4 +1,4 @@
-"""Tables with named columns in Parquet or Arrow IPC (Feather), read a few rows at a time; damage costs what it hits."""
+"""Reads named columns of Parquet or Arrow IPC (Feather) files a few rows at a time; damage costs what it hits."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from roadscan.ingest.reading.arrow_batches import MappedBatches, unlisted_batche
 from roadscan.store.codecs.parquet.foreign_pages import ParquetPages
 
 UNREADABLE: Final = (pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError, MemoryError)
-"""What Arrow raises on damaged bytes."""
+"""Errors that Arrow raises on damaged bytes."""
 
 _MAPPED_CHUNKS: Final = 8
-"""Chunks of a mapped file after which its pages are given back."""
-_LARGE_FILE_BYTES: Final = 32 << 20
-_BUFFER_BYTES: Final = 1 << 20
+"""Chunks of a mapped file after which its pages are released."""
+_LARGE_FILE_BYTES: Final = 32 << 20  # larger files are read through a buffer
+_BUFFER_BYTES: Final = 1 << 20  # bytes of that buffer
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Lost:
     reason: str
     records: int
     whole: bool = False
-    """True where the whole file is meant."""
+    """True where the whole file is lost."""
 
 
 class ColumnTable(Protocol):
@@ -39,10 +39,10 @@ class ColumnTable(Protocol):
     schema: pa.Schema
 
     def parts(self, rows: int, columns: Sequence[str]) -> Iterator[tuple[int, pa.RecordBatch | Lost]]:
-        """(number of the first row, at most `rows` rows of `columns`, or what was lost)."""
+        """Yield the number of the first row and at most `rows` rows of `columns`, or what was lost."""
 
     def ending(self, column: str) -> pa.RecordBatch | None:
-        """The last rows of one column; None where they cannot be read."""
+        """Return the last rows of one column; None where they cannot be read."""
 
 
 class _Parquet:
@@ -113,7 +113,7 @@ class _Arrow:
 
 
 def _joined(reader: pa.ipc.RecordBatchFileReader, rows: int) -> Iterator[pa.RecordBatch | Lost]:
-    """Batches in their order; short ones are copied into one of at most `rows` rows: each costs some calls."""
+    """Yield batches in their order, short ones merged into one of at most `rows` rows: each batch costs some calls."""
     short: list[pa.RecordBatch] = []
     held = 0
     for number in range(reader.num_record_batches):
@@ -140,7 +140,7 @@ def _batch(reader: pa.ipc.RecordBatchFileReader, number: int) -> pa.RecordBatch 
 
 
 def open_table(file: Path) -> ColumnTable:
-    """The table of a file, told by its first bytes.
+    """Return the table of a file, identified by its first bytes.
 
     Raises
     ------
@@ -162,7 +162,7 @@ def open_table(file: Path) -> ColumnTable:
 
 
 def need_table(file: Path) -> ColumnTable:
-    """The table of a file, or :class:`FormatError` with its name where it cannot be opened."""
+    """Return the table of a file, or raise :class:`FormatError` with its name where it cannot be opened."""
     try:
         return open_table(file)
     except FormatError as error:
@@ -172,11 +172,11 @@ def need_table(file: Path) -> ColumnTable:
 
 
 def is_number(kind: pa.DataType) -> bool:
-    """True for a column of whole or floating-point numbers."""
+    """Return True for a column of integers or floating-point numbers."""
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
 
 
 def brief(error: BaseException) -> str:
-    """First line of what went wrong."""
+    """Return the first line of an error's text."""
     text = str(error).strip().splitlines()
     return text[0][:200] if text else type(error).__name__

@@ -1,4 +1,4 @@
-"""Named columns with units: which column of a file is which quantity, and in what unit.
+"""Finds named columns with units: which column of a file is which quantity, in which unit.
 
 A column is found by a name that carries its unit (``latitude_deg``, ``height_m``); any other name
 has to be mapped, with its unit, in the log's options. Nothing is guessed.
@@ -22,7 +22,7 @@ Dimension: TypeAlias = Literal[
 ]
 
 _BRACKETS: Final = re.compile(r"[(\[<{].*")
-"""What many programs put a unit into: `Latitude (deg)`."""
+"""How many programs add a unit to a name: `Latitude (deg)`."""
 
 STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
 """Size of the unit g (CGPM 1901)."""
@@ -58,8 +58,7 @@ UNITS: Final[dict[Dimension, dict[str, float]]] = {
     "count": {"": 1.0},
     "text": {"": 1.0},
 }
-"""Units by dimension and their size in radians, metres, seconds or what they make of these; `utc` is ISO 8601
-text."""
+"""Units by dimension, with their size in radians, metres, seconds or combinations of these; `utc` is ISO 8601 text."""
 
 
 class ColumnOption(Strict):
@@ -79,40 +78,40 @@ class Quantity:
     name: str
     dimension: Dimension
     also: tuple[str, ...] = ()
-    """Other names it is known by."""
+    """Alternative names of the column."""
     optional: bool = False
 
     @property
     def usual_unit(self) -> str:
-        """The first of its units, "" where it has none."""
+        """First of its units, "" where it has none."""
         return next(iter(UNITS[self.dimension]))
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """How near the columns of a text come to those of a format."""
+    """How well the columns of a text match a format."""
 
     found: int
     """Columns whose names carry their units."""
     unitless: dict[str, tuple[Quantity, str]]
-    """Columns by name that lack nothing but the unit, with a usual one."""
+    """Columns by name that only lack the unit, with a usual one."""
     absent: tuple[Quantity, ...]
     """Quantities without a column."""
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Order of nearness, the greater the nearer."""
+        """Rank of the match; a greater one is better."""
         return self.found + len(self.unitless), -len(self.absent)
 
     @property
     def is_near(self) -> bool:
-        """True if at least two columns, and half of all, are there."""
+        """True if at least two columns, and half of all, are present."""
         there = self.found + len(self.unitless)
         return there >= max(2, len(self.absent))
 
 
 def likeness(quantities: Iterable[Quantity], names: Sequence[str]) -> Likeness:
-    """How near columns of these `names` come to the `quantities`; time may be without unit, the clock has it."""
+    """Return how well columns of these `names` match the `quantities`; the clock gives a missing unit of time."""
     plain = {_BRACKETS.sub("", name.lower()).strip(" _"): name for name in names}
     bracketed = {name: bracket[0].strip("()[]<>{} ") for name in names if (bracket := _BRACKETS.search(name.lower()))}
     found, unitless, absent = 0, {}, []
@@ -149,7 +148,7 @@ def find_columns(
     file: Path,
     plain_units: Mapping[str, float] | None = None,
 ) -> dict[str, Found]:
-    """Find the column of each quantity.
+    """Return the column of each quantity.
 
     Parameters
     ----------
@@ -183,7 +182,7 @@ def find_columns(
 
 
 def fits(quantities: Iterable[Quantity], names: Iterable[str], plain: Iterable[str] = ()) -> bool:
-    """True if every needed quantity has a column whose name carries its unit (or stands in `plain`)."""
+    """Return True if every required quantity has a column whose name has its unit (or is in `plain`)."""
     lower = [n.lower() for n in names]
     return all(
         q.optional or any(n in _spellings(q) for n in lower) or (q.name in plain and _plain(q, lower))
@@ -204,13 +203,13 @@ def need_stamp_unit(column: Found, clock: Clock, file: Path) -> None:
 
 
 def unit_in_name(name: str, dimension: Dimension) -> str:
-    """Unit that ends a column's name (``timestamp_ns`` → ``ns``), "" for none."""
+    """Return the unit at the end of a column's name (``timestamp_ns`` → ``ns``), "" for none."""
     ends = [unit for unit in UNITS[dimension] if unit and name.lower().endswith("_" + unit)]
     return max(ends, key=len, default="")
 
 
 def _spellings(quantity: Quantity) -> dict[str, str]:
-    """Lower-case column names that carry the quantity's unit, and that unit."""
+    """Return lower-case column names that carry the quantity's unit, with that unit."""
     stems = (quantity.name, *quantity.also)
     return {f"{stem}_{unit}" if unit else stem: unit for stem in stems for unit in UNITS[quantity.dimension]}
 
@@ -293,7 +292,7 @@ def check_keys(stated: Iterable[str], known: Iterable[str], file: Path) -> None:
 
 
 def named_column(what: str, stated: str | None, known: Iterable[str], names: tuple[str, ...], file: Path) -> str:
-    """Name of the column that holds `what`: the stated one, or the one called as in `known`.
+    """Return the name of the column that holds `what`: the stated one, or one of `known`.
 
     Raises
     ------
@@ -323,6 +322,6 @@ def named_column(what: str, stated: str | None, known: Iterable[str], names: tup
 
 
 def stamp_column(stated: str | None, names: tuple[str, ...], known: tuple[str, ...], file: Path) -> Found:
-    """Column of numeric time stamps, see :func:`named_column`, with the unit that its name ends in."""
+    """Return the column of numeric time stamps (see :func:`named_column`), with the unit at the end of its name."""
     column = named_column("the time stamps", stated, known, names, file)
     return Found(column, 1.0, unit_in_name(column, "time"))

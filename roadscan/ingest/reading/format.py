@@ -1,9 +1,9 @@
-"""The contract of a raw format, and the registry that finds formats by themselves.
+"""The interface of a raw format, and the registry that finds all formats.
 
 A format is one file of `roadscan/formats/` (or one entry point of the group ``roadscan.formats``) with one
 subclass of :class:`LogFormat`. It streams :class:`Rows`, :class:`Reject` for each damaged record, and a
 :class:`~roadscan.core.witness.Finding` for what is doubtful of the log; everything else (schemas, partitions,
-fingerprints, rejects table, where findings are told) is done for it.
+fingerprints, rejects table, where findings are reported) is done for it.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.reading.columns import Quantity
 
-NO_LEVER_ARM: Final = [0.0, 0.0, 0.0]
+NO_LEVER_ARM: Final = [0.0, 0.0, 0.0]  # body axes, for mountings at the reference point (m)
 
 ENTRY_POINT_GROUP: Final = "roadscan.formats"
-"""Entry-point group through which a third party's package adds a format."""
+"""Entry-point group through which another package adds a format."""
 
 
 class NoOptions(Strict):
@@ -62,16 +62,16 @@ _CARTESIAN: Final = 'crs = "local", or a geocentric one such as "EPSG:4978"'
 
 @dataclass(frozen=True)
 class SourceDefaults:
-    """What the survey file says of all logs that do not say it themselves."""
+    """Defaults of the survey file, for logs that do not state a setting themselves."""
 
     clock: Clock | None = None
-    """Time system of stamps that neither the log nor its entry in the survey file explains."""
+    """Time system of stamps for which neither the log nor its entry in the survey file states one."""
     week: Clock | None = None
     """Clock of seconds of the GPS week, where the survey file gives a week or date for all logs."""
     crs: str | None = None
-    """CRS of positions that neither the log nor its entry in the survey file explains."""
+    """CRS of positions for which neither the log nor its entry in the survey file states one."""
     height: HeightKind | None = None
-    """Kind of heights that neither the log nor its entry in the survey file explains."""
+    """Kind of heights for which neither the log nor its entry in the survey file states one."""
 
 
 @dataclass(frozen=True)
@@ -97,15 +97,15 @@ class LogSource:
     trajectory_span_gps_ns: tuple[int, int] | None = None
     """Span of the run's trajectory, where it is already ingested."""
     defaults: SourceDefaults = SourceDefaults()
-    """What the survey file says of all logs; a reader takes it where the log says nothing, and never against it."""
+    """Defaults of the survey file; a reader uses them where the log says nothing, and never against it."""
 
     @property
     def any_clock(self) -> Clock | None:
-        """The stated clock, or the survey's default: for stamps whose time system the log does not say."""
+        """Stated clock, or the survey's default: for stamps whose time system the log does not say."""
         return self.defaults.clock if self.clock is None else self.clock
 
     def need_clock(self, system: str, **more: object) -> Clock:
-        """The stated clock or the survey's default, or an error that asks for one: time is never guessed.
+        """Return the stated clock or the survey's default, or raise an error that asks for one: time is never guessed.
 
         Parameters
         ----------
@@ -123,7 +123,7 @@ class LogSource:
         return clock
 
     def need_crs(self, example: str = "EPSG:4979") -> str:
-        """The stated CRS or the survey's default, or an error that asks for one: a datum is never guessed."""
+        """Return the stated CRS or the survey's default, or raise an error that asks for one: it is never guessed."""
         crs = self.defaults.crs if self.crs is None else self.crs
         if crs is None:
             raise ConfigError(
@@ -136,11 +136,11 @@ class LogSource:
 
     @property
     def any_height(self) -> HeightKind | None:
-        """The stated kind of heights, or the survey's default."""
+        """Stated kind of heights, or the survey's default."""
         return self.defaults.height if self.height is None else self.height
 
     def need_height(self, known: HeightKind | None = None, by: str = "", way_out: str = "") -> HeightKind:
-        """Kind of the log's heights: what the log says, or what the survey file states; an error where neither does.
+        """Return the kind of the log's heights: as the log, or the survey file, states; an error where neither does.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ class LogSource:
         )
 
     def need_file(self) -> None:
-        """Refuse a log that is no file, or one that cannot be opened, for formats of single files."""
+        """Refuse a log that is no file or cannot be opened, for formats of single files."""
         try:
             if self.path.is_dir():
                 raise FormatError("the log is a folder", expected="a file", file=self.path)
@@ -187,7 +187,7 @@ class LogSource:
             raise FormatError(f"the log cannot be opened: {error.strerror}", file=self.path) from error
 
     def need_sensor(self, *kinds: SensorKind) -> Sensor:
-        """The rig's sensor that wrote the log, or an error where none is named or it is of another kind."""
+        """Return the rig's sensor that wrote the log; an error where none is named, or it is of another kind."""
         wanted = " or ".join(kinds)
         if self.sensor is None:
             raise ConfigError(
@@ -226,22 +226,22 @@ class Rows:
     records: npt.NDArray[np.int64] | None = None
     """(n,) record number of each row, where they do not follow one another."""
     velocity_level_m_per_s: npt.NDArray[np.float32] | None = None
-    """(n, 3) stated velocity of each row, north, east, down: a witness of its position, which no table holds."""
+    """(n, 3) stated velocity of each row, north, east, down: evidence about its position, which no table stores."""
 
     @property
     def numbers(self) -> npt.NDArray[np.int64]:
-        """(n,) record number of each row."""
+        """Return the record number (n,) of each row."""
         return self.first_record + np.arange(self.batch.num_rows) if self.records is None else self.records
 
     @property
     def offsets(self) -> npt.NDArray[np.int64]:
-        """(n,) byte offset of each row, −1 where it is not known."""
+        """Return the byte offset (n,) of each row, −1 where unknown."""
         if self.first_offset < 0 or not self.record_bytes:
             return np.full(self.batch.num_rows, -1, np.int64)
         return self.first_offset + (self.numbers - self.first_record) * self.record_bytes
 
     def places(self, rows: npt.NDArray[np.int64]) -> list[tuple[int, int, int]]:
-        """Record number, byte offset and count of each run of neighbouring records among some rows (m,), ascending."""
+        """Return record number, byte offset and count of each run of adjacent records among rows (m,), ascending."""
         numbers, offsets = self.numbers[rows], self.offsets[rows]
         runs = np.split(np.arange(rows.size), np.flatnonzero(np.diff(numbers) != 1) + 1)
         return [(int(numbers[run[0]]), int(offsets[run[0]]), run.size) for run in runs if run.size]
@@ -252,7 +252,7 @@ class Reject:
     """A record (or a run of records) that could not be read."""
 
     reason: str
-    """Why."""
+    """Reason."""
     record: int = -1
     """Number of the first record, −1 where it has none."""
     offset: int = -1
@@ -265,7 +265,7 @@ class Reject:
 
 @dataclass(frozen=True)
 class LogHeader:
-    """What is known of a log before its records are read; kept in the log record."""
+    """What is known of a log before its records are read; stored in the log record."""
 
     attributes: dict[str, Any] = field(default_factory=dict)
     """JSON values that readings need to be understood.
@@ -287,7 +287,7 @@ Item: TypeAlias = Rows | Reject | Finding
 
 @dataclass(frozen=True)
 class Provisional:
-    """What may be assumed to look into a log of which nothing is stated: for looking only, never for ingest."""
+    """Settings that may be assumed to inspect a log of which nothing is stated; ingest never uses them."""
 
     clock: Clock | None = None
     """Clock that shows the stamps as they are: `free` for a count of seconds, week 0 for seconds of the week."""
@@ -298,7 +298,7 @@ class Provisional:
 
 
 def beside(log: Path, named: Path) -> Path:
-    """Absolute path of a file that a log's settings name: relative to the log's folder."""
+    """Return the absolute path of a file that a log's settings name, relative to the log's folder."""
     return (log if log.is_dir() else log.parent) / named
 
 
@@ -338,16 +338,16 @@ class LogFormat(ABC):
 
     @abstractmethod
     def sniff(self, path: Path) -> bool:
-        """True if the file or folder is of this format, judged by content (cheap, never raises)."""
+        """Return True if the file or folder is of this format, judged by content (cheap, never raises)."""
 
     def files(self, path: Path) -> list[Path]:
-        """All files that make up the log, sorted; their content is its fingerprint."""
+        """Return all files of the log, sorted; their content is its fingerprint."""
         if path.is_dir():
             return sorted(p for p in path.rglob("*") if p.is_file())
         return [path]
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
-        """Files beside the log that its settings name; their content is part of the log's fingerprint too.
+        """Return files beside the log that its settings name; their content is part of the log's fingerprint too.
 
         A relative path counts from the log's folder (:func:`beside`).
         """
@@ -378,13 +378,13 @@ class LogFormat(ABC):
 
 @functools.cache
 def log_formats() -> dict[str, LogFormat]:
-    """All formats by name: those of this folder, and installed entry points."""
+    """Return all formats by name: those of roadscan, and installed entry points."""
     found = found_kinds("formats/**/*.py", LogFormat, ENTRY_POINT_GROUP)
     return {name: kind() for name, kind in found.items()}
 
 
 def format_named(name: str) -> LogFormat:
-    """Format by name, or an error that names the nearest known one."""
+    """Return a format by name, or raise an error that names the nearest known one."""
     formats = log_formats()
     if name not in formats:
         raise ConfigError(f"unknown format '{name}'{nearest(name, formats)}", expected="one of: " + ", ".join(formats))
@@ -392,7 +392,7 @@ def format_named(name: str) -> LogFormat:
 
 
 def format_of(path: Path) -> LogFormat:
-    """The one format whose content test the file or folder passes."""
+    """Return the one format whose content test the file or folder passes."""
     if not path.exists():
         raise FormatError("the log does not exist", change="check the path in the survey file", file=path)
     fitting = [f for f in log_formats().values() if f.sniff(path)]

@@ -1,4 +1,4 @@
-"""Rows of a time that has not come yet: stamps on another scale than their log says."""
+"""Rejects rows with times in the future: their stamps are on another scale than the log says."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ TIME_IN_FUTURE: Final = Witness(
 )
 
 _MARGIN_NS: Final = 86_400 * NS_PER_S
-"""Clocks of two computers, and local times taken as UTC, differ by less."""
+"""Tolerance (ns): clocks of two computers, or local times taken as UTC, differ by less."""
 _ORIGIN_GPS_S: Final = {
     TimeSystem.UNIX_UTC: -GPS_EPOCH_UNIX_S,
     TimeSystem.GPS: 0,
     TimeSystem.GPS_ADJUSTED: ADJUSTED_OFFSET_S,
 }
-"""GPS seconds at which the count of each scale begins, to some leap seconds."""
+"""GPS seconds at which the count of each scale begins, to within some leap seconds."""
 _EARLIEST_GPS_S: Final = 630_720_000
-"""2000: no mobile mapping before."""
+"""Start of 2000 (GPS s): there was no mobile mapping before."""
 
 
 @dataclass
 class FutureTimes:
-    """Holds the epochs of one log against the calendar."""
+    """Checks the epochs of one log against today's date."""
 
     latest_gps_ns: int
     system: TimeSystem | None
-    """Time system on which the stamps were read, where one is known; a free clock counts from no date."""
+    """Assumed time system of the stamps, where one is known; a free clock has no date."""
     _reason: str = field(default="")
 
     @classmethod
     def of(cls, source: LogSource, header: LogHeader) -> FutureTimes:
-        """For a log as the survey file describes it."""
+        """Return the check of a log as the survey file describes it."""
         written_unix_s = source.path.stat().st_mtime if source.path.exists() else 0.0
         now = dt.datetime.fromtimestamp(max(time.time(), written_unix_s), dt.UTC)
         said = header.attributes.get("time_system") or (source.any_clock.system if source.any_clock else None)
@@ -64,7 +64,7 @@ class FutureTimes:
         return cls(gps_ns_from_utc(now) + _MARGIN_NS, known)
 
     def refused(self, rows: Rows) -> list[tuple[npt.NDArray[np.int64], str]]:
-        """Rows of a chunk (by index) that lie in the future, with the reason."""
+        """Return the rows of a chunk (by index) that lie in the future, with the reason."""
         batch = rows.batch
         if self.system is TimeSystem.FREE or not batch.num_rows or "epoch_gps_ns" not in batch.schema.names:
             return []

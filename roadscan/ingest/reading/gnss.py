@@ -1,4 +1,4 @@
-"""GNSS solutions as logs write them, turned into the columns of the `gnss` table.
+"""Converts GNSS solutions of logs to the columns of the `gnss` table.
 
 As with poses, everything is *component first*: positions are (3, n). Errors are stated in the local
 level, north-east-down; covariances of logs that count up are negated.
@@ -27,12 +27,12 @@ Int64 = npt.NDArray[np.int64]
 QUALITIES: Final = (
     "none", "fixed", "float", "sbas", "dgps", "ppp", "pps", "single", "dead_reckoning", "manual", "simulated",
 )  # fmt: skip
-"""Kinds of solutions (column `quality`); a quality is held as its number in here."""
-NO_POSITION: Final = 0
-UNKNOWN_QUALITY: Final = -1
+"""Kinds of solutions (column `quality`); a quality is stored as its index in this list."""
+NO_POSITION: Final = 0  # index of `none`
+UNKNOWN_QUALITY: Final = -1  # a kind that is not in `QUALITIES`
 
 VELOCITY_MAX_M_PER_S: Final = 1e4
-"""A velocity beyond this is damage."""
+"""A larger velocity is damage."""
 
 _ANGLES: Final = ("course_deg", "heading_deg", "roll_deg", "pitch_deg")
 
@@ -48,15 +48,15 @@ class RawSolutions:
     epochs: Int64
     """(n,) GPS nanoseconds."""
     position: Float64
-    """(3, n) in the units of the log's :class:`Placement`; not looked at where there is none."""
+    """(3, n) in the units of the log's :class:`Placement`; ignored where there is none."""
     quality: Int64
-    """(n,) numbers of :data:`QUALITIES`; `NO_POSITION` where the epoch has no position."""
+    """(n,) indices of :data:`QUALITIES`; `NO_POSITION` where the epoch has no position."""
     columns: dict[str, Float64]
     """Further columns of `gnss` by name, (n,) with NaN where missing."""
 
 
 def utc_clock(source: LogSource, says: str) -> Clock:
-    """The clock of a log whose times are UTC by its nature, in ns, as stated or none.
+    """Return the clock of a log whose times are always UTC, in ns, whether stated or not.
 
     says : why they are UTC.
 
@@ -77,14 +77,14 @@ def utc_clock(source: LogSource, says: str) -> Clock:
 
 
 class GnssReader:
-    """Turns the blocks of one log into rows of `gnss` and rejects."""
+    """Converts the blocks of one log to rows of `gnss` and rejects."""
 
     def __init__(self, source: LogSource, placement: Placement) -> None:
         self._placement = placement
         self._placer = BlockPlacer(placement, source.path)
 
     def items(self, raw: RawSolutions, sieve: Sieve) -> Iterator[Item]:
-        """Rows of the sound solutions of a block, then its rejects.
+        """Yield the rows of a block's sound solutions, then its rejects.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class GnssReader:
         yield from sieve.rejects(raw.records, raw.offsets)
 
     def _world(self, raw: RawSolutions, sieve: Sieve) -> Float64:
-        """World positions (3, n), NaN where there is none."""
+        """Return world positions (3, n), NaN where there is none."""
         world = np.full(raw.position.shape, np.nan)
         located = np.flatnonzero(sieve.good & (raw.quality != NO_POSITION))
         part = Sieve(located.size)
@@ -121,7 +121,7 @@ class GnssReader:
 
 
 def _check(columns: dict[str, Float64], sieve: Sieve) -> None:
-    """Drop records with a value that cannot be."""
+    """Drop records with an impossible value."""
     check_sigmas({name: v for name, v in columns.items() if name.startswith("sigma_")}, sieve)
     for name, values in columns.items():
         if name == "satellites":
@@ -143,7 +143,7 @@ def _limit(name: str, values: Float64, low: float, high: float, sieve: Sieve) ->
 
 
 def geocentric_placement(source: LogSource) -> WorldPlacement:
-    """Placement of geocentric positions, in the datum of the stated geocentric or geographic CRS.
+    """Return the placement of geocentric positions, in the datum of the stated geocentric or geographic CRS.
 
     Raises
     ------
@@ -171,12 +171,12 @@ def geocentric_placement(source: LogSource) -> WorldPlacement:
 
 
 def signed_square(root: Float64) -> Float64:
-    """Covariance of its signed square root, as RTKLIB writes it: sign(c) · √|c|."""
+    """Return the covariance of its signed square root, as RTKLIB writes it: sign(c) · √|c|."""
     return np.sign(root) * root * root + 0.0  # minus zero becomes zero
 
 
 def ned_from_ecef(world: str, xyz_world_m: Float64) -> Float64:
-    """(n, 3, 3) rotations from geocentric axes to north-east-down at positions (3, n). Groves (2013), eq. 2.150."""
+    """Return (n, 3, 3) north-east-down from geocentric axes at positions (3, n). Groves (2013), eq. 2.150."""
     degrees = geodetic_from_world(world, xyz_world_m.T)
     longitude, latitude = np.radians(degrees[:, 0]), np.radians(degrees[:, 1])
     so, co, sa, ca = np.sin(longitude), np.cos(longitude), np.sin(latitude), np.cos(latitude)

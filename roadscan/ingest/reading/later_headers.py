@@ -1,4 +1,4 @@
-"""A header that stands in the middle of a text file: files that were appended to one another.
+"""Detects headers in the middle of a text file, as in files that were appended to one another.
 
 What follows it is read by the first header only where it says the same; other columns, units, time systems or kinds of
 height would be taken for those of the first.
@@ -29,39 +29,39 @@ _WORD_STARTS: Final = "_%$\"'\ufeff"
 
 
 class Headers(Protocol):
-    """Knows the headers of a format."""
+    """Recognises the headers of a format."""
 
     @property
     def other(self) -> str:
-        """Why a row is left out that stands behind a header which says otherwise than the first."""
+        """Return the reason to leave out a row that follows a header which differs from the first."""
 
     def comment(self, line: str) -> bool | None:
-        """Whether rows behind this comment are read by the first header; None where it says nothing of that."""
+        """Return whether rows after this comment have the first header's layout; None if it says nothing about it."""
 
     def row(self, fields: Sequence[str]) -> bool | None:
-        """The same of a line that is no comment."""
+        """Return the same for a line that is no comment."""
 
 
 @dataclass(frozen=True)
 class NameLines:
-    """Lines of column names, as a file begins with one."""
+    """Lines of column names, like the one at a file's start."""
 
     names: tuple[str, ...]
     numbers: tuple[int, ...]
-    """Columns that hold numbers."""
+    """Columns of numbers."""
     first: tuple[str, ...] = ()
-    """Fields of the file's own first header, where `names` are stated instead."""
+    """Fields of the file's first header, where `names` are stated instead."""
     other: str = OTHER
 
     def comment(self, line: str) -> bool | None:
-        """A comment that holds the same names in another order is a header of another file."""
+        """Return False for a comment with the same names in another order: it is the header of another file."""
         words = [_plain(word) for word in line.lstrip("#%/; ").replace(",", " ").split()]
         if len(words) < 2 or sorted(words) != sorted(map(_plain, self.names)):
             return None
         return words == [_plain(name) for name in self.names]
 
     def row(self, fields: Sequence[str]) -> bool | None:
-        """A line of words where numbers belong; the last line of a file without a line end may stand before it."""
+        """Check a line of words in columns of numbers; a last line without a line end may precede the words."""
         words = [_plain(field) for field in fields]
         for own in (self.names, self.first):
             plain = [_plain(name) for name in own]
@@ -75,7 +75,7 @@ class NameLines:
 
 
 def _is_behind_a_row(words: Sequence[str], names: Sequence[str]) -> bool:
-    """True where a row without a line end stands before the names."""
+    """Return True where a row without a line end precedes the names."""
     many = len(names)
     return (
         many > 1
@@ -90,7 +90,7 @@ def _plain(word: str) -> str:
 
 
 def _is_word(word: str) -> bool:
-    """True for a name; numbers, empty fields and the words of missing values are none."""
+    """Return True for a name; numbers, empty fields and words for missing values are none."""
     return (
         len(word) > 1
         and (word[0].isalpha() or word[0] in _WORD_STARTS)

@@ -1,4 +1,4 @@
-"""Poses as logs write them, turned into the columns of the `trajectory` table.
+"""Converts poses of logs to the columns of the `trajectory` table.
 
 Positions come as longitude and latitude, as easting and northing, or already in the world frame;
 attitudes as quaternions. Everything here is *component first*: positions are (3, n), quaternions
@@ -45,17 +45,17 @@ Int64 = npt.NDArray[np.int64]
 Index = Int64 | slice
 
 North = Literal["true", "grid"]
-"""North that a heading is counted from."""
+"""North from which a heading is counted."""
 
-HEIGHT_MIN_M: Final = -1_000.0
+HEIGHT_MIN_M: Final = -1_000.0  # lowest height that is no damage
 HEIGHT_MAX_M: Final = 20_000.0
-"""Heights outside these are damage: no survey vehicle is there."""
+"""Greatest height that is no damage: survey vehicles are within these limits."""
 ANGLE_MAX_RAD: Final = 4 * math.pi
 """Attitude angles beyond two turns are damage."""
 SIGMA_MAX_M: Final = 1e6
-"""A position less certain than this is damage."""
+"""A position with a larger σ is damage."""
 SIGMA_MAX_DEG: Final = 360.0
-"""An angle less certain than a whole turn is damage."""
+"""An angle with a σ above a whole turn is damage."""
 GRID_MAX_M: Final = 2.1e7
 """Eastings and northings beyond half the Earth's girth are damage."""
 
@@ -64,7 +64,7 @@ GRID_MAX_M: Final = 2.1e7
 
 
 def quaternion_product(a: Float64, b: Float64) -> Float64:
-    """Hamilton product a ⊗ b, (4, n), of quaternions (4, n) or (4,): the rotation b, then a."""
+    """Return the Hamilton product a ⊗ b, (4, n), of quaternions (4, n) or (4,): rotation b, then a."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     w = aw * bw - ax * bx - ay * by - az * bz
@@ -77,7 +77,7 @@ def quaternion_product(a: Float64, b: Float64) -> Float64:
 
 
 def quaternion_about(axis: Literal["x", "y", "z"], angle_rad: Float64) -> Float64:
-    """(4, n) quaternions of turns by `angle_rad` (n,) about one axis."""
+    """Return (4, n) quaternions of rotations by `angle_rad` (n,) about one axis."""
     out = np.zeros((4, *np.shape(angle_rad)))
     out[0] = np.cos(angle_rad / 2)
     out["xyz".index(axis) + 1] = np.sin(angle_rad / 2)
@@ -85,7 +85,7 @@ def quaternion_about(axis: Literal["x", "y", "z"], angle_rad: Float64) -> Float6
 
 
 def ned_from_rph(roll_rad: Float64, pitch_rad: Float64, heading_rad: Float64) -> Float64:
-    """(4, n) level (north-east-down) from body of angles (n,): Rz(heading) · Ry(pitch) · Rx(roll).
+    """Return (4, n) level (north-east-down) from body of angles (n,): Rz(heading) · Ry(pitch) · Rx(roll).
 
     The quaternion of :func:`roadscan.core.frames.rotation_from_rph`; Groves (2013), eq. 2.38.
     """
@@ -97,7 +97,7 @@ def ned_from_rph(roll_rad: Float64, pitch_rad: Float64, heading_rad: Float64) ->
 
 
 def body_quaternion(axes: str | None, file: Path) -> Float64:
-    """(4,) quaternion, maker's axes from body, for the stated `axes` (such as ``"flu"``).
+    """Return the (4,) quaternion, maker's axes from body, of the stated `axes` (such as ``"flu"``).
 
     Raises
     ------
@@ -119,18 +119,18 @@ def body_quaternion(axes: str | None, file: Path) -> Float64:
 
 
 class Placement(ABC):
-    """How a log's positions and attitudes become poses in a world frame."""
+    """Conversion of a log's positions and attitudes to poses in a world frame."""
 
     world: str
     """World frame of the poses (see :mod:`roadscan.core.crs`)."""
 
     @abstractmethod
     def check(self, position: Float64, sieve: Sieve) -> None:
-        """Drop records whose position (3, n) cannot be."""
+        """Drop records with impossible positions (3, n)."""
 
     @abstractmethod
     def place(self, position: Float64, attitude: Float64) -> tuple[Float64, Float64]:
-        """World positions (3, n) in metres and world-from-body quaternions (4, n).
+        """Return world positions (3, n) in metres and world-from-body quaternions (4, n).
 
         Raises
         ------
@@ -237,7 +237,7 @@ class LevelPlacement(Placement):
 
 
 class WorldPlacement(Placement):
-    """x, y, z and attitude that are in a world frame already: local, or geocentric."""
+    """x, y, z and attitude that are already in a world frame: local, or geocentric."""
 
     def __init__(self, crs: str, file: Path) -> None:
         if crs != LOCAL_WORLD and not crs_from_text(crs).is_geocentric:
@@ -258,7 +258,7 @@ class WorldPlacement(Placement):
 
 
 def level_placement(source: LogSource, north: North | None) -> Placement:
-    """Placement of poses with roll, pitch and heading, for the CRS that the survey states.
+    """Return the placement of poses with roll, pitch and heading, for the CRS that the survey states.
 
     Raises
     ------
@@ -300,7 +300,7 @@ def level_placement(source: LogSource, north: North | None) -> Placement:
 
 
 def check_geographic(crs: str, file: Path) -> pyproj.CRS:
-    """The geographic CRS of positions; an error where it is none, or does not count longitude from Greenwich."""
+    """Return the geographic CRS of positions; an error where it is none, or its prime meridian is not Greenwich."""
     if crs == LOCAL_WORLD:
         raise ConfigError(
             'crs = "local", but the log\'s positions are latitude and longitude',
@@ -321,7 +321,7 @@ def check_geographic(crs: str, file: Path) -> pyproj.CRS:
 
 
 def _geodetic_of_grid(crs: str, file: Path) -> pyproj.CRS:
-    """Geodetic CRS of the projected one that positions are in; an error where it is none."""
+    """Return the geodetic CRS of the positions' projected CRS; an error where that is not projected."""
     projected = crs_from_text(crs)
     geographic = projected.geodetic_crs
     if projected.is_compound or not projected.is_projected or geographic is None:
@@ -334,7 +334,7 @@ def _geodetic_of_grid(crs: str, file: Path) -> pyproj.CRS:
 
 
 def height_in(source: LogSource, crs: str) -> HeightKind:
-    """Kind of heights of positions in a geographic or projected CRS, where the log's own entry states none.
+    """Return the kind of heights in a geographic or projected CRS, where the log's entry states none.
 
     Three axes say it, two do not.
 
@@ -354,7 +354,7 @@ def _check_cartesian(position: Float64, sieve: Sieve) -> None:
 
 
 def _ellipsoid(crs: pyproj.CRS) -> tuple[float, float]:
-    """Semi-major axis (m) and squared eccentricity."""
+    """Return semi-major axis (m) and squared eccentricity."""
     ellipsoid = crs.ellipsoid
     if ellipsoid is None:
         raise CrsError(f"{crs.name} has no ellipsoid", expected="a geographic CRS")
@@ -399,7 +399,7 @@ class RawPoses:
 
 
 class BlockPlacer:
-    """Places the positions of one log, block by block; one that cannot be placed costs its record."""
+    """Converts the positions of one log to the world frame block by block; a failing position costs its record."""
 
     def __init__(self, placement: Placement, file: Path) -> None:
         self._placement = placement
@@ -409,7 +409,7 @@ class BlockPlacer:
     def place(
         self, records: Int64, position: Float64, attitude: Float64, sieve: Sieve
     ) -> tuple[Float64, Float64] | None:
-        """World positions (3, m) and attitudes (4, m) of the records that are sound afterwards, None where none is.
+        """Return world positions (3, m) and attitudes (4, m) of the records that remain sound, None where none does.
 
         Raises
         ------
@@ -434,7 +434,7 @@ class BlockPlacer:
         return placed
 
     def _give_up(self, error: RoadscanError, records: Int64, sieve: Sieve) -> None:
-        """No position of the block can be placed: a fault of the log, unless earlier blocks were sound."""
+        """Raise the error if no position of the log's first block can be converted; else drop the records."""
         if not self._placed_any:
             raise error.at(self._file, int(records[np.flatnonzero(sieve.good)[0]]))
         sieve.drop(sieve.good.copy(), error.arrived)
@@ -444,7 +444,7 @@ def block_rows(
     table: str, columns: Mapping[str, pa.Array], records: Int64, offsets: Int64, record_bytes: int = 0,
     velocity: Float64 | None = None,
 ) -> Rows:  # fmt: skip
-    """Rows of the sound records of a block.
+    """Return the rows of a block's sound records.
 
     Parameters
     ----------
@@ -454,7 +454,7 @@ def block_rows(
     velocity : (3, n) north, east, down in m/s.
     """
     unbroken = int(records[-1] - records[0]) == records.size - 1
-    with np.errstate(over="ignore"):  # of damaged records: such a velocity is no witness
+    with np.errstate(over="ignore"):  # from damaged records: such a velocity is no evidence
         beside = None if velocity is None else np.ascontiguousarray(velocity.T, dtype=np.float32)
     return Rows(
         table,
@@ -468,14 +468,14 @@ def block_rows(
 
 
 def check_sigmas(sigmas: dict[str, Float64], sieve: Sieve) -> None:
-    """Drop records with a σ (by column name, (n,), NaN where missing) that is negative or beyond all reason."""
+    """Drop records with a σ (by column name, (n,), NaN where missing) that is negative or too large."""
     for name, sigma in sigmas.items():
         limit = SIGMA_MAX_DEG if name.endswith("_deg") else SIGMA_MAX_M
         sieve.drop(~(np.isnan(sigma) | ((sigma >= 0) & (sigma <= limit))), f"{name} is no σ: not within 0 to {limit:g}")
 
 
 class PoseReader:
-    """Turns the blocks of one log into rows of `trajectory` and rejects.
+    """Converts the blocks of one log to rows of `trajectory` and rejects.
 
     Parameters
     ----------
@@ -499,7 +499,7 @@ class PoseReader:
         self._epochs = EpochReader(clock, source.path)
 
     def items(self, raw: RawPoses, sieve: Sieve) -> Iterator[Item]:
-        """Rows of the sound poses of a block, then its rejects.
+        """Yield the rows of a block's sound poses, then its rejects.
 
         Raises
         ------
@@ -529,7 +529,7 @@ class PoseReader:
 
 
 def unit_quaternions(quaternion: Float64, sieve: Sieve) -> Float64:
-    """Quaternions (4, n) brought to length 1; those farther than 1e-3 from it are dropped."""
+    """Return quaternions (4, n) normalised to length 1; those that differ from it by more than 1e-3 are dropped."""
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.sqrt(np.sum(quaternion * quaternion, axis=0))
         sieve.drop(~np.isfinite(length), "quaternion is missing or not a number")

@@ -1,4 +1,4 @@
-"""What every reader of records needs: which are sound, why others are not, and when they were written.
+"""Shared parts of all record readers: which records are sound, why others are not, and their epochs.
 
 Nothing here knows a format. A :class:`Sieve` collects the faults of a block's records, an
 :class:`EpochReader` brings a log's stamps to GPS time block by block.
@@ -33,24 +33,24 @@ Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 LEAP_NS: Final = 10 * NS_PER_S
-"""A single stamp farther than this outside its two neighbours is damage, not a late record."""
+"""A stamp farther than this outside its two neighbours is damage, not a late record."""
 
-_DAY_NS: Final = 86_400 * NS_PER_S
-_MOST_REJECTS: Final = 200
+_DAY_NS: Final = 86_400 * NS_PER_S  # nanoseconds in a day
+_MOST_REJECTS: Final = 200  # rejects of a block that are listed singly
 
 
 Options = TypeVar("Options", bound=Strict)
 
 
 def options_of(source: LogSource, kind: type[Options]) -> Options:
-    """The log's settings as the format's own model; its defaults where none were given."""
+    """Return the log's settings as the format's model; its defaults where none were given."""
     if isinstance(source.options, kind):
         return source.options
     return kind.parse(source.options.model_dump(), file=source.path)
 
 
 class Sieve:
-    """Which records of a block are sound, and why the others are not."""
+    """Tracks which records of a block are sound, and why the others are not."""
 
     def __init__(self, records: int) -> None:
         self.good: Bool = np.ones(records, dtype=bool)
@@ -59,11 +59,11 @@ class Sieve:
 
     @property
     def kept(self) -> Int64 | slice:
-        """Index of the sound records: the whole block where none is damaged (no copy is made then)."""
+        """Index of the sound records: a slice of the whole block where none is damaged, which avoids a copy."""
         return slice(None) if not self._faults else np.flatnonzero(self.good)
 
     def drop(self, bad: Bool, reason: str) -> None:
-        """Drop the records of the mask `bad` (n,); the first reason given for a record stands."""
+        """Drop the records of the mask `bad` (n,); the first reason given for a record is kept."""
         fresh = bad & self.good
         if fresh.any():
             self._faults.append((np.flatnonzero(fresh), reason))
@@ -78,14 +78,14 @@ class Sieve:
         self.drop(finite & ~((values >= low) & (values <= high)), f"{name} is outside {low:g} to {high:g} {unit}")
 
     def take_over(self, part: Sieve, rows: Int64) -> None:
-        """Drop what `part`, the sieve of this block's records `rows` alone, has dropped."""
+        """Drop what `part`, a sieve of only this block's records `rows`, has dropped."""
         for faulty, reason in part._faults:
             bad = np.zeros(self.good.size, dtype=bool)
             bad[rows[faulty]] = True
             self.drop(bad, reason)
 
     def rejects(self, records: Int64, offsets: Int64) -> Iterator[Reject]:
-        """One :class:`Reject` a run of neighbouring records dropped for the same reason.
+        """Yield one :class:`Reject` for each run of adjacent records that were dropped for the same reason.
 
         Parameters
         ----------
@@ -97,7 +97,7 @@ class Sieve:
 
 
 def few_rejects(rejects: Sequence[Reject]) -> list[Reject]:
-    """Rejects of a batch; where there are very many runs of records, one a reason."""
+    """Return the rejects of a batch; where there are too many runs of records, one for each reason."""
     if len(rejects) <= _MOST_REJECTS:
         return list(rejects)
     merged: dict[str, list[Reject]] = {}
@@ -112,7 +112,7 @@ def few_rejects(rejects: Sequence[Reject]) -> list[Reject]:
 
 
 def isolate(attempt: Callable[[Int64], object], rows: Int64) -> list[tuple[int, RoadscanError]]:
-    """Find the single rows on which `attempt` fails, by halving.
+    """Return the single rows on which `attempt` fails, found by bisection.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def isolate(attempt: Callable[[Int64], object], rows: Int64) -> list[tuple[int, 
 
 
 def drop_failing(sieve: Sieve, attempt: Callable[[Int64], object]) -> RoadscanError | None:
-    """Drop the sound records on which `attempt` fails; the first error if none is left, else None."""
+    """Drop the sound records on which `attempt` fails; return the first error if none is left, else None."""
     tried = np.flatnonzero(sieve.good)
     failed = isolate(attempt, tried)
     if failed and len(failed) == tried.size:
@@ -155,7 +155,7 @@ def drop_failing(sieve: Sieve, attempt: Callable[[Int64], object]) -> RoadscanEr
 
 
 class EpochReader:
-    """Stamps of one log to GPS time, block by block.
+    """Converts the stamps of one log to GPS time, block by block.
 
     A stamp that the clock refuses costs its record. If the clock refuses all stamps of the log's
     first block, it is the clock that is wrong: the error is raised, with file and record.
@@ -178,7 +178,7 @@ class EpochReader:
         self._last_epoch: int | None = None
 
     def epochs(self, stamps: npt.NDArray[np.generic], sieve: Sieve, records: Int64) -> Int64:
-        """GPS time (ns, (n,)) of a block's stamps; 0 where the record is dropped.
+        """Return GPS time (ns, (n,)) of a block's stamps; 0 where the record is dropped.
 
         Parameters
         ----------
@@ -206,8 +206,8 @@ class EpochReader:
         return out
 
     def _unrolled(self, stamps: npt.NDArray[np.generic], sieve: Sieve, records: Int64) -> Float64:
-        """Seconds of the first stamp's week, growing over a week's end."""
-        with np.errstate(invalid="ignore", over="ignore"):  # a stamp that is not a number is dropped already
+        """Return seconds of the first stamp's week, unrolled over a week's end."""
+        with np.errstate(invalid="ignore", over="ignore"):  # a stamp that is not a number has already been dropped
             seconds = stamps.astype(np.float64) * self._stamp_s
             impossible = ~((seconds >= 0) & (seconds < 2 * WEEK_S))  # some programs count on past the week's end
         if impossible[sieve.good].all() and sieve.good.any():
@@ -226,7 +226,7 @@ class EpochReader:
         if not sieve.good.any():
             return seconds
         growing = seconds[good]
-        if np.ptp(growing) < WEEK_S / 2:  # no week ends inside the block: one shift for all of it
+        if np.ptp(growing) < WEEK_S / 2:  # no week ends inside the block: one shift applies to all of it
             growing = growing + (unroll_week(growing[:1], self._last_seconds)[0] - growing[0])
         else:
             growing = unroll_week(growing, self._last_seconds)
@@ -235,7 +235,7 @@ class EpochReader:
         return seconds
 
     def _give_up(self, error: RoadscanError, sieve: Sieve, records: Int64) -> None:
-        """All stamps of the block are refused: a fault of the log, unless earlier blocks were sound."""
+        """Raise the error if the clock refuses all stamps of the log's first block; else drop the records."""
         if self._last_epoch is None:
             raise error.at(self._file, int(records[np.flatnonzero(sieve.good)[0]]))
         sieve.drop(sieve.good.copy(), error.arrived)
@@ -259,16 +259,16 @@ class EpochReader:
 
 @dataclass(frozen=True)
 class UnorderedStamps:
-    """Stamps of points that stand in no order of time: brought to GPS time about one of them."""
+    """Converts stamps of points in no order of time to GPS time, relative to one of them."""
 
     clock: Clock
     anchor: float
-    """A stamp of the log's start, in the clock's unit."""
+    """A stamp near the log's start, in the clock's unit."""
     anchor_gps_ns: int
 
     @classmethod
     def of(cls, clock: Clock, sample: Float64, file: Path) -> Self:
-        """Take the middle one of `sample` (n,), finite stamps of the log's start, as the anchor.
+        """Return a converter with the middle one of `sample` (n,), finite stamps of the log's start, as its anchor.
 
         Raises
         ------
@@ -285,11 +285,11 @@ class UnorderedStamps:
         return cls(clock, float(anchor[0]), epoch)
 
     def epochs(self, stamps: Float64, sieve: Sieve, name: str = "gps_time") -> Int64:
-        """GPS time (ns, (n,)) of `stamps` (n,); records without a possible one are dropped, and 0."""
+        """Return GPS time (ns, (n,)) of `stamps` (n,); records with an impossible one are dropped and get 0."""
         scale_ns = UNIT_NS[self.clock.unit]
         with np.errstate(invalid="ignore", over="ignore"):
             elapsed_ns = (stamps - self.anchor) * scale_ns
-            # A day's margin: leap seconds and drift are left to the clock's own exact rule. Seconds of the week have
+            # A day's margin: leap seconds and drift are left to the clock's exact rule. Seconds of the week have
             # no leap seconds, and those of week 0, which inspect assumes, may be of its first day.
             first_day_ns = 0 if self.clock.system is TimeSystem.GPS_WEEK and not self.clock.drift_ppm else _DAY_NS
             earliest = EARLIEST_GPS_NS - self.anchor_gps_ns + first_day_ns

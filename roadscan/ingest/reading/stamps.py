@@ -1,4 +1,4 @@
-"""Time stamps in a column of text: numbers in the clock's unit, or calendar times (ISO 8601).
+"""Reads time stamps in a column of text: numbers in the clock's unit, or calendar times (ISO 8601).
 
 Calendar times with a zone are UTC; without one, the survey file has to say on which scale they are
 written. Both are counted in nanoseconds from 1970 on that scale, and the clock does the rest.
@@ -33,7 +33,7 @@ TIME: Final = Quantity(
 )
 """Column of time stamps by its common names."""
 DATES: Final = ("date", "date_utc", "utc_date")
-"""Names of a column that holds the date where the column of stamps holds the time of day alone."""
+"""Names of a column with the date, where the column of stamps only has the time of day."""
 _TIME_OF_DAY: Final = re.compile(r"T?\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d*)?)?(?:Z|[+-]\d{2}:?\d{2})?")
 _OTHER_TIMES: Final = (
     (re.compile(r"^\s*\d{1,2}\.\d{1,2}\.\d{4}"), ": day, month and year stand as in German texts"),
@@ -41,16 +41,16 @@ _OTHER_TIMES: Final = (
     (re.compile(r"[AaPp]\.?[Mm]\.?\s*$"), ": hours of 12 with AM and PM are not read"),
     (re.compile(r"\d{2}:\d{2}:\d{2}:\d+"), ": the fraction of the second stands behind a colon"),
 )
-"""What is to be said of times that other programs write."""
+"""Messages about time formats that other programs write."""
 _LEAP_SECOND: Final = re.compile(r"23:59:60")
 _UNIT_STAMPS: Final = 50
-"""Stamps that a unit is proposed by."""
+"""Stamps from which a unit is proposed."""
 _OF_OUR_TIME_S: Final = (4.75e8, 2.524e9)
-"""Seconds from 1970 or 1980 that give a date between 1985 and 2060."""
+"""Range of seconds since 1970 or 1980 that give a date between 1985 and 2060."""
 _SLOWEST_STEP_NS: Final = 2 * NS_PER_S
-"""Sensors of a survey write at least every two seconds."""
+"""Longest usual interval between a sensor's records (ns)."""
 CALENDAR_SCALES: Final = (TimeSystem.UNIX_UTC, TimeSystem.UNIX_GPS, TimeSystem.UNIX_TAI)
-"""Scales that a calendar time without a zone can be written in."""
+"""Scales on which a calendar time without a zone can be written."""
 
 
 SCALE_OF_TIMES: Final = Witness(
@@ -71,32 +71,32 @@ WEEK_COLUMN: Final = Witness(
     told=("error",),
 )
 _WEEKS: Final = ("gps_week", "gpsweek", "gps_week_number", "week_number", "week")
-"""Names of a column that holds the GPS week."""
+"""Names of a column with the GPS week."""
 
 
 @dataclass(frozen=True)
 class StampColumn:
-    """The column of a text table that holds the log's stamps."""
+    """The column of a text table with the log's stamps."""
 
     column: str
     kind: Kind
     clock: Clock
-    """Clock of the numbers that :meth:`stamps` gives."""
+    """Clock of the numbers that :meth:`stamps` returns."""
     zoned: bool
-    """Calendar times carry a zone."""
+    """Calendar times have a zone."""
     date: str | None = None
-    """Column of the date, where `column` holds the time of day alone."""
+    """Column of the date, where `column` only has the time of day."""
     is_utc: bool = False
-    """Calendar times are UTC: `clock` counts what :meth:`stamps` makes of them, leap seconds included."""
+    """Calendar times are UTC: `clock` reads the numbers that :meth:`stamps` returns, including leap seconds."""
 
     @property
     def kinds(self) -> dict[str, Kind]:
-        """Kind of each column that the stamps are read from."""
+        """Return the kind of each column from which the stamps are read."""
         return {self.column: self.kind} | ({} if self.date is None else {self.date: "text"})
 
     @classmethod
     def of(cls, source: LogSource, file: Path, layout: TextLayout, found: Found) -> Self:
-        """See how the stamps of `file` are written, and hold the stated clock against that.
+        """Find how the stamps of `file` are written, and check the stated clock against that.
 
         Raises
         ------
@@ -124,7 +124,7 @@ class StampColumn:
         return cls(found.column, kind, own, zoned, date)
 
     def stamps(self, block: TextBlock, sieve: Sieve) -> npt.NDArray[np.generic]:
-        """Stamps (n,) of a block, float64 or int64, in the unit of `clock`; faulty ones are dropped from `sieve`."""
+        """Return stamps (n,) of a block, float64 or int64, in `clock`'s unit; drop faulty ones from `sieve`."""
         if self.kind != "text":
             return block.stamps(self.column)
         words = block.text(self.column)
@@ -134,7 +134,7 @@ class StampColumn:
 
 
 def _check_week(clock: Clock, layout: TextLayout, file: Path) -> None:
-    """Refuse a clock that states another week than the log's own column of weeks, which may count them modulo 1024."""
+    """Refuse a clock whose week differs from the log's column of weeks, which may count modulo 1024."""
     column = next((name for name in layout.names if name.lower() in _WEEKS), None)
     if clock.system is not TimeSystem.GPS_WEEK or column is None or clock.week == 0:  # inspect assumes week 0
         return
@@ -150,7 +150,7 @@ def _check_week(clock: Clock, layout: TextLayout, file: Path) -> None:
 
 
 def first_unit(path: Path, layout: TextLayout, found: Found) -> str:
-    """Unit that the stamps of a text table seem to be in: that of the column's name, else by :func:`likely_unit`."""
+    """Return the likely unit of a text table's stamps: that of the column's name, else of :func:`likely_unit`."""
     if found.unit in UNIT_NS:
         return found.unit
     index = layout.names.index(found.column)
@@ -159,7 +159,7 @@ def first_unit(path: Path, layout: TextLayout, found: Found) -> str:
 
 
 def likely_unit(stamps: Float64) -> str:
-    """Unit in which stamps (n,) would be of our time or, for small counts, at least one in two seconds.
+    """Return the unit in which stamps (n,) are present-day times or, for small counts, at least one in two seconds.
 
     It is good for a proposal alone.
     """
@@ -183,7 +183,7 @@ def _first_word(path: Path, layout: TextLayout, column: str) -> str:
 
 
 def _date_column(word: str, column: str, layout: TextLayout, file: Path) -> str | None:
-    """Column of the date that a time of day such as `word` belongs to; None where `word` is more than that.
+    """Return the column of the date for a time of day such as `word`; None where `word` includes a date.
 
     Raises
     ------
@@ -204,7 +204,7 @@ def _date_column(word: str, column: str, layout: TextLayout, file: Path) -> str 
 
 
 def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool, is_utc: bool = False) -> Clock:
-    """Clock of calendar times such as `word`, counted in nanoseconds from 1970 on the scale they are written in.
+    """Return the clock of calendar times such as `word`, in nanoseconds from 1970 on the scale of the times.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ def calendar_clock(clock: Clock | None, word: str, file: Path, *, zoned: bool, i
 
 
 def calendar_ns(words: Sequence[str], sieve: Sieve, *, zoned: bool) -> Int64:
-    """Nanoseconds (n,) from 1970 of ISO 8601 times; a word that is none costs its record."""
+    """Return nanoseconds (n,) from 1970 of ISO 8601 times; a word that is none costs its record."""
     whole = parse_calendar(words, zoned=zoned)
     if whole is not None:
         return whole
@@ -257,7 +257,7 @@ def calendar_ns(words: Sequence[str], sieve: Sieve, *, zoned: bool) -> Int64:
 
 
 def _leaping_ns(words: Sequence[str], sieve: Sieve, *, zoned: bool) -> Int64:
-    """Nanoseconds (n,) from 1970 on the scale of GPS of UTC times; 23:59:60 is read where UTC had a leap second."""
+    """Return nanoseconds (n,) from 1970 on the GPS scale of UTC times; 23:59:60 is valid at leap seconds."""
     leaps = np.array([_LEAP_SECOND.search(word) is not None for word in words], dtype=np.int64)
     plain = [word.replace("23:59:60", "23:59:59") for word in words] if leaps.any() else words
     utc_ns = calendar_ns(plain, sieve, zoned=zoned)
@@ -267,7 +267,7 @@ def _leaping_ns(words: Sequence[str], sieve: Sieve, *, zoned: bool) -> Int64:
 
 
 def parse_calendar(words: Sequence[str], *, zoned: bool) -> Int64 | None:
-    """Nanoseconds (n,) from 1970 of ISO 8601 times that all have a zone, or all have none; None where one is not so."""
+    """Return nanoseconds (n,) from 1970 of ISO 8601 times that all have, or all lack, a zone; None if one differs."""
     kind = pa.timestamp("ns", "UTC") if zoned else pa.timestamp("ns")
     try:
         text = pc.replace_substring(pa.array(words, pa.string()), ",", ".")  # ISO 8601 allows a decimal comma

@@ -1,4 +1,4 @@
-"""Time stamps in a column of a Parquet or Arrow table: GPS time, numbers of a clock, or Arrow's own timestamps."""
+"""Reads time stamps in a column of a Parquet or Arrow table: GPS time, numbers of a clock, or Arrow timestamps."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ EPOCH: Final = "epoch_gps_ns"
 
 @dataclass(frozen=True)
 class TableStamps:
-    """The column of a table that holds the log's stamps."""
+    """The column of a table with the log's stamps."""
 
     column: str
     clock: Clock
-    """Clock of the numbers that :meth:`stamps` gives."""
+    """Clock of the numbers that :meth:`stamps` returns."""
 
     @classmethod
     def of(cls, source: LogSource, schema: pa.Schema, time: Found | None) -> Self:
-        """See how the stamps are written, and hold the stated clock against that.
+        """Find how the stamps are written, and check the stated clock against that.
 
         Parameters
         ----------
@@ -57,12 +57,12 @@ class TableStamps:
         return cls(time.column, clock)
 
     def stamps(self, batch: pa.RecordBatch, sieve: Sieve) -> npt.NDArray[np.generic]:
-        """Stamps (n,) of a batch, float64 or int64, in the unit of `clock`; missing ones are dropped from `sieve`."""
+        """Return stamps (n,) of a batch, float64 or int64, in `clock`'s unit; missing ones are dropped from `sieve`."""
         return column_stamps(batch.column(self.column), sieve, is_epoch=self.column == EPOCH)
 
 
 def column_stamps(stamps: pa.Array, sieve: Sieve, *, is_epoch: bool) -> npt.NDArray[np.generic]:
-    """Values (n,) of a column of stamps, 0 where one is missing; GPS epochs outside 1980–2080 are dropped."""
+    """Return values (n,) of a column of stamps, 0 where missing; GPS epochs outside 1980–2080 are dropped."""
     sieve.drop(np.asarray(stamps.is_null()), "the time stamp is missing")
     if pa.types.is_timestamp(stamps.type):
         stamps = stamps.cast(pa.timestamp("ns", stamps.type.tz), safe=False).cast(pa.int64())

@@ -1,4 +1,4 @@
-"""Tables in text files: CSV and its kin, read in blocks, where a damaged line costs that line.
+"""Reads tables in text files (CSV and similar) in blocks; a damaged line costs only that line.
 
 A record is one line. Blocks are parsed by Arrow; only a block in which Arrow stumbles is parsed
 line by line, which finds the lines at fault. Files compressed with gzip, bzip2 or xz are read as
@@ -36,38 +36,38 @@ from roadscan.ingest.reading.later_headers import AGAIN, Headers, NameLines
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
 
-BLOCK_BYTES: Final = 1 << 20
+BLOCK_BYTES: Final = 1 << 20  # bytes of a block of text
 LINE_BYTES_MAX: Final = 1 << 16
-"""A line without an end for so long is no text line."""
+"""Longest line (bytes): text without a line end for longer is no table."""
 SEARCHED_BYTES: Final = 16 << 20
-"""A text in which so many bytes hold nothing of a format is not of that format."""
+"""A text whose first bytes, this many, contain nothing of a format is not of that format."""
 HEAD_BYTES: Final = 1 << 16
-"""The column names have to stand in so many bytes."""
+"""Bytes in which the column names have to occur."""
 
 Kind: TypeAlias = Literal["number", "integer", "text"]
 """Type of a column: float64, int64 or text. An empty number is NaN, an empty whole number is a fault."""
 
 _ARROW_TYPES: Final[dict[Kind, pa.DataType]] = {"number": pa.float64(), "integer": pa.int64(), "text": pa.string()}
 _LETTERS: Final = frozenset(b"abcdfghijklmopqrstuvwxyzABCDFGHIJKLMOPQRSTUVWXYZ_")
-"""Letters of names that stand in no number (1e5, nan)."""
+"""Letters of names that occur in no number (1e5, nan)."""
 _DELIMITERS: Final = (",", ";", "\t", "|")
 _UTF8: Final = "utf-8"
 _MARKED: Final = {
-    codecs.BOM_UTF32_LE: "utf-32-le",  # begins as that of UTF-16 does
+    codecs.BOM_UTF32_LE: "utf-32-le",  # a UTF-16 mark is the start of this one
     codecs.BOM_UTF32_BE: "utf-32-be",
     codecs.BOM_UTF16_LE: "utf-16-le",
     codecs.BOM_UTF16_BE: "utf-16-be",
 }
 """Encodings by the byte order mark at a text's start."""
 _UNMARKED: Final = {"utf-16-le": (1, 2), "utf-16-be": (0, 2)}
-"""Encodings of which one byte of two is zero in texts of Latin letters: which one it is."""
+"""Encodings in which every other byte is zero for Latin letters: the positions of these bytes, and of the others."""
 _ZEROS: Final = 0.9
-"""Share of these bytes that are zero, and of the others that are not."""
+"""Least share of zeros among these bytes, and of others among the rest."""
 _DECIMAL_LINES: Final = 200
-"""Lines of records whose numbers show the decimal mark."""
+"""Lines of records from which the decimal mark is found."""
 _COMMA_NUMBER: Final = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 _MAY_BE_THOUSANDS: Final = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
-"""A number whose comma may as well part the thousands: 648,500."""
+"""A number whose comma may also separate thousands: 648,500."""
 _DAMAGE: Final = (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, OSError)
 
 
@@ -113,27 +113,27 @@ class TextOptions(Strict):
 
 @dataclass(frozen=True)
 class TextCoding:
-    """How the bytes of a text file become lines of UTF-8."""
+    """How a text file's bytes are converted to lines of UTF-8."""
 
     encoding: str = _UTF8
-    """Name of Python's codec."""
+    """Name of the Python codec."""
     ends_with_return: bool = False
-    """Lines end with a carriage return alone, as on an old Macintosh."""
+    """Lines end with a carriage return alone, as on old Macintosh systems."""
 
     @classmethod
     def of(cls, head: bytes, encoding: str | None = None) -> TextCoding:
-        """Coding of the text that begins with `head`: by its byte order mark, or as stated."""
+        """Return the coding of the text that begins with `head`: by its byte order mark, or as stated."""
         marked = next((name for mark, name in _MARKED.items() if head.startswith(mark)), None)
         found = cls(encoding or marked or _UTF8)
         text = found.decoded(head)
         return replace(found, ends_with_return=b"\r" in text and b"\n" not in text)
 
     def decoded(self, head: bytes) -> bytes:
-        """First bytes of a text as UTF-8 with line feeds; a character that is cut off at the end is left out."""
+        """Return the first bytes of a text as UTF-8 with line feeds, without an incomplete last character."""
         return b"".join(self.pieces([head]))
 
     def pieces(self, pieces: Iterable[bytes]) -> Iterator[bytes]:
-        """Pieces of the file's bytes as UTF-8 with line feeds. Bytes that are no text become U+FFFD."""
+        """Yield the file's bytes as UTF-8 with line feeds. Invalid bytes become U+FFFD."""
         decode = None if self.encoding == _UTF8 else codecs.getincrementaldecoder(self.encoding)("replace").decode
         for number, piece in enumerate(pieces):
             data = piece if decode is None else decode(piece).encode("utf-8")
@@ -144,18 +144,18 @@ class TextCoding:
 
 @dataclass(frozen=True)
 class TextLayout:
-    """How a text table is laid out."""
+    """Layout of a text table."""
 
     names: tuple[str, ...]
     delimiter: str
     """One character; a blank stands for any run of blanks."""
     comment: str
     data_offset: int
-    """Byte at which the first line behind the names starts."""
+    """Byte at which the first line after the names starts."""
     decimal: str = "."
     """Decimal mark of the numbers."""
     coding: TextCoding = TextCoding()
-    """How the file's bytes become lines of UTF-8."""
+    """Conversion of the file's bytes to lines of UTF-8."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class TextBlock:
     columns: dict[str, pa.Array]
     """Columns asked for, by name."""
     records: Int64
-    """(n,) record numbers; the first line behind the names is 0, comments and blank lines do not count."""
+    """(n,) record numbers; the first line after the names is 0, comments and blank lines do not count."""
     offsets: Int64
     """(n,) byte offset of each line in the text."""
 
@@ -183,7 +183,7 @@ class TextBlock:
 
 
 def open_text(path: Path) -> IO[bytes]:
-    """Open a text file, decompressing gzip, bzip2 and xz (told by their first bytes)."""
+    """Open a text file, decompressing gzip, bzip2 and xz (identified by their first bytes)."""
     raw = path.open("rb")
     magic = raw.read(6)
     raw.close()
@@ -197,19 +197,19 @@ def open_text(path: Path) -> IO[bytes]:
 
 
 def head_of(path: Path, size: int = HEAD_BYTES) -> bytes:
-    """First bytes of a text file (decompressed, up to any damage); b"" where it cannot be read."""
+    """Return the first bytes of a text file (decompressed, up to any damage); b"" where it cannot be read."""
     head = b""
     try:
         with open_text(path) as stream:
             while len(head) < size and (part := cast(Any, stream).read1(size - len(head))):
                 head += part
     except _DAMAGE:
-        pass  # the reader will say what is wrong behind the head
+        pass  # the reader will report damage after the head
     return head
 
 
 def sniff_layout(path: Path) -> TextLayout | None:
-    """Layout as a plain file with column names, or None where it is no such file. Never raises."""
+    """Return the layout of a plain file with column names, or None where it is none. Never raises."""
     try:
         return text_layout(path, TextOptions())
     except (FormatError, ConfigError):
@@ -217,7 +217,7 @@ def sniff_layout(path: Path) -> TextLayout | None:
 
 
 def text_layout(path: Path, options: TextOptions) -> TextLayout:
-    """Find delimiter, column names and the first data line.
+    """Find the delimiter, the column names and the first data line.
 
     Raises
     ------
@@ -245,7 +245,7 @@ def text_layout(path: Path, options: TextOptions) -> TextLayout:
 
 
 def first_words(path: Path, options: TextOptions) -> tuple[str, list[str]]:
-    """Delimiter and fields of the line of names, or of the first record where no line names the columns.
+    """Return the delimiter and the fields of the line of names, or of the first record where no line has names.
 
     Raises as :func:`text_layout`.
     """
@@ -254,13 +254,13 @@ def first_words(path: Path, options: TextOptions) -> tuple[str, list[str]]:
 
 
 def first_record(path: Path, options: TextOptions) -> list[str]:
-    """Fields of the first line that is no comment, names or not. Raises as :func:`text_layout`."""
+    """Return the fields of the first line that is no comment, names or not. Raises as :func:`text_layout`."""
     return _start_of(path, options).fields
 
 
 @dataclass(frozen=True)
 class _Start:
-    """The first line of a table that counts."""
+    """The first relevant line of a table."""
 
     fields: list[str]
     names: list[str]
@@ -274,7 +274,7 @@ class _Start:
 
 
 def _start_of(path: Path, options: TextOptions) -> _Start:
-    """First line that is neither skipped, blank nor a comment; with the comment above it that names its columns."""
+    """Return the first line that is not skipped, blank or a comment, and the comment above it with column names."""
     for name, value in (("delimiter", options.delimiter), ("comment", options.comment)):
         if value and (len(value) > 1 or not value.isascii() or value in '"\r\n'):
             raise ConfigError(f"{name} = {value!r}", expected="one character, no quote or line end", file=path)
@@ -308,7 +308,7 @@ def _start_of(path: Path, options: TextOptions) -> _Start:
 
 
 def _no_text(head: bytes, path: Path) -> FormatError:
-    """The error for bytes with zeros among them: they are no text, or one of two bytes a letter."""
+    """Return the error for bytes with zeros among them: no text, or an encoding of two bytes per letter."""
     for encoding, (zero, step) in _UNMARKED.items():
         own, others = head[zero::step], head[1 - zero :: step]
         if own and own.count(0) >= _ZEROS * len(own) and others.count(0) <= (1 - _ZEROS) * len(others):
@@ -346,7 +346,7 @@ def _decoded_names(line: bytes, path: Path) -> str:
 
 
 def _named_by_comment(comment: str, fields: list[str], delimiter: str) -> list[str] | None:
-    """Names of columns in the comment above the first record: as many words, one for each of its fields; else None."""
+    """Return column names in the comment above the first record, if it has one word for each field; else None."""
     numbers = sum(not math.isnan(_number(field.strip().replace(",", "."))) for field in fields)
     names = [name.strip() for name in _fields(comment.strip(), delimiter)]
     if len(names) != len(fields) or len(names) < 2 or 2 * numbers < len(fields):
@@ -356,7 +356,7 @@ def _named_by_comment(comment: str, fields: list[str], delimiter: str) -> list[s
 
 
 def _decimal_of(path: Path, layout: TextLayout) -> str:
-    """Decimal mark of the first records' numbers.
+    """Return the decimal mark of the first records' numbers.
 
     Raises
     ------
@@ -384,13 +384,13 @@ def _decimal_of(path: Path, layout: TextLayout) -> str:
 def _delimiter_of(line: str) -> str:
     counts = {delimiter: line.count(delimiter) for delimiter in _DELIMITERS}
     if any(counts[one] for one in _DELIMITERS if one != ","):
-        counts[","] -= len(re.findall(r"(?<=\d),(?=\d)", line))  # decimal commas between another delimiter
+        counts[","] -= len(re.findall(r"(?<=\d),(?=\d)", line))  # decimal commas with another delimiter
     most = max(_DELIMITERS, key=lambda delimiter: counts[delimiter])
     return most if counts[most] else " "
 
 
 def first_fields(path: Path, layout: TextLayout, lines: int = 1) -> list[list[str]]:
-    """Fields of the first `lines` lines that have as many fields as there are names."""
+    """Return the fields of the first `lines` lines that have as many fields as there are names."""
     found: list[list[str]] = []
     head = layout.coding.decoded(head_of(path, 2 * layout.data_offset + HEAD_BYTES))
     for raw in head[layout.data_offset :].splitlines():
@@ -404,7 +404,7 @@ def first_fields(path: Path, layout: TextLayout, lines: int = 1) -> list[list[st
 
 
 def stamp_kind(path: Path, layout: TextLayout, name: str, unit: str) -> Kind:
-    """Kind of a column of time stamps, that of most of its first sound values: number, text or integer.
+    """Return the kind of a column of time stamps, from most of its first sound values: number, text or integer.
 
     Only nanoseconds are read as integers: they alone have more digits than float64 holds. Stamps in another
     `unit` may be whole at first and decimal later.
@@ -434,10 +434,10 @@ def number_stamp_kind(path: Path, layout: TextLayout, name: str, unit: str) -> K
 def text_blocks(
     path: Path, layout: TextLayout, kinds: Mapping[str, Kind], headers: Headers | None = None
 ) -> Iterator[TextBlock | Reject]:
-    """Read the columns `kinds` in blocks of whole lines; lines at fault become rejects.
+    """Read the columns `kinds` in blocks of whole lines; faulty lines become rejects.
 
-    A compressed stream that breaks off costs what lies behind the break. Memory is bounded by
-    a block of some 1 MB of text. Behind a header that differs from the first no line is read.
+    A truncated compressed stream costs what follows the break. Memory is bounded by
+    a block of some 1 MB of text. Lines after a header that differs from the first are not read.
 
     Parameters
     ----------
@@ -460,7 +460,7 @@ def text_blocks(
 
 @dataclass
 class _Lines:
-    """Reads lines of a file block by block, and heeds headers that stand among them."""
+    """Reads lines of a file block by block, and checks headers among them."""
 
     layout: TextLayout
     kinds: Mapping[str, Kind]
@@ -471,7 +471,7 @@ class _Lines:
     def items(
         self, data: bytes, starts: Int64, ends: Int64, records: Int64, offsets: Int64
     ) -> Iterator[TextBlock | Reject]:
-        """Rows and rejects of the lines of a block that count (see :func:`parse_lines`)."""
+        """Yield rows and rejects of the data lines of a block (see :func:`parse_lines`)."""
         marks = self._comments(data, starts, ends)
         whole = None if marks or self._foreign else _parsed(data, starts, ends, self.layout, self.kinds)
         if whole is not None:
@@ -498,7 +498,7 @@ class _Lines:
             self._foreign = not marks[starts.size, False]
 
     def _comments(self, data: bytes, starts: Int64, ends: Int64) -> dict[tuple[int, bool], bool]:
-        """Headers among the comments: the line before which each stands, and whether it says what the first says."""
+        """Return headers among the comments: the line each precedes, and whether it agrees with the first."""
         comment = self.layout.comment.encode()
         found: dict[tuple[int, bool], bool] = {}
         if not comment or comment not in data:
@@ -514,7 +514,7 @@ class _Lines:
         return found
 
     def _rows(self, data: bytes, starts: Int64, ends: Int64) -> dict[tuple[int, bool], bool]:
-        """Headers among the lines that count."""
+        """Return headers among the data lines."""
         found: dict[tuple[int, bool], bool] = {}
         for k, (a, b) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
             line = data[a:b]
@@ -530,7 +530,7 @@ class _Lines:
 
 
 def _name_lines(path: Path, layout: TextLayout, kinds: Mapping[str, Kind]) -> NameLines:
-    """Lines of column names of a file; the last line above its records is its own, where names are stated."""
+    """Return the lines of column names of a file: the last line above its records, where names are stated."""
     numbers = tuple(k for k, name in enumerate(layout.names) if kinds.get(name, "text") != "text")
     head = layout.coding.decoded(head_of(path, 2 * layout.data_offset)) if layout.data_offset else b""
     above = head[: layout.data_offset]
@@ -548,12 +548,12 @@ def parse_lines(
     records: Int64,
     offsets: Int64,
 ) -> Iterator[TextBlock | Reject]:
-    """Read the columns `kinds` of lines in memory; a line at fault becomes a reject.
+    """Read the columns `kinds` of lines in memory; a faulty line becomes a reject.
 
     Parameters
     ----------
-    starts, ends : (n,) bytes of `data` where each line starts, and ends behind its line feed.
-    layout : `data_offset` and `comment` are not looked at.
+    starts, ends : (n,) bytes of `data` where each line starts, and ends after its line feed.
+    layout : `data_offset` and `comment` are ignored.
     records, offsets : (n,) record number and byte offset of each line, as blocks and rejects state them.
     """
     table = _parsed(data, starts, ends, layout, kinds)
@@ -566,7 +566,7 @@ def parse_lines(
 def _parsed(
     data: bytes, starts: Int64, ends: Int64, layout: TextLayout, kinds: Mapping[str, Kind]
 ) -> dict[str, pa.Array] | None:
-    """Columns of lines without faults; None where a line is at fault."""
+    """Return the columns of lines without faults; None where a line is faulty."""
     whole = int((ends - starts).sum()) == len(data)
     return _parse(data if whole else _joined(data, starts, ends), layout, kinds, starts.size)
 
@@ -574,9 +574,9 @@ def _parsed(
 def line_blocks(
     path: Path, start: int = 0, limit: int | None = None, coding: TextCoding | None = None
 ) -> Iterator[tuple[int, bytes | Reject]]:
-    """Pieces of whole lines from byte `start` of the text on, each with its offset.
+    """Yield pieces of whole lines from byte `start` of the text on, each with its offset.
 
-    A reject stands for a line without end, or for all that follows the break of a compressed stream.
+    A reject replaces a line without end, or everything after the break of a compressed stream.
 
     Parameters
     ----------
@@ -610,7 +610,7 @@ def line_blocks(
 
 
 def byte_pieces(path: Path) -> Iterator[bytes | Reject]:
-    """Pieces of a file (decompressed) of up to some 1 MB; a last reject where a compressed stream breaks off."""
+    """Yield pieces of a file (decompressed) of up to some 1 MB; last a reject where a compressed stream breaks off."""
     with open_text(path) as stream:
         packed = isinstance(stream, gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile)
         parts: list[bytes] = []
@@ -647,7 +647,7 @@ def _coded_pieces(path: Path, coding: TextCoding) -> Iterator[bytes | Reject]:
 
 
 def _lines(data: bytes, comment: str) -> tuple[Int64, Int64]:
-    """Start and end (n,) of each line that is neither blank nor a comment."""
+    """Return start and end (n,) of each line that is neither blank nor a comment."""
     letters = np.frombuffer(data, dtype=np.uint8)
     ends = np.flatnonzero(letters == ord("\n")) + 1
     if ends.size == 0 or ends[-1] < letters.size:
@@ -662,7 +662,7 @@ def _lines(data: bytes, comment: str) -> tuple[Int64, Int64]:
 
 
 def _with_inner_return(letters: npt.NDArray[np.uint8], starts: Int64, ends: Int64) -> npt.NDArray[np.bool_]:
-    """Lines (n,) with a carriage return before their end: passed over, they would hide what only returns divide."""
+    """Return which lines (n,) have a carriage return before their end, which would hide lines that end with it."""
     found = np.zeros(starts.size, dtype=bool)
     returns = np.flatnonzero(letters[:-1] == ord("\r"))
     inner = returns[letters[returns + 1] != ord("\n")]
@@ -677,9 +677,9 @@ def _joined(data: bytes, starts: Int64, ends: Int64) -> bytes:
 
 
 def _parse(data: bytes, layout: TextLayout, kinds: Mapping[str, Kind], lines: int) -> dict[str, pa.Array] | None:
-    """Columns of a block without faults, parsed by Arrow; None where a line is at fault."""
+    """Return the columns of a block, parsed by Arrow; None where a line is faulty."""
     if b'"' in data:
-        return None  # a stray quote must not swallow its neighbours
+        return None  # a stray quote must not swallow the following lines
     if layout.delimiter == " ":
         data = b"\n".join(b" ".join(line.split()) for line in data.splitlines())
     try:
@@ -713,7 +713,7 @@ def _parse_singly(
     records: Int64,
     offsets: Int64,
 ) -> Iterator[TextBlock | Reject]:
-    """A block with faults, line by line."""
+    """Parse a block with faults line by line."""
     where = {name: layout.names.index(name) for name in kinds}
     kept: list[int] = []
     values: dict[str, list[Any]] = {name: [] for name in kinds}
@@ -744,18 +744,18 @@ def _fields(line: str, delimiter: str) -> list[str]:
         return line.split()
     try:
         rows = list(csv.reader([line], delimiter=delimiter))
-    except csv.Error:  # a carriage return in the middle, a field without end
+    except csv.Error:  # a carriage return in the middle, or an unclosed field
         return []
     return rows[0] if len(rows) == 1 else []
 
 
 def _with_point(word: str, decimal: str) -> str:
-    """A number with a point for its decimal comma; any other word as it is."""
+    """Return a number with a point in place of its decimal comma; any other word unchanged."""
     return word.replace(",", ".") if decimal == "," and _COMMA_NUMBER.fullmatch(word.strip()) else word
 
 
 def _value(name: str, word: str, kind: Kind, decimal: str) -> float | int | str | None:
-    """One field, or ValueError saying what is wrong with it."""
+    """Return the value of one field, or raise ValueError saying what is wrong with it."""
     if kind == "text":
         return word
     word = _with_point(word.strip(), decimal)
@@ -772,12 +772,12 @@ def _value(name: str, word: str, kind: Kind, decimal: str) -> float | int | str 
 
 
 def is_number(word: str) -> bool:
-    """True for a number as written in data files."""
+    """Return True for a number as written in data files."""
     return math.isfinite(_number(word))
 
 
 def _number(word: str) -> float:
-    """Number of a word as written in data files, NaN for anything else."""
+    """Return the number of a word as written in data files, NaN for anything else."""
     try:
         return float(word) if "_" not in word and word.isascii() else math.nan
     except ValueError:

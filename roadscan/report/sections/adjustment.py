@@ -1,4 +1,4 @@
-"""Section of the report: what the adjustment did, how well passes and control agree, and each target as it was seen."""
+"""Report section on the adjustment: its corrections, the agreement of passes and control, and each target as seen."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from roadscan.report.section import Material, Section
 from roadscan.run.session import Session
 from roadscan.store.store import Store
 
-_MOST_TARGETS: Final = 24
-_TARGET_MM: Final = 25.0
+_MOST_TARGETS: Final = 24  # pictures of targets
+_TARGET_MM: Final = 25.0  # width of a target's picture
 
 _FEWEST_RMSE: Final = 3
-"""With fewer, an RMSE has no σ of its own that is worth stating."""
+"""Least residuals for an RMSE with a useful σ."""
 _LARGER: Final = 1.5
-"""Ties differ by more than their σ where they do by so many of it; chance alone does not reach it with ten of them."""
-_FEWEST_TIES: Final = 10
+"""Ratio of differences of ties to their σ that is reported; chance alone does not reach it with ten ties."""
+_FEWEST_TIES: Final = 10  # least ties for that comparison
 _ODD_SIGMAS: Final = 3.0
-"""A residual of more σ than this is named."""
+"""Residuals of more σ than this are listed."""
 _NAMES: Final = {"check": "check points", "left_out": "each GCP left out", "datum": "all GCPs against the poses"}
 
 Rows = Sequence[dict[str, Any]]
 
 
 class Adjustment(Section):
-    """Corrections of the poses, and what they are worth."""
+    """Corrections of the poses, and their accuracy."""
 
     name = "adjustment"
     title = "Adjustment: seams and control"
     position = 300
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """Figures in words, what was found wrong, accuracy, seams before and after, control points, targets."""
+        """Yield figures in words, faults, accuracy, seams before and after, control points, targets."""
         session = material.session
         store, manifest = session.store, session.manifest
         for one in known_findings(manifest):
@@ -75,7 +75,7 @@ def _pictures(store: Store, paths: Sequence[str], caption: str, width_mm: float 
 
 
 def _of_target(store: Store, path: str) -> str:
-    """Point, run and status, which stand in the picture's own title, and the time, whose GPS second ends its name."""
+    """Return point, run and status, which are the picture's title, and the time, whose GPS second ends its name."""
     title = Image.open(io.BytesIO(store.read_bytes(path))).info.get("Title", "")
     gps_s = int(path.removesuffix(".png").rsplit("-", 1)[-1])
     return f"{title}, {iso_from_gps_ns(gps_s * NS_PER_S)[:19].replace('T', ' ')}"
@@ -107,7 +107,7 @@ def _accuracy(rows: Rows) -> Iterator[Table | Paragraph]:
 
 
 def _rmse(value_m: float, count: int) -> str:
-    """RMSE in mm with its own σ: that of n normal errors is RMSE / √(2n)."""
+    """Return the RMSE in mm with its σ: that of n normal errors is RMSE / √(2n)."""
     return _mm(value_m) + (f" ± {1e3 * value_m / (2 * count) ** 0.5:.2f}" if count >= _FEWEST_RMSE else "")
 
 
@@ -129,7 +129,7 @@ def _by_distance(rows: Rows) -> Iterator[Table]:
 
 
 def agreement(rows: Rows) -> Iterator[Table | Paragraph]:
-    """Agreement of the passes over all ties that count, with the σ that these have."""
+    """Yield the agreement of the passes over all used ties, with the σ of these."""
     kinds: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
         if row["accepted"]:
@@ -165,7 +165,7 @@ def _rms(values: Sequence[float]) -> float:
 
 
 def _seams(rows: Rows) -> Iterator[Table]:
-    """Agreement of the passes by section of 100 m."""
+    """Yield the agreement of the passes by section of 100 m."""
     if not rows:
         return
     yield Table(
@@ -208,7 +208,7 @@ def _control(rows: Rows) -> Iterator[Table | Paragraph]:
 
 
 def _sigmas(row: dict[str, Any]) -> float | None:
-    """How many of its σ the surface is too high after the adjustment."""
+    """Return how many of its σ the surface is too high after the adjustment."""
     after, sigma = row["height_after_m"], row["sigma_height_m"]
     return None if after is None or not sigma else float(-after / sigma)
 

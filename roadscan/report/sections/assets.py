@@ -1,4 +1,4 @@
-"""Section of the report: assets by kind, a map of them, and a table a kind."""
+"""Report section on assets by kind, with a map, and a table for each kind."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from roadscan.report.section import Material, Section
 from roadscan.store.asset_schema import AssetSchema, asset_schema, asset_tables
 from roadscan.tiles.tasks.wanted_products import product_context
 
-_CROSS: Final = 3.0
-_MOST_LINES: Final = 6000
+_CROSS: Final = 3.0  # half the stroke of a cross, in units of the drawing
+_MOST_LINES: Final = 6000  # lines of the map
 _SEEN: Final = "some of the most probable ones, in pictures or as returns in the colours of their classes"
 
 Float64 = npt.NDArray[np.float64]
 
 
 class Assets(Section):
-    """What stands on, beside and over the road."""
+    """Objects on, beside and over the road."""
 
     name = "assets"
     title = "Assets"
     position = 600
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """A row a kind; a map; the assets of each kind that was found, and what some of them look like."""
+        """Yield a row per kind; a map; the assets of each kind that was found, and pictures of some."""
         layers = _layers(material)
         if not layers:
             return
@@ -95,7 +95,7 @@ def _words(value: Any) -> str:
 
 
 def _drawing(held: Sequence[tuple[AssetSchema, Layer]]) -> Drawing:
-    """All assets on the map, a colour a kind."""
+    """Return all assets on the map, one colour per kind."""
     page = MapPage.around(np.concatenate([shapely.get_coordinates(layer.shapes_m) for _, layer in held]))
     lines: list[Line] = []
     legend: list[tuple[str, str]] = []
@@ -112,7 +112,7 @@ def _drawing(held: Sequence[tuple[AssetSchema, Layer]]) -> Drawing:
 
 
 def _points(place: Float64) -> Iterator[str]:
-    """A line, or the two strokes of a cross, as SVG writes them."""
+    """Yield a line, or the two strokes of a cross, as SVG writes them."""
     if len(place) == 1:
         (x, y), c = place[0].tolist(), _CROSS
         yield f"{x - c:.1f},{y:.1f} {x + c:.1f},{y:.1f}"

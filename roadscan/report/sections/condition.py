@@ -1,4 +1,4 @@
-"""Section of the report: the road's condition by section of each lane, with its strip charts."""
+"""Report section on the road's condition by section of each lane, with its strip charts."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ class _Column(NamedTuple):
     """Column of its standard deviation."""
 
 
-_SHAPE: Final = (
+_SHAPE: Final = (  # columns with their decimals
     _Column("MRI (m/km)", "mri_m_per_km", 2, "sigma_mri_m_per_km"),
     _Column("rut left (mm)", "rut_depth_mean_left_mm", 1, "sigma_rut_depth_mean_mm"),
     _Column("rut right (mm)", "rut_depth_mean_right_mm", 1, "sigma_rut_depth_mean_mm"),
     _Column("cross-slope (%)", "cross_slope_mean_percent", 2, "sigma_cross_slope_mean_percent"),
     _Column("faulting (mm)", "faulting_mean_mm", 1, "sigma_faulting_mean_mm"),
 )
-_SURFACE: Final = (
+_SURFACE: Final = (  # columns with their decimals
     _Column("cracked wheel path (%)", "cracked_wheel_path_percent", 1),
     _Column("MPD (mm)", "mpd_mean_mm", 2, "sigma_mpd_mean_mm"),
     _Column("ravelled (%)", "ravelled_percent", 1, "sigma_ravelled_percent"),
     _Column("lane width (m)", "lane_width_m", 2, "sigma_lane_width_m"),
 )
-_MOST_PICTURES: Final = 12
-_MOST_NAMES: Final = 4
+_MOST_PICTURES: Final = 12  # pictures of lanes
+_MOST_NAMES: Final = 4  # names of columns that a sentence lists
 _REASON: Final = re.compile(r"(?:^|; )((?:[a-z0-9]+_[a-z0-9_]+)(?:, [a-z0-9_]+)*): ")
-"""Where a reason begins in the remark of a section: behind the names of the quantities that it is said of."""
+"""Start of a reason in a section's remark: after the names of the quantities it is about."""
 _KINDS: Final = {
     CROSS_SECTION: "cross-sections at its typical and at its deepest rut: the road's height without its tilt, and the "
     "wire from which the depth is measured. Medians over 5 m choose them, so that no pothole is taken for a rut.",
@@ -57,7 +57,7 @@ class Condition(Section):
     position = 500
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """A row a section; strip charts, cross-sections by lane and kilometre; patches and regions."""
+        """Yield a row per section; strip charts, cross-sections by lane and kilometre; patches and regions."""
         session = material.session
         rows = _sections(session)
         if not rows:
@@ -80,12 +80,12 @@ def _sections(session: Session) -> list[dict[str, Any]]:
 
 @dataclass
 class _Notes:
-    """Remarks by their number, each once."""
+    """Distinct remarks by their number."""
 
     numbers: dict[str, int] = field(default_factory=dict)
 
     def of(self, row: dict[str, Any], columns: Sequence[_Column]) -> str:
-        """Numbers of the remarks on quantities in the columns, or on quantities of their kind."""
+        """Return the numbers of the remarks on quantities in the columns, or on quantities of their kind."""
         found = []
         for names, reason in _reasons(row["reason"] or ""):
             if any(column.name in names for column in columns):
@@ -93,12 +93,12 @@ class _Notes:
         return ", ".join(map(str, sorted(set(found)))) or "–"
 
     def paragraphs(self) -> Iterator[Paragraph]:
-        """A line each."""
+        """Yield the remarks, a line each."""
         yield from (Paragraph(f"Remark {number}: {reason}.") for reason, number in self.numbers.items())
 
 
 def _reasons(remark: str) -> Iterator[tuple[list[str], str]]:
-    """Quantities, and what is said of them."""
+    """Yield the quantities, and the remark on them."""
     starts = list(_REASON.finditer(remark))
     for start, following in zip(starts, [*starts[1:], None], strict=True):
         end = len(remark) if following is None else following.start()
@@ -106,7 +106,7 @@ def _reasons(remark: str) -> Iterator[tuple[list[str], str]]:
 
 
 def _table(rows: Sequence[dict[str, Any]], columns: Sequence[_Column], caption: str, notes: _Notes) -> Iterator[Table]:
-    """A table of those columns that a section has a value in; none without any."""
+    """Yield a table of those columns with a value in any section; none without any."""
     known = [column for column in columns if any(row[column.name] is not None for row in rows)]
     if not known:
         return
@@ -134,7 +134,7 @@ def _value(row: dict[str, Any], column: _Column) -> str:
 
 
 def _lacking(session: Session) -> Iterator[Paragraph]:
-    """Columns that no section has a value in, with the reason."""
+    """Yield the columns without a value in any section, with the reason."""
     told = known_sections(session.manifest)
     titles = {column.name: column.title for column in (*_SHAPE, *_SURFACE)}
     for reason, quantities in ({} if told is None else told[1]).items():
@@ -159,7 +159,7 @@ def _pictures(session: Session) -> Iterator[Picture]:
 
 
 def _caption(unit: str) -> str:
-    """What a picture of a lane shows, from its name: road_lane_number_kind.png."""
+    """Return the caption of a lane's picture from its name: road_lane_number_kind.png."""
     name = unit.removesuffix(".png")
     kind = next(one for one in _KINDS if name.endswith(f"_{one}"))
     road, lane, number = name.removesuffix(f"_{kind}").rsplit("_", 2)

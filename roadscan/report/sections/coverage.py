@@ -1,4 +1,4 @@
-"""Section of the report: a map of what was driven and which tiles hold readings, and the passes."""
+"""Report section with a map of the driven paths and of tiles with readings, and the passes."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from roadscan.tiles.tasks.tile_plan import TILE
 
 _ONE_PASS: Final = "#cfd6dd"
 _OVERLAPPED: Final = "#9fb4c7"
-_MOST_SQUARES: Final = 4000
-_MOST_POINTS: Final = 1500
+_MOST_SQUARES: Final = 4000  # squares of the map: tiles are merged until there are no more
+_MOST_POINTS: Final = 1500  # points of a path on the map
 
 Float64 = npt.NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class Coverage(Section):
     position = 110
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """A map of runs over tiles; a row a pass."""
+        """Yield a map of runs over tiles, and a row per pass."""
         session = material.session
         try:
             plan = plan_of(session)
@@ -84,7 +84,7 @@ def _corners(tiles: Sequence[OutputRecord], size_m: float) -> Float64:
 
 
 def _squares(tiles: Sequence[OutputRecord], size_m: float) -> tuple[list[tuple[float, float, str]], float]:
-    """West and south edge and colour of squares, and their edge (m): tiles, or squares of them where they are many."""
+    """Return west and south edge and colour of squares, and their edge (m): tiles, or groups of many tiles."""
     ids, together = [TileId.parse(record.unit) for record in tiles], 1
     while len({(tile.column // together, tile.row // together) for tile in ids}) > _MOST_SQUARES:
         together *= 2

@@ -1,4 +1,4 @@
-"""Section of the report: what the witnesses of the inputs said."""
+"""Report section on the findings of the witnesses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from roadscan.report.section import Material, Section
 
 
 class Doubts(Section):
-    """Inputs that were left out, and those that are doubtful."""
+    """Inputs that were left out, and doubtful ones."""
 
     name = "doubts"
     title = "What was left out, and what is doubtful"

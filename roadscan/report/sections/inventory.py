@@ -1,4 +1,4 @@
-"""Section of the report: the inventory of assets, its conflicts, and what changed since the last survey."""
+"""Report section on the inventory of assets, its conflicts, and changes since the last survey."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from roadscan.store.asset_schema import asset_schema
 
 _STATUS: Final = ("found", "missing", "confirmed", "rejected")
 _COLOURS: Final = {"appeared": "#2ca02c", "gone": "#d62728", "moved": "#1f77b4", "changed": "#ff7f0e"}
-_WIDTH: Final = 900.0
-_MARGIN: Final = 20.0
-_MOST_MARKS: Final = 400
+_WIDTH: Final = 900.0  # width of the map, in its units
+_MARGIN: Final = 20.0  # margin of the map
+_MOST_MARKS: Final = 400  # changes that the map shows
 
 
 class InventorySection(Section):
@@ -31,7 +31,7 @@ class InventorySection(Section):
     position = 650
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """Counts by kind and status; conflicts; changes between the last two epochs with a map."""
+        """Yield counts by kind and status; conflicts; changes between the last two epochs with a map."""
         inventory = truth_of(material.session)
         if not inventory.truth.commits:
             return
@@ -83,7 +83,7 @@ def _changes(changes: EpochChanges) -> Iterator[Block]:
 
 
 def _map(changes: EpochChanges) -> Drawing:
-    """Where they are, northing up."""
+    """Return a map of the changes, north up."""
     shown = changes.changes[:_MOST_MARKS]
     points = np.array([shapely.get_coordinates(shapely.from_wkb(c.geometry))[0] for c in shown])
     low, extent = points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1.0)

@@ -1,4 +1,4 @@
-"""Section of the report: the files that the survey has, with a small picture of each raster and each picture."""
+"""Report section on the survey's files, with a small picture of each raster and each picture."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from roadscan.tiles.product import products
 _EDGE: Final = 900
 """Longer edge of a small picture (pixels)."""
 _MOST_BYTES: Final = 512_000_000
-"""A file of an object store that is larger is not fetched for a small picture."""
-_MOST_OF_A_PRODUCT: Final = 4
+"""Largest file of an object store (bytes) that is fetched for a small picture."""
+_MOST_OF_A_PRODUCT: Final = 4  # small pictures of a product
 _SHOWN_ELSEWHERE: Final = (ADJUSTMENT_PICTURES, CONDITION_PICTURES, RAVELLING_PICTURES, REGION_PICTURES)
 _SUFFIXES: Final = (".tif", ".png", ".jpg")
 
@@ -38,14 +38,14 @@ UInt8 = npt.NDArray[np.uint8]
 
 
 class Made(Section):
-    """Products: how many files, how large, where; what they look like."""
+    """Products: number, size and place of their files, with small pictures."""
 
     name = "products"
     title = "Products"
     position = 900
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """A row a product, then small pictures of the first rasters and pictures of each survey product."""
+        """Yield a row per product, then small pictures of the first rasters and pictures of each survey product."""
         session = material.session
         files = {name: one for name, one in material.summary.files.items() if name != "report"}
         if not files:
@@ -70,13 +70,13 @@ def _size(count: int) -> str:
 
 
 def _title(product: str) -> str:
-    """What a product is, in words; its name where a package that is not installed made it."""
+    """Return the title of a product; its name where it is of a package that is not installed."""
     kind = products().get(product)
     return product if kind is None else kind.title
 
 
 def _shown(session: Session) -> Iterator[OutputRecord]:
-    """The first rasters and pictures of each product over many tiles, by path."""
+    """Yield the first rasters and pictures of each product over many tiles, by path."""
     counts: Counter[str] = Counter()
     stems: set[str] = set()
     for record in sorted(session.manifest.all(), key=lambda r: r.path):
@@ -123,7 +123,7 @@ def _png(picture: Image.Image) -> bytes:
 
 
 def _stretched(band: Any) -> UInt8:
-    """Eight bits; numbers that are no bytes are stretched from their 2nd to their 98th percentile. White: no value."""
+    """Return 8-bit values; other numbers are stretched from their 2nd to their 98th percentile. White: no value."""
     values = np.ma.filled(band.astype(np.float64), np.nan)
     there = values[np.isfinite(values)]
     if band.dtype != np.uint8 and there.size:

@@ -1,4 +1,4 @@
-"""Section of the report: computed trajectories, estimated clocks and calibrated mountings, with their pictures."""
+"""Report section on computed trajectories, estimated clocks and calibrated mountings, with their pictures."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from roadscan.report.section import Material, Section
 
 
 class Navigation(Section):
-    """What was computed of poses, clocks and mountings."""
+    """Computed poses, clocks and mountings."""
 
     name = "navigation"
     title = "Trajectories, clocks and mountings"
     position = 200
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """A line for each of them, doubts, and the recorded pictures."""
+        """Yield a line for each of them, doubts, and the stored pictures."""
         store = material.session.store
         found = navigation_status(material.session.survey, store, material.logs, material.records)
         for one in trajectory_findings(material.logs):
@@ -30,7 +30,7 @@ class Navigation(Section):
 
 
 def _pictures(found: NavigationStatus) -> dict[str, str]:
-    """Captions by path: one picture may show several estimates."""
+    """Return captions by path: one picture may show several estimates."""
     shown = {one["picture"]: f"Trajectory of run '{one['run']}'" for one in found.trajectories if one["picture"]}
     shown |= {one["picture"]: f"Clock of {one['run']}/{one['sensor']}" for one in found.clocks if one["picture"]}
     return shown | {one["picture"]: "Calibration of the mountings" for one in found.mountings if one["picture"]}

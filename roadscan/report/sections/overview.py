@@ -1,4 +1,4 @@
-"""Section of the report: what there is, in a few lines, and what failed."""
+"""Report section with a short summary of the survey, and what failed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Overview(Section):
     position = 10
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """A table of figures; each failure by name."""
+        """Yield a table of figures, and each failure by name."""
         yield Table(("figure", "value"), tuple(_figures(material.summary)))
         failures = material.summary.failures
         if not failures:

@@ -1,4 +1,4 @@
-"""Section of the report: places to look at in the page, each with a small picture of its map."""
+"""Report section on places to inspect in the page, each with a small map."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from roadscan.site.material import Material as Site
 from roadscan.site.parts.vectors import site_layers
 from roadscan.site.thumbnail import thumbnail
 
-_WHOLE_PX: Final = (900, 420)
-_PLACE_PX: Final = (440, 300)
+_WHOLE_PX: Final = (900, 420)  # size of the map of the whole survey
+_PLACE_PX: Final = (440, 300)  # size of the map of a place
 _LAYERS: Final = ("condition", "distress")
-_OF_A_LAYER: Final = 2
-_LEAST_SEEN_M: Final = 12.0
-_WIDTH_MM: Final = 82.0
+_OF_A_LAYER: Final = 2  # places of a layer
+_LEAST_SEEN_M: Final = 12.0  # least extent that a map shows
+_WIDTH_MM: Final = 82.0  # width of a map on paper
 
 
 class Places(Section):
-    """The whole survey, and the worst of each layer of condition and distress."""
+    """The whole survey, and the worst places of each layer of condition and distress."""
 
     name = "places"
     title = "Places to look at"
@@ -55,7 +55,7 @@ class Places(Section):
 
 
 def _worst(site: Site, layer: SiteLayer) -> Iterator[Picture]:
-    """The rows of a layer with the greatest values, where its style parts these into classes."""
+    """Yield the rows of a layer with the greatest values, where its style divides these into classes."""
     style = next((one for one in layer.styles if one.limits), None)
     if style is None:
         return
@@ -71,26 +71,26 @@ def _worst(site: Site, layer: SiteLayer) -> Iterator[Picture]:
 
 
 def _where(row: Any, layer: SiteLayer, bounds: Box) -> str:
-    """Key of a row, and the middle of its shape on the map."""
+    """Return the key of a row, and the middle of its shape on the map."""
     west, south, east, north = bounds
     named = f" {row[layer.key]}" if layer.key else ""
     return f"{named} at easting {(west + east) / 2:,.0f} m, northing {(south + north) / 2:,.0f} m"
 
 
 def _figure(value: float, title: str) -> str:
-    """A value with its unit, which stands in brackets at the end of the title of its style."""
+    """Return a value with its unit, which is in brackets at the end of its style's title."""
     name, bracket, unit = title.partition(" (")
     return f"{name} {value:.4g}" + (f" {unit.removesuffix(')')}" if bracket else "")
 
 
 def _value(row: Any, style: Style) -> float:
-    """The value by which a style colours a row; minus infinity where there is none."""
+    """Return the value by which a style colours a row; minus infinity where there is none."""
     value = row.get(style.by)
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else -math.inf
 
 
 def _around(bounds: Box) -> Box:
-    """What is seen of a feature: all of it, and more around a small one."""
+    """Return the visible box of a feature: all of it, and more around a small one."""
     west, south, east, north = bounds
     half = max(0.6 * max(east - west, north - south), _LEAST_SEEN_M / 2)
     e, n = (west + east) / 2, (south + north) / 2

@@ -1,4 +1,4 @@
-"""Section of the report: which logs were read, what was rejected, and what became of the readings."""
+"""Report section on the logs that were read, rejected records, and the use of the readings."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from roadscan.store.logs import LogRecord
 
 
 class Recorded(Section):
-    """Logs with their spans, rejected records by reason, readings by fate."""
+    """Logs with their spans, rejected records by reason, readings by result."""
 
     name = "recorded"
     title = "What was recorded"
     position = 100
 
     def blocks(self, material: Material) -> Iterator[Block]:
-        """A row a log; rejects by reason; fates."""
+        """Yield a row per log; rejects by reason; counts of readings."""
         if not material.logs:
             return
         yield Table(
@@ -40,7 +40,7 @@ class Recorded(Section):
 
 
 def seconds_of(epoch_gps_ns: int) -> str:
-    """``2026-05-04 09:30:00`` (UTC) for a GPS epoch."""
+    """Return ``2026-05-04 09:30:00`` (UTC) for a GPS epoch."""
     return f"{utc_from_gps_ns(epoch_gps_ns):%Y-%m-%d %H:%M:%S}"
 
 

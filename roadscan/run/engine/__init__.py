@@ -1,1 +1,1 @@
-"""What runs tasks: in this process or on Dask, alone or in bundles; keys of outputs."""
+"""Runs tasks in this process or on Dask, singly or in bundles; computes keys of outputs."""

@@ -1,4 +1,4 @@
-"""Bundles: small pieces of work that go to a worker together. Each piece ends by itself: with a record or a reason."""
+"""Bundles of small pieces of work for one worker. Each piece ends independently: with a record or a reason."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Bundle(Generic[T]):
-    """A task: pieces, and what makes one file of each."""
+    """A task of several pieces, with the function that makes one file from each."""
 
     function: Callable[[T], OutputRecord]
     pieces: tuple[T, ...]
@@ -23,7 +23,7 @@ class Bundle(Generic[T]):
 
 @dataclass(frozen=True)
 class Ended:
-    """What came of a piece."""
+    """Result of a piece."""
 
     record: OutputRecord | None
     reason: str = ""
@@ -33,9 +33,9 @@ class Ended:
 
 
 def cut_bundles(work: Sequence[float], most: float, workers: int) -> list[range]:
-    """Pieces in their order, by the work of each: bundles of at most `most` work, or less, to give each worker four.
+    """Return consecutive pieces as bundles of at most `most` work, or less, to give each worker four.
 
-    A piece with more work is a bundle of its own.
+    A piece with more work is a separate bundle.
     """
     limit = min(most, sum(work) / (4 * max(workers, 1)))
     ends: list[int] = []
@@ -57,7 +57,7 @@ def run_bundles(
     compute: Compute,
     report: Callable[[int, int], None],
 ) -> list[tuple[T, str]]:
-    """Do all pieces, some at a time, and keep their records; returns those that failed, with the reason.
+    """Process all pieces, some at a time, and store their records; return the failed ones with the reason.
 
     A bundle that fails as a whole (its worker died) is done again piece by piece, so that only the piece at fault is
     lost.
@@ -66,7 +66,7 @@ def run_bundles(
     ----------
     work : estimate of a piece's work.
     most : work of a bundle, in the same unit; a run that is killed loses no more of each worker's.
-    report : hears of pieces done, and of their number.
+    report : receives the number of pieces done, and of all.
     """
     tasks = [
         Bundle(function, tuple(pieces[n] for n in numbers))
@@ -98,7 +98,7 @@ def run_bundles(
 
 
 def do_bundle(bundle: Bundle[T]) -> list[Ended]:
-    """Do the pieces of a bundle one after another (runs on a worker)."""
+    """Process the pieces of a bundle one after another (runs on a worker)."""
     return [_ended(bundle.function, piece) for piece in bundle.pieces]
 
 

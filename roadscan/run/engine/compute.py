@@ -1,4 +1,4 @@
-"""What runs tasks, and how they end; in this process, or on a cluster (:mod:`roadscan.run.engine.on_dask`)."""
+"""Runs tasks in this process; the cluster is in :mod:`roadscan.run.engine.on_dask`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 _OBJECTS = 100_000
-"""New objects that Python's collector waits for."""
+"""New objects after which Python's garbage collector runs."""
 
 
 @dataclass(frozen=True)
 class Done(Generic[T, R]):
-    """A task that ended: with a result, or with the error that stopped it."""
+    """A finished task with its result, or with the error that stopped it."""
 
     task: T
     result: R | None
@@ -28,12 +28,12 @@ class Done(Generic[T, R]):
 
 
 def reason_of(error: Exception | None) -> str:
-    """Why a task gave nothing, for the list of failures.
+    """Return why a task failed, for the list of failures.
 
     Raises
     ------
     Stopped
-        where the program was asked to end, and a library made an error of its own of that.
+        where the program was asked to end, and a library raised another error instead.
     """
     stop_if_asked()
     if error is None:
@@ -42,12 +42,12 @@ def reason_of(error: Exception | None) -> str:
 
 
 def damaged_file(error: Exception | None) -> str:
-    """File of the store that a task found damaged, empty where it failed for another reason."""
+    """Return the file of the store that a task found damaged, empty where it failed for another reason."""
     return (error.file or "") if isinstance(error, DamagedError) else ""
 
 
 class LazyTasks(Sequence[T]):
-    """Tasks that are made when they are handed out: while workers are at the first, and not all in memory."""
+    """Tasks that are created when they are accessed, while workers run the first ones, so that memory holds few."""
 
     def __init__(self, pieces: Sequence[Any], make: Callable[[Any], T]) -> None:
         self._pieces, self._make = pieces, make
@@ -56,7 +56,7 @@ class LazyTasks(Sequence[T]):
         return len(self._pieces)
 
     def __getitem__(self, place: Any) -> Any:
-        """One task, or some."""
+        """Return one task, or some."""
         return [*map(self._make, self._pieces[place])] if isinstance(place, slice) else self._make(self._pieces[place])
 
     def __iter__(self) -> Iterator[T]:
@@ -64,21 +64,21 @@ class LazyTasks(Sequence[T]):
 
 
 class Compute(Protocol):
-    """Runs a function over tasks; results come in any order."""
+    """Applies a function to tasks; results come in any order."""
 
     @property
     def workers(self) -> int:
-        """How many tasks run at the same time."""
+        """Number of tasks that run at the same time."""
         ...
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
-        """Run all tasks; an error of one does not stop the others."""
+        """Run all tasks; an error in one does not stop the others."""
         ...
 
 
 @contextlib.contextmanager
 def rare_collections() -> Iterator[None]:
-    """Let Python look for cycles among its objects less often.
+    """Run Python's cyclic garbage collector less often.
 
     A run keeps hundreds of thousands of records and makes no cycles: looking for them takes a third of its time.
     """

@@ -1,4 +1,4 @@
-"""Where a run's tasks run: in this process, on an embedded Dask cluster, or on a scheduler's."""
+"""Chooses where a run's tasks run: in this process, on an embedded Dask cluster, or on a scheduler's cluster."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class WhenNeeded:
-    """Opens the cluster at the first task: a run with nothing to do starts none."""
+    """Opens the cluster at the first task, so that a run with nothing to do starts none."""
 
     def __init__(
         self,
@@ -33,7 +33,7 @@ class WhenNeeded:
 
     @property
     def workers(self) -> int:
-        """Workers asked for; those of a cluster that runs elsewhere are known once it is opened."""
+        """Requested workers; those of an external cluster are known once it is opened."""
         if self._scheduler is not None:
             return self._open().workers
         return self._workers or os.cpu_count() or 1
@@ -65,7 +65,7 @@ def compute_on(
     ----------
     workers : number of worker processes; 0 computes in this process; None takes one a core.
     scheduler : address such as ``tls://host:8786``.
-    dashboard : hears the address of the embedded cluster's dashboard when it opens; None: there is none.
+    dashboard : receives the address of the embedded cluster's dashboard when it opens; None: there is none.
 
     Raises
     ------
@@ -82,6 +82,6 @@ def compute_on(
     if scheduler is None and workers == 0:
         yield Inline()
         return
-    logging.getLogger("distributed").setLevel(logging.ERROR)  # a run says itself what failed and why
+    logging.getLogger("distributed").setLevel(logging.ERROR)  # a run itself reports what failed and why
     with contextlib.ExitStack() as stack:
         yield WhenNeeded(stack, workers, scheduler, dashboard)

@@ -1,4 +1,4 @@
-"""A Dask cluster of roadscan's own, for the time of a run, that lets nobody else in."""
+"""A private Dask cluster for the duration of a run, closed to everyone else."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from roadscan.core.stopping import Stopped
 from roadscan.run.engine.on_dask import QUIET_CLIENT, OnDask
 
 LOOPBACK = "127.0.0.1"
-"""Where all of it listens: other machines cannot reach it."""
+"""Address on which everything listens, so that other machines cannot reach it."""
 
 MEMORY_KEPT = {
     "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
@@ -43,7 +43,7 @@ memory, whose first touch costs a sixth of a worker's time. Only glibc reads the
 """
 
 ONE_THREAD = {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1}
-"""Environment of a worker, as Dask sets it by default: there is a process a core."""
+"""Environment of a worker, as Dask sets it by default: there is one process per core."""
 
 QUIET_CLUSTER = QUIET_CLIENT | {
     "distributed.worker.memory.target": False,
@@ -64,22 +64,22 @@ QUIET_CLUSTER = QUIET_CLIENT | {
     ],
     "distributed.scheduler.dashboard.bokeh-application.allow_websocket_origin": [LOOPBACK, "localhost"],
 }
-"""Settings of a cluster of roadscan's own: a worker's memory is bounded by the size of its blocks, so Dask's spilling
+"""Settings of a private cluster: a worker's memory is bounded by the size of its blocks, so Dask's spilling
 and pausing stay out of the way; nobody looks at its figures, of which it would take hundreds a second; what is tried
 again when a worker dies, :meth:`OnDask.map` decides; and a worker that dies twice within Dask's 15 s would not be
 started anew, but closed. The last two are of the dashboard: it hands no request on to other machines, and no page of
 another site that is open in a browser may read it."""
 
-_STARTS = 3
+_STARTS = 3  # attempts to start the workers
 _LOST_S = 30.0
-"""Without a worker for so long, a nanny has given up."""
+"""Seconds without a worker after which a nanny has given up."""
 
 
 class _ClosedScheduler(Scheduler):  # type: ignore[misc]
-    """A scheduler that serves web pages only where somebody asked for a dashboard."""
+    """A scheduler that serves web pages only if a dashboard was requested."""
 
     def start_http_server(self, routes: Any, dashboard_address: str | None, *rest: Any, **more: Any) -> None:
-        """Dask would serve pages on port 8787 in any case."""
+        """Skip the server, which Dask would start on port 8787 in any case."""
         if dashboard_address is not None:
             super().start_http_server(routes, dashboard_address, *rest, **more)
 
@@ -88,12 +88,12 @@ class _ClosedWorker(Worker):  # type: ignore[misc]
     """A worker that serves no web page."""
 
     def start_http_server(self, *_: Any, **__: Any) -> None:
-        """Dask would serve some in any case."""
+        """Skip the server, which Dask would start."""
 
 
 @contextlib.contextmanager
 def embedded(workers: int | None = None, dashboard: Callable[[str], None] | None = None) -> Iterator[OnDask]:
-    """A cluster of roadscan's own: so many processes on this machine (None: one a core).
+    """Run a private cluster with this many processes on this machine (None: one per core).
 
     All of them listen on loopback alone, and speak TLS with a key that is made here and dies with the cluster: who does
     not hold it is refused. Where the program is asked to stop, the workers are killed: else each would finish its task
@@ -102,7 +102,7 @@ def embedded(workers: int | None = None, dashboard: Callable[[str], None] | None
     Parameters
     ----------
     workers : number of processes; None: one a core.
-    dashboard : hears the address of the dashboard, which every user of this machine can look at; None: there is none.
+    dashboard : receives the address of the dashboard, which every user of this machine can open; None: there is none.
 
     Raises
     ------
@@ -127,13 +127,13 @@ def embedded(workers: int | None = None, dashboard: Callable[[str], None] | None
         try:
             yield OnDask(client, number)
         except Stopped:
-            logging.disable()  # what closes from here on is bound to miss its workers
+            logging.disable()  # workers are expected to disappear from here on
             _kill(cluster)
             raise
 
 
 def _started(workers: int, *, with_dashboard: bool) -> SpecCluster:
-    """The cluster, open; where a worker dies while it starts, all are started anew."""
+    """Return the open cluster; where a worker dies during the start, all are started again."""
     reason: Exception | None = None
     for _ in range(_STARTS):
         try:
@@ -148,12 +148,12 @@ def _started(workers: int, *, with_dashboard: bool) -> SpecCluster:
 
 
 def closed_cluster(workers: int, security: Security, *, with_dashboard: bool = False) -> SpecCluster:
-    """As Dask's ``LocalCluster``, with doors closed; it is opened with :data:`QUIET_CLUSTER`, and a private folder.
+    """Return a cluster like Dask's ``LocalCluster``, but private; it needs :data:`QUIET_CLUSTER` and a private folder.
 
     The key travels to the workers through a pipe from their parent. OpenSSL reads keys from files alone: for that
     moment, it lies in a folder that only this user can open.
     """
-    quiet = "CRITICAL"  # of a worker that dies, the run itself says what is lost
+    quiet = "CRITICAL"  # the run itself reports what a dead worker loses
     shared = {"host": LOOPBACK, "protocol": "tls://", "security": security}
     nanny = {
         "cls": Nanny,
@@ -177,7 +177,7 @@ def closed_cluster(workers: int, security: Security, *, with_dashboard: bool = F
 
 @contextlib.contextmanager
 def _scratch() -> Iterator[str]:
-    """Folder for Dask's temporary files, for this user alone.
+    """Create a folder for Dask's temporary files, accessible to this user only.
 
     Dask puts it into ``sys.path``. By itself it takes one below /tmp whose name everybody knows: who makes that folder
     first could have code of his loaded.
@@ -192,8 +192,8 @@ def _scratch() -> Iterator[str]:
 
 @contextlib.contextmanager
 def _held_back() -> Iterator[None]:
-    """Hand requests to stop on at the end: a cluster that is half opened leaves processes and semaphores behind."""
-    if threading.current_thread() is not threading.main_thread():  # it alone is told of signals
+    """Delay requests to stop until the end: a half-open cluster would leave processes and semaphores behind."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread receives signals
         yield
         return
     came: list[int] = []
@@ -212,14 +212,14 @@ def _held_back() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Threads that are started meanwhile, and all processes that these start, do not see Ctrl-C.
+    """Keep Ctrl-C from threads that are started meanwhile, and from all their child processes.
 
     A terminal sends it to all processes of a run. The run ends its workers itself.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # no such masks on this system
+    if not hasattr(signal, "pthread_sigmask"):  # systems without such masks
         yield
         return
-    resource_tracker.ensure_running()  # where it is started later, it lets SIGINT through in the thread that does so
+    resource_tracker.ensure_running()  # started later, it would let SIGINT through in the thread that starts it
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -228,7 +228,7 @@ def _without_interrupts() -> Iterator[None]:
 
 
 def _kill(cluster: SpecCluster) -> None:
-    """End all workers at once; what they had not finished is not in the store."""
+    """End all workers at once; their unfinished work is not in the store."""
     for nanny in cluster.workers.values():
         nanny.auto_restart = False
         if nanny.pid is not None:
@@ -237,7 +237,7 @@ def _kill(cluster: SpecCluster) -> None:
 
 
 def _keep_alive(cluster: SpecCluster, workers: int) -> None:
-    """Replace nannies that have had no worker for a while: one that cannot start its worker anew does not try again."""
+    """Replace nannies that have had no worker for a while: one that failed to restart its worker does not try again."""
     since_s: dict[Any, float] = {}
 
     def look() -> None:

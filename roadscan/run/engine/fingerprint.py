@@ -1,4 +1,4 @@
-"""Keys: short hashes of everything that an output depends on."""
+"""Keys: short hashes of everything on which an output depends."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from roadscan.core.crs import Geoid
 
 
 def key_of(*parts: Any) -> str:
-    """Sixteen hexadecimal digits over JSON-like values (order matters, dictionaries are sorted)."""
+    """Return sixteen hexadecimal digits for JSON-like values (order matters, dictionaries are sorted)."""
     text = json.dumps(parts, sort_keys=True, default=str, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 def keys_of(common: str, content: npt.NDArray[np.void], ends: npt.NDArray[np.int64]) -> list[str]:
-    """A key for each part of an array of records, (parts,) `ends` of the parts; `common` shapes all of them.
+    """Return a key for each part of an array of records, (parts,) `ends` of the parts; `common` enters all keys.
 
     Faster than :func:`key_of` for the tiles of a network.
     """
@@ -34,5 +34,5 @@ def keys_of(common: str, content: npt.NDArray[np.void], ends: npt.NDArray[np.int
 
 
 def grid_key(geoid: Geoid | None) -> list[str] | None:
-    """Name and content of a geoid grid: a replaced grid is another grid."""
+    """Return name and content of a geoid grid: a replaced grid counts as another one."""
     return None if geoid is None else [geoid.grid, geoid.content]

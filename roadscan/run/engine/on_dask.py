@@ -1,4 +1,4 @@
-"""Tasks on a Dask cluster: what runs them, and how a scheduler that runs elsewhere is reached."""
+"""Runs tasks on a Dask cluster, and connects to an external scheduler."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ QUIET_CLIENT = {
 runs a survey can change how large a task is."""
 
 _HELD_A_THREAD = 2
-"""Tasks of each worker thread that the scheduler holds at least, while there are any …"""
+"""Least tasks per worker thread that the scheduler holds while there are any …"""
 
 _MORE_HELD = 28
-"""… and more in all while many wait, so that messages carry several of tasks that end quickly."""
+"""… and more in total while many wait, so that one message carries several short tasks."""
 
 _TOGETHER_S = 0.02
-"""How long results wait for half of the others at most, so that one message asks for them all."""
+"""Seconds for which results wait for others (at most half of them), so that one message requests all."""
 
 
 class OnDask:
-    """Runs tasks on a Dask cluster; a bounded number is handed out at a time."""
+    """Runs tasks on a Dask cluster; a limited number is submitted at a time."""
 
     def __init__(self, client: Client, workers: int | None = None) -> None:
         """`workers` is how many there are when all are alive, where that is known."""
@@ -47,16 +47,16 @@ class OnDask:
 
     @property
     def workers(self) -> int:
-        """Threads of all workers, also of those that are started anew."""
+        """Threads of all workers, including those that are being restarted."""
         return self._alive() if self._workers is None else self._workers
 
     def _alive(self) -> int:
         return int(max(1, sum(self._client.nthreads().values())))
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
-        """Run all tasks, most of them at the same time; a task is tried once more if its worker dies.
+        """Run all tasks, most of them in parallel; a task is retried once if its worker dies.
 
-        Those that waited at the same worker die with it. So all of them are tried again when the others have ended, on
+        Tasks that waited at the same worker fail with it. So all of them are tried again when the others have ended, on
         half of the threads and no more than are alive, where none waits behind another: what dies there is at fault
         itself.
         """
@@ -71,7 +71,7 @@ class OnDask:
             yield Done(done.task, None, _death()) if isinstance(done.error, KilledWorker) else done
 
     def send(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Any]:
-        """Hand some tasks to the scheduler; returns their futures.
+        """Submit tasks to the scheduler; return their futures.
 
         Tasks travel as bytes: the scheduler hands them on without importing or holding what they name.
         """
@@ -82,7 +82,7 @@ class OnDask:
     def _ended(
         self, function: Callable[[T], R], tasks: Sequence[T], held: Callable[[int], int]
     ) -> Iterator[Done[T, R]]:
-        """Tasks as they end; `held` says how many the scheduler holds while so many are left to hand out."""
+        """Yield tasks as they end; `held` returns how many the scheduler should hold for a number of remaining ones."""
         running: dict[str, T] = {}
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
@@ -117,7 +117,7 @@ def _death() -> RoadscanError:
 
 
 def _taken(ended: queue.SimpleQueue[Any], wanted: int) -> list[Any]:
-    """The next futures to end: as many as are wanted, or those of a moment."""
+    """Return the next futures to end: as many as are wanted, or those of a short time."""
     taken = [ended.get()]
     until = time.perf_counter() + _TOGETHER_S
     with contextlib.suppress(queue.Empty):
@@ -129,7 +129,7 @@ def _taken(ended: queue.SimpleQueue[Any], wanted: int) -> list[Any]:
 
 
 def _called(sent: bytes) -> bytes:
-    """Result of a function and its task, as :class:`OnDask` sends them (runs on a worker).
+    """Return the serialised result of a function and its task, as :class:`OnDask` sends them (runs on a worker).
 
     It is made to bytes while the task runs: a result that cannot be is the task's error then, and one whose worker dies
     of it counts as a death.
@@ -142,7 +142,7 @@ def _called(sent: bytes) -> bytes:
 
 @functools.cache
 def _freeze() -> None:
-    """Tell Python's collector, once a process, that what was loaded for a first task stays.
+    """Exempt everything loaded for a first task from garbage collection, once per process.
 
     Else it looks through all of that again and again while records are made.
     """
@@ -152,7 +152,7 @@ def _freeze() -> None:
 
 @contextlib.contextmanager
 def connected(scheduler: str) -> Iterator[OnDask]:
-    """The cluster of a scheduler (an address such as ``tls://host:8786``); where it has no worker, tasks wait for one.
+    """Connect to the cluster of a scheduler (such as ``tls://host:8786``); without workers, tasks wait for one.
 
     Certificates for TLS come from Dask's configuration (``distributed.comm.tls``).
 
@@ -164,7 +164,7 @@ def connected(scheduler: str) -> Iterator[OnDask]:
     with dask.config.set(QUIET_CLIENT):
         try:
             client = Client(scheduler, timeout="30s")
-        except TypeError as error:  # so Dask says that it has no certificate
+        except TypeError as error:  # Dask's way to report that it has no certificate
             raise RoadscanError(
                 f"the scheduler {scheduler} is reached by TLS, and no certificate is stated",
                 expected="distributed.comm.tls in Dask's configuration: ca-file, client.cert and client.key",

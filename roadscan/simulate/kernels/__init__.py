@@ -1,1 +1,1 @@
-"""The simulator's loops, compiled with Numba: arrays in, arrays out."""
+"""The simulator's kernels, compiled with Numba: arrays in, arrays out."""

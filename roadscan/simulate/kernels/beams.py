@@ -13,7 +13,7 @@ from roadscan.simulate.kernels.road import STATION, RoadArrays, defect_depth, no
 Float64 = npt.NDArray[np.float64]
 
 ROOT_TOLERANCE_M = 1e-8
-"""A beam's end lies this near to the surface (m), measured along the height."""
+"""Largest distance of a beam's end from the surface (m), along the height."""
 
 # A beam is followed in road coordinates: station, offset and height are parabolas of its range r, because map and
 # road bend. beam (3, 3) holds the coefficients of 1, r, r² of each.

@@ -1,4 +1,4 @@
-"""Where a beam first meets the road: a map of cells with bounds of its height, and the search within a cell.
+"""Finds where a beam first meets the road: a map of cells with height bounds, and the search within a cell.
 
 A cell knows a plane near which its ground lies, how far the ground reaches above it, and how strongly it bends. Beams
 above the bound pass on without looking; where the bend allows it, a root of the clearance is known to be the first.
@@ -46,37 +46,37 @@ TILE_CELLS = 32
 """Cells along a tile's side."""
 TILE_M = CELL_M * TILE_CELLS
 SAMPLE_M = 0.1
-"""Distance of the places from which the bounds are made (m)."""
+"""Distance of the samples from which the bounds are made (m)."""
 WITHIN_M = 0.11
-"""A place counts for the cells within this distance of it: more than half the diagonal between places."""
+"""A sample counts for the cells within this distance (m): more than half the diagonal between samples."""
 SLACK_M = 0.003
-"""Added to the bounds, for what lies between the places and for the bend of the map along a beam."""
+"""Margin of the bounds (m) for the ground between samples and the map's bend along a beam."""
 
 GROUND, STEEP, EDGE = 1, 2, 4
 """Flags of a cell: it has ground; kerb faces or edges of patches; the surface's edge."""
 GAP_TOLERANCE_M = 1e-7
-"""A beam's end lies this near to the surface (m), measured along the height."""
+"""Largest distance of a beam's end from the surface (m), along the height."""
 LAST_STEP_M = 1e-5
-"""A step along the beam that needs no check (m)."""
+"""Largest last step along the beam without a check (m)."""
 UNSEEN_M = 1e-5
-"""A beam may cut off a crest by so much (m)."""
+"""Largest height of a crest that a beam may cut off (m)."""
 STRIDE_M = 0.25
 """Longest step of the search along a beam, seen from above (m)."""
 KERB_BEND = 6.0
-"""Second derivative of the cubic step from 0 to 1, at most."""
+"""Largest second derivative of the cubic step from 0 to 1."""
 HOLE_SLOPE = 2.5
-"""Slope of a pothole's or crack's wall over depth / radius, at most: 2.42 for potholes."""
+"""Upper limit of wall slope over depth / radius, of potholes and cracks: 2.42 for potholes."""
 
 
 class Cells(NamedTuple):
-    """The map in tiles of 32 × 32 cells of a metre, kept where there is anything."""
+    """The map in tiles of 32 × 32 cells of a metre, stored where there is road or a body."""
 
     corner: Float64
     """(2,) easting and northing of the first tile's corner."""
     tiles: Int32
     """(ty, tx) number of the tile, −1: empty."""
     top: Float64
-    """(t,) what lies in a tile lies below this (m)."""
+    """(t,) upper limit of everything in a tile (m)."""
     plane: Float32
     """(t · 1024, 5) height at the cell's middle, rise to the east and to the north (m/m), how far the ground reaches
     above that plane (m), its curvature at most (1/m)."""
@@ -85,7 +85,7 @@ class Cells(NamedTuple):
     node: Int32
     """(t · 1024,) node of the road near it."""
     first: Int32
-    """(t · 1024 + 1,) where the bodies of each cell begin in `members`."""
+    """(t · 1024 + 1,) first body of each cell in `members`."""
     members: Int32
     """(m,) bodies, cell by cell."""
 
@@ -95,7 +95,7 @@ class Cells(NamedTuple):
 
 @compiled
 def bound_cells(road: RoadArrays, cells: Cells, station: Float64, offset: Float64, plain: Float64) -> None:
-    """Raise the bounds of the cells under places of the road.
+    """Raise the bounds of the cells under samples of the road.
 
     station : (s,) evenly spaced, offset : (o,) evenly spaced; the outermost of both only serve for differences;
     plain : (s, o) scratch.
@@ -145,7 +145,7 @@ def raise_bounds(
     flags: int,
     near: int,
 ) -> None:
-    """Let one place count for its cell, and for those within :data:`WITHIN_M`."""
+    """Apply one sample to its cell, and to those within :data:`WITHIN_M`."""
     x, y = easting - cells.corner[0], northing - cells.corner[1]
     for ci in range(int((x - WITHIN_M) / CELL_M), int((x + WITHIN_M) / CELL_M) + 1):
         for cj in range(int((y - WITHIN_M) / CELL_M), int((y + WITHIN_M) / CELL_M) + 1):
@@ -157,7 +157,7 @@ def raise_bounds(
                 lay_plane(road, cells, index, middle_e, middle_n, near)
             plane = cells.plane
             level = plane[index, 0] + plane[index, 1] * (easting - middle_e) + plane[index, 2] * (northing - middle_n)
-            # Half the diagonal between places is 0.1 m at most: the ground bends up by less than this over it.
+            # Half the diagonal between samples is 0.1 m at most: the ground bends up by less than this over it.
             room = height - level + SLACK_M + 0.005 * bend
             plane[index, 3] = max(plane[index, 3], room)
             plane[index, 4] = max(plane[index, 4], bend)
@@ -168,7 +168,7 @@ def raise_bounds(
 
 @inner
 def lay_plane(road: RoadArrays, cells: Cells, index: int, easting: float, northing: float, near: int) -> None:
-    """Lay a cell's plane through the ground around its middle."""
+    """Fit a cell's plane to the ground around its centre."""
     reach = 0.35 * CELL_M
     k, _, _ = project(road, easting, northing, near)
     cells.node[index] = k
@@ -194,7 +194,7 @@ def lay_plane(road: RoadArrays, cells: Cells, index: int, easting: float, northi
 
 @inner
 def kerb_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
-    """Height of the kerb on this side (m); 0: none."""
+    """Return the height of the kerb on this side (m); 0: none."""
     column = KERB_RIGHT if offset > 0.0 else KERB_LEFT
     value: float = road.nodes[k, column] + u * road.nodes[k, column + 1]
     return value
@@ -202,7 +202,7 @@ def kerb_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
 
 @inner
 def steps_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
-    """What kerbs and patches add to the height (m)."""
+    """Return the height that kerbs and patches add (m)."""
     section, patches = road.section, road.patches
     height = 0.0
     away = abs(offset) - section[PAVED_EDGE]
@@ -218,7 +218,7 @@ def steps_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
 
 @inner
 def is_near_steps(road: RoadArrays, k: int, u: float, offset: float, reach: float) -> bool:
-    """Whether a kerb's face or the edge of a patch is within reach."""
+    """Return whether a kerb's face or the edge of a patch is within reach."""
     section, patches = road.section, road.patches
     away = abs(offset) - section[PAVED_EDGE]
     if kerb_height(road, k, u, offset) > 0.0 and -reach <= away <= section[KERB_FACE] + reach:
@@ -239,7 +239,7 @@ def is_near_steps(road: RoadArrays, k: int, u: float, offset: float, reach: floa
 def steps_between(
     road: RoadArrays, k0: int, u0: float, offset0: float, k1: int, u1: float, offset1: float, level: float
 ) -> tuple[float, float]:
-    """Curvature (1/m) and rise (m) that kerb faces and patches may add to the ground between two near places.
+    """Return curvature (1/m) and rise (m) that kerb faces and patches may add between two nearby points.
 
     level : their distance seen from above.
     """
@@ -275,7 +275,7 @@ def first_ground(
     begin: float,
     end: float,
 ) -> tuple[float, int, float, float]:
-    """Range at which a beam first meets the ground of a cell between two ranges, node, u and offset; NaN: it does not.
+    """Return range, node, u and offset where a beam first meets the ground of a cell between two ranges; NaN: never.
 
     −1: the beam comes from below the ground. The surface here is the one without potholes, cracks and joints, and it
     goes on beyond its edges.
@@ -304,7 +304,7 @@ def first_ground(
 def chased(
     road: RoadArrays, beam: Float64, guess: float, fall: float, near: int
 ) -> tuple[float, float, int, float, float]:
-    """Range, fall of the clearance there, node, u and offset where a beam meets the ground, by the secant from a guess.
+    """Return range, fall of the clearance, node, u and offset where a beam meets the ground, by the secant method.
 
     NaN where the secant does not settle. fall : loss of clearance per metre of range at first.
     """
@@ -331,7 +331,7 @@ def chased(
 def searched(
     road: RoadArrays, beam: Float64, start: float, end: float, bend: float, level: float, near: int
 ) -> tuple[float, int, float, float]:
-    """The same for any ground, step by step: no step is longer than the bend of the ground allows.
+    """Return the same for any ground, step by step: steps are limited by the bend of the ground.
 
     bend : curvature of the ground, kerb faces and patches left out (1/m); level : metres seen from above per metre of
     range.
@@ -371,7 +371,7 @@ def searched(
 def between_signs(
     road: RoadArrays, beam: Float64, low: float, low_gap: float, high: float, high_gap: float, near: int
 ) -> tuple[float, int, float, float]:
-    """Root of the clearance between two ranges of different signs: Illinois method (Dowell and Jarratt 1971)."""
+    """Return the root of the clearance between ranges of opposite signs: Illinois method (Dowell and Jarratt 1971)."""
     r, k, u, offset = high, near, 0.0, 0.0
     side = 0
     for _ in range(100):
@@ -397,7 +397,7 @@ def between_signs(
 
 @inner
 def hole_clearance(road: RoadArrays, beam: Float64, r: float, near: int) -> tuple[float, float, int, float, float]:
-    """Height of a beam's point above the floor, depth of the floor, node, u and offset."""
+    """Return height of a beam's point above the floor, depth of the floor, node, u and offset."""
     k, u, offset = project(road, along_beam(beam, 0, r), along_beam(beam, 1, r), near)
     depth, _ = defect_depth(road, k, u, offset)
     return along_beam(beam, 2, r) - worn_height(road, k, u, offset) + depth, depth, k, u, offset
@@ -405,7 +405,7 @@ def hole_clearance(road: RoadArrays, beam: Float64, r: float, near: int) -> tupl
 
 @inner
 def steepest(road: RoadArrays, k: int, offset: float) -> float:
-    """Slope of the ground near a node, at most: walls of defects, a kerb's face, edges of patches (m/m)."""
+    """Return the largest slope of the ground near a node: defects' walls, a kerb's face, edges of patches (m/m)."""
     section, nodes, defects, patches = road.section, road.nodes, road.defects, road.patches
     slope = 0.0
     for n in range(max(k - 1, 0), min(k + 2, nodes.shape[0] - 1)):

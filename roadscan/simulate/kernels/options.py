@@ -1,4 +1,4 @@
-"""How the simulator's loops are compiled."""
+"""Compiler options of the simulator's kernels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def compiled(function: _Function) -> _Function:
-    """Compile a loop. It counts no references to arrays: for these short functions that took half of the time.
+    """Compile a kernel without reference counts of arrays, which take half of the time of these short functions.
 
     So nothing can be allocated inside; scratch arrays are handed in.
     """
@@ -20,12 +20,12 @@ def compiled(function: _Function) -> _Function:
 
 
 def inner(function: _Function) -> _Function:
-    """Compile a loop that other loops alone call: an entry for Python takes as long to make as a small function."""
+    """Compile a function that only other kernels call, without an entry for Python, which takes long to compile."""
     return compiler.compiled(function, _FOLDER, counted=False, entry=False)
 
 
 def inlined(function: _Function) -> _Function:
-    """Compile a piece of a loop into its callers: handing on the road's arrays costs more than the arithmetic."""
+    """Compile a function into its callers, where passing the road's arrays costs more than the arithmetic."""
     return compiler.compiled(function, _FOLDER, counted=False, entry=False, inlined=True)
 
 

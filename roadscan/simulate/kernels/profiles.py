@@ -1,4 +1,4 @@
-"""Profiles of a triangulation head: where the parallel beams of its planes meet the road."""
+"""Profiles of a triangulation head: finds where the parallel beams of its planes meet the road."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ UInt8 = npt.NDArray[np.uint8]
 Flags = npt.NDArray[np.bool_]
 
 WALL_STEP_M = 0.0005
-"""How finely a line of sight out of a defect is walked (m)."""
+"""Step along a line of sight out of a defect (m)."""
 WALK_M = 0.5
-"""How far above the last guess a beam's walk begins (m)."""
+"""Distance above the last guess at which a beam's search begins (m)."""
 
 
 @compiled
 def survey_planes(road: RoadArrays, easting: Float64, northing: Float64, near: Int64, out: Float64) -> None:
-    """Station and offset of points on the planes of profiles.
+    """Write station and offset of points on the planes of profiles.
 
     easting, northing : (p, m); near : (p,) nodes to start from; out : (p, m, 2).
     """
@@ -56,7 +56,7 @@ def survey_planes(road: RoadArrays, easting: Float64, northing: Float64, near: I
 
 @inlined
 def road_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
-    """Beam of the reading at transverse position `y` of profile `p`, in road coordinates.
+    """Write the beam of the reading at transverse position `y` of profile `p`, in road coordinates.
 
     planes : (p, 3, 9) for station, offset and height the coefficients of 1, y, y², y³, y⁴, r, y·r, y²·r, r², where r
     counts from the plane's middle range; beam : (3, 3), out.
@@ -71,7 +71,7 @@ def road_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
 
 @inlined
 def map_beam(planes: Float64, p: int, y: float, beam: Float64) -> None:
-    """The same in the map.
+    """Write the same beam in the map.
 
     planes : (p, 3, 6) for easting, northing and height the coefficients of 1, y, y², r, y·r, r².
     """
@@ -95,16 +95,16 @@ class Planes(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """Things that may stand in the beams' way."""
+    """Bodies that may block the beams."""
 
     standing: Float64
-    """(b, 18) see :mod:`roadscan.simulate.kernels.things`; the last m rows are overwritten by what moves."""
+    """(b, 18) see :mod:`roadscan.simulate.kernels.things`; the last m rows are overwritten by moving bodies."""
     moving: Float64
-    """(p, m, 18) what moves, as it is at each profile."""
+    """(p, m, 18) moving bodies, as they are at each profile."""
 
 
 class Head(NamedTuple):
-    """A head's readings, and the errors that it makes."""
+    """A head's readings and errors."""
 
     y_sensor_m: Float64
     """(n,) transverse positions of the readings."""
@@ -112,27 +112,27 @@ class Head(NamedTuple):
     """Range of raw 0."""
     range_step_m: float
     lost_share: float
-    """Of readings without a return."""
+    """Share of readings without a return."""
     range_noise_m: float
     """1 σ."""
     intensity_noise: float
     """1 σ."""
     wrong_share: float
-    """Of wrong readings."""
+    """Share of wrong readings."""
     wrong_within_m: float
-    """How far these lie off."""
+    """Largest error of wrong readings."""
     normal: Float32
     """(65536,) standard normal numbers by 16 random bits; (0,): no errors of any kind."""
     random_from: np.uint64
-    """Where the random numbers of the first reading begin; reading i of profile p has its own."""
+    """Key of the first reading's random numbers; reading i of profile p has its own key."""
     spot: Float64
-    """(s, 2) places of the parts of a beam's spot, along and across its profile (m); (0, 2): it has no width."""
+    """(s, 2) places of the parts of a beam's spot, along and across its profile (m); (0, 2): no width."""
     camera: float
     """Tangent of the angle between the beams and the camera's line of sight, which leans forward; 0: it sees all."""
 
 
 class Measured(NamedTuple):
-    """What is measured; written by :func:`scan_profiles`."""
+    """Measured values; written by :func:`scan_profiles`."""
 
     ranges: UInt16
     """(p, n) raw."""
@@ -160,7 +160,7 @@ def scan_profiles(
         fall = 1.0
         for i in range(y_sensor_m.size):
             y = y_sensor_m[i]
-            start = 2.0 * r - before if i > 1 else r  # the road goes on as it did
+            start = 2.0 * r - before if i > 1 else r  # the road continues as before
             before = r
             road_beam(road_planes, p, y, beam)
             r, k, u, offset, fall = plain_range(road, beam, start, fall, i > 1)
@@ -223,16 +223,16 @@ def scan_profiles(
 
 @inlined
 def seen_in_spot(road: RoadArrays, planes: Planes, p: int, y: float, r: float, head: Head) -> tuple[float, float]:
-    """Mean depth that the parts of a beam's spot show, and the share of them that the camera sees.
+    """Return the mean depth that the parts of a beam's spot show, and the share of them that the camera sees.
 
-    A triangulating head tells the middle of what its camera sees of the spot. What walls hide from the camera is lost;
+    A triangulating head measures the centre of the visible part of the spot. What walls hide from the camera is lost;
     where all is, so is the reading. The parts are taken to fall upright: a beam that leans by half a degree meets a
     floor 100 mm down 1 mm beside. The road is taken as level as far as the camera's line of sight runs below it.
     """
     beam = planes.in_road
     station = beam[p, 0, 0] + y * (beam[p, 0, 1] + y * beam[p, 0, 2]) + r * beam[p, 0, 5]
     offset = beam[p, 1, 0] + y * (beam[p, 1, 1] + y * beam[p, 1, 2]) + r * beam[p, 1, 5]
-    across = beam[p, 1, 1]  # of the road, for a metre of the profile; negative against the road
+    across = beam[p, 1, 1]  # of the road, per metre of the profile; negative against the road
     ahead = 1.0 if across > 0.0 else -1.0
     total, shown = 0.0, 0.0
     for s in range(head.spot.shape[0]):
@@ -249,7 +249,7 @@ def seen_in_spot(road: RoadArrays, planes: Planes, p: int, y: float, r: float, h
 
 @inlined
 def depth_at(road: RoadArrays, station: float, offset: float) -> float:
-    """Depth of the deepest defect at a station and offset (m)."""
+    """Return the depth of the deepest defect at a station and offset (m)."""
     k = node_at(road, station)
     depth, _ = defect_depth(road, k, station - road.nodes[k, STATION], offset)
     result: float = depth
@@ -258,7 +258,7 @@ def depth_at(road: RoadArrays, station: float, offset: float) -> float:
 
 @inlined
 def is_hidden(road: RoadArrays, station: float, offset: float, depth: float, lean: float) -> bool:
-    """Whether a wall stands between a place `depth` deep and a camera whose line of sight leans by `lean` (m/m)."""
+    """Return whether a wall hides a place `depth` deep from a camera whose line of sight leans by `lean` (m/m)."""
     steps = max(int(abs(lean) * depth / WALL_STEP_M), 8)
     for i in range(1, steps):
         up = depth * i / steps
@@ -269,7 +269,7 @@ def is_hidden(road: RoadArrays, station: float, offset: float, depth: float, lea
 
 @inner
 def place_movers(bodies: Float64, movers: Float64, p: int) -> None:
-    """Overwrite the last of the bodies (b, 18) by what moves (p, m, 18), as it is at profile `p`."""
+    """Overwrite the last of the bodies (b, 18) by the moving ones (p, m, 18), as they are at profile `p`."""
     first = bodies.shape[0] - movers.shape[1]
     for m in range(movers.shape[1]):
         for column in range(movers.shape[2]):
@@ -278,7 +278,7 @@ def place_movers(bodies: Float64, movers: Float64, p: int) -> None:
 
 @compiled
 def in_the_way(bodies: Float64, beam: Float64, middle_m: float, found_m: float, key: np.uint64) -> tuple[int, float]:
-    """First body that a beam in the map meets before the range `found_m`, and the range there; −1: none.
+    """Return the first body that a beam meets before the range `found_m`, and the range there; −1: none.
 
     The beam is taken as straight: over the metres of a profiler the map bends by less than 10⁻⁷ m.
     """
@@ -293,7 +293,7 @@ def in_the_way(bodies: Float64, beam: Float64, middle_m: float, found_m: float, 
 
 @inlined
 def over_texture(road: RoadArrays, beam: Float64, r: float, station: float, offset: float, plain: float) -> float:
-    """Height of the texture where a beam meets it (m).
+    """Return the height of the texture where a beam meets it (m).
 
     The beam meets the surface without texture at range `r`; its place was found for the range `plain` above a defect.
     Beams lean a few degrees at most, so the place moves by hundredths of a millimetre: the texture's slopes tell the
@@ -311,7 +311,7 @@ def over_texture(road: RoadArrays, beam: Float64, r: float, station: float, offs
 def plain_range(
     road: RoadArrays, beam: Float64, start: float, fall: float, is_fall_known: bool
 ) -> tuple[float, int, float, float, float]:
-    """Range, node, u, offset where a beam in road coordinates meets the surface without defects, and its fall there.
+    """Return range, node, u, offset where a road beam meets the surface without defects, and its fall there.
 
     The slope of a neighbouring reading is right to better than a tenth, so a last step of 10 µm leaves less than 1 µm.
     Where the secant does not settle (the face of a kerb), the beam is walked down.
@@ -339,7 +339,7 @@ def plain_range(
 
 @inlined
 def road_clearance(road: RoadArrays, beam: Float64, r: float) -> tuple[float, int, float, float]:
-    """Height of the point of a beam in road coordinates above the surface without defects, its node, u and offset."""
+    """Return height above the surface without defects of a point of a road beam, its node, u and offset."""
     station, offset = along_beam(beam, 0, r), along_beam(beam, 1, r)
     k = node_at(road, station)
     u = station - road.nodes[k, STATION]
@@ -348,7 +348,7 @@ def road_clearance(road: RoadArrays, beam: Float64, r: float) -> tuple[float, in
 
 @inner
 def walked_range(road: RoadArrays, beam: Float64, near: float) -> tuple[float, int, float, float]:
-    """Range, node, u, offset of the first meeting of a beam in road coordinates with the surface, within 0.5 m."""
+    """Return range, node, u, offset where a road beam first meets the surface, within 0.5 m."""
     stride = 0.002
     low = near - WALK_M
     while road_clearance(road, beam, low)[0] <= 0.0 and low > near - 4.0 * WALK_M:
@@ -373,7 +373,7 @@ def walked_range(road: RoadArrays, beam: Float64, near: float) -> tuple[float, i
 def polished_range(
     road: RoadArrays, beam: Float64, start: float, fall: float, near: int
 ) -> tuple[float, int, float, float]:
-    """Range, node, u, offset where a beam in the map meets the surface without defects, near `start`."""
+    """Return range, node, u, offset where a map beam meets the surface without defects, near `start`."""
     r = start
     k, u, offset = near, 0.0, 0.0
     for _ in range(10):

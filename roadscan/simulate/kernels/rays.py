@@ -1,4 +1,4 @@
-"""Rays of lidars, line scanners and cameras: what each meets first, the road or a body beside it."""
+"""Rays of lidars, line scanners and cameras: finds what each meets first, the road or a body beside it."""
 
 from __future__ import annotations
 
@@ -34,36 +34,36 @@ Int64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 NOTHING, ROAD, LOST = -1, -2, -3
-"""What a ray met, where it is not a body: nothing within reach; the road; the underside or the edge of the road."""
+"""Results of a ray that meets no body: nothing within reach; the road; the road's underside or edge."""
 ON_GROUND, NO_OBJECT = 0, -1
-"""Objects of rays that meet the road, and nothing."""
+"""Object numbers of rays that meet the road, and nothing."""
 
 # Places in the scratch array of a ray's search.
 BEST, HIT, NODE, PAST, OFFSET, DEPTH = 0, 1, 2, 3, 4, 5
-STATE_SIZE = 6
+STATE_SIZE = 6  # numbers of a ray's search state
 
 MIXED_WITHIN_M = 0.15
-"""Sub-rays that meet things nearer to one another than this see one and the same (m)."""
+"""Sub-rays that meet things closer together than this see the same thing (m)."""
 BENT_SHARE = 0.5
 """Ranges across a beam, and from ray to ray, leave a plane by less than this share of their change where they lie on
 one smooth surface: at a low angle they change fast, and small bumps move them far."""
 PULSE_M = 1.5
-"""Echoes nearer to one another than this merge into one: half the length of a pulse of 10 ns (m)."""
+"""Echoes closer together than this merge (m): half the length of a pulse of 10 ns."""
 
 
 class World(NamedTuple):
-    """All that rays can meet and that stands still."""
+    """All standing things that rays can meet."""
 
     road: RoadArrays
     cells: Cells
     bodies: Float64
     """(n, 18), see :mod:`roadscan.simulate.kernels.things`."""
     object_id: Int32
-    """(n,) object that each body belongs to."""
+    """(n,) object of each body."""
 
 
 class Movers(NamedTuple):
-    """Bodies that move, at the beginning of each slot of time; within a slot they move evenly."""
+    """Moving bodies at the beginning of each time slot; within a slot they move evenly."""
 
     bodies: Float64
     """(slots, n, 18)"""
@@ -105,7 +105,7 @@ class Rays(NamedTuple):
     """(m, 4) the group's ray that comes next on each side: after and before along the scan, above and below across it;
     −1: not known. Each is the neighbour of its neighbour."""
     steps: Int64
-    """(2,) rays to look at on a side, along and across the scan, for edges within the width."""
+    """(2,) rays to examine on each side, along and across the scan, for edges within the width."""
     fan_rad: Float64
     """(5, 2) tangents of the sub-rays' angles from the ray, along and across the scan: the ray's middle, then towards
     the sides in the order of `beside`; (1, 2) zeros for rays without width."""
@@ -118,7 +118,7 @@ class Rays(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What rays have met."""
+    """Results of rays."""
 
     place: Float64
     """(g, m, 5) range, easting, northing, height (m), intensity; range NaN: nothing; intensity NaN: glass."""
@@ -129,7 +129,7 @@ class Found(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Room for the work on rays; what is written here counts for one ray, and `centres` for one group."""
+    """Scratch arrays; their content is valid for one ray, that of `centres` for one group."""
 
     beam: Float64
     """(3, 3) easting, northing and height by range."""
@@ -140,9 +140,9 @@ class Scratch(NamedTuple):
     axes: Float64
     """(2, 3) see :func:`lay_axes`."""
     echoes: Float64
-    """(s, 5) what the sub-rays of one ray met, see :func:`note_echo`; column 4: whether it was cast, then its group."""
+    """(s, 5) results of a ray's sub-rays, see :func:`note_echo`; column 4: whether it was cast, then its group."""
     centres: Float64
-    """(m, 5) the same of the middles of a group's rays."""
+    """(m, 5) the same for the middles of a group's rays."""
 
 
 # --- frames ------------------------------------------------------------------------------------------
@@ -150,7 +150,7 @@ class Scratch(NamedTuple):
 
 @inlined
 def bend(bases: Float64, axis: int, x: float, y: float, z: float) -> float:
-    """Easting, northing or height (axis 0, 1, 2) of a point near an anchor: quadratic in its east, north, up.
+    """Return easting, northing or height (axis 0, 1, 2) of a point near an anchor, quadratic in its east, north, up.
 
     bases : (3, 10) coefficients of 1, x, y, z, x², xy, xz, y², yz, z².
     """
@@ -162,7 +162,7 @@ def bend(bases: Float64, axis: int, x: float, y: float, z: float) -> float:
 
 @inlined
 def turned(poses: Poses, p: int, share: float, axis: int, x: float, y: float, z: float) -> float:
-    """One component of a sensor's vector in the anchor's frame.
+    """Return one component of a sensor's vector in the anchor's frame.
 
     Linear in time: over the 0.55 ms of a lidar's packet that is good to 10⁻⁸ at 10 degrees a second.
     """
@@ -177,7 +177,7 @@ def lay_beam(
     bases: Float64, poses: Poses, p: int, share: float, origin: Float64, i: int,
     dx: float, dy: float, dz: float, reach: float, beam: Float64,
 ) -> None:  # fmt: skip
-    """Lay the parabola of a ray through the map: easting, northing, height by its range.
+    """Write the parabola of a ray through the map: easting, northing, height by its range.
 
     origin : (m, 3), of which ray `i` takes its own; beam : (3, 3), out.
     """
@@ -222,7 +222,7 @@ def cast(
         :data:`ROAD`, :data:`LOST`, :data:`NOTHING`), node, u, offset and depth of the road there.
     """
     state[BEST], state[HIT] = reach, NOTHING
-    # The chord of the beam; bodies are met on it first, and where that counts on the beam itself.
+    # The chord of the beam; bodies are met on it first, and the hit is refined on the beam itself.
     dx = beam[0, 1] + reach * beam[0, 2]
     dy = beam[1, 1] + reach * beam[1, 2]
     dz = beam[2, 1] + reach * beam[2, 2]
@@ -249,7 +249,7 @@ def cast(
 
 @inner
 def place_mover(movers: Movers, time_s: float, i: int, body: Float64) -> None:
-    """Body `i` of the movers at a time. body : (1, 18), out."""
+    """Write body `i` of the movers at a time. body : (1, 18), out."""
     slot = min(max(int(time_s / movers.slot_s), 0), movers.bodies.shape[0] - 1)
     past = time_s - slot * movers.slot_s
     for column in range(BODY_COLUMNS):
@@ -266,7 +266,7 @@ def meet_movers(
     world: World, movers: Movers, time_s: float, beam: Float64, dx: float, dy: float, dz: float, key: np.uint64,
     body: Float64, state: Float64,
 ) -> None:  # fmt: skip
-    """Let the nearest moving body in the way stop a beam."""
+    """Stop a beam at the nearest moving body in its way."""
     count = movers.bodies.shape[1]
     if count == 0:
         return
@@ -289,7 +289,7 @@ def meet_movers(
 
 @inlined
 def next_border(from_m: float, per_m: float, index: int, size: float) -> float:
-    """Range at which a line leaves an interval of a row of equal ones."""
+    """Return the range at which a line leaves an interval of a row of equal ones."""
     if per_m > 0.0:
         return ((index + 1) * size - from_m) / per_m
     if per_m < 0.0:
@@ -301,7 +301,7 @@ def next_border(from_m: float, per_m: float, index: int, size: float) -> float:
 def walk_tiles(
     world: World, beam: Float64, dx: float, dy: float, dz: float, reach: float, key: np.uint64, state: Float64
 ) -> None:
-    """Walk a beam from tile to tile of the map (Amanatides and Woo 1987) up to what it meets first."""
+    """Follow a beam from tile to tile of the map (Amanatides and Woo 1987) to what it meets first."""
     cells = world.cells
     x, y = beam[0, 0] - cells.corner[0], beam[1, 0] - cells.corner[1]
     rows, columns = cells.tiles.shape
@@ -340,7 +340,7 @@ def walk_cells(
     world: World, tile: int, tile_i: int, tile_j: int, beam: Float64, dx: float, dy: float, dz: float,
     begin: float, end: float, key: np.uint64, state: Float64,
 ) -> None:  # fmt: skip
-    """The same from cell to cell of one tile."""
+    """Follow a beam from cell to cell of one tile."""
     cells = world.cells
     x = beam[0, 0] - cells.corner[0] - tile_i * TILE_M
     y = beam[1, 0] - cells.corner[1] - tile_j * TILE_M
@@ -375,7 +375,7 @@ def walk_cells(
 def meet_ground(
     world: World, index: int, middle_e: float, middle_n: float, beam: Float64, begin: float, end: float, state: Float64
 ) -> None:
-    """Let the ground of a cell stop a beam, if it does so before anything else."""
+    """Stop a beam at the ground of a cell, if it meets that before anything else."""
     road = world.road
     r, k, u, offset = first_ground(road, world.cells, index, middle_e, middle_n, beam, begin, end)
     if math.isnan(r):
@@ -433,7 +433,7 @@ def cast_rays(
 
 @inlined
 def lay_axes(rays: Rays, g: int, i: int, axes: Float64) -> None:
-    """Directions along and across the scan at right angles to a ray and to one another.
+    """Write directions along and across the scan, perpendicular to a ray and to each other.
 
     They point to the sides of the neighbours. A ray without any takes the axis that it is farthest from.
 
@@ -458,7 +458,7 @@ def lay_axes(rays: Rays, g: int, i: int, axes: Float64) -> None:
 
 @inlined
 def between(rays: Rays, g: int, i: int, side: int) -> tuple[float, float, float]:
-    """From the neighbour of a ray on the side after `side` (or itself) to that on `side` (or itself)."""
+    """Return the vector from a ray's neighbour on the side after `side` (or itself) to that on `side` (or itself)."""
     on, back = rays.beside[i, side], rays.beside[i, side + 1]
     on, back = (on if on >= 0 else i), (back if back >= 0 else i)
     first, second = rays.direction[g, back], rays.direction[g, on]
@@ -467,7 +467,7 @@ def between(rays: Rays, g: int, i: int, side: int) -> tuple[float, float, float]
 
 @inlined
 def lay_ray(bases: Float64, poses: Poses, rays: Rays, g: int, i: int, s: int, scratch: Scratch) -> float:
-    """Lay the beam of sub-ray `s`, whose axes are laid; its time since the movers' first slot (s)."""
+    """Write the beam of sub-ray `s`, given its axes; return its time since the movers' first slot (s)."""
     p = g * (poses.begin_m.shape[0] // rays.direction.shape[0]) + rays.interval[i]
     share = rays.share[i]
     x, y, z = rays.direction[g, i, 0], rays.direction[g, i, 1], rays.direction[g, i, 2]
@@ -487,7 +487,7 @@ def cast_one(
     world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, g: int, i: int, s: int, scratch: Scratch,
     echoes: Float64, row: int,
 ) -> None:  # fmt: skip
-    """Cast sub-ray `s` (0: the middle) of a ray, and note what it meets in a row of the echoes."""
+    """Cast sub-ray `s` (0: the middle) of a ray, and write its result to a row of the echoes."""
     number = np.uint64(g * rays.direction.shape[1] + i)
     time_s = lay_ray(bases, poses, rays, g, i, s, scratch)
     key = mixed(rays.key + number) + np.uint64(s)
@@ -499,7 +499,7 @@ def cast_one(
 def cast_once(
     world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, g: int, i: int, s: int, scratch: Scratch
 ) -> None:
-    """Cast a sub-ray unless that has been done."""
+    """Cast a sub-ray unless that was already done."""
     if scratch.echoes[s, 4] == 0.0:
         cast_one(world, movers, bases, poses, rays, g, i, s, scratch, scratch.echoes, s)
         scratch.echoes[s, 4] = 1.0
@@ -507,7 +507,7 @@ def cast_once(
 
 @inner
 def may_meet_edge(centres: Float64, rays: Rays, i: int) -> bool:
-    """Whether an edge may lie on any side of a ray."""
+    """Return whether an edge may lie on any side of a ray."""
     found = False
     for side in range(4):
         found = found or may_lie_edge(centres, rays.beside, i, side, rays.steps[side // 2])
@@ -518,7 +518,7 @@ def may_meet_edge(centres: Float64, rays: Rays, i: int) -> bool:
 def meets_edge(
     world: World, movers: Movers, bases: Float64, poses: Poses, rays: Rays, g: int, i: int, scratch: Scratch
 ) -> bool:
-    """Whether the sub-rays on those sides of a ray where an edge may lie meet another surface than its middle.
+    """Return whether sub-rays on sides with a possible edge meet another surface than the ray's middle.
 
     What is smaller than the distance between rays, and met by no middle, is missed.
     """
@@ -532,7 +532,7 @@ def meets_edge(
         cast_once(world, movers, bases, poses, rays, g, i, s, scratch)
         if is_other(echoes, s):
             return True
-        # Where nothing is met ranges are NaN, and nothing more is asked.
+        # Without a hit ranges are NaN, and all comparisons fail.
         if abs(echoes[s, 0] - echoes[0, 0]) > MIXED_WITHIN_M:
             across = ((s - 1) ^ 1) + 1
             cast_once(world, movers, bases, poses, rays, g, i, across, scratch)
@@ -543,7 +543,7 @@ def meets_edge(
 
 @inlined
 def may_lie_edge(centres: Float64, beside: Int64, i: int, side: int, steps: int) -> bool:
-    """Whether an edge may lie between a ray and those up to some steps to a side, by what their middles met.
+    """Return whether an edge may lie between a ray and the next ones on a side, by what their middles met.
 
     So it is where a neighbour is not known, where it sees another object, or where its range is explained neither by
     the ranges before, nor this ray's by the ranges beyond. Beside a neighbour that sees nothing, an edge costs the ray
@@ -571,7 +571,7 @@ def may_lie_edge(centres: Float64, beside: Int64, i: int, side: int, steps: int)
 
 @inlined
 def stepped(beside: Int64, i: int, side: int, steps: int) -> int:
-    """The ray that lies some steps to a side of another; −1: not known."""
+    """Return the ray that is some steps to a side of another; −1: unknown."""
     for _ in range(steps):
         if i >= 0:
             i = beside[i, side]
@@ -580,13 +580,13 @@ def stepped(beside: Int64, i: int, side: int, steps: int) -> int:
 
 @inlined
 def object_seen(echoes: Float64, row: int) -> int:
-    """Object that an echo comes from; :data:`NO_OBJECT`: there is none, as from glass."""
+    """Return the object of an echo; :data:`NO_OBJECT`: none, as from glass."""
     return int(echoes[row, 2]) if echoes[row, 3] > 0.0 else NO_OBJECT
 
 
 @inlined
 def is_other(echoes: Float64, s: int) -> bool:
-    """Whether row `s` of the echoes of one ray comes from another object than its middle.
+    """Return whether row `s` of a ray's echoes comes from another object than its middle.
 
     Nothing is no other object, and where two touch within :data:`MIXED_WITHIN_M` they are taken for one.
     """
@@ -598,7 +598,7 @@ def is_other(echoes: Float64, s: int) -> bool:
 
 @inlined
 def is_bent(echoes: Float64, s: int, across: int) -> bool:
-    """Whether two opposite sub-rays see the object in the middle of their ray, but not one smooth surface of it."""
+    """Return whether two opposite sub-rays see the object of the ray's middle, but not on one smooth surface."""
     middle = object_seen(echoes, 0)
     if object_seen(echoes, s) != middle or object_seen(echoes, across) != middle:
         return False
@@ -607,7 +607,7 @@ def is_bent(echoes: Float64, s: int, across: int) -> bool:
 
 @inlined
 def is_smooth(before: float, middle: float, after: float) -> bool:
-    """Whether three ranges, equally far from one another in angle, lie on one smooth surface.
+    """Return whether three ranges at equal angular steps lie on one smooth surface.
 
     On a plane, at however low an angle, the inverse ranges of rays from one place change evenly.
     """
@@ -621,7 +621,7 @@ def note_echo(
     world: World, movers: Movers, time_s: float, beam: Float64, weight: float, body: Float64, state: Float64,
     echoes: Float64, s: int,
 ) -> None:  # fmt: skip
-    """Row `s` of the echoes: range (NaN: none), intensity, object, energy."""
+    """Write row `s` of the echoes: range (NaN: none), intensity, object, energy."""
     hit, r = int(state[HIT]), state[BEST]
     echoes[s, 0], echoes[s, 1], echoes[s, 2], echoes[s, 3] = np.nan, np.nan, NO_OBJECT, 0.0
     if hit in (NOTHING, LOST):
@@ -646,7 +646,7 @@ def note_echo(
 def write_found(
     rays: Rays, beam: Float64, found: Found, g: int, i: int, r: float, value: float, number: float, is_mixed: bool
 ) -> None:
-    """What a receiver makes of the range, intensity and object of a ray whose middle is `beam`."""
+    """Write the receiver's range, intensity and object of a ray whose middle is `beam`."""
     is_seen = rays.limits_m[0] <= r <= rays.limits_m[1]
     found.place[g, i, 0] = r if is_seen else np.nan
     for axis in range(3):
@@ -658,11 +658,11 @@ def write_found(
 
 @inner
 def merged(echoes: Float64) -> tuple[float, float, float, bool]:
-    """Range, intensity, object and whether they are mixed, of the echoes (5, 5) of one ray; its middle comes first.
+    """Return range, intensity, object and whether they are mixed, of the echoes (5, 5) of one ray, its middle first.
 
     Echoes within a pulse's length of one another merge, and the range is their mean by energy (mixed pixels of time of
     flight scanners: Ye and Borenstein 2002; Tuley, Vandapel, Hebert 2005). Of groups farther apart the strongest
-    counts. Where a group comes from one surface, the ray's middle tells its range, however long the spot on it is.
+    counts. Where a group comes from one surface, the ray's middle gives its range, however long the spot on it is.
     """
     energy, low, high = strongest_group(echoes)
     if energy == 0.0 or is_one_surface(echoes, low, high):
@@ -679,17 +679,17 @@ def merged(echoes: Float64) -> tuple[float, float, float, bool]:
 
 @inlined
 def is_within(echoes: Float64, s: int, low: float, high: float) -> bool:
-    """Whether row `s` of the echoes belongs to the group of these ranges."""
+    """Return whether row `s` of the echoes belongs to the group of these ranges."""
     inside: bool = echoes[s, 3] > 0.0 and low <= echoes[s, 0] <= high
     return inside
 
 
 @inner
 def is_one_surface(echoes: Float64, low: float, high: float) -> bool:
-    """Whether the echoes (5, 5) within ranges come from the surface in the ray's middle and from no other.
+    """Return whether the echoes (5, 5) within ranges only come from the surface in the ray's middle.
 
     So it is where other objects are met only where they touch it, and ranges on its own change evenly across the ray;
-    where only one side of an axis belongs to the echoes, the object alone tells.
+    where only one side of an axis belongs to the echoes, only the object decides.
     """
     if not is_within(echoes, 0, low, high):
         return False
@@ -704,7 +704,7 @@ def is_one_surface(echoes: Float64, low: float, high: float) -> bool:
 
 @inner
 def strongest_group(echoes: Float64) -> tuple[float, float, float]:
-    """Energy, nearest and farthest range of the echoes that arrive together with the most energy; 0: there are none.
+    """Return energy, nearest and farthest range of the group of echoes with the most energy; 0: none.
 
     echoes : (s, 5), of which column 4 is scratch: the group.
     """
@@ -722,7 +722,7 @@ def strongest_group(echoes: Float64) -> tuple[float, float, float]:
 
 @inner
 def grown_group(echoes: Float64, s: int) -> tuple[float, float, float]:
-    """Energy, nearest and farthest range of the echoes that merge with that of row `s`, directly or by others."""
+    """Return energy, nearest and farthest range of the echoes that merge with row `s`, directly or through others."""
     energy, low, high = echoes[s, 3], echoes[s, 0], echoes[s, 0]
     echoes[s, 4] = s
     is_growing = True

@@ -20,27 +20,27 @@ Int64 = npt.NDArray[np.int64]
 
 NODE_STEP_M = 0.5
 """Distance from node to node of the reference line."""
-NODE_TOLERANCE_M = 1e-9
+NODE_TOLERANCE_M = 1e-9  # tolerance of a node's ends
 
 # Columns of the nodes.
 STATION = 12
-DEFECTS, DEFECTS_END, PATCHES, PATCHES_END, ITEMS, ITEMS_END = 13, 14, 15, 16, 17, 18
-FALL_LEFT, FALL_RIGHT, KERB_LEFT, KERB_RIGHT = 19, 21, 23, 25
-HUMPS, HUMPS_END = 27, 28
-NODE_COLUMNS = 29
+DEFECTS, DEFECTS_END, PATCHES, PATCHES_END, ITEMS, ITEMS_END = 13, 14, 15, 16, 17, 18  # row numbers
+FALL_LEFT, FALL_RIGHT, KERB_LEFT, KERB_RIGHT = 19, 21, 23, 25  # columns of falls and kerbs
+HUMPS, HUMPS_END = 27, 28  # columns of humps
+NODE_COLUMNS = 29  # numbers of a node
 
 # Places in the section.
 CROWN, LANES_EDGE, SHOULDER_SLOPE, PAVED_EDGE, VERGE_SLOPE, ROUNDING, SURFACE_EDGE, KERB_FACE = 0, 1, 2, 3, 4, 5, 6, 7
-TRACK_FIRST, TRACK_PER_M, TRACK_STATION, TRACK_STATION_PER_M, TEXTURE_PER_M, CONTRAST = 8, 9, 10, 11, 12, 13
-ASPHALT, PAINT, DEFECT, SHOULDER, VERGE, KERB = 14, 15, 16, 17, 18, 19
-RUTS = 20
-RUT_COLUMNS = 6
+TRACK_FIRST, TRACK_PER_M, TRACK_STATION, TRACK_STATION_PER_M, TEXTURE_PER_M, CONTRAST = 8, 9, 10, 11, 12, 13  # tracks
+ASPHALT, PAINT, DEFECT, SHOULDER, VERGE, KERB = 14, 15, 16, 17, 18, 19  # places of the intensities of materials
+RUTS = 20  # place of the first rut
+RUT_COLUMNS = 6  # numbers of a rut
 KERB_TOP_M = 0.15
-"""Width of a kerb's top, told by its intensity."""
+"""Width of a kerb's top, which differs in intensity."""
 
 
 class RoadArrays(NamedTuple):
-    """The road as the kernels see it."""
+    """The road's arrays for the kernels."""
 
     nodes: Float64
     """(n, 29), the last node only ends the line: easting, northing (m, from the origin), sine and cosine of the grid
@@ -77,7 +77,7 @@ class RoadArrays(NamedTuple):
 
 @compiled
 def clothoid(curvature: float, rate: float, u: float) -> tuple[float, float, float, float]:
-    """Point and direction on a short clothoid: along and right (m), sine and cosine of the turned angle.
+    """Return point and direction on a short clothoid: along and right (m), sine and cosine of the turned angle.
 
     Power series of the Fresnel integrals; for radii over 20 m and u up to 0.5 m good to 1e-12 m.
     """
@@ -94,9 +94,9 @@ def clothoid(curvature: float, rate: float, u: float) -> tuple[float, float, flo
 
 @inner
 def project(road: RoadArrays, easting: float, northing: float, near: int) -> tuple[int, float, float]:
-    """Node, station past it and offset of the foot of a map point on the reference line.
+    """Return node, station past it and offset of the foot of a map point on the reference line.
 
-    `near` is a node to start from. Beyond both ends the line goes on with its last curvature.
+    `near` is a node to start from. Beyond both ends the line continues with its last curvature.
     """
     nodes = road.nodes
     last = nodes.shape[0] - 2
@@ -119,7 +119,7 @@ def project(road: RoadArrays, easting: float, northing: float, near: int) -> tup
                 offset = (right - aside) * cosine - (ahead - along) * sine
                 move = gap / (1.0 - (curvature + rate * u) * offset)
                 u += move
-                if abs(move) < 1e-4:  # converges quadratically: what is left is below 1e-9
+                if abs(move) < 1e-4:  # converges quadratically: the remainder is below 1e-9
                     break
             if -NODE_TOLERANCE_M <= u <= NODE_STEP_M + NODE_TOLERANCE_M:
                 break
@@ -132,7 +132,7 @@ def project(road: RoadArrays, easting: float, northing: float, near: int) -> tup
 
 @inlined
 def node_at(road: RoadArrays, station: float) -> int:
-    """Node at or before a station."""
+    """Return the node at or before a station."""
     before = int((station - road.nodes[0, STATION]) / NODE_STEP_M)
     last: int = road.nodes.shape[0] - 2
     return min(max(before, 0), last)
@@ -140,7 +140,7 @@ def node_at(road: RoadArrays, station: float) -> int:
 
 @compiled
 def place(road: RoadArrays, station: Float64, offset: Float64, out: Float64) -> None:
-    """Map points of stations and offsets.
+    """Write map points of stations and offsets.
 
     station, offset : (n,); out : (n, 3) easting, northing (m, from the origin), grid heading (rad).
     """
@@ -162,7 +162,7 @@ def place(road: RoadArrays, station: Float64, offset: Float64, out: Float64) -> 
 
 @inlined
 def softened(x: float, half: float) -> float:
-    """max(x, 0), with the bend rounded by a parabola within `half` of it."""
+    """Return max(x, 0), with the bend rounded by a parabola within `half` of it."""
     if x >= half:
         return x
     if x <= -half:
@@ -172,14 +172,14 @@ def softened(x: float, half: float) -> float:
 
 @inlined
 def smooth_step(x: float) -> float:
-    """0 below 0, 1 above 1, a cubic between."""
+    """Return 0 below 0, 1 above 1, a cubic between."""
     y = min(max(x, 0.0), 1.0)
     return y * y * (3.0 - 2.0 * y)
 
 
 @inlined
 def section_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
-    """Height of the cross-section above the reference line: crossfall, shoulder, verge, kerb and ruts (m)."""
+    """Return the cross-section's height above the reference line: crossfall, shoulder, verge, kerb and ruts (m)."""
     nodes, section = road.nodes, road.section
     fall_left = nodes[k, FALL_LEFT] + u * nodes[k, FALL_LEFT + 1]
     fall_right = nodes[k, FALL_RIGHT] + u * nodes[k, FALL_RIGHT + 1]
@@ -213,7 +213,7 @@ def section_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
 
 @inlined
 def cubic_weights(x: float) -> tuple[float, float, float, float]:
-    """Weights of the four values around a place `x` (0–1) between the middle two: Catmull and Rom (1974)."""
+    """Return weights of the four values around a place `x` (0–1) between the middle two: Catmull and Rom (1974)."""
     x2 = x * x
     x3 = x2 * x
     return (
@@ -226,7 +226,7 @@ def cubic_weights(x: float) -> tuple[float, float, float, float]:
 
 @inlined
 def along_track(tracks: Float64, i: int, j: int, weights: tuple[float, float, float, float]) -> float:
-    """Height of track `i` between its samples `j` and `j` + 1 (m)."""
+    """Return the height of track `i` between its samples `j` and `j` + 1 (m)."""
     value: float = (
         weights[0] * tracks[i, j - 1]
         + weights[1] * tracks[i, j]
@@ -238,7 +238,7 @@ def along_track(tracks: Float64, i: int, j: int, weights: tuple[float, float, fl
 
 @inlined
 def unevenness(road: RoadArrays, station: float, offset: float) -> float:
-    """Random unevenness (m): bicubic between the tracks, which go on unchanged beyond the outermost."""
+    """Return random unevenness (m): bicubic between the tracks, constant beyond the outermost."""
     tracks, section = road.tracks, road.section
     along = (station - section[TRACK_STATION]) * section[TRACK_STATION_PER_M]
     across = (offset - section[TRACK_FIRST]) * section[TRACK_PER_M]
@@ -256,7 +256,7 @@ def unevenness(road: RoadArrays, station: float, offset: float) -> float:
 
 @inlined
 def edge_distance(patches: Float64, i: int, station: float, offset: float) -> float:
-    """Distance inwards from the outline of patch `i` (m); negative outside."""
+    """Return the distance inwards from the outline of patch `i` (m); negative outside."""
     ds = station - patches[i, 1]
     do = offset - patches[i, 2]
     if patches[i, 0] == 1.0:
@@ -268,14 +268,14 @@ def edge_distance(patches: Float64, i: int, station: float, offset: float) -> fl
 
 @inlined
 def patch_height(patches: Float64, i: int, station: float) -> float:
-    """Height of patch `i` above the road around it, within its edge (m)."""
+    """Return the height of patch `i` above the road around it, within its edge (m)."""
     height: float = patches[i, 5] + patches[i, 8] * (station - patches[i, 1])
     return height
 
 
 @inlined
 def worn_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
-    """Height without potholes, cracks, joints and texture. Everywhere smooth and defined (m)."""
+    """Return the height without potholes, cracks, joints and texture. Everywhere smooth and defined (m)."""
     nodes = road.nodes
     height: float = nodes[k, 6] + u * (
         nodes[k, 7] + u * (nodes[k, 8] + u * (nodes[k, 9] + u * (nodes[k, 10] + u * nodes[k, 11])))
@@ -298,7 +298,7 @@ def worn_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
 
 @inner
 def defect_depth(road: RoadArrays, k: int, u: float, offset: float) -> tuple[float, float]:
-    """Depth of the deepest pothole, crack or joint here, and the smallest radius or half width near this node (m)."""
+    """Return the depth of the deepest pothole, crack or joint, and the smallest radius or half width nearby (m)."""
     nodes, defects = road.nodes, road.defects
     deepest = 0.0
     finest = 1e9
@@ -328,13 +328,13 @@ def defect_depth(road: RoadArrays, k: int, u: float, offset: float) -> tuple[flo
 
 @inlined
 def texture_height(road: RoadArrays, station: float, offset: float) -> float:
-    """Macrotexture (m) of the paved surface, bilinear; 0 beside it."""
+    """Return the macrotexture (m) of the paved surface, bilinear; 0 beside it."""
     return texture_plane(road, station, offset)[0]
 
 
 @inlined
 def texture_plane(road: RoadArrays, station: float, offset: float) -> tuple[float, float, float]:
-    """Macrotexture (m) of the paved surface, bilinear, and its slopes along and across; 0 beside it."""
+    """Return the macrotexture (m) of the paved surface, bilinear, and its slopes along and across; 0 beside it."""
     texture, section = road.texture, road.section
     if texture.size == 0 or abs(offset) > section[PAVED_EDGE]:
         return 0.0, 0.0, 0.0
@@ -356,7 +356,7 @@ def texture_plane(road: RoadArrays, station: float, offset: float) -> tuple[floa
 
 @inlined
 def on_surface(road: RoadArrays, k: int, u: float, offset: float) -> bool:
-    """Whether the surface is defined here."""
+    """Return whether the surface is defined here."""
     last = road.nodes.shape[0] - 2
     inside: bool = abs(offset) <= road.section[SURFACE_EDGE]
     return inside and (k > 0 or u >= -NODE_TOLERANCE_M) and (k < last or u <= NODE_STEP_M + NODE_TOLERANCE_M)
@@ -367,7 +367,7 @@ def on_surface(road: RoadArrays, k: int, u: float, offset: float) -> bool:
 
 @inlined
 def material(road: RoadArrays, k: int, u: float, offset: float) -> float:
-    """Intensity of what the surface is made of, paint and spills left out."""
+    """Return the intensity of the surface material, without paint and spills."""
     nodes, section, patches = road.nodes, road.section, road.patches
     away = abs(offset)
     value = section[ASPHALT]
@@ -388,7 +388,7 @@ def material(road: RoadArrays, k: int, u: float, offset: float) -> float:
 
 @inlined
 def brightness(road: RoadArrays, k: int, u: float, offset: float, depth: float, stone: float) -> float:
-    """Intensity of the surface (digital numbers), where a defect is `depth` deep and the texture `stone` high (m)."""
+    """Return the intensity (digital numbers) of a surface with a defect `depth` deep and texture `stone` high (m)."""
     nodes, section, lines, items = road.nodes, road.section, road.lines, road.items
     if depth > 0.0:
         inside: float = section[DEFECT]
@@ -409,7 +409,7 @@ def brightness(road: RoadArrays, k: int, u: float, offset: float, depth: float, 
 
 @inlined
 def painted(items: Float64, i: int, station: float, offset: float, under: float) -> float:
-    """Intensity where item `i` lies over a surface of intensity `under`."""
+    """Return the intensity where item `i` covers a surface of intensity `under`."""
     kind = items[i, 0]
     ds = station - items[i, 2]
     do = offset - items[i, 3]
@@ -439,7 +439,7 @@ def painted(items: Float64, i: int, station: float, offset: float, under: float)
 
 @compiled
 def survey_points(road: RoadArrays, easting: Float64, northing: Float64, near: Int64, out: Float64) -> None:
-    """What lies at map points, exactly.
+    """Write the exact surface properties at map points.
 
     easting, northing : (n,) m from the origin; near : (n,) nodes to start from;
     out : (n, 6) height without texture (NaN off the surface), station, offset, depth of defects, intensity, texture.
@@ -459,7 +459,7 @@ def survey_points(road: RoadArrays, easting: Float64, northing: Float64, near: I
 
 @compiled
 def heights_along(road: RoadArrays, station: Float64, offset: Float64, out: Float64) -> None:
-    """Height without potholes, cracks, joints and texture at stations and offsets. All arrays (n,), m."""
+    """Write the height without potholes, cracks, joints and texture at stations and offsets. All arrays (n,), m."""
     for i in range(station.size):
         k = node_at(road, station[i])
         out[i] = worn_height(road, k, station[i] - road.nodes[k, STATION], offset[i])

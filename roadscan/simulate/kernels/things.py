@@ -1,4 +1,4 @@
-"""What stands upright beside the road, as simple bodies, and where a beam meets them.
+"""Upright objects beside the road as simple bodies, and where a beam meets them.
 
 A body is a row of numbers; lengths are metres, coordinates count from the scene's origin.
 """
@@ -16,15 +16,15 @@ from roadscan.simulate.kernels.options import inlined, inner
 Float64 = npt.NDArray[np.float64]
 
 BOX, CYLINDER, ELLIPSOID, WALL, DISC, TRIANGLE, OCTAGON, DIAMOND = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
-"""Kinds of bodies. Walls, discs and those after them are thin, and seen from both sides."""
+"""Kinds of bodies. Walls, discs and later ones are thin, and visible from both sides."""
 
 # Columns of a body.
 KIND, EASTING, NORTHING, SINE, COSINE, HALF_LENGTH, HALF_WIDTH, LOW, HIGH = 0, 1, 2, 3, 4, 5, 6, 7, 8
-LOW_END, HIGH_END, SKIRT, ALONG, BAY, WINDOW, STOREY = 9, 10, 11, 12, 13, 14, 15
-INTENSITY, DENSITY = 16, 17
-BODY_COLUMNS = 18
+LOW_END, HIGH_END, SKIRT, ALONG, BAY, WINDOW, STOREY = 9, 10, 11, 12, 13, 14, 15  # columns of walls
+INTENSITY, DENSITY = 16, 17  # columns of all bodies
+BODY_COLUMNS = 18  # numbers of a body
 _OCTAGON_CUT = math.sqrt(2.0)
-"""Sum of both shares of the half width at which a regular octagon's slanting sides lie."""
+"""Sum of the shares of the half width at which a regular octagon's slanting sides lie."""
 # Easting, northing: its middle. Sine, cosine: of the grid heading of its length. Half length: radius of a cylinder, of
 # an ellipsoid seen from above, of a disc. A wall runs along its length from LOW … HIGH at its start to LOW_END …
 # HIGH_END; it goes on SKIRT below that, and if BAY > 0 it has windows of WINDOW by WINDOW in bays and storeys, whose
@@ -33,7 +33,7 @@ _OCTAGON_CUT = math.sqrt(2.0)
 
 @inlined
 def is_stopped(rows: Float64, i: int, key: np.uint64, side: int) -> bool:
-    """Whether the beam of a key is stopped on a side of body `i`, rather than let through its gaps."""
+    """Return whether the beam of a key is stopped on a side of body `i`, rather than passing through its gaps."""
     density = rows[i, DENSITY]
     if density >= 1.0:
         return True
@@ -44,7 +44,7 @@ def is_stopped(rows: Float64, i: int, key: np.uint64, side: int) -> bool:
 
 @inlined
 def slab(from_m: float, per_m: float, half: float) -> tuple[float, float]:
-    """Where a line is within ± `half` of a plane: begin and end; begin > end: nowhere."""
+    """Return begin and end of the part of a line within ± `half` of a plane; begin > end: none."""
     if per_m == 0.0:
         return (-np.inf, np.inf) if abs(from_m) <= half else (np.inf, -np.inf)
     first, second = (-half - from_m) / per_m, (half - from_m) / per_m
@@ -55,7 +55,7 @@ def slab(from_m: float, per_m: float, half: float) -> tuple[float, float]:
 def meet(
     rows: Float64, i: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, key: np.uint64
 ) -> float:
-    """Range at which a line (origin and change per metre of range) first meets body `i` from outside; NaN: never."""
+    """Return the range at which a line (origin, change per metre) first meets body `i` from outside; NaN: never."""
     kind = rows[i, KIND]
     x, y = ox - rows[i, EASTING], oy - rows[i, NORTHING]
     sine, cosine = rows[i, SINE], rows[i, COSINE]
@@ -74,7 +74,7 @@ def meet(
 def meet_box(
     rows: Float64, i: int, ahead: float, right: float, oz: float, ahead_per_m: float, right_per_m: float, dz: float
 ) -> float:
-    """Slab method (Kay and Kajiya 1986)."""
+    """Return the range to a box by the slab method (Kay and Kajiya 1986)."""
     half = 0.5 * (rows[i, HIGH] - rows[i, LOW])
     a0, a1 = slab(ahead, ahead_per_m, rows[i, HALF_LENGTH])
     b0, b1 = slab(right, right_per_m, rows[i, HALF_WIDTH])
@@ -95,7 +95,7 @@ def meet_plate(
     dz: float,
     key: np.uint64,
 ) -> float:
-    """A wall or a disc: its plane is crossed once."""
+    """Return the range to a wall or a disc, whose plane is crossed once."""
     if right_per_m == 0.0:
         return np.nan
     r = -right / right_per_m
@@ -128,7 +128,7 @@ def meet_plate(
 def meet_cylinder(
     rows: Float64, i: int, x: float, y: float, oz: float, dx: float, dy: float, dz: float
 ) -> float:  # fmt: skip
-    """An upright cylinder with both of its ends."""
+    """Return the range to an upright cylinder with both of its ends."""
     radius, low, high = rows[i, HALF_LENGTH], rows[i, LOW], rows[i, HIGH]
     half = 0.5 * (high - low)
     c0, c1 = slab(oz - low - half, dz, half)
@@ -149,7 +149,7 @@ def meet_cylinder(
 def meet_ellipsoid(
     rows: Float64, i: int, x: float, y: float, oz: float, dx: float, dy: float, dz: float, key: np.uint64
 ) -> float:
-    """The crown of a tree: a shell with gaps, which may stop a beam on its near side or on its far side."""
+    """Return the range to a tree's crown: a shell with gaps, which may stop a beam on its near or far side."""
     flat = 1.0 / rows[i, HALF_LENGTH]
     half = 0.5 * (rows[i, HIGH] - rows[i, LOW])
     px, py, pz = x * flat, y * flat, (oz - rows[i, LOW] - half) / half
@@ -169,7 +169,7 @@ def meet_ellipsoid(
 
 @inner
 def shade(rows: Float64, i: int, x: float, y: float, z: float) -> float:
-    """Intensity of body `i` at a point of its outside; NaN in a window, which mirrors beams away."""
+    """Return the intensity of body `i` at a point of its outside; NaN in a window, which mirrors beams away."""
     if rows[i, BAY] > 0.0:
         along = (x - rows[i, EASTING]) * rows[i, SINE] + (y - rows[i, NORTHING]) * rows[i, COSINE]
         share = 0.5 + 0.5 * along / rows[i, HALF_LENGTH]

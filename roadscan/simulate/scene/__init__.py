@@ -60,7 +60,7 @@ __all__ = [
     "shipped_scenes",
 ]
 
-_EARLIEST, _LATEST = dt.datetime(1981, 1, 1, tzinfo=dt.UTC), dt.datetime(2080, 1, 1, tzinfo=dt.UTC)
+_EARLIEST, _LATEST = dt.datetime(1981, 1, 1, tzinfo=dt.UTC), dt.datetime(2080, 1, 1, tzinfo=dt.UTC)  # of starts
 
 
 class MapScene(Strict):
@@ -171,7 +171,7 @@ class Scene(Strict):
             )
 
     def _check_roadside(self) -> None:
-        """Refuse what does not stand on the road; a scene that is shortened by `changed` leaves it out instead."""
+        """Refuse objects off the road; a scene that `changed` shortens leaves them out instead."""
         for kind, listed in self.roadside:
             for i, one in enumerate(listed):
                 for key in ("start_m", "end_m") if isinstance(one, Barrier) else ("station_m",):
@@ -201,14 +201,14 @@ class Scene(Strict):
         return scene
 
     def changed(self, **values: Any) -> Self:
-        """The scene with some values replaced; dictionaries are merged, key by key.
+        """Return the scene with some values replaced; dictionaries are merged, key by key.
 
         ``scene.changed(length_m=20.0, lidar={"on": False})`` keeps all other settings of the lidar.
         """
         return self.parse(_merged(self.model_dump(), values))
 
     def noiseless(self) -> Self:
-        """The scene without any error but the rounding of the logs.
+        """Return the scene without any error except the rounding of the logs.
 
         No noise, true mountings stated, right clocks, perfect IMUs, beams without width.
         """
@@ -233,13 +233,13 @@ class Scene(Strict):
 
 
 def shipped_scenes() -> dict[str, Any]:
-    """Scenes that come with roadscan: name → resource."""
+    """Return the scenes that come with roadscan: name → resource."""
     folder = resources.files("roadscan.simulate") / "scenes"
     return {f.name.removesuffix(".toml"): f for f in sorted(folder.iterdir(), key=lambda f: f.name)}
 
 
 def _floats(value: object, where: str) -> Iterator[tuple[str, float]]:
-    """All floats of a model, with the keys that lead to them."""
+    """Yield all floats of a model, with the keys that lead to them."""
     if isinstance(value, float):
         yield where, value
     elif isinstance(value, BaseModel):
@@ -251,7 +251,7 @@ def _floats(value: object, where: str) -> Iterator[tuple[str, float]]:
 
 
 def _is_open_end(where: str, value: float) -> bool:
-    """Whether an infinity says that markings or joints go as far as the road does."""
+    """Return whether an infinity means that markings or joints go as far as the road."""
     is_open = where.startswith(("road.markings.", "road.joints."))
     return is_open and where.endswith(".start_m" if value < 0.0 else ".end_m")
 

@@ -57,7 +57,7 @@ class Mount(Strict):
     """What the rig file has wrong."""
 
     def nominal(self) -> Mount:
-        """The mounting as the rig file states it."""
+        """Return the mounting that the rig file states."""
         e = self.error
         forward, right, down = (a + b for a, b in zip(self.lever_arm_body_m, e.lever_arm_body_m, strict=True))
         return Mount(
@@ -298,13 +298,13 @@ class Noise(Strict):
     """Error of the control points, on each coordinate (m)."""
 
     def pose_sigma(self) -> tuple[float, float, float, float, float, float]:
-        """1 σ of the stated north, east, down (m), roll, pitch, heading (degrees)."""
+        """Return 1 σ of the stated north, east, down (m), roll, pitch, heading (degrees)."""
         down = self.position_m if self.down_m is None else self.down_m
         heading = 2.0 * self.attitude_deg if self.heading_deg is None else self.heading_deg
         return self.position_m, self.position_m, down, self.attitude_deg, self.attitude_deg, heading
 
     def pose_time_constants_s(self) -> tuple[float, float, float, float, float, float]:
-        """Time constants of the same (s)."""
+        """Return time constants of the same (s)."""
         turned = self.attitude_time_constant_s or self.time_constant_s
         return *(self.time_constant_s,) * 3, *(turned,) * 3
 

@@ -505,21 +505,21 @@ class Road(Strict):
 
     @property
     def half_width_m(self) -> float:
-        """From the reference line to the lanes' edge (m)."""
+        """Distance from the reference line to the lanes' edge (m)."""
         return self.lanes * self.lane_width_m / 2
 
     @property
     def paved_m(self) -> float:
-        """From the reference line to the outer edge of the shoulder, where a kerb stands (m)."""
+        """Distance from the reference line to the outer edge of the shoulder, where a kerb stands (m)."""
         return self.half_width_m + self.shoulder_width_m
 
     @property
     def edge_m(self) -> float:
-        """From the reference line to the outer edge of the verge (m)."""
+        """Distance from the reference line to the outer edge of the verge (m)."""
         return self.paved_m + self.verge_width_m
 
     def lane_offset_m(self, lane: int) -> float:
-        """Offset of the middle of lane `lane`, counted from 1 at the left (m)."""
+        """Return the offset of the middle of lane `lane`, counted from 1 at the left (m)."""
         return (lane - (self.lanes + 1) / 2) * self.lane_width_m
 
     @model_validator(mode="after")

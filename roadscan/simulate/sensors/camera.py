@@ -1,4 +1,4 @@
-"""The camera: when it takes its pictures, the folder that they are written to, and where it truly was."""
+"""Simulates the camera: when it takes pictures, the folder of its pictures, and its true poses."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _POSE: Final = ("x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz")
 
 
 def exposures_gps_ns(scene: Scene, drive: Drive) -> Int64:
-    """Epochs (n,) of a pass's pictures: one each `camera.every_m` driven, from the first profile on."""
+    """Return epochs (n,) of a pass's pictures: one each `camera.every_m` driven, from the first profile on."""
     return drive.epoch_gps_ns(np.arange(0.0, drive.length_m, scene.camera.every_m))
 
 
@@ -58,7 +58,7 @@ def write_camera(
 
 
 def _exposed(scene: Scene, drive: Drive, taken: npt.NDArray[np.float32], number: int) -> npt.NDArray[np.uint8]:
-    """Values (height, width), or (height, width, 3) with blue first, as the camera's chip gives them."""
+    """Return pixel values (height, width), or (height, width, 3) with blue first, as the camera's chip gives them."""
     if scene.camera.noise > 0.0:
         rng = stream(scene.seed, drive.number, "camera", number)
         taken = taken + np.float32(scene.camera.noise) * rng.standard_normal(taken.shape, dtype=np.float32)

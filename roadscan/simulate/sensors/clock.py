@@ -1,4 +1,4 @@
-"""A sensor's clock: from the true epoch to the stamp it writes, and what the survey file states of it."""
+"""A sensor's clock: converts true epochs to stamps, and gives the clock's entry in the survey file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from roadscan.simulate.scene import ClockError, Scene
 Int64 = npt.NDArray[np.int64]
 
 _NOTHING_S: Final = 1e-9
-"""Stands for no offset where the survey file has to state one."""
+"""Offset that stands for none where the survey file has to state one (s)."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class SensorClock:
 
     @classmethod
     def of(cls, scene: Scene, error: ClockError, usual: TimeSystem) -> SensorClock:
-        """Clock of a sensor whose log usually is stamped in `usual`."""
+        """Return the clock of a sensor whose log usually has stamps of `usual`."""
         return cls(error, error.system or usual, gps_ns_from_utc(scene.start))
 
     def shown_gps_ns(self, epoch_gps_ns: Int64) -> Int64:
-        """GPS time (ns, (n,)) that the clock shows at true epochs (n,)."""
+        """Return GPS time (ns, (n,)) that the clock shows at true epochs (n,)."""
         if self.error.is_right:
             return epoch_gps_ns
         elapsed_s = (epoch_gps_ns - self.start_gps_ns).astype(np.float64) / NS_PER_S
@@ -51,7 +51,7 @@ class SensorClock:
         return shown
 
     def stamps_ns(self, epoch_gps_ns: Int64) -> Int64:
-        """Stamps (ns of the system's own count, (n,)) at true epochs (n,)."""
+        """Return stamps (ns of the system's count, (n,)) at true epochs (n,)."""
         shown = self.shown_gps_ns(epoch_gps_ns)
         match self.system:
             case TimeSystem.GPS | TimeSystem.FREE:
@@ -68,7 +68,7 @@ class SensorClock:
         )
 
     def toml(self, unit: str | None, first_gps_ns: int) -> str:
-        """The survey file's ``clock = …`` for a log whose first stamp is of the epoch `first_gps_ns`, in `unit`.
+        """Return the survey file's ``clock = …`` for a log whose first stamp is at `first_gps_ns`, in `unit`.
 
         Week and date are those that the clock shows then.
         """
@@ -87,7 +87,7 @@ class SensorClock:
         return "{ " + ", ".join(parts) + " }"
 
     def _correction(self) -> list[str]:
-        """The stamp's formula turned round. A clock that starts anew each hour counts as one of POSIX seconds."""
+        """Return the inverse of the stamp's formula. A clock that restarts each hour counts as one of POSIX seconds."""
         rate = self.error.drift_ppm * 1e-6
         system = TimeSystem.UNIX_UTC if self.system is TimeSystem.UTC_HOUR else self.system
         counting = SensorClock(self.error, system, self.start_gps_ns)

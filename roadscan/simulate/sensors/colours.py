@@ -1,4 +1,4 @@
-"""Colours of what a camera of colours sees: a share of red, green and blue for each thing, and the faces of signs."""
+"""Colours in pictures: shares of red, green and blue for each object, and the faces of signs."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from roadscan.simulate.things import described_signs
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 
-SKY: Final = np.array([0.86, 0.95, 1.06], np.float32)
+SKY: Final = np.array([0.86, 0.95, 1.06], np.float32)  # shares of red, green and blue
 SIGN_COLOURS: Final = {
     "white": (1.0, 1.0, 1.0), "red": (0.78, 0.08, 0.11), "blue": (0.06, 0.24, 0.66), "yellow": (0.98, 0.78, 0.08),
     "green": (0.04, 0.46, 0.24), "brown": (0.42, 0.24, 0.12), "orange": (0.96, 0.46, 0.06), "black": (0.07, 0.07, 0.07),
 }  # fmt: skip
 _LIGHT: Final = ("white", "yellow", "orange")
-_PAINT: Final = {"white": (1.0, 1.0, 1.0), "yellow": (1.0, 0.76, 0.20)}
+_PAINT: Final = {"white": (1.0, 1.0, 1.0), "yellow": (1.0, 0.76, 0.20)}  # shares of red, green and blue
 _PAINT_FROM: Final = 150.0
-"""Shade from which on the road is paint."""
+"""Least shade of paint on the road."""
 _KINDS: Final = {
     "tree": (0.55, 0.85, 0.42), "facade": (1.0, 0.93, 0.80), "fence": (0.95, 0.82, 0.66), "box": (0.95, 0.95, 1.0),
     "planting": (0.50, 0.86, 0.40), "signal": (0.85, 0.88, 0.85), "overhead": (1.0, 0.98, 0.95),
 }  # fmt: skip
-_CARS: Final = ((1.0, 1.0, 1.0), (0.95, 0.45, 0.40), (0.50, 0.62, 0.95), (0.85, 0.86, 0.90), (0.55, 0.60, 0.58))
-_ASPHALT: Final = (1.0, 0.99, 0.97)
-_FACE_PX: Final = 256
-_ON_FACE_M: Final = 0.01
-_SHADE_WITHIN: Final = 1.0
+_CARS: Final = ((1.0, 1.0, 1.0), (0.95, 0.45, 0.40), (0.50, 0.62, 0.95), (0.85, 0.86, 0.90), (0.55, 0.60, 0.58))  # RGB
+_ASPHALT: Final = (1.0, 0.99, 0.97)  # shares of red, green and blue
+_FACE_PX: Final = 256  # pixels of a face's edge
+_ON_FACE_M: Final = 0.01  # margin around a face or a marking
+_SHADE_WITHIN: Final = 1.0  # largest difference from a face's shade
 _RIM: Final = 0.13
 """Width of a rim as a share of the plate."""
 
@@ -49,13 +49,13 @@ class _Face:
     """(2,) unit vector to the right as seen from the front."""
     half_m: tuple[float, float]
     shade: float
-    """By which the face is told from back and post."""
+    """Shade that distinguishes the face from back and post."""
     tint: Float32
     """(256, 256, 3), the upper row first."""
 
 
 class Tints:
-    """Shares of red, green and blue of all that stands in a world."""
+    """Shares of red, green and blue of all objects in a world."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -73,7 +73,7 @@ class Tints:
         self._stripes = [m for m in world.scene.road.markings if m.colour != "white"]
 
     def of(self, hits: Hits) -> Float32:
-        """Shares (n, 3) of what the n rays of the first group met; of those that met nothing that of the sky."""
+        """Return shares (n, 3) for the n rays of the first group; those of the sky for rays without a hit."""
         number, place = hits.object_id[0], hits.enh_m[0]
         out = np.where((number >= 0)[:, None], self._of_object[np.maximum(number, 0)], SKY)
         for own, face in self._faces.items():
@@ -87,7 +87,7 @@ class Tints:
         return out.astype(np.float32)
 
     def _on_road(self, place_m: Float64, tint: Float32) -> Float32:
-        """Shares of painted places (n, 3)."""
+        """Apply shares to painted places (n, 3)."""
         station, offset = self._world.surface.station_offset_m(place_m[:, 0], place_m[:, 1])
         for one in self._stripes:
             near = np.abs(offset - one.offset_m) <= one.width_m / 2 + _ON_FACE_M
@@ -96,7 +96,7 @@ class Tints:
 
 
 def _face(sign: Sign, plate: Float64) -> _Face:
-    """The face of a sign whose plate is the body (18,)."""
+    """Return the face of a sign whose plate is the body (18,)."""
     middle = np.array([plate[body.EASTING], plate[body.NORTHING], (plate[body.LOW] + plate[body.HIGH]) / 2])
     along = np.array([plate[body.SINE], plate[body.COSINE]])
     right = along if sign.faces == "backward" else -along
@@ -105,7 +105,7 @@ def _face(sign: Sign, plate: Float64) -> _Face:
 
 
 def _on_face(face: _Face, place_m: Float64, shade: Float64) -> Float32:
-    """Shares (n, 3) at places of a sign of these shades (n,): of its face on the front, 1 elsewhere."""
+    """Return shares (n, 3) at places of a sign with shades (n,): of its face on the front, 1 elsewhere."""
     past = place_m - face.middle_m
     along = past[:, :2] @ face.right
     u = (along / face.half_m[0] + 1.0) / 2 * _FACE_PX - 0.5
@@ -120,7 +120,7 @@ def _on_face(face: _Face, place_m: Float64, shade: Float64) -> Float32:
 
 
 def _painted(sign: Sign) -> Float32:
-    """A face (256, 256, 3): its colour, its rim, its text."""
+    """Return a face (256, 256, 3): its colour, its rim, its text."""
     face = np.empty((_FACE_PX, _FACE_PX, 3), np.uint8)
     face[:] = _eight_bits(sign.colour)
     if sign.rim is not None:
@@ -138,7 +138,7 @@ def _eight_bits(colour: str) -> tuple[int, int, int]:
 
 
 def _outline(shape: str, scale: float) -> Float64:
-    """Pixels (k, 2) of the outline of a shape on a face, drawn in about its middle."""
+    """Return pixels (k, 2) of the outline of a shape on a face, scaled about its middle."""
     if shape == "triangle":
         middle, unit = np.array([0.5, 2.0 / 3.0]), np.array([[0.0, 1.0], [1.0, 1.0], [0.5, 0.0]])
     else:
@@ -151,7 +151,7 @@ def _outline(shape: str, scale: float) -> Float64:
 
 
 def _write(face: npt.NDArray[np.uint8], text: str, ink: tuple[int, int, int]) -> None:
-    """Text in the middle of a face, as large as fits into 80 % of its width."""
+    """Draw text in the middle of a face, as large as fits into 80 % of its width."""
     font, thick = cv2.FONT_HERSHEY_DUPLEX, 6
     (width, height), _ = cv2.getTextSize(text, font, 1.0, thick)
     scale = min(0.72 * _FACE_PX / width, 0.4 * _FACE_PX / height)

@@ -1,4 +1,4 @@
-"""The wheel encoder: counts the path that one wheel drives."""
+"""Simulates the wheel encoder, which counts the path of one wheel."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from roadscan.simulate.sensors.clock import SensorClock
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-CHUNK: Final = 65_536
-_GRID_NS: Final = 20_000_000
+CHUNK: Final = 65_536  # records of a chunk
+_GRID_NS: Final = 20_000_000  # step of the path's table
 _SCHEMA: Final = pa.schema([("time_ns", pa.int64()), ("ticks", pa.int64())])
 
 
@@ -38,7 +38,7 @@ class WheelEncoder:
             self._turned -= np.interp(drive.start_gps_ns, self._grid, self._turned)
 
     def ticks(self, epoch_gps_ns: Int64) -> Int64:
-        """Count (n,) at epochs (n,), upwards both ways.
+        """Return the count (n,) at epochs (n,), increasing in both directions of travel.
 
         In a right turn forwards the right wheel drives less than the middle of the vehicle, backwards more.
         """
@@ -62,7 +62,7 @@ def write_encoder(scene: Scene, drive: Drive, clock: SensorClock, file: Path) ->
 
 
 def _heading(drive: Drive, epochs: Int64) -> Float64:
-    """Headings (n,) clockwise from north (rad)."""
+    """Return headings (n,) clockwise from north (rad)."""
     poses = drive.poses(epochs)
     level = drive.earth.ecef_from_level(poses.position_ecef_m)
     angles: Float64 = (level.inv() * poses.ecef_from_body).as_euler("ZYX")[:, 0]

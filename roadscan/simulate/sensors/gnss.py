@@ -1,4 +1,4 @@
-"""A GNSS receiver with real-time kinematic corrections: its solutions as RTKLIB ``.pos`` and NMEA 0183."""
+"""Simulates a GNSS receiver with real-time kinematic corrections: its solutions as RTKLIB ``.pos`` and NMEA 0183."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from roadscan.simulate.scene import Mount, Scene
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-FIXED: Final = 1
+FIXED: Final = 1  # quality of a fixed solution, as RTKLIB numbers it
 FLOAT: Final = 2
-"""Quality of a solution, as RTKLIB numbers it."""
+"""Quality of a float solution, as RTKLIB numbers it."""
 RECEIVER_UNDULATION_M: Final = 46.9
-"""Height of the geoid above the ellipsoid that the receiver's own coarse model gives everywhere here (NMEA GGA)."""
-_SATELLITES: Final = 14
-_DIFFERENCE_NS: Final = 10_000_000
-_VELOCITY_SIGMA_M_PER_S: Final = 0.03
-_KNOTS_PER_M_PER_S: Final = 3600.0 / 1852.0
-_SHORTEST_JUMP_S, _LONGEST_JUMP_S = 1.0, 5.0
+"""Geoid height of the receiver's coarse model, which is constant here (NMEA GGA; m)."""
+_SATELLITES: Final = 14  # number of satellites in the logs
+_DIFFERENCE_NS: Final = 10_000_000  # step of the velocity's differences
+_VELOCITY_SIGMA_M_PER_S: Final = 0.03  # error of each velocity component
+_KNOTS_PER_M_PER_S: Final = 3600.0 / 1852.0  # knots in a metre per second
+_SHORTEST_JUMP_S, _LONGEST_JUMP_S = 1.0, 5.0  # duration of multipath jumps
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Solutions:
 
 
 def solve(scene: Scene, drive: Drive) -> Solutions:
-    """Solutions of a whole pass at the antenna, in the datum of the scene's CRS."""
+    """Return the solutions of a whole pass at the antenna, in the datum of the scene's CRS."""
     gnss = scene.gnss
     step = round(NS_PER_S / gnss.rate_hz)
     first, last = drive.recorded_span_gps_ns
@@ -139,7 +139,7 @@ def _sentences(solutions: Solutions, i: int) -> list[str]:
 
 
 def _quality(scene: Scene, drive: Drive, epochs: Int64) -> Int64:
-    """Quality of the solution at each epoch (n,), 0 in a gap."""
+    """Return the quality of the solution at each epoch (n,), 0 in a gap."""
     quality = np.full(epochs.size, FIXED, dtype=np.int64)
     seconds = (epochs - drive.start_gps_ns) / NS_PER_S
     gaps = [g for g in scene.gnss.gaps if not g.passes or drive.number + 1 in g.passes]
@@ -152,7 +152,7 @@ def _quality(scene: Scene, drive: Drive, epochs: Int64) -> Int64:
 
 
 def _jumps(scene: Scene, epochs: Int64, rng: np.random.Generator) -> Float64:
-    """Multipath errors (n, 3), north-east-down (m)."""
+    """Return multipath errors (n, 3), north-east-down (m)."""
     out = np.zeros((epochs.size, 3))
     if not epochs.size:
         return out
@@ -165,14 +165,14 @@ def _jumps(scene: Scene, epochs: Int64, rng: np.random.Generator) -> Float64:
 
 
 def _calendar(epoch_gps_ns: int) -> str:
-    """``2026/05/04 09:30:18.000``: GPS time as a calendar without leap seconds."""
+    """Return ``2026/05/04 09:30:18.000``: GPS time as a calendar without leap seconds."""
     milliseconds = (epoch_gps_ns + 500_000) // 1_000_000 + GPS_EPOCH_UNIX_S * 1000
     moment = np.datetime64(milliseconds, "ms").item()
     return f"{moment:%Y/%m/%d %H:%M:%S}.{milliseconds % 1000:03d}"
 
 
 def _degrees_minutes(degrees: float, digits: int) -> str:
-    """``4806.1234567``: whole degrees of `digits` figures and minutes."""
+    """Return ``4806.1234567``: whole degrees of `digits` figures and minutes."""
     whole, rest = divmod(round(abs(degrees) * 60 * 10**8), 60 * 10**8)
     return f"{whole:0{digits}d}{rest // 10**8:02d}.{rest % 10**8:08d}"
 

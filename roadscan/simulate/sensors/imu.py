@@ -1,4 +1,4 @@
-"""Inertial measurement units: what gyroscopes and accelerometers on the moving vehicle feel, as a CSV log."""
+"""Simulates inertial measurement units: gyroscopes and accelerometers on the moving vehicle, as a CSV log."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from roadscan.simulate.sensors.clock import SensorClock
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-CHUNK: Final = 16_384
-STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
+CHUNK: Final = 16_384  # samples of a chunk
+STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # size of the unit g (m/s²)
 AT_BODY: Final = Mount(lever_arm_body_m=(0.0, 0.0, 0.0))
 """An IMU at the IMU reference point, axes forward, right, down."""
 _STENCIL_S: Final = 0.010
-"""Motion is differentiated over about this to each side: shorter, the rounding of ECEF positions shows."""
+"""Approximate step (s) of differences of motion: with a shorter one, the rounding of ECEF positions shows."""
 COLUMNS: Final = (
     "time_ns",
     *(f"angular_rate_{a}_rad_per_s" for a in "xyz"),
@@ -38,7 +38,7 @@ COLUMNS: Final = (
 
 @dataclass(frozen=True)
 class ImuOnRig:
-    """One IMU: where it sits and how good it is."""
+    """One IMU: its mounting and its errors."""
 
     name: str
     mount: Mount
@@ -47,27 +47,27 @@ class ImuOnRig:
 
     @property
     def step_ns(self) -> int:
-        """From sample to sample."""
+        """Time from sample to sample (ns)."""
         return round(NS_PER_S / self.rate_hz)
 
     @property
     def stride(self) -> int:
-        """Samples over which motion is differentiated, to each side."""
+        """Samples on each side over which motion is differentiated."""
         return max(1, round(_STENCIL_S * self.rate_hz))
 
 
 def first_gps_ns(drive: Drive, imu: ImuOnRig) -> int:
-    """Epoch of the first sample of a pass."""
+    """Return the epoch of the first sample of a pass."""
     return drive.recorded_span_gps_ns[0] + 2 * imu.stride * imu.step_ns
 
 
 def imu_of(scene: Scene) -> ImuOnRig:
-    """The vehicle's IMU."""
+    """Return the vehicle's IMU."""
     return ImuOnRig("imu", AT_BODY, scene.imu.errors or IMU_GRADES[scene.imu.grade], scene.imu.rate_hz)
 
 
 def head_imus(scene: Scene) -> list[ImuOnRig]:
-    """IMUs inside the profiler heads, with the heads' mountings; none where they have none."""
+    """Return the IMUs inside the profiler heads, with the heads' mountings; none where they have none."""
     grade = scene.profilers.head_imus
     if grade is None or not scene.profilers.on:
         return []
@@ -94,7 +94,7 @@ def write_imu(scene: Scene, drive: Drive, imu: ImuOnRig, clock: SensorClock, fil
 
 
 def felt(drive: Drive, mount: Mount, epochs: Int64, step_ns: int, stride: int = 2) -> tuple[Float64, Float64]:
-    """Angular rate (rad/s) and specific force (m/s²) in sensor axes, (n, 3) each, at even epochs (n,).
+    """Return angular rate (rad/s) and specific force (m/s²) in sensor axes, (n, 3) each, at even epochs (n,).
 
     Derivatives are central differences of fourth order over `stride` epochs. In ECEF, with the Earth's rate ω:
     rate = rate of the body + ω; force = acceleration + 2 ω × velocity + force at rest (Groves 2013, eq. 5.36).
@@ -134,7 +134,7 @@ class _SensorErrors:
         )
 
     def applied(self, rate: Float64, force: Float64) -> tuple[Float64, Float64]:
-        """Rates and forces (n, 3) as the sensor states them."""
+        """Return rates and forces (n, 3) with the sensor's errors."""
         true = np.concatenate([rate, force], axis=1)
         noise = self._noise * self._rng.standard_normal(true.shape)
         stated = true * self._scale + self._bias.take(len(true)) + noise

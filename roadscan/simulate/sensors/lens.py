@@ -1,4 +1,4 @@
-"""A camera's lens: the pinhole with Brown–Conrady distortion, in the parameters of OpenCV; and the view all around."""
+"""A camera's lens: a pinhole with Brown–Conrady distortion, in OpenCV's parameters; and a picture of 360°."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from roadscan.simulate.scene import Camera
 
 Float64 = npt.NDArray[np.float64]
 
-_STEPS: Final = 30
-_WITHIN: Final = 1e-10
+_STEPS: Final = 30  # most steps of Newton's method
+_WITHIN: Final = 1e-10  # error at which they end
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Sphere:
     height_px: int
 
     def rays(self, column_px: npt.ArrayLike, row_px: npt.ArrayLike) -> Float64:
-        """Unit vectors (n, 3: ahead, right, down) of places (n,) in the picture; its middle looks ahead."""
+        """Return unit vectors (n, 3: ahead, right, down) of places (n,) in the picture; its middle looks ahead."""
         turn = 2.0 * np.pi * ((np.asarray(column_px, np.float64) + 0.5) / self.width_px - 0.5)
         dip = np.pi * ((np.asarray(row_px, np.float64) + 0.5) / self.height_px - 0.5)
         return np.stack([np.cos(dip) * np.cos(turn), np.cos(dip) * np.sin(turn), np.sin(dip)], axis=-1)
@@ -43,12 +43,12 @@ class Lens:
 
     @classmethod
     def of(cls, camera: Camera) -> Self:
-        """The lens of a scene's camera; its principal point is the picture's middle where none is stated."""
+        """Return the lens of a scene's camera; its principal point is the picture's middle unless stated."""
         middle = ((camera.width_px - 1) / 2, (camera.height_px - 1) / 2)
         return cls(camera.focal_px, camera.principal_px or middle, camera.distortion)
 
     def rays(self, column_px: npt.ArrayLike, row_px: npt.ArrayLike) -> Float64:
-        """Unit vectors (n, 3: ahead along the optical axis, right, down) of places (n,) in the picture.
+        """Return unit vectors (n, 3: ahead along the optical axis, right, down) of places (n,) in the picture.
 
         Raises
         ------
@@ -62,7 +62,7 @@ class Lens:
         return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
 
     def _straightened(self, u: Float64, v: Float64) -> tuple[Float64, Float64]:
-        """Undistorted coordinates by Newton's method from the picture's middle outwards."""
+        """Return undistorted coordinates by Newton's method from the picture's middle outwards."""
         x, y = u.copy(), v.copy()
         for _ in range(_STEPS):
             bent_x, bent_y, xx, xy, yy = self._bent(x, y)
@@ -80,7 +80,7 @@ class Lens:
         )
 
     def _bent(self, x: Float64, y: Float64) -> tuple[Float64, Float64, Float64, Float64, Float64]:
-        """Distorted coordinates (Brown 1971; signs of OpenCV), and derivatives: x by x, x by y = y by x, y by y."""
+        """Return distorted coordinates (Brown 1971; OpenCV's signs), and derivatives: xx, xy = yx, yy."""
         k1, k2, p1, p2, k3 = self.distortion
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))

@@ -1,4 +1,4 @@
-"""The spinning lidar: firings of a Velodyne HDL-32E and its PCAP log.
+"""Simulates the spinning lidar: firings of a Velodyne HDL-32E and its PCAP log.
 
 32 lasers fire one after another 1.152 µs apart, a cycle each 46.08 µs, 12 cycles a packet, while the head turns.
 The beams' elevations and the heights of their origins are those of the maker's drawing 86-0106.
@@ -26,27 +26,27 @@ from roadscan.simulate.sensors.pcap import PcapWriter
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-LASERS: Final = 32
-CYCLES: Final = 12
-FIRING_NS: Final = 1_152
-CYCLE_NS: Final = 46_080
+LASERS: Final = 32  # lasers of the HDL-32E
+CYCLES: Final = 12  # firing cycles of a packet
+FIRING_NS: Final = 1_152  # time between two lasers
+CYCLE_NS: Final = 46_080  # time of a firing cycle
 PACKET_NS: Final = CYCLES * CYCLE_NS
 INTERVALS: Final = 4
-"""Within a quarter of a packet the sensor moves evenly."""
+"""Intervals of a packet, within which the sensor moves evenly."""
 GROUP_PACKETS: Final = 8
-"""Packets whose firings know one another as neighbours. A pass has whole groups of them."""
+"""Packets whose firings are neighbours of each other. A pass has whole groups of them."""
 _INTERVAL_NS: Final = PACKET_NS // INTERVALS
-RANGE_STEP_M: Final = 0.002
-RANGE_MIN_M: Final = 0.9
-_LONGEST_RAW: Final = 65_535
+RANGE_STEP_M: Final = 0.002  # unit of ranges in packets
+RANGE_MIN_M: Final = 0.9  # shorter ranges are not measured
+_LONGEST_RAW: Final = 65_535  # largest raw range
 BLOCK_PACKETS: Final = 128
-"""Packets measured at once, whole groups: the noise is drawn by the block, so this changes bytes."""
+"""Packets measured together, whole groups: the noise is drawn by block, so this changes bytes."""
 BODY_FROM_AXES: Final = np.diag([1.0, -1.0, -1.0])
 """Axes flu: x forward, y left, z up."""
 REFLECTIVITY: Final = 0.35
 """Lidar intensity for one digital number of a profiler."""
 
-_LOWEST_DEG: Final = -92.0 / 3.0
+_LOWEST_DEG: Final = -92.0 / 3.0  # elevation of the lowest beam
 _LOWER_HALF_RISE_MM: Final = (
     17.17, 16.27, 15.40, 14.54, 13.71, 12.89, 12.09, 11.31, 10.54, 9.78, 9.04, 8.30, 7.58, 6.86, 6.15, 5.45,
 )  # fmt: skip
@@ -65,7 +65,7 @@ class Beams:
 
 
 def hdl32e_beams() -> Beams:
-    """Elevations −30.67° … +10.67° in firing order, to the hundredth as the maker prints them."""
+    """Return elevations −30.67° … +10.67° in firing order, to the hundredth as the maker prints them."""
     ascending = np.round(_LOWEST_DEG + 4.0 / 3.0 * np.arange(LASERS), 2)
     elevation, rise = np.empty(LASERS), np.empty(LASERS)
     elevation[0::2], elevation[1::2] = ascending[:16], ascending[16:]
@@ -75,7 +75,7 @@ def hdl32e_beams() -> Beams:
 
 @dataclass(frozen=True)
 class Packets:
-    """A block of p packets as the head measured them."""
+    """A block of p measured packets."""
 
     epoch_gps_ns: Int64
     """(p,) first firing of each packet."""
@@ -91,7 +91,7 @@ class Packets:
     """(p, 12, 32)"""
 
     def firing_gps_ns(self) -> Int64:
-        """Epoch of each firing (p, 12, 32)."""
+        """Return the epoch of each firing (p, 12, 32)."""
         offsets = CYCLE_NS * np.arange(CYCLES)[:, None] + FIRING_NS * np.arange(LASERS)
         out: Int64 = self.epoch_gps_ns[:, None, None] + offsets
         return out
@@ -111,12 +111,12 @@ def write_lidar(scene: Scene, world: World, drive: Drive, file: Path, hits_file:
 
 
 def starts_gps_ns(drive: Drive) -> int:
-    """Epoch of a pass's first firing."""
+    """Return the epoch of a pass's first firing."""
     return drive.start_gps_ns - round(RUN_UP_S / 2 * 1e9)
 
 
 def measure(scene: Scene, world: World, drive: Drive) -> Iterator[Packets]:
-    """Packets of a whole pass, in blocks of :data:`BLOCK_PACKETS`."""
+    """Yield packets of a whole pass, in blocks of :data:`BLOCK_PACKETS`."""
     first = starts_gps_ns(drive)
     span = drive.duration_s + RUN_UP_S
     count = GROUP_PACKETS * math.ceil(span * 1e9 / (GROUP_PACKETS * PACKET_NS))
@@ -159,7 +159,7 @@ def _measure_block(
 
 
 def _pattern(scene: Scene, beams: Beams) -> Pattern:
-    """The firings of a group of packets."""
+    """Return the firings of a group of packets."""
     cycles = GROUP_PACKETS * CYCLES
     origin = np.zeros((cycles, LASERS, 3))
     origin[:, :, 2] = beams.rise_m
@@ -179,12 +179,12 @@ def _pattern(scene: Scene, beams: Beams) -> Pattern:
 
 
 def _degrees_a_cycle(scene: Scene) -> float:
-    """How far the head turns from cycle to cycle."""
+    """Return the rotation of the head in a cycle."""
     return scene.lidar.turns_per_s * 360.0 * CYCLE_NS * 1e-9
 
 
 def _beside(beams: Beams, cycles: int) -> Int64:
-    """Neighbours (32 · cycles, 4) of each firing: its laser one cycle later and earlier, the lasers above and below."""
+    """Return neighbours (32 · cycles, 4) of firings: the laser a cycle later and earlier, those above and below."""
     number = np.full((cycles + 2, LASERS + 2), -1)
     order = np.argsort(beams.elevation_deg)
     number[1:-1, 1:-1] = np.arange(cycles * LASERS).reshape(cycles, LASERS)[:, order]
@@ -195,7 +195,7 @@ def _beside(beams: Beams, cycles: int) -> Int64:
 
 
 def _azimuths(scene: Scene, start_deg: float, numbers: Int64) -> tuple[npt.NDArray[np.uint16], Float64]:
-    """Azimuth that each cycle states (p, 12), hundredths, and that of each firing (p, 12, 32), degrees."""
+    """Return the stated azimuth of each cycle (p, 12), hundredths, and that of each firing (p, 12, 32), degrees."""
     per_cycle = scene.lidar.turns_per_s * 36_000.0 * CYCLE_NS * 1e-9
     cycle = numbers[:, None] * CYCLES + np.arange(CYCLES)
     share = FIRING_NS / CYCLE_NS * np.arange(LASERS)
@@ -211,7 +211,7 @@ def _azimuths(scene: Scene, start_deg: float, numbers: Int64) -> tuple[npt.NDArr
 def _recorded(
     scene: Scene, drive: Drive, block: int, found: Hits
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8]]:
-    """Ranges and intensities (p, 12, 32) with noise, as whole numbers."""
+    """Return ranges and intensities (p, 12, 32) with noise, as integers."""
     rng = stream(scene.seed, drive.number, "lidar", block)
     noise = scene.noise
     exact = found.range_m.reshape(-1, CYCLES, LASERS)
@@ -243,7 +243,7 @@ _HITS_SCHEMA: Final = pa.schema(
 
 
 def _hits(block: Packets) -> pa.RecordBatch:
-    """Where the returns of a block come from, one row a return that was recorded."""
+    """Return the origins of a block's returns, one row for each recorded return."""
     seen = block.ranges > 0
     flat = seen.reshape(len(seen), -1)
     laser = np.broadcast_to(np.arange(LASERS, dtype=np.uint8), seen.shape)

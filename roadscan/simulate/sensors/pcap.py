@@ -1,4 +1,4 @@
-"""Velodyne captures: data packets of 1,206 bytes, position packets of 512, in UDP, IP, Ethernet and PCAP."""
+"""Writes Velodyne captures: data packets of 1,206 bytes, position packets of 512, in UDP, IP, Ethernet and PCAP."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from roadscan.simulate.sensors.clock import SensorClock
 
 Int64 = npt.NDArray[np.int64]
 
-DATA_BYTES: Final = 1_206
-POSITION_BYTES: Final = 512
-DATA_PORT: Final = 2_368
-POSITION_PORT: Final = 8_308
-UPPER_BLOCK: Final = 0xEEFF
-STRONGEST_RETURN: Final = 0x37
-HDL_32E: Final = 0x21
-HOUR_NS: Final = 3_600 * NS_PER_S
+DATA_BYTES: Final = 1_206  # bytes of a data packet
+POSITION_BYTES: Final = 512  # bytes of a position packet
+DATA_PORT: Final = 2_368  # UDP port of data packets
+POSITION_PORT: Final = 8_308  # UDP port of position packets
+UPPER_BLOCK: Final = 0xEEFF  # flag of a block of the upper lasers
+STRONGEST_RETURN: Final = 0x37  # mode byte of the strongest return
+HDL_32E: Final = 0x21  # product byte
+HOUR_NS: Final = 3_600 * NS_PER_S  # nanoseconds of an hour
 POSITION_DELAY_NS: Final = 120_000_000
-"""From a full second to the position packet that names it."""
+"""Time from a full second to the position packet that names it (ns)."""
 _CAPTURE_DELAY_NS: Final = 600_000
-"""From a packet's first firing to its arrival at the computer."""
-_SENSOR_ADDRESS: Final = bytes([192, 168, 3, 43])
-_BROADCAST_ADDRESS: Final = bytes([255, 255, 255, 255])
+"""Time from a packet's first firing to its arrival at the computer (ns)."""
+_SENSOR_ADDRESS: Final = bytes([192, 168, 3, 43])  # IP address of the sensor
+_BROADCAST_ADDRESS: Final = bytes([255, 255, 255, 255])  # IP address of a broadcast
 _ETHERNET: Final = bytes.fromhex("ffffffffffff6076880000000800")
 _FIRING: Final = np.dtype([("range", "<u2"), ("intensity", "u1")])
-_BLOCK: Final = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("firings", _FIRING, 32)])
-_RECORD: Final = np.dtype(
+_BLOCK: Final = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("firings", _FIRING, 32)])  # block of a data packet
+_RECORD: Final = np.dtype(  # PCAP record of a data packet
     [
         ("captured_s", "<u4"),
         ("captured_us", "<u4"),
@@ -51,7 +51,7 @@ _RECORD: Final = np.dtype(
 
 
 class PcapWriter:
-    """Writes one capture: data packets as they come, a position packet at the start and after each full second.
+    """Writes one capture: data packets, and a position packet at the start and after each full second.
 
     Stamps within the packets are of the sensor's clock, those of the capture itself of a computer's that is right.
     """
@@ -102,7 +102,7 @@ class PcapWriter:
         return self._next_position_gps_ns <= last_gps_ns
 
     def _position_packet(self, shown_gps_ns: int, epoch_gps_ns: int) -> bytes:
-        """PCAP record of a position packet: µs past the hour at byte 198, PPS state at 202, GPRMC at 206.
+        """Return the PCAP record of a position packet: µs past the hour at byte 198, PPS state at 202, GPRMC at 206.
 
         shown_gps_ns : what the sensor's clock shows at the true epoch.
         """
@@ -117,7 +117,7 @@ class PcapWriter:
         return struct.pack("<IIII", seconds, rest // 1_000, len(frame), len(frame)) + frame
 
     def _gprmc(self, epoch_gps_ns: int, utc_s: int) -> bytes:
-        """Recommended minimum sentence of the full UTC second `utc_s` (NMEA 0183)."""
+        """Return the recommended minimum sentence of the full UTC second `utc_s` (NMEA 0183)."""
         about = np.array([epoch_gps_ns - 500_000_000, epoch_gps_ns])
         position = self._drive.poses(about).position_ecef_m
         lon, lat, _ = self._drive.earth.geographic_from_ecef(position)[1]
@@ -155,14 +155,14 @@ def _data_packets(
 
 
 def _utc_ns(epoch_gps_ns: Int64) -> Int64:
-    """POSIX nanoseconds of GPS epochs."""
+    """Return POSIX nanoseconds of GPS epochs."""
     leap = leap_seconds_at_gps(epoch_gps_ns // NS_PER_S)
     out: Int64 = epoch_gps_ns + (GPS_EPOCH_UNIX_S - leap) * NS_PER_S
     return out
 
 
 def _headers(payload_bytes: int, port: int) -> bytes:
-    """Ethernet, IPv4 and UDP headers (42 bytes) of a broadcast of `payload_bytes` to `port`."""
+    """Return Ethernet, IPv4 and UDP headers (42 bytes) of a broadcast of `payload_bytes` to `port`."""
     udp = struct.pack(">HHHH", 443 if port == DATA_PORT else port, port, 8 + payload_bytes, 0)
     ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(udp) + payload_bytes, 0, 0, 64, 17, 0)
     ip += _SENSOR_ADDRESS + _BROADCAST_ADDRESS
@@ -173,6 +173,6 @@ def _headers(payload_bytes: int, port: int) -> bytes:
 
 
 def _degrees_minutes(degrees: float, digits: int) -> str:
-    """``4806.12345``: whole degrees of `digits` figures and minutes."""
+    """Return ``4806.12345``: whole degrees of `digits` figures and minutes."""
     whole, rest = divmod(math.floor(abs(degrees) * 60 * 1e5), 60 * 100_000)
     return f"{whole:0{digits}d}{rest // 100_000:02d}.{rest % 100_000:05d}"

@@ -1,4 +1,4 @@
-"""What a camera sees of a scene: a ray through each pixel, sunlight and shadows, more rays at edges."""
+"""Renders what a camera sees of a scene: a ray through each pixel, sunlight and shadows, more rays at edges."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ Flags = npt.NDArray[np.bool_]
 
 EYE: Final = np.eye(3)
 """Axes frd: x ahead along the optical axis, y right, z down."""
-_RAYS_AT_ONCE: Final = 1 << 17
-_NEAREST_M: Final = 0.05
-_KEYS_A_PICTURE: Final = 1 << 32
+_RAYS_AT_ONCE: Final = 1 << 17  # rays cast together
+_NEAREST_M: Final = 0.05  # nearer things are not met
+_KEYS_A_PICTURE: Final = 1 << 32  # random keys reserved for a picture
 
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 150.0, 42.0
-"""Where the sun stands, in every scene and at any time."""
+"""Azimuth and elevation of the sun (degrees), in every scene and at any time."""
 _AMBIENT: Final = 0.45
-"""Share of the light that comes from all sides; what the sun lights fully has the rest, too."""
-_LIT_GROUND: Final = _AMBIENT + (1.0 - _AMBIENT) * math.sin(math.radians(SUN_ELEVATION_DEG))
-_SHADOWS_WITHIN_M: Final = 40.0
+"""Share of ambient light; fully sunlit surfaces also get the rest."""
+_LIT_GROUND: Final = _AMBIENT + (1.0 - _AMBIENT) * math.sin(math.radians(SUN_ELEVATION_DEG))  # light
+_SHADOWS_WITHIN_M: Final = 40.0  # farther things cast no shadows
 _OFF_SURFACE_M: Final = 0.02
-"""Rays to the sun start so far before the surface, so that it does not stop them itself."""
+"""Distance from the surface at which rays to the sun start (m), so that it does not stop them itself."""
 
-_GLASS: Final = 58.0
+_GLASS: Final = 58.0  # tone of glass
 _HORIZON, _ZENITH, _LAND = 226.0, 168.0, 142.0
 """Tones of the sky, and of the land beyond the verge, which has no surface."""
-_HAZE_M: Final = 300.0
+_HAZE_M: Final = 300.0  # distance at which haze leaves e⁻¹ of the contrast
 _EDGE: Final = 16.0
-"""A pixel whose neighbours differ by more gets more rays."""
-_INSIDE_PX: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-_AROUND: Final = tuple((i, j) for i in (0, -1, 1) for j in (0, -1, 1))
+"""Difference of neighbouring pixels from which a pixel gets more rays."""
+_INSIDE_PX: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # further rays
+_AROUND: Final = tuple((i, j) for i in (0, -1, 1) for j in (0, -1, 1))  # offsets of a pixel's neighbours
 
 
 def picture(world: World, drive: Drive, epoch_gps_ns: int, number: int, tints: Tints | None = None) -> Float32:
@@ -70,7 +70,7 @@ def picture(world: World, drive: Drive, epoch_gps_ns: int, number: int, tints: T
 
 @dataclass(frozen=True)
 class _Seen:
-    """What n rays have met."""
+    """Results of n rays."""
 
     ray: Float32
     """(n, 3) in the camera's axes."""
@@ -87,12 +87,12 @@ class _Seen:
 
     @property
     def point_m(self) -> Float32:
-        """(n, 3) in the camera's axes; NaN where nothing was met."""
+        """Return (n, 3) points in the camera's axes; NaN where nothing was met."""
         return np.asarray(self.ray * self.range_m[:, None])
 
 
 class _Eye:
-    """A camera at the instant of an exposure; its shutter opens for no time."""
+    """A camera at the instant of an exposure, which takes no time."""
 
     def __init__(self, world: World, drive: Drive, epoch_gps_ns: int, number: int, tints: Tints | None) -> None:
         self._world = world
@@ -109,12 +109,12 @@ class _Eye:
         a, e = math.radians(SUN_AZIMUTH_DEG), math.radians(SUN_ELEVATION_DEG)
         north_east_down = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), -math.sin(e)])
         self.sun: Float64 = level @ north_east_down
-        """(3,) towards the sun, in the camera's axes."""
+        """(3,) direction to the sun, in the camera's axes."""
         self.down: Float64 = level[:, 2]
         """(3,) downwards."""
 
     def look(self, column_px: Float32, row_px: Float32) -> _Seen:
-        """Rays through places (n,) of the picture."""
+        """Cast rays through places (n,) of the picture."""
         parts = []
         for begin in range(0, column_px.size, _RAYS_AT_ONCE):
             part = slice(begin, begin + _RAYS_AT_ONCE)
@@ -130,7 +130,7 @@ class _Eye:
         return _Seen(ray.astype(single), range_m.astype(single), shade.astype(single), object_id, glass, shares)
 
     def tones(self, seen: _Seen, plane: Float32) -> Float32:
-        """Values (n,) or (n, 3) of what rays have met on surfaces with the normals (n, 3; NaN: not known)."""
+        """Return values (n,) or (n, 3) of rays that met surfaces with normals (n, 3; NaN: unknown)."""
         up = -seen.ray @ self.down.astype(np.float32)
         sky = np.where(up >= 0.0, _HORIZON + (_ZENITH - _HORIZON) * np.sqrt(np.maximum(up, 0.0)), _LAND)
         light = self._light(seen, plane)
@@ -142,7 +142,7 @@ class _Eye:
         return out
 
     def _light(self, seen: _Seen, plane: Float32) -> Float32:
-        """Light (n,) as a share of that of level ground in the sun."""
+        """Return light (n,) as a share of that of level ground in the sun."""
         facing = np.nan_to_num(plane @ self.sun.astype(np.float32), nan=math.sin(math.radians(SUN_ELEVATION_DEG)))
         sunny = np.flatnonzero((facing > 0.0) & np.isfinite(seen.range_m))
         direct = np.zeros(facing.size)
@@ -166,7 +166,7 @@ class _Eye:
 
 
 def _coloured(seen: _Seen, light: Float32, near: Float32, sky: Float64) -> Float32:
-    """Values (n, 3) of what rays have met in a light (n,), at a nearness (n,) of 1 … 0, before a sky (n,)."""
+    """Return values (n, 3) of hits in a light (n,), at a nearness (n,) of 1 … 0, before a sky (n,)."""
     tint = seen.tint if seen.tint is not None else np.ones((len(light), 3), np.float32)
     shade = np.nan_to_num(seen.shade)
     lit = (shade * light * near)[:, None] * tint + (_HORIZON * (1.0 - near))[:, None] * SKY
@@ -175,7 +175,7 @@ def _coloured(seen: _Seen, light: Float32, near: Float32, sky: Float64) -> Float
 
 
 def _planes(seen: _Seen, shape: tuple[int, int]) -> Float32:
-    """Normals (n, 3) towards the camera of the surfaces in the pixels, by their neighbours; NaN where none is met."""
+    """Return normals (n, 3) towards the camera of the surfaces in the pixels, by their neighbours; NaN for no hit."""
     point = seen.point_m.reshape(*shape, 3)
     object_id = seen.object_id.reshape(shape)
     normal = np.cross(_step(point, object_id, 1), _step(point, object_id, 0)).reshape(-1, 3)
@@ -188,7 +188,7 @@ def _planes(seen: _Seen, shape: tuple[int, int]) -> Float32:
 
 
 def _step(point: Float32, object_id: Int32, axis: int) -> Float32:
-    """From each pixel (h, w, 3) to the nearer of its neighbours along an axis that see the same object."""
+    """Return the step from each pixel (h, w, 3) to its nearer neighbour along an axis with the same object."""
     ahead = np.full_like(point, np.nan)
     inner, outer = ([slice(None)] * 2 for _ in range(2))
     inner[axis], outer[axis] = slice(None, -1), slice(1, None)
@@ -203,7 +203,7 @@ def _step(point: Float32, object_id: Int32, axis: int) -> Float32:
 
 
 def _closer(eye: _Eye, seen: _Seen, plane: Float32, edges: npt.NDArray[np.int64], shape: tuple[int, int]) -> Float32:
-    """Values (n,) or (n, 3) of pixels with more than one thing in them: the mean of four rays through each."""
+    """Return values (n,) or (n, 3) of pixels with several things in them: the mean of four rays through each."""
     row, column = (a.astype(np.float32) for a in np.unravel_index(edges, shape))
     inside = [eye.look(column + x, row + y) for x, y in _INSIDE_PX]
     tones = (eye.tones(one, _plane_beside(one, seen, plane, edges, shape)) for one in inside)
@@ -214,7 +214,7 @@ def _closer(eye: _Eye, seen: _Seen, plane: Float32, edges: npt.NDArray[np.int64]
 def _plane_beside(
     one: _Seen, seen: _Seen, plane: Float32, pixels: npt.NDArray[np.int64], shape: tuple[int, int]
 ) -> Float32:
-    """Normals (n, 3) at points within pixels: that of the plane of a pixel around that is nearest to the point."""
+    """Return normals (n, 3) at points within pixels: that of the adjacent pixel whose plane is nearest to each."""
     row, column = np.unravel_index(pixels, shape)
     best = np.full(pixels.size, np.inf, np.float32)
     out = np.full((pixels.size, 3), np.nan, np.float32)

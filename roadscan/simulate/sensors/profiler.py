@@ -1,4 +1,4 @@
-"""The triangulation pair: profiles of the road as ``scans`` Parquet, one file a head and run."""
+"""Simulates the triangulation pair: profiles of the road as ``scans`` Parquet, one file per head and run."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 
 BLOCK_PROFILES: Final = 512
-"""Profiles measured at once and a Parquet row group."""
+"""Profiles measured together, and rows of a Parquet row group."""
 BESIDE_M: Final = 4.0
-"""Things farther from the middle of a head's profiles are not met (m)."""
-_OUT_OF_REACH_M: Final = 1e9
+"""Things farther from the middle of a head's profiles cannot be met (m)."""
+_OUT_OF_REACH_M: Final = 1e9  # easting of bodies that cannot be met
 _SPOT_PARTS: Final = (-0.4, -0.2, 0.0, 0.2, 0.4)
 """Places of the parts of a beam's spot, as shares of its width."""
 _BENT_M: Final = 1e-7
-"""Planes that miss their points in road coordinates by more are followed in the map, which takes longer."""
+"""Planes with a larger error in road coordinates are followed in the map (m), which takes longer."""
 _REACH_M: Final = 0.3
-"""The planes are fitted within this of their middle range."""
+"""Range around the middle range within which the planes are fitted (m)."""
 GEOMETRY_KEY: Final = "roadscan.scan_geometry"
 BODY_FROM_AXES: Final = np.eye(3)
 """Axes frd: y to the right, z down along the range."""
@@ -72,17 +72,17 @@ class Head:
 
     @property
     def y_sensor_m(self) -> Float64:
-        """Transverse position of the readings (n,)."""
+        """Return the transverse position of the readings (n,)."""
         first, step = self.first_step_m
         return np.asarray(first + step * np.arange(self.settings.readings, dtype=np.float64))
 
     @property
     def first_step_m(self) -> tuple[float, float]:
-        """Transverse position of the first reading and the step from reading to reading (m)."""
+        """Return the transverse position of the first reading and the step from reading to reading (m)."""
         return -self.settings.width_m / 2, self.settings.width_m / (self.settings.readings - 1)
 
     def geometry(self) -> dict[str, object]:
-        """How the readings lie in the sensor's frame, as the log's metadata state it."""
+        """Return the geometry of the readings in the sensor's frame, for the log's metadata."""
         first, step = self.first_step_m
         return {
             "kind": "cartesian",
@@ -106,13 +106,13 @@ class Profiles:
     intensity: npt.NDArray[np.uint8]
     """(p, n)"""
     hits: Float64
-    """(p, n, 4) easting, northing, height in the map, and exact range (m); (0, 0, 0) if not wanted."""
+    """(p, n, 4) easting, northing, height in the map, and exact range (m); (0, 0, 0) if not requested."""
     object_id: Int32
-    """(p, n) 0: the road, −1: nothing; (0, 0) if not wanted."""
+    """(p, n) 0: the road, −1: nothing; (0, 0) if not requested."""
 
 
 def heads(settings: Profilers) -> list[Head]:
-    """The heads of the rig; none where they are switched off."""
+    """Return the heads of the rig; none where they are switched off."""
     if not settings.on:
         return []
     return [Head("profiler_left", settings.left, settings), Head("profiler_right", settings.right, settings)]
@@ -128,7 +128,7 @@ def write_profiles(
     hits_file: Path | None,
     things: Sequence[Object] = (),
 ) -> Iterator[int]:
-    """Write the profiles of one head, a row group a step; yields the readings of each.
+    """Write the profiles of one head, one row group per step; yields the readings of each.
 
     things : what stands on or beside the road, and may stand in the beams' way.
     """
@@ -181,7 +181,7 @@ def measure(
     *,
     with_hits: bool = False,
 ) -> Iterator[Profiles]:
-    """Profiles of a whole pass, one each `spacing_m` driven, in blocks of :data:`BLOCK_PROFILES`."""
+    """Yield profiles of a whole pass, one each `spacing_m` driven, in blocks of :data:`BLOCK_PROFILES`."""
     spacing = head.settings.spacing_m
     count = math.floor(drive.length_m / spacing + 1e-9) + 1
     encoder, movers = WheelEncoder(scene, drive), _Movers.of(scene, surface, drive)
@@ -204,7 +204,7 @@ class _Pass:
     movers: _Movers
 
     def block(self, driven_m: Float64, first: int, *, with_hits: bool) -> Profiles:
-        """Profiles (p,) after distances driven; first : number of the first one."""
+        """Return profiles (p,) at distances driven; first : number of the first one."""
         head, drive, surface = self.head, self.drive, self.surface
         epochs = drive.epoch_gps_ns(driven_m)
         origins, rotations = drive.poses(epochs).sensor(head.mount, BODY_FROM_AXES)
@@ -245,7 +245,7 @@ class _Pass:
 
 @dataclass(frozen=True)
 class _Near:
-    """Bodies of all things, to choose from."""
+    """Bodies of all things, for selection by distance."""
 
     bodies: Float64
     """(b, 18)"""
@@ -254,13 +254,13 @@ class _Near:
 
     @classmethod
     def of(cls, things: Sequence[Object]) -> Self:
-        """All bodies of the things, those that stand still."""
+        """Return all bodies of the standing things."""
         rows = [np.zeros((0, BODY_COLUMNS)), *(thing.bodies for thing in things)]
         owners = [np.zeros(0, np.int32), *(np.full(len(thing.bodies), thing.id, np.int32) for thing in things)]
         return cls(np.concatenate(rows), np.concatenate(owners))
 
     def within(self, path_m: Float64) -> tuple[Float64, Int32]:
-        """Bodies (m, 18) that profiles through map points (p, 2) can meet, and their objects (m,)."""
+        """Return bodies (m, 18) that profiles through map points (p, 2) can meet, and their objects (m,)."""
         if not self.bodies.size:
             return self.bodies, self.object_id
         low, high = path_m.min(axis=0) - BESIDE_M, path_m.max(axis=0) + BESIDE_M
@@ -272,7 +272,7 @@ class _Near:
 
 @dataclass(frozen=True)
 class _Movers:
-    """Cars that move while a pass is recorded, and what they are made of at an epoch."""
+    """Moving cars of a pass, and their bodies at an epoch."""
 
     surface: Surface
     start_gps_ns: int
@@ -280,13 +280,13 @@ class _Movers:
 
     @classmethod
     def of(cls, scene: Scene, surface: Surface, drive: Drive) -> Self:
-        """The cars of this pass."""
+        """Return the cars of this pass."""
         cars = zip(scene.roadside.moving_cars, moving_objects(scene, surface), strict=True)
         driving = ((car, known) for car, known in cars if not car.passes or drive.number + 1 in car.passes)
         return cls(surface, drive.start_gps_ns, tuple(driving))
 
     def at(self, epoch_gps_ns: Int64, path_m: Float64) -> tuple[Float64, Int32]:
-        """Bodies (p, m, 18) of the cars that profiles (p,) through map points (p, 2) can meet, their objects (m,).
+        """Return car bodies (p, m, 18) that profiles (p,) through map points (p, 2) can meet, and their objects (m,).
 
         Cars move evenly within slots of time, as for all other rays, so blocks of profiles change nothing.
         """
@@ -299,7 +299,7 @@ class _Movers:
         return np.concatenate(rows, axis=1), np.concatenate(owners)
 
     def _near(self, car: MovingCar, epoch_gps_ns: Int64, path_m: Float64) -> npt.NDArray[np.bool_]:
-        """Whether each profile (p,) can meet a car."""
+        """Return whether each profile (p,) can meet a car."""
         nodes = self.surface.arrays.nodes
         station = car.station_m + car.speed_m_per_s * (epoch_gps_ns - self.start_gps_ns) * 1e-9
         easting, northing, _ = self.surface.place(np.clip(station, nodes[0, STATION], nodes[-1, STATION]), car.offset_m)
@@ -308,7 +308,7 @@ class _Movers:
         return np.asarray(away < BESIDE_M + car.length_m + car.width_m)
 
     def _moved(self, car: MovingCar, count: int, epoch_gps_ns: Int64, near: npt.NDArray[np.bool_]) -> Float64:
-        """Bodies (p, count, 18) of a car at each profile; out of reach where it is not `near` or not on the road."""
+        """Return bodies (p, count, 18) of a car at each profile; out of reach where not `near` or not on the road."""
         rows = np.zeros((epoch_gps_ns.size, count, BODY_COLUMNS))
         rows[..., KIND] = BOX
         rows[..., EASTING] = _OUT_OF_REACH_M
@@ -329,7 +329,7 @@ class _Movers:
 
 
 def _object_ids(body_hit: Int32, owners: Int32, range_m: Float64) -> Int32:
-    """Object of each reading (p, n): 0 the road, −1 nothing."""
+    """Return the object of each reading (p, n): 0 the road, −1 nothing."""
     if not body_hit.size:
         return body_hit
     ids = np.append(owners, 0).astype(np.int32)[body_hit]
@@ -340,7 +340,7 @@ def _object_ids(body_hit: Int32, owners: Int32, range_m: Float64) -> Int32:
 def _planes(
     surface: Surface, drive: Drive, origins: Float64, rotations: Float64, half_width_m: float, middle_m: float
 ) -> kernels.Planes:
-    """Fit the planes to 15 exact points of each, around their middle range.
+    """Return planes fitted to 15 exact points of each, around their middle range.
 
     What the planes in the map leave out is below 10⁻¹¹ m.
     """
@@ -370,19 +370,19 @@ def _planes(
 
 
 def _hits(drive: Drive, origins: Float64, rotations: Float64, y_sensor_m: Float64, range_m: Float64) -> Float64:
-    """Map coordinates and ranges (p, n, 4) of the points at true ranges (p, n), by the exact projection."""
+    """Return map coordinates and ranges (p, n, 4) of the points at true ranges (p, n), by the exact projection."""
     sensor = np.zeros((*range_m.shape, 3))
     sensor[:, :, 1] = y_sensor_m
     sensor[:, :, 2] = range_m
     ecef = origins[:, None] + sensor @ rotations.swapaxes(1, 2)
-    with np.errstate(invalid="ignore"):  # PROJ answers NaN with infinity
+    with np.errstate(invalid="ignore"):  # PROJ returns infinity for NaN
         enh = drive.earth.map_from_ecef(ecef.reshape(-1, 3)).reshape(ecef.shape)
     enh[np.isnan(range_m)] = np.nan
     return np.concatenate([enh, range_m[:, :, None]], axis=-1)
 
 
 def _spot(settings: Profilers) -> Float64:
-    """Parts of a beam's spot (25, 2), along and across the profile (m); (0, 2) where it has no width."""
+    """Return parts of a beam's spot (25, 2), along and across the profile (m); (0, 2) where it has no width."""
     if not settings.spot_along_m and not settings.spot_across_m:
         return np.zeros((0, 2))
     along = (settings.spot_along_m or settings.spot_across_m) * np.array(_SPOT_PARTS)
@@ -392,13 +392,13 @@ def _spot(settings: Profilers) -> Float64:
 
 @functools.cache
 def _normal_numbers() -> npt.NDArray[np.float32]:
-    """Standard normal numbers (65536,) of equal probability."""
+    """Return standard normal numbers (65536,) of equal probability."""
     numbers: npt.NDArray[np.float32] = ndtri((np.arange(65_536) + 0.5) / 65_536).astype(np.float32)
     return numbers
 
 
 def _random_from(scene: Scene, drive: Drive, head: Head) -> int:
-    """Where the random numbers of a head's first reading in a pass begin."""
+    """Return the key of the random numbers of a head's first reading in a pass."""
     return int(stream(scene.seed, drive.number, head.name).integers(0, 2**62))
 
 

@@ -1,4 +1,4 @@
-"""The line scanner: a SICK LMS 200, its telegrams as a byte log, and their stamps in a CSV beside it.
+"""Simulates the line scanner: a SICK LMS 200, its telegrams as a byte log, and their stamps in a CSV beside it.
 
 The mirror turns 75 times a second. Readings run from right to left, seen from behind the scanner with its lid up:
 reading i lies at the angle 90° − i · resolution from z towards y, in the sensor's y-z plane, x out of the lid. It is
@@ -36,10 +36,10 @@ UInt8 = npt.NDArray[np.uint8]
 UInt16 = npt.NDArray[np.uint16]
 
 TURN_NS: Final = round(NS_PER_S / 75)
-"""One turn of the mirror."""
-RANGE_MIN_M: Final = 0.05
+"""Duration of one turn of the mirror (ns)."""
+RANGE_MIN_M: Final = 0.05  # nearer things are not met
 BLOCK_SCANS: Final = 32
-"""Scans measured at once: the noise is drawn by the block, so this changes bytes."""
+"""Scans measured together: the noise is drawn by block, so this changes bytes."""
 BODY_FROM_AXES: Final = np.eye(3)
 """Axes frd: y to the right, z down along the middle reading."""
 STAMPS_FILE: Final = "sick_stamps.csv"
@@ -47,37 +47,37 @@ STAMP_COLUMN: Final = "time_ns"
 OFFSET_COLUMN: Final = "byte"
 
 _PIECES: Final = 10
-"""Within such a part of a scan's half turn the sensor moves evenly."""
-_PIECE_NS: Final = TURN_NS // (2 * _PIECES) + 1
-_CODES: Final = 9
+"""Parts of a scan's half turn, within which the sensor moves evenly."""
+_PIECE_NS: Final = TURN_NS // (2 * _PIECES) + 1  # duration of such a part
+_CODES: Final = 9  # highest values that are codes
 _TOO_FAR: Final = 0
-"""Of the codes: no reading within range."""
-_HEAD: Final = (0x02, 0x80)
-_ALL_VALUES: Final = 0xB0
-_MILLIMETRES: Final = 1 << 14
-_STATUS: Final = 0x10
-_POLYNOMIAL: Final = 0x8005
+"""Code of a reading out of range."""
+_HEAD: Final = (0x02, 0x80)  # first byte and a scanner's address
+_ALL_VALUES: Final = 0xB0  # command of complete scans
+_MILLIMETRES: Final = 1 << 14  # bits of the count word: readings in mm
+_STATUS: Final = 0x10  # status without faults
+_POLYNOMIAL: Final = 0x8005  # SICK's CRC-16 without its highest term
 
 
 @dataclass(frozen=True)
 class Scanner:
-    """How the scanner is set."""
+    """Settings of the scanner."""
 
     settings: Sick
 
     @property
     def readings(self) -> int:
-        """Readings a scan."""
+        """Number of readings in a scan."""
         return round(180.0 / self.settings.resolution_deg) + 1
 
     @property
     def turns(self) -> int:
-        """Turns of the mirror that a scan takes."""
+        """Number of turns of the mirror in a scan."""
         return 2 if self.settings.interlaced else 1
 
     @property
     def range_bits(self) -> int:
-        """Bits of a reading that are its range, by the measuring mode that reaches far enough: 8, 16 or 32 m."""
+        """Bits of a reading that are its range, by the least measuring mode that reaches far enough: 8, 16 or 32 m."""
         return next(bits for bits in (13, 14, 15) if self.settings.range_max_m * 1000 < (1 << bits) - _CODES)
 
     @property
@@ -97,7 +97,7 @@ class Scanner:
         return np.arange(self.readings, dtype=np.float64) * (self.settings.resolution_deg / 360.0 * NS_PER_S / 75)
 
     def pattern(self) -> Pattern:
-        """The readings of a scan."""
+        """Return the readings of a scan."""
         piece = np.minimum(self.past_ns // _PIECE_NS, _PIECES - 1).astype(np.int64)
         return Pattern(
             np.zeros((self.readings, 3)),
@@ -110,14 +110,14 @@ class Scanner:
         )
 
     def beside(self) -> Int64:
-        """Neighbours (n, 4) of each reading: the next and the last one of the same turn; none across the scan."""
+        """Return neighbours (n, 4) of each reading: next and last one of the same turn; none across the scan."""
         number = np.arange(self.readings)
         after, before = number + self.turns, number - self.turns
         after[after >= self.readings] = -1
         return np.stack([after, np.maximum(before, -1), np.full_like(number, -1), np.full_like(number, -1)], axis=-1)
 
     def options(self) -> str:
-        """The log's ``options = …`` in the survey file."""
+        """Return the log's ``options = …`` in the survey file."""
         parts = [f'stamps = "{STAMPS_FILE}"', f'stamp_column = "{STAMP_COLUMN}"', f'offset_column = "{OFFSET_COLUMN}"']
         return "{ " + ", ".join([*parts, f"turns = {self.turns}", f"range_bits = {self.range_bits}"]) + " }"
 
@@ -162,7 +162,7 @@ def write_sick(
 
 
 def measure(scene: Scene, world: World, drive: Drive) -> Iterator[Scans]:
-    """Scans of a whole pass, in blocks of :data:`BLOCK_SCANS`."""
+    """Yield scans of a whole pass, in blocks of :data:`BLOCK_SCANS`."""
     scanner = Scanner(scene.sick)
     first = drive.start_gps_ns - round(RUN_UP_S / 2 * NS_PER_S)
     count = math.ceil((drive.duration_s + RUN_UP_S) * scene.sick.scans_per_s)
@@ -187,7 +187,7 @@ def measure(scene: Scene, world: World, drive: Drive) -> Iterator[Scans]:
 
 
 def _values(scene: Scene, drive: Drive, block: int, exact_m: Float64) -> UInt16:
-    """Readings as stated: with noise, rounded to millimetres, codes where there are none."""
+    """Return the readings as stated: with noise, rounded to millimetres, codes where there are none."""
     rng = stream(scene.seed, drive.number, "sick", block)
     seen = np.isfinite(exact_m)
     if scene.noise.dropout > 0.0:
@@ -201,7 +201,7 @@ def _values(scene: Scene, drive: Drive, block: int, exact_m: Float64) -> UInt16:
 
 
 def telegrams(values: UInt16) -> UInt8:
-    """Telegrams (s, bytes) of scans (s, n)."""
+    """Return telegrams (s, bytes) of scans (s, n)."""
     count, readings = values.shape
     size = 2 * readings + 4
     head = [*_HEAD, size & 0xFF, size >> 8, _ALL_VALUES, readings & 0xFF, (readings | _MILLIMETRES) >> 8]
@@ -215,7 +215,7 @@ def telegrams(values: UInt16) -> UInt8:
 
 
 def _crc(rows: UInt8) -> Int64:
-    """The maker's CRC-16 (s,) of each row (s, bytes), as its listing computes it: shifted by a bit for each byte."""
+    """Return the maker's CRC-16 (s,) of each row (s, bytes), as its listing computes it: shifted by a bit per byte."""
     crc = np.zeros(len(rows), np.int64)
     before = np.zeros(len(rows), np.int64)
     for byte in rows.T.astype(np.int64):
@@ -235,7 +235,7 @@ def _hits_schema(readings: int) -> pa.Schema:
 
 
 def _hits(scanner: Scanner, block: Scans, schema: pa.Schema) -> pa.RecordBatch:
-    """Where the readings of a block come from."""
+    """Return the origins of a block's readings."""
     codes_from = (1 << scanner.range_bits) - _CODES
     own = np.arange(scanner.turns)[:, None] == scanner.turn_of
     seen = (block.values < codes_from)[:, None, :] & own

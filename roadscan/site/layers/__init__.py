@@ -1,1 +1,1 @@
-"""Kinds of layers of the site, a file a kind."""
+"""Kinds of layers of the site, one per file."""

@@ -1,4 +1,4 @@
-"""Layers of the inventory, one a kind, or of the assets that the newest run found where there is none."""
+"""Layers of the inventory, one per kind, or of the assets of the newest run where there is no inventory."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ GEOMETRY_OF: Final[dict[str, Geometry]] = {
     "PointZ": "point", "LineStringZ": "line", "MultiLineStringZ": "line", "PolygonZ": "polygon",
     "MultiPolygonZ": "polygon",
 }  # fmt: skip
-"""How a layer calls the geometry of a schema."""
-_WIDTH_PX: Final = {"point": 9, "line": 3, "polygon": 2}
+"""Layer geometry by geometry of a schema."""
+_WIDTH_PX: Final = {"point": 9, "line": 3, "polygon": 2}  # line widths and marker sizes
 _COLOURS: Final = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
-_GRADES: Final = (GOOD_TO_POOR[0], GOOD_TO_POOR[2], GOOD_TO_POOR[4])
+_GRADES: Final = (GOOD_TO_POOR[0], GOOD_TO_POOR[2], GOOD_TO_POOR[4])  # colours of severities
 _STATES: Final = {"found": BLUE, "confirmed": GREEN, "missing": RED, "rejected": GREY}
 
 _Rows = tuple[pa.Table, npt.NDArray[Any]]
 
 
 class Assets(LayerKind):
-    """What stands beside, on and over the road, and of an inventory the distresses of the pavement."""
+    """Objects beside, on and over the road, and distresses of the pavement of an inventory."""
 
     name = "assets"
 
     def layers(self, material: Material) -> Iterator[SiteLayer]:
-        """A layer a kind of which there is anything."""
+        """Yield a layer for each kind with any object."""
         is_inventory = material.inventory is not None
         for place, (kind, colour) in enumerate(zip(asset_kind_names(), cycle(_COLOURS), strict=False)):
             held = _of_inventory(material, kind) if is_inventory else _found(material, kind)
@@ -63,14 +63,14 @@ class Assets(LayerKind):
 
 
 def _found(material: Material, kind: str) -> _Rows | None:
-    """What the newest run found; its tables lie below `products/assets`."""
+    """Return the rows of the newest run, whose tables are below `products/assets`."""
     path = f"{FOLDER}/{asset_schema(kind).table}.parquet"
     held = material.rows_of([r for r in material.session.manifest.all() if r.path == path])
     return None if held is None or held.shapes_m is None else (held.rows, held.shapes_m)
 
 
 def _of_inventory(material: Material, kind: str) -> _Rows | None:
-    """What the inventory holds today, without what people rejected; shapes in metres."""
+    """Return the rows of the inventory today, without those that people rejected; shapes in metres."""
     shown = material.inventory
     own = None if shown is None else shown[1].assets.get(kind)
     if own is None:
@@ -104,13 +104,13 @@ def _layer(material: Material, kind: str, held: _Rows, order: int, colour: str) 
 
 
 def _evidence(material: Material, row: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What shows an asset: pictures, the passes of its first and last return, its place on the strips."""
+    """Return the evidence for an asset: pictures, the passes of its first and last return, its place on the strips."""
     epochs = (row.get("first_epoch_gps_ns"), row.get("last_epoch_gps_ns"))
     return [*evidence.of_pictures(material, row), *evidence.of_passes(material, epochs), *evidence_of_row(row)]
 
 
 def _styles(schema: AssetSchema, width_px: float) -> Iterator[Style]:
-    """Styles of a distress: by its type and severity, and by the figures that its severity follows from."""
+    """Yield styles of a distress: by its type and severity, and by the figures behind its severity."""
     for column in schema.own if schema.found_in else ():
         if column.values:
             colours = _GRADES if column.name == "severity" else _COLOURS
@@ -121,7 +121,7 @@ def _styles(schema: AssetSchema, width_px: float) -> Iterator[Style]:
 
 
 def site_column(column: AssetColumn, names: Sequence[str], *, is_edited: bool) -> SiteColumn:
-    """A column of assets as the page reads it, with the one of `names` that holds its 1 σ."""
+    """Return a column of assets for the page, with the one of `names` that is its 1 σ."""
     sigma = {"easting_m": "sigma_horizontal_m", "northing_m": "sigma_horizontal_m"}.get(
         column.name, f"sigma_{column.name}"
     )

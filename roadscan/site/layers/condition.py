@@ -1,4 +1,4 @@
-"""Layers of the roads: reference lines, lanes, surfaces, sections in colours of their condition, patches, regions."""
+"""Layers of the roads: reference lines, lanes, surfaces, sections by condition, patches, regions."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from roadscan.site.layer import (
 )
 from roadscan.site.material import Material
 
-_ROUGHNESS = Style("MRI (m/km)", 6, by="mri_m_per_km", limits=(1.0, 1.5, 2.7, 4.0))
-_RUTS_MM = (2.5, 5.1, 10.2, 15.0)
+_ROUGHNESS = Style("MRI (m/km)", 6, by="mri_m_per_km", limits=(1.0, 1.5, 2.7, 4.0))  # limits: see `_STYLES`
+_RUTS_MM = (2.5, 5.1, 10.2, 15.0)  # limits: see `_STYLES`
 _STYLES = (
     _ROUGHNESS,
     Style("Rut depth left (mm)", 6, by="rut_depth_mean_left_mm", limits=_RUTS_MM),
@@ -29,18 +29,18 @@ _STYLES = (
     Style("Mean profile depth (mm)", 6, by="mpd_mean_mm", limits=(0.4, 0.6, 0.8, 1.2)),
 )
 """Limits of good, fair and poor for IRI, rutting, cracking and faulting are those of 23 CFR 490.313 (IRI 95 and 170
-in/mi, rutting 0.20 and 0.40 in, cracking 5 and 20 %, faulting 0.10 and 0.15 in); the others only part the colours."""
+in/mi, rutting 0.20 and 0.40 in, cracking 5 and 20 %, faulting 0.10 and 0.15 in); the others only divide the colours."""
 
 _BY_TILE = (_ROUGHNESS, Style("Rut depth (mm)", 6, by="rut_depth_mean_mm", limits=_RUTS_MM))
 
 
 class Condition(LayerKind):
-    """What the stage `condition` makes."""
+    """Results of the stage `condition`."""
 
     name = "condition"
 
     def layers(self, material: Material) -> Iterator[SiteLayer]:
-        """A layer a table that the survey has."""
+        """Yield a layer for each table that the survey has."""
         for table, about in (
             ("reference_lines", described("reference_lines", "Reference lines", "survey", "line", 210,
                 [Style("one colour", 1, PURPLE)], key="road", visible=False)),

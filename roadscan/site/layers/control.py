@@ -14,9 +14,9 @@ from roadscan.site.layer import BLUE, RED, LayerKind, SiteLayer, Style, schema_c
 from roadscan.site.material import Material
 from roadscan.store.readings.row_groups import read_groups
 
-_STYLE = Style("Role", 9, by="role", values={"gcp": BLUE, "check": RED})
+_STYLE = Style("Role", 9, by="role", values={"gcp": BLUE, "check": RED})  # marker size in pixels
 _RESIDUALS_M = (-0.010, -0.003, 0.003, 0.010)
-"""Within 3 mm is what an adjusted survey reaches; beyond 10 mm a point or a pass is to be looked at."""
+"""Limits of residuals (m): an adjusted survey reaches 3 mm; beyond 10 mm a point or a pass should be checked."""
 _RESIDUAL_STYLES = [
     Style(f"Residual {title}, surveyed − measured (mm)", 9, by=column, limits=_RESIDUALS_M, shown_in=("mm", 1000.0),
           is_difference=True)
@@ -29,12 +29,12 @@ _ARROWS = {
 
 
 class Control(LayerKind):
-    """A point a run that saw it, with surveyed minus measured; before an adjustment the points alone."""
+    """Points per run that measured them, with surveyed minus measured; before an adjustment only the points."""
 
     name = "control"
 
     def layers(self, material: Material) -> Iterator[SiteLayer]:
-        """One layer; none without surveyed points."""
+        """Yield one layer; none without surveyed points."""
         held = material.table("control_residuals")
         if held is not None and held.rows.num_rows:
             yield _layer(material, "control_residuals", held.rows, _ARROWS)

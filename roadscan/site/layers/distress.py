@@ -27,7 +27,7 @@ class Distress(LayerKind):
     name = "distress"
 
     def layers(self, material: Material) -> Iterator[SiteLayer]:
-        """A layer a product that was made."""
+        """Yield a layer for each product that was made."""
         cracks = [
             Style("Type", 2, by="type", values=_TYPES),
             Style("Mean width (m)", 2, by="width_mean_m", limits=(0.003, 0.006, 0.013, 0.019)),

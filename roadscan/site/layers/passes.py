@@ -1,4 +1,4 @@
-"""Layer of the passes: where the vehicles drove."""
+"""Layer of the passes: the vehicles' paths."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from roadscan.tiles.lane_direction import STEP_M
 
 RUN_COLOURS = (BLUE, RED, GREEN, PURPLE, SKY, ORANGE)
 _FAITHFUL_M = 0.02
-"""A line strays no farther from the driven path than this: a network of them is still a small file."""
+"""Largest distance of a line from the driven path (m), with which a network is still a small file."""
 _POSE = ["epoch_gps_ns", "x_world_m", "y_world_m", "z_world_m"]
 
 
 class Passes(LayerKind):
-    """A line a pass, as the poses are recorded or computed, before an adjustment."""
+    """Lines of the passes from recorded or computed poses, before an adjustment."""
 
     name = "passes"
 
     def layers(self, material: Material) -> Iterator[SiteLayer]:
-        """One layer; none where no pass has a trajectory."""
+        """Yield one layer; none where no pass has a trajectory."""
         plan = material.plan
         sources = dict.fromkeys(s.trajectory for s, _ in plan.sources if s.trajectory is not None)
         paths = {one.run: _path(material, one) for one in sources}
@@ -88,7 +88,7 @@ _COLUMNS = [
 
 
 def _path(material: Material, one: TrajectorySource) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-    """Epochs (n,) and places (n, 2; m) of poses that lie in another cube of the step than the one before."""
+    """Return epochs (n,) and positions (n, 2; m) of the poses that enter another cube of the step."""
     epochs, world = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
     for file in sorted(one.files, key=lambda f: f.span or (0, 0)):
         for group in range(len(file.group_rows)):

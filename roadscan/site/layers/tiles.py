@@ -36,12 +36,12 @@ _SHOWN = (
 
 
 class Tiles(LayerKind):
-    """A square a tile: done, stale, failed."""
+    """Squares of the tiles: done, stale, failed."""
 
     name = "tiles"
 
     def layers(self, material: Material) -> Iterator[SiteLayer]:
-        """One layer; none where nothing is known of any tile."""
+        """Yield one layer; none where nothing is known of any tile."""
         keys, known = _keys(material)
         failed = {one["unit"]: one["reason"] for one in read_failures(material.store) if one.get("stage") == "tiles"}
         held = {t: str(t) for t in {*material.tiles, *keys} if str(t) in failed or t in material.tiles or t in keys}
@@ -73,7 +73,7 @@ class Tiles(LayerKind):
 
 
 def _keys(material: Material) -> tuple[dict[TileId, str], bool]:
-    """Keys of the tiles that readings may touch; False where they cannot be told, as without the raw logs."""
+    """Return keys of the tiles that readings may touch; False where they are unknown, as without the raw logs."""
     try:
         planned = tiles_of(material.session)
     except RoadscanError:

@@ -1,1 +1,1 @@
-"""Parts of the site, a file a part."""
+"""Parts of the site, one per file."""

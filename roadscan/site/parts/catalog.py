@@ -37,7 +37,7 @@ _COPC_TYPE: Final = "application/vnd.laszip+copc"
 _FEATURES_TYPE: Final = "application/vnd.flatgeobuf"
 _COG_TYPE: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
 _DENSE: Final = 20
-"""Points along each edge of a sheet: its border is no straight line in longitude and latitude."""
+"""Points along each edge of a sheet, whose border is not straight in longitude and latitude."""
 _DIMENSIONS: Final = (
     ("X", 8, "floating"), ("Y", 8, "floating"), ("Z", 8, "floating"), ("Intensity", 2, "unsigned"),
     ("ReturnNumber", 1, "unsigned"), ("NumberOfReturns", 1, "unsigned"), ("Classification", 1, "unsigned"),
@@ -47,13 +47,13 @@ _DIMENSIONS: Final = (
 
 
 class Catalog(SitePart):
-    """A collection, an item a sheet."""
+    """A collection with one item per sheet."""
 
     name = "catalog"
     position = 150
 
     def members(self, material: Material) -> Mapping[str, Any]:
-        """Where its files lie."""
+        """Return the paths of its files."""
         if not _is_placed(material):
             return {"catalog": None}
         points = "catalog/points.vpc" if cloud_sheets(material) else None
@@ -62,7 +62,7 @@ class Catalog(SitePart):
         }
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """All of them."""
+        """Yield all documents."""
         if not _is_placed(material):
             return
         items = [_item(material, name, tiles) for name, tiles in material.sheets.items()]
@@ -81,7 +81,7 @@ def _is_placed(material: Material) -> bool:
 
 
 def to_longitude_latitude(frame: MapFrame) -> Any:
-    """Function of arrays (n, 2) of easting and northing (m) to longitude and latitude (degrees, WGS 84)."""
+    """Return a function from easting and northing (n, 2; m) to longitude and latitude (degrees, WGS 84)."""
     from pyproj import Transformer
 
     turned = Transformer.from_crs(crs_from_text(frame.crs or ""), "OGC:CRS84", always_xy=True)
@@ -94,7 +94,7 @@ def to_longitude_latitude(frame: MapFrame) -> Any:
 
 
 def from_longitude_latitude(frame: MapFrame) -> Any:
-    """Function of arrays (n, 2) of longitude and latitude (degrees, WGS 84) to easting and northing (m)."""
+    """Return a function from longitude and latitude (n, 2; degrees, WGS 84) to easting and northing (m)."""
     from pyproj import Transformer
 
     turned = Transformer.from_crs("OGC:CRS84", crs_from_text(frame.crs or ""), always_xy=True)
@@ -111,7 +111,7 @@ def _sheet_box(material: Material, tiles: Sequence[TileId]) -> tuple[float, floa
 
 
 def _times(material: Material, tiles: Sequence[TileId]) -> tuple[str, str]:
-    """First and last instant (UTC) of tiles."""
+    """Return the first and last instant (UTC) of tiles."""
     held = [material.summaries[t] for t in tiles if t in material.summaries]
     ends = min(s.first_epoch_gps_ns for s in held), max(s.last_epoch_gps_ns for s in held)
     first, last = (utc_from_gps_ns(one).astimezone(dt.UTC) for one in ends)
@@ -145,7 +145,7 @@ def _item(material: Material, name: str, tiles: Sequence[TileId]) -> dict[str, A
 
 
 def _assets(material: Material, sheet: str, up: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """What belongs to a sheet: its points, and the GeoTIFFs that bear its name."""
+    """Yield the assets of a sheet: its points, and the GeoTIFFs with its name."""
     if sheet in cloud_sheets(material):
         yield "points", {"href": up + cloud_url(sheet), "type": _COPC_TYPE, "roles": ["data"], "title": "Points (COPC)"}
     for record in cog_records(material):
@@ -157,7 +157,7 @@ def _assets(material: Material, sheet: str, up: str) -> Iterator[tuple[str, dict
 
 
 def _code(frame: MapFrame) -> str | None:
-    """Authority and number of the horizontal CRS, where it has one."""
+    """Return authority and number of the horizontal CRS, where it has one."""
     found = crs_from_text(frame.crs or "").to_authority() if frame.crs else None
     return None if found is None else ":".join(found)
 
@@ -196,7 +196,7 @@ def _collection(material: Material, items: Sequence[Mapping[str, Any]]) -> dict[
 
 
 def _items_table(items: Sequence[Mapping[str, Any]]) -> Document:
-    """The items as a row each (stac-geoparquet 1.1): properties are columns, assets and links are kept as they are."""
+    """Return the items as rows (stac-geoparquet 1.1): properties are columns, assets and links are kept."""
     rows = []
     for item in items:
         told = {name: value for name, value in item.items() if name not in ("properties", "geometry", "bbox", "assets")}
@@ -209,7 +209,7 @@ def _items_table(items: Sequence[Mapping[str, Any]]) -> Document:
     column = {"encoding": "WKB", "geometry_types": ["Polygon"], "crs": None, "bbox": []}
     boxes = np.array([item["bbox"] for item in items])
     column["bbox"] = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]
-    column.pop("crs")  # left out, it is longitude and latitude in WGS 84
+    column.pop("crs")  # the default is longitude and latitude in WGS 84
     about = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": column}}
 
     def write(path: Path, _ask: Ask) -> None:
@@ -221,7 +221,7 @@ def _items_table(items: Sequence[Mapping[str, Any]]) -> Document:
 
 
 def _virtual(material: Material, item: Mapping[str, Any], tiles: Sequence[TileId]) -> dict[str, Any]:
-    """An item of a virtual point cloud, as PDAL Wrench makes it and QGIS reads it."""
+    """Return an item of a virtual point cloud, as PDAL Wrench makes it and QGIS reads it."""
     frame = material.context.map
     box_m = cloud_box_m(material, tiles)
     units = (frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m)

@@ -1,4 +1,4 @@
-"""Point clouds: COPC, a file a kilometre sheet, with an index."""
+"""Point clouds: one COPC file per kilometre sheet, with an index."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ _CLASSES: Final = {
 
 
 class Clouds(SitePart):
-    """All points that pass the filters, as the product `las` has them."""
+    """All points that pass the filters, as in the product `las`."""
 
     name = "clouds"
     position = 400
 
     def members(self, material: Material) -> Mapping[str, Any]:
-        """Where the index lies."""
+        """Return the path of the index."""
         points = sum(one.points for one in material.summaries.values())
         return {"clouds": {"url": "clouds/index.json", "points": points} if cloud_sheets(material) else None}
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """The index, and a file a sheet."""
+        """Yield the index, and one file per sheet."""
         sheets = cloud_sheets(material)
         if not sheets:
             return
@@ -61,12 +61,12 @@ class Clouds(SitePart):
 
 
 def cloud_url(sheet: str) -> str:
-    """Where the points of a sheet lie."""
+    """Return the path of a sheet's points."""
     return f"clouds/{sheet}.copc.laz"
 
 
 def cloud_box_m(material: Material, tiles: Sequence[TileId]) -> list[float]:
-    """Box of the tiles of a sheet, with the least and the greatest height of their cells (m)."""
+    """Return the box of a sheet's tiles, with the least and the greatest height of their cells (m)."""
     boxes = [material.context.grid.bounds(t) for t in tiles]
     heights = [material.summaries[t] for t in tiles]
     return [
@@ -76,7 +76,7 @@ def cloud_box_m(material: Material, tiles: Sequence[TileId]) -> list[float]:
 
 
 def cloud_sheets(material: Material) -> dict[str, tuple[TileId, ...]]:
-    """Sheets with points whose readings can be placed again."""
+    """Return sheets with points whose readings can be georeferenced again."""
     if not material.wishes.clouds:
         return {}
     try:
@@ -130,7 +130,7 @@ def _writer(material: Material, name: str, tiles: Sequence[TileId]) -> Any:
 
 
 def _points(material: Material, tiles: Sequence[TileId]) -> Generator[TilePoints, None, None]:
-    """Points of tiles, block by block."""
+    """Yield points of tiles, block by block."""
     session, config = material.session, material.session.survey.config.tiles
     planned = TilePlan(plan_of(session), footprints_of(session), tiles_of(session), (), material.context)
     numbers = tiles_of(session).numbers(tiles)

@@ -1,4 +1,4 @@
-"""Rasters of the survey as cloud-optimised GeoTIFFs, for other programs: as the products of the survey made them."""
+"""Rasters of the survey as cloud-optimised GeoTIFFs for other programs, as the survey's products made them."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ _PRODUCTS: Final = ("hillshade", "kilometre", "mosaic", "surface_hillshade", "su
 
 
 class Cogs(SitePart):
-    """Sheets and the indices that join them; the page reads them not."""
+    """Sheets and the indices that join them; the page does not read them."""
 
     name = "cogs"
     position = 500
 
     def members(self, material: Material) -> Mapping[str, Any]:
-        """Paths of all files."""
+        """Return the paths of all files."""
         return {"cogs": [cog_url(record) for record in cog_records(material)]}
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """A copy of each file."""
+        """Yield a copy of each file."""
         for record in cog_records(material):
             yield Document(cog_url(record), record.digest, _copied(material, record))
 
 
 def cog_records(material: Material) -> list[OutputRecord]:
-    """Records of the files, by path; none for a part of a survey."""
+    """Return records of the files, by path; none for a part of a survey."""
     if material.wishes.near is not None:
         return []
     found = [r for name in _PRODUCTS for r in material.session.manifest.of(name).values()]
@@ -39,7 +39,7 @@ def cog_records(material: Material) -> list[OutputRecord]:
 
 
 def cog_url(record: OutputRecord) -> str:
-    """Where a file lies in the site."""
+    """Return the path of a file in the site."""
     return f"cogs/{record.product}/{record.path.rsplit('/', 1)[-1]}"
 
 

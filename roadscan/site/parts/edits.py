@@ -16,29 +16,29 @@ from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from roadscan.store.inventory_schema import asset_columns, editable_columns
 
 POST: Final = "edits"
-"""Where a server takes edits."""
+"""Path at which a server takes edits."""
 FORMS: Final = "edits/forms.json"
 """The columns that people fill in, by layer."""
 
 
 class Edits(SitePart):
-    """The layers of the inventory, where edits are wished for and the survey has one."""
+    """The layers of the inventory, where edits are requested and the survey has one."""
 
     name = "edits"
     position = 150
 
     def members(self, material: Material) -> Mapping[str, Any]:
-        """The layers, the commit that they show, and where edits are sent; null where nothing is to be edited."""
+        """Return the layers, their commit, and the address for edits; null where nothing is to be edited."""
         return {"edits": _about(material)}
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """The forms of all kinds; what is edited lies in the layers."""
+        """Yield the forms of all kinds; the edited objects are in the layers."""
         if _about(material) is not None:
             yield json_document(FORMS, forms())
 
 
 def kinds() -> list[dict[str, str]]:
-    """All kinds of assets by title: the layer that each has, and how it is drawn."""
+    """Return all kinds of assets by title: the layer of each, and its geometry."""
     known = [asset_schema(kind) for kind in asset_kind_names()]
     told = [
         {"layer": f"{LAYER}{one.table}", "title": one.title, "geometry": GEOMETRY_OF[one.geometry]} for one in known
@@ -47,7 +47,7 @@ def kinds() -> list[dict[str, str]]:
 
 
 def forms() -> dict[str, Any]:
-    """The columns of each kind that people fill in when they draw one of it, its own first."""
+    """Return the columns of each kind that people fill in for a new object, its specific ones first."""
     columns = {}
     for kind in asset_kind_names():
         schema, edited = asset_schema(kind), editable_columns(kind)

@@ -26,24 +26,24 @@ _MULTI: Final = {
 
 
 class Features(SitePart):
-    """A file a layer; the page reads them not."""
+    """Files of the layers, one each; the page does not read them."""
 
     name = "features"
     position = 510
 
     def members(self, material: Material) -> Mapping[str, Any]:
-        """Paths of all files."""
+        """Return the paths of all files."""
         return {"features": [features_url(layer) for layer in site_layers(material)[0]]}
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """A file a layer."""
+        """Yield a file for each layer."""
         for layer in site_layers(material)[0]:
             key = key_of(code_digest(__name__), material.context.map.wkt(), _digest(layer))
             yield Document(features_url(layer), key, _written(material, layer))
 
 
 def features_url(layer: SiteLayer) -> str:
-    """Where a layer's file lies in the site."""
+    """Return the path of a layer's file in the site."""
     return f"features/{layer.name}.fgb"
 
 
@@ -61,7 +61,7 @@ def _written(material: Material, layer: SiteLayer) -> Any:
 
 
 def features_of(layer: SiteLayer) -> Layer:
-    """The features of a layer, with shapes of one type: of several parts where any is so."""
+    """Return the features of a layer, with shapes of one type: multipart where any is."""
     shapes = layer.shapes_m.copy()
     kind = next((t for t in _MULTI if t in {s.geom_type.removeprefix("Multi") for s in shapes}), "Unknown")
     if any(s.geom_type.startswith("Multi") for s in shapes):
@@ -74,7 +74,7 @@ def features_of(layer: SiteLayer) -> Layer:
 
 
 def _column(values: list[Any]) -> pa.Array:
-    """Values of a column; as text where they are of several types or all unknown."""
+    """Return the values of a column; as text where they are of several types or all unknown."""
     try:
         found = pa.array(values)
     except (pa.ArrowInvalid, pa.ArrowTypeError):

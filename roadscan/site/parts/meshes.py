@@ -17,18 +17,18 @@ _PRODUCT: Final = "surface_mesh"
 
 
 class Meshes(SitePart):
-    """A file a tile, in binary glTF."""
+    """Binary glTF files, one per tile."""
 
     name = "meshes"
     position = 350
 
     def members(self, material: Material) -> Mapping[str, Any]:
-        """Where the index lies."""
+        """Return the path of the index."""
         found = _meshes(material)
         return {"meshes": {"url": "meshes/index.json", "meshes": len(found)} if found else None}
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """The index and all meshes."""
+        """Yield the index and all meshes."""
         found = _meshes(material)
         if not found:
             return

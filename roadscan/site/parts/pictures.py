@@ -33,18 +33,18 @@ _CODE: Final = "roadscan.site.parts.pictures"
 
 
 class Pictures(SitePart):
-    """Pictures that have a pose, by kilometre sheet of the camera."""
+    """Pictures with a pose, by kilometre sheet of the camera."""
 
     name = "pictures"
     position = 600
 
     def members(self, material: Material) -> Mapping[str, Any]:
-        """Where the index lies."""
+        """Return the path of the index."""
         held = placed_pictures(material)
         return {"pictures": {"url": "pictures/index.json", "pictures": len(held)} if held is not None else None}
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """The index, poses by sheet, and the pictures."""
+        """Yield the index, poses by sheet, and the pictures."""
         held = placed_pictures(material)
         if held is None:
             return
@@ -118,7 +118,7 @@ def _poses(held: PlacedPictures, numbers: list[int], epochs: list[str]) -> dict[
 
 
 def _epochs(material: Material, held: PlacedPictures) -> list[str]:
-    """GPS time of each picture (ns), as its camera's clock was found."""
+    """Return GPS time of each picture (ns) by its camera's estimated clock."""
     known: dict[tuple[str, str], int] = {}
     for log in held.logs:
         for taken in taken_pictures(material.store, material.plan.records, log.sensor):

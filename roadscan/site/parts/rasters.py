@@ -1,4 +1,4 @@
-"""Rasters: height, hillshade, intensity and the pavement in levels, as square pictures in the survey's own map."""
+"""Rasters: height, hillshade, intensity and the pavement in levels, as square pictures in the survey's map."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ _ABOUT: Final[dict[Raster, dict[str, Any]]] = {
 
 
 class Rasters(SitePart):
-    """All rasters have the same levels and pictures."""
+    """Rasters with common levels and pictures."""
 
     name = "rasters"
     position = 300
 
     def members(self, material: Material) -> Mapping[str, Any]:
-        """Levels, and what the numbers of each raster stand for."""
+        """Return the levels, and what the numbers of each raster mean."""
         images = images_of(material)
         if not images.levels:
             return {"raster_grid": None, "rasters": []}
@@ -72,7 +72,7 @@ class Rasters(SitePart):
         }
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """Which pictures there are, level by level, and then all pictures, those of one place together."""
+        """Yield lists of the existing pictures, level by level, then all pictures, those of one place together."""
         yield from self.listed(material)
         images = images_of(material)
         for level in images.levels:
@@ -81,13 +81,13 @@ class Rasters(SitePart):
                     yield images.document(raster, Place(level, column, row))
 
     def listed(self, material: Material) -> Iterator[Document]:
-        """Which pictures there are, level by level."""
+        """Yield lists of the existing pictures, level by level."""
         images = images_of(material)
         for number, level in enumerate(images.levels):
             yield images.list_of(number, level)
 
     def find(self, material: Material, path: str) -> Document | None:
-        """A picture by its path."""
+        """Return a picture by its path."""
         found, images = _PATH.fullmatch(path), images_of(material)
         if found is None or int(found[2]) >= len(images.levels):
             return None
@@ -109,10 +109,10 @@ class Images:
 
     @cached_property
     def levels(self) -> tuple[int, ...]:
-        """Levels of the pyramid that the site has; they are numbered from 0 there."""
+        """Levels of the pyramid that the site has, where they are numbered from 0."""
         finest = self.material.wishes.finest_pixel_m
         known = range(len(self.pyramid.factors)) if self.material.tiles else range(0)
-        always = self.pyramid.stored_levels - 1 if self.material.tiles else 0  # coarser ones are made from it
+        always = self.pyramid.stored_levels - 1 if self.material.tiles else 0  # coarser levels are made from it
         return tuple(k for k in known if k >= always or self.pyramid.pixel_m(k) >= finest - 1e-12)
 
     @cached_property
@@ -128,7 +128,7 @@ class Images:
 
     @cached_property
     def scales(self) -> Scales:
-        """What numbers stand for."""
+        """Meaning of the numbers."""
         return Scales.of(self.material.summaries.values())
 
     @cached_property
@@ -136,7 +136,7 @@ class Images:
         return TileWindows(self.pyramid, self.material.cells())
 
     def about(self, level: int) -> dict[str, Any]:
-        """A level as the page reads it."""
+        """Return a level's JSON values for the page."""
         places = self.pyramid.places(level)
         low, high = places.min(axis=0).tolist(), places.max(axis=0).tolist()
         pixel_m, number = self.pyramid.pixel_m(level), self.levels.index(level)
@@ -147,7 +147,7 @@ class Images:
         }  # fmt: skip
 
     def told(self, raster: Raster) -> dict[str, Any]:
-        """A raster as the page reads it."""
+        """Return a raster's JSON values for the page."""
         held = self.material.summaries.values()
         ends = min(s.height_min_m for s in held), max(s.height_max_m for s in held)
         scale: dict[Raster, tuple[float, float, float, float]] = {
@@ -162,7 +162,7 @@ class Images:
         return {"name": raster, **_ABOUT[raster], **named, "url": f"rasters/{raster}/{{level}}/{{column}}_{{row}}.png"}
 
     def list_of(self, number: int, level: int) -> Document:
-        """Which pictures a level has."""
+        """Return a list of a level's pictures."""
 
         def write(path: Path, _ask: Ask) -> None:
             path.write_bytes(json_bytes({"level": number, "rows": self.pyramid.runs(level)}))
@@ -177,7 +177,7 @@ class Images:
         return key_of(self.pyramid.tiles)
 
     def document(self, raster: Raster, place: Place) -> Document:
-        """A picture."""
+        """Return a picture."""
         number = self.levels.index(place.level)
         path = f"rasters/{raster}/{number}/{place.column}_{place.row}.png"
         return Document(path, self._key(raster, place), lambda file, ask: self._write(file, ask, raster, place))
@@ -195,7 +195,7 @@ class Images:
         coarser_picture(path, raster, below, place, self.pyramid.tile_px)
 
     def _key(self, raster: Raster, place: Place) -> str:
-        """Hash of the tiles that a picture shows, and of how."""
+        """Return a hash of a picture's tiles and of its settings."""
         tiles = self.material.tiles
         if place.level < self.pyramid.stored_levels:
             parts: Any = [tiles[t].digest for t in self.pyramid.tiles_in(place.level, place)]
@@ -215,5 +215,5 @@ class Images:
 
 @functools.lru_cache(maxsize=2)
 def images_of(material: Material) -> Images:
-    """Pictures of a survey; the same object for the same material."""
+    """Return the pictures of a survey; the same object for the same material."""
     return Images(material)

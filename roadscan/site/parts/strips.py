@@ -1,4 +1,4 @@
-"""Strips: values along each lane by station, coarse and in pieces where it is long, and its cross-sections."""
+"""Strips: values along each lane by station, coarse and in pieces for long lanes, and cross-sections."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from roadscan.store.manifest import OutputRecord
 _SERIES: Final = ("station_from_m", "station_to_m", "value", "sigma", "share", "reason")
 _TOLD: Final = ("from_m", "to_m", "value", "sigma", "share", "reason")
 _DIGITS: Final = {"sigma": 4, "share": 4}
-"""Significant digits that are told of what qualifies a value; values are told whole."""
+"""Significant digits of values that qualify others; other values are written in full."""
 _CODE: Final = "roadscan.site.parts.strips"
 
 _WHOLE_M: Final = 300.0
-"""The file of a lane that is no longer holds all values."""
+"""Longest lane whose file has all values."""
 _BINS: Final = 300
-"""The file of a longer lane has so many bins in place of values, where these are more than twice as many."""
+"""Bins in the file of a longer lane, in place of more than twice as many values."""
 _BEYOND_M: Final = 1.0
-"""The last piece reaches so far beyond the lane's end, where a section may end."""
+"""Margin of the last piece beyond the lane's end, where a section may end."""
 _PARTS: Final = 4
-"""Values of a longer lane lie in so many pieces for each file of the table, which holds about a kilometre."""
+"""Pieces of a longer lane's values for each file of the table, which covers about a kilometre."""
 
 Float64 = npt.NDArray[np.float64]
 
@@ -49,9 +49,9 @@ class Lane:
     material: Material
     """Its survey."""
     row: Mapping[str, Any]
-    """Of the table `lanes`."""
+    """Row of the table `lanes`."""
     station_m: Float64
-    """(n,) of the middle's vertices."""
+    """(n,) stations of the centre line's vertices."""
     middle_m: Float64
     """(n, 2) easting and northing."""
     values: tuple[OutputRecord, ...]
@@ -59,7 +59,7 @@ class Lane:
 
     @property
     def url(self) -> str:
-        """Where its strip lies."""
+        """Path of its strip."""
         return f"strips/{self.number}.json"
 
     @property
@@ -69,12 +69,12 @@ class Lane:
 
     @property
     def is_long(self) -> bool:
-        """True where its file holds bins, and pieces of it the values."""
+        """True where its file has bins, and pieces of it the values."""
         return float(self.station_m[-1] - self.station_m[0]) > _WHOLE_M
 
     @functools.cached_property
     def groups(self) -> dict[str, tuple[OutputRecord, ...]]:
-        """Records of its values by the name that files of one stretch share, in the order of the stretches."""
+        """Records of its values by the common name of files of one stretch, in the order of the stretches."""
         found: dict[str, tuple[OutputRecord, ...]] = {}
         for record in sorted(self.values, key=lambda r: r.path.rsplit("/", 1)[-1]):
             name = record.path.rsplit("/", 1)[-1].removesuffix(".parquet")
@@ -83,7 +83,7 @@ class Lane:
 
     @functools.cached_property
     def pieces(self) -> list[dict[str, Any]]:
-        """Where its values lie, piece by piece; none where its own file holds them."""
+        """Pieces of its values; none where its own file has them."""
         if not self.is_long:
             return []
         begins = {name: min(_first_station(self, one) for one in own) for name, own in self.groups.items()}
@@ -99,11 +99,11 @@ class Lane:
         ]
 
     def key(self, records: Sequence[OutputRecord]) -> str:
-        """Hash of some of its files, and of the lane."""
+        """Return a hash of some of its files, and of the lane."""
         return self.material.key(records, self.survey, self.number, self.row, self.middle_m.tolist())
 
     def direction_deg(self, station_m: float) -> float:
-        """Direction of travel at a station, clockwise from map north (degrees)."""
+        """Return the direction of travel at a station, clockwise from map north (degrees)."""
         at = int(np.clip(np.searchsorted(self.station_m, station_m, side="right") - 1, 0, self.station_m.size - 2))
         east, north = (self.middle_m[at + 1] - self.middle_m[at]).tolist()
         turned = 180.0 if self.row["direction"] == "backward" else 0.0
@@ -117,12 +117,12 @@ class Strips(SitePart):
     position = 200
 
     def members(self, material: Material) -> Mapping[str, Any]:
-        """Where the index lies."""
+        """Return the path of the index."""
         lanes = lanes_of(material)
         return {"strips": {"url": "strips/index.json", "lanes": len(lanes)} if lanes else None}
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """The index, a file a lane, pieces of a long one, and its cross-sections by the files of the table."""
+        """Yield the index, a file per lane, pieces of a long one, and its cross-sections by the files of the table."""
         lanes = lanes_of(material)
         if not lanes:
             return
@@ -138,7 +138,7 @@ class Strips(SitePart):
 
 
 def _later(path: str, key: str, make: Any) -> Document:
-    """A document whose tables are read when it is written."""
+    """Return a document whose tables are read when it is written."""
 
     def write(file: Path, _ask: Ask) -> None:
         file.write_bytes(json_bytes(make()))
@@ -148,7 +148,7 @@ def _later(path: str, key: str, make: Any) -> Document:
 
 @functools.lru_cache(maxsize=2)
 def lanes_of(material: Material) -> tuple[Lane, ...]:
-    """Lanes with any values, in the order of the table; those of a box that is wished for, and of surveys over it."""
+    """Return lanes with any values, in the table's order; those in a requested box, and of surveys shown over it."""
     found: list[Lane] = []
     for one in (material, *material.others):
         found += _lanes(one, len(found))
@@ -156,7 +156,7 @@ def lanes_of(material: Material) -> tuple[Lane, ...]:
 
 
 def _lanes(material: Material, first: int) -> list[Lane]:
-    """Lanes of one survey, numbered from `first`."""
+    """Return the lanes of one survey, numbered from `first`."""
     held = material.table("lanes")
     if held is None or held.shapes_m is None:
         return []
@@ -194,7 +194,7 @@ def _about(lane: Lane) -> dict[str, Any]:
 
 
 def _first_station(lane: Lane, record: OutputRecord) -> float:
-    """Least station of a file of values; infinite where it holds none."""
+    """Return the least station of a file of values; infinite where it has none."""
     begins = lane.material.store.read_table(record.path, ["station_from_m"]).column("station_from_m").to_numpy()
     return float(begins.min(initial=np.inf))
 
@@ -234,7 +234,7 @@ def _strip(lane: Lane) -> Any:
 
 
 def _series(rows: pa.Table) -> Iterator[dict[str, Any]]:
-    """Values of each quantity of sections and of cross-sections, by station."""
+    """Yield the values of each quantity of sections and of cross-sections, by station."""
     ordered = rows.sort_by([(n, "ascending") for n in ("quantity", "extent", "station_from_m", "station_to_m")])
     kinds = ordered.select(["quantity", "extent"]).group_by(["quantity", "extent"], use_threads=False).aggregate([])
     for kind in sorted(kinds.to_pylist(), key=lambda k: (k["quantity"], k["extent"])):
@@ -245,7 +245,7 @@ def _series(rows: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def _binned(series: Mapping[str, Any], station_m: Float64) -> dict[str, Any]:
-    """A series with bins of one width along a lane: mean and range of the values whose middle lies in each."""
+    """Return a series with bins of equal width along a lane: mean and range of the values centred in each."""
     edges = np.linspace(float(station_m[0]), float(station_m[-1]), _BINS + 1)
     value = np.array(series["value"], np.float64)
     known = np.flatnonzero(np.isfinite(value))

@@ -1,4 +1,4 @@
-"""Vectors: a file a layer, or a kilometre sheet of a layer."""
+"""Vectors: one file per layer, or per kilometre sheet of a layer."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from roadscan.site.material import Material, box_of, sheet_name
 from roadscan.site.part import SitePart
 
 _MOST_VERTICES: Final = 10_000
-"""A layer with more is cut into kilometre sheets."""
+"""A layer with more vertices is divided into kilometre sheets."""
 _FROM_FAR: Final = ("survey", "control", "condition")
-"""Groups whose layers are worth a look from far away; single cracks and poles are not seen there."""
+"""Groups of layers that are useful in an overview; single cracks and poles are not visible there."""
 _MOST_FROM_FAR: Final = 30_000
-"""A layer in sheets with more features has no file for who looks from far away."""
+"""A divided layer with more features has no overview file."""
 _SEEN_PX: Final = 4000
-"""Pixels across which a whole survey may be seen."""
+"""Largest width of a whole survey on a screen (pixels)."""
 _OVERVIEW: Final = "overview"
 _DECIMALS: Final = 5
-"""Coordinates are told to 10 µm."""
+"""Decimals of coordinates (10 µm)."""
 
 
 class Vectors(SitePart):
-    """All layers; one whose table is damaged is left out, and said to be."""
+    """All layers; one with a damaged table is left out, and reported."""
 
     name = "layers"
     position = 100
 
     def members(self, material: Material) -> Mapping[str, Any]:
-        """What the layers are and where their files lie."""
+        """Return the layers with the paths of their files."""
         found, left_out = site_layers(material)
         return {"layers": [about(layer) for layer in found], "left_out": list(left_out)}
 
     def documents(self, material: Material) -> Iterator[Document]:
-        """A file a layer, or a sheet of it; for a layer in sheets one more, for who looks from far away."""
+        """Yield a file per layer, or per sheet of it, and an overview file for a divided layer."""
         for layer in site_layers(material)[0]:
             for path, content in files_of(layer):
                 yield json_document(path, content())
 
 
 def files_of(layer: SiteLayer) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
-    """Paths of a layer's files, each with a function that gives its content."""
+    """Yield the paths of a layer's files, each with a function that returns its content."""
     parts = parts_of(layer)
     for name, numbers in parts:
         yield _url(layer, name), functools.partial(_features, layer, numbers)
@@ -58,7 +58,7 @@ def files_of(layer: SiteLayer) -> Iterator[tuple[str, Callable[[], dict[str, Any
 
 @functools.lru_cache(maxsize=2)
 def site_layers(material: Material) -> tuple[tuple[SiteLayer, ...], tuple[str, ...]]:
-    """Layers in the order in which they are drawn, and why others are not there."""
+    """Return layers in drawing order, and why others are missing."""
     found: list[SiteLayer] = []
     left_out: list[str] = []
     for kind in layer_kinds():
@@ -71,7 +71,7 @@ def site_layers(material: Material) -> tuple[tuple[SiteLayer, ...], tuple[str, .
 
 
 def _near(layer: SiteLayer, material: Material) -> SiteLayer:
-    """A layer without the features that lie outside what is wished for."""
+    """Return a layer without the features outside the requested box."""
     if material.wishes.near is None:
         return layer
     kept = np.flatnonzero(shapely.intersects(layer.shapes_m, shapely.box(*material.wishes.near))).tolist()
@@ -82,7 +82,7 @@ def _near(layer: SiteLayer, material: Material) -> SiteLayer:
 
 
 def parts_of(layer: SiteLayer) -> list[tuple[str, list[int]]]:
-    """Names of a layer's files, and numbers of their features: all in one, or by the sheet of their middle."""
+    """Return names of a layer's files, and indices of their features: all in one, or by the sheet of their centre."""
     if shapely.get_num_coordinates(layer.shapes_m).sum() <= _MOST_VERTICES:
         return [("whole", list(range(len(layer.rows))))]
     found: dict[str, list[int]] = {}
@@ -92,7 +92,7 @@ def parts_of(layer: SiteLayer) -> list[tuple[str, list[int]]]:
 
 
 def about(layer: SiteLayer) -> dict[str, Any]:
-    """A layer as the page reads it in the entry."""
+    """Return a layer's JSON values for the entry."""
     held = parts_of(layer)
     parts = [
         {"url": _url(layer, name), "bounds_m": box_of(layer.shapes_m[numbers]), "features": len(numbers)}
@@ -112,7 +112,7 @@ def _has_overview(layer: SiteLayer, parts: Sequence[Any]) -> bool:
 
 
 def _overview(layer: SiteLayer) -> dict[str, Any]:
-    """All features of a layer, as coarse as they are seen with the whole survey, with the values that colour them."""
+    """Return all features of a layer at the resolution of an overview, with the values that colour them."""
     west, south, east, north = shapely.total_bounds(layer.shapes_m).tolist()
     coarse = shapely.simplify(shapely.force_2d(layer.shapes_m), max(east - west, north - south) / _SEEN_PX)
     coarse = shapely.transform(coarse, lambda places: np.round(places, 1))
@@ -142,12 +142,12 @@ def _features(layer: SiteLayer, numbers: Sequence[int]) -> dict[str, Any]:
 
 
 def _told(name: str, value: Any) -> Any:
-    """A value as the page gets it: epochs as text, whatever their size."""
+    """Return a value for the page: epochs as text, whatever their size."""
     return str(value) if name.endswith("_gps_ns") and value is not None else value
 
 
 def geometry_of(shape: Any) -> dict[str, Any]:
-    """A shape as GeoJSON writes it, in metres of the map."""
+    """Return a shape as GeoJSON, in metres of the map."""
     kind = shape.geom_type
     if kind.startswith("Multi"):
         return {"type": kind, "coordinates": [geometry_of(one)["coordinates"] for one in shape.geoms]}

@@ -1,4 +1,4 @@
-"""The bytes of file formats: the only room that knows how a page, a block, a directory or a checksum is laid out."""
+"""Encoders and decoders of file formats: the only place that knows the layout of pages, blocks and checksums."""
 
 from __future__ import annotations
 
@@ -7,4 +7,4 @@ from typing import Final
 import roadscan
 
 SOFTWARE: Final = "roadscan " + ".".join(roadscan.__version__.split(".")[:2])
-"""Program and version as the files name it."""
+"""Program and version as written into files."""

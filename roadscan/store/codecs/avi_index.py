@@ -1,6 +1,6 @@
-"""Which frames of an AVI are still in their places, by its index.
+"""Finds by an AVI's index which frames are still at their places.
 
-An AVI keeps no times: frame k is the k-th in the file. Where one is damaged, a reader goes on with the next, and all
+An AVI stores no times: frame k is the k-th in the file. Where one is damaged, a reader continues with the next, and all
 later frames seem a frame too early; only the index tells which one is gone (Microsoft, *AVI RIFF File
 Reference*: ``idx1`` holds identifier, flags, offset and length of each chunk).
 """
@@ -22,7 +22,7 @@ _VIDEO: Final = (b"dc", b"db")
 
 
 def frames_in_place(path: Path) -> Bool | None:
-    """Whether each frame (n,) of an AVI stands where its index says; None without a usable index."""
+    """Return whether each frame (n,) of an AVI stands where its index says; None without a usable index."""
     with path.open("rb") as stream:
         head = stream.read(12)
         if head[:4] != b"RIFF" or head[8:] != b"AVI ":
@@ -37,14 +37,14 @@ def frames_in_place(path: Path) -> Bool | None:
         entries = entries[[bytes(one)[2:4] in _VIDEO for one in entries["id"]]]
         if not entries.size:
             return None
-        for base in (movi, 0):  # offsets count from the list of frames, or, in some files, from the file's start
+        for base in (movi, 0):  # offsets count from the list of frames or, in some files, from the file's start
             if _stands(stream, base, entries[0]) or _stands(stream, base, entries[-1]):
                 return np.array([_stands(stream, base, entry) for entry in entries], dtype=bool)
     return None
 
 
 def _movi_and_index(stream: BinaryIO, size: int) -> tuple[int, int, int] | None:
-    """Byte of the list of frames ('movi'), byte and length of the index behind it."""
+    """Return the byte of the list of frames ('movi'), and the byte and length of the index after it."""
     movi = None
     at = 12
     while at + 12 <= size:
@@ -59,6 +59,6 @@ def _movi_and_index(stream: BinaryIO, size: int) -> tuple[int, int, int] | None:
 
 
 def _stands(stream: BinaryIO, base: int, entry: np.void) -> bool:
-    """True if the chunk that an index entry names stands in its place."""
+    """Return True if the chunk of an index entry is at its place."""
     stream.seek(base + int(entry["offset"]))
     return stream.read(8) == _CHUNK.pack(bytes(entry["id"]), int(entry["length"]))

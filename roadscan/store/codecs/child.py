@@ -1,4 +1,4 @@
-"""Native decoders in a process of their own, which damaged bytes may crash, stall or swell without harm to the run.
+"""Runs native decoders in a separate process, so that damaged bytes cannot crash, stall or exhaust the run.
 
 A worker is a file of this folder with a function `opened`, which takes the arguments given here as text and returns a
 function from a request to a reply, both bytes. It is run as a script, by this very file, and imports nothing of
@@ -17,18 +17,18 @@ from typing import Any, BinaryIO, Final, Self
 
 _WORKERS: Final = Path(__file__).parent
 MEMORY_BYTES: Final = 4 << 30
-"""No decoder needs more; files may claim more."""
+"""Memory limit of a decoder: none needs more, though damaged files may claim more."""
 
 _SIZE: Final = struct.Struct("<q")
-"""Before each request and reply: its bytes; less than 0 before the text of an error."""
+"""Header of each request and reply: its length in bytes; negative before the text of an error."""
 
 
 class ChildError(Exception):
-    """A worker could not answer; says why, in the decoder's own words where it had any."""
+    """A worker could not answer; the message is the decoder's where it gave one."""
 
 
 class Child:
-    """A worker, started by the first request and again by the first one after a crash; use as a context manager."""
+    """A worker process, started by the first request and again by the first one after a crash; a context manager."""
 
     def __init__(self, worker: str, *arguments: str) -> None:
         self._command = [sys.executable, "-P", __file__, str(_WORKERS), worker, *arguments]
@@ -48,7 +48,7 @@ class Child:
             self._process = None
 
     def ask(self, request: bytes, timeout_s: float) -> bytes:
-        """Reply to a request.
+        """Send a request and return the reply.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class Child:
 
 
 def _exchanged(process: subprocess.Popen[bytes], request: bytes) -> tuple[int | None, bytes]:
-    """Size and bytes of the reply; None where none came."""
+    """Return length and bytes of the reply; None where none came."""
     if process.stdin is None or process.stdout is None:
         return None, b""
     try:
@@ -98,7 +98,7 @@ def _exchanged(process: subprocess.Popen[bytes], request: bytes) -> tuple[int | 
 
 
 def _serve(answer: Any, requests: BinaryIO, replies: BinaryIO) -> None:
-    """Answer requests until there are no more."""
+    """Answer requests until the input ends."""
     while len(head := requests.read(_SIZE.size)) == _SIZE.size:
         try:
             reply, sign = answer(requests.read(_SIZE.unpack(head)[0])), 1
@@ -109,7 +109,7 @@ def _serve(answer: Any, requests: BinaryIO, replies: BinaryIO) -> None:
 
 
 def _limit_memory() -> None:
-    """Keep the process below `MEMORY_BYTES`, where the system can."""
+    """Limit the process to `MEMORY_BYTES`, where the system can."""
     try:
         import resource
     except ImportError:

@@ -1,4 +1,4 @@
-"""Whose code makes and reads bytes where roadscan has kernels of its own: these, or libraries alone."""
+"""Chooses between roadscan's kernels and libraries for encoding and decoding."""
 
 from __future__ import annotations
 
@@ -17,4 +17,4 @@ def _chosen() -> str:
 
 
 LIBRARY: Final = _chosen() == "library"
-"""True if the environment says ``ROADSCAN_CODECS=library``: slower, other bytes, the same content."""
+"""True if the environment has ``ROADSCAN_CODECS=library``: slower, with other bytes but the same content."""

@@ -1,6 +1,6 @@
-"""Cloud-optimised GeoTIFFs that leave empty ground out: the same pixels give the same bytes.
+"""Writes cloud-optimised GeoTIFFs that omit empty blocks: equal pixels give equal bytes.
 
-GDAL's own driver does neither: it makes overviews of every block of a raster, empty or not, which takes fifteen times
+GDAL's driver does neither: it makes overviews of every block of a raster, empty or not, which takes fifteen times
 as long for a square kilometre with a road through it. GDAL, which reads the files, is the oracle in tests. Pixels are
 float32 with NaN or uint8 with 0 where nothing lies. Blocks go through TIFF's predictors (3 and 2), then DEFLATE, which
 takes least time, or where most of a block may be empty ZSTD, which takes a third of the room for that.
@@ -35,14 +35,14 @@ from roadscan.store.codecs.zlib_stream import compressed
 BLOCK: Final = 512
 """Largest edge of a compressed block (pixels)."""
 
-_SMALLEST_OVERVIEW: Final = 128
-_DEFLATE, _ZSTD = 8, 50000
-_NEW_SUBFILE, _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _PHOTOMETRIC = 254, 256, 257, 258, 259, 262
+_SMALLEST_OVERVIEW: Final = 128  # overviews are made until the longer edge (pixels) is not larger than this
+_DEFLATE, _ZSTD = 8, 50000  # TIFF compression codes
+_NEW_SUBFILE, _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _PHOTOMETRIC = 254, 256, 257, 258, 259, 262  # TIFF tags
 _SAMPLES, _PLANES, _SOFTWARE, _DATE, _PREDICTOR, _BLOCK_WIDTH, _BLOCK_HEIGHT = 277, 284, 305, 306, 317, 322, 323
 _EXTRA_SAMPLES, _SAMPLE_FORMAT, _PIXEL_SCALE, _TIE_POINT, _GDAL_METADATA, _GDAL_NODATA = (
     338, 339, 33550, 33922, 42112, 42113
 )  # fmt: skip
-_GEO_KEYS: Final = (34735, 34736, 34737)
+_GEO_KEYS: Final = (34735, 34736, 34737)  # TIFF tags of the GeoTIFF keys
 
 Pixels = npt.NDArray[Any]
 
@@ -57,11 +57,11 @@ class Band:
 
 @dataclass(frozen=True)
 class About:
-    """What a raster says of itself."""
+    """Georeference and metadata of a raster."""
 
     frame: MapFrame
     transform: Affine
-    """Map position, in the CRS's own unit, of a (column, row) counted from the north-west corner."""
+    """Map position, in the CRS's unit, of a (column, row) counted from the north-west corner."""
     bands: tuple[Band, ...]
     date: dt.date
     items: tuple[tuple[str, str], ...]
@@ -75,15 +75,15 @@ class Image:
     width: int
     height: int
     edge: int
-    """Of a block."""
+    """Edge of a block (pixels)."""
     dtype: str
     blocks: Sequence[Any]
-    """Buffers, None where nothing lies; by band, then row by row."""
+    """Compressed blocks, None for empty ones; by band, then row by row."""
     compression: int = _DEFLATE
 
 
 def write_cog(path: Path, images: Sequence[Image], about: About) -> None:
-    """Write a whole file: the image, then its overviews, falling."""
+    """Write a whole file: the image, then its overviews in decreasing size."""
     pages = [Page(_layout(image, len(about.bands), number > 0), image.blocks) for number, image in enumerate(images)]
     first = Page((*pages[0].tags, *_description(about)), pages[0].blocks)
     with path.open("wb") as stream:
@@ -91,7 +91,7 @@ def write_cog(path: Path, images: Sequence[Image], about: About) -> None:
 
 
 def overview_factors(width: int, height: int) -> list[int]:
-    """Powers of two by which a raster is reduced, until its longer edge is 128 pixels or less."""
+    """Return the powers of two by which a raster is reduced, until its longer edge is 128 pixels or less."""
     factors: list[int] = []
     while max(width, height) / 2 ** len(factors) > _SMALLEST_OVERVIEW:
         factors.append(2 ** (len(factors) + 1))
@@ -99,7 +99,7 @@ def overview_factors(width: int, height: int) -> list[int]:
 
 
 def dense_image(bands: Sequence[npt.NDArray[np.float32]]) -> Image:
-    """Compress bands (rows, columns), from the north, NaN where nothing lies."""
+    """Return compressed bands (rows, columns), north up, NaN where no data is."""
     height, width = bands[0].shape
     edge = _block_edge(max(height, width))
     blocks = [
@@ -117,7 +117,7 @@ def sparse_image(
     row: npt.NDArray[np.uint16],
     bands: Iterable[tuple[Pixels, float, float]],
 ) -> Image:
-    """Compress the cells of a square of `size` cells; only blocks that hold one are made.
+    """Return the compressed cells of a square of `size` cells; only blocks with a cell are made.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def sparse_image(
     starts = np.append(np.searchsorted(row, np.arange(size, dtype=np.uint16)), len(row))
     cuts = np.zeros((across + 1, across * edge), np.int64)
     cut_lines(column, starts, edge, cuts[:, :size])
-    cuts[:, :size] = cuts[:, :size][:, ::-1].copy()  # from the north
+    cuts[:, :size] = cuts[:, :size][:, ::-1].copy()  # row counted from the north
     rounded, out, lines = np.empty(len(row), np.float32), np.empty(4 * edge * edge, np.uint8), _lines(edge)
     blocks: list[bytes | None] = []
     for values, factor, step in bands:
@@ -153,7 +153,7 @@ def write_sparse_cog(
     places: Iterable[tuple[int, int, int, int]],
     about: About,
 ) -> None:
-    """Write a raster of one band that is put together from pieces, which may lie far apart, in bounded memory.
+    """Write a raster of one band from pieces, which may lie far apart, in bounded memory.
 
     A block is open from the first piece that reaches into it to the last; then it is compressed, halved into the block
     above it, and forgotten. Each pixel of an overview is the mean of those of the 2 × 2 below it that hold a value.
@@ -190,12 +190,12 @@ _Place = tuple[int, int, int]
 
 
 def _block_edge(longest: int) -> int:
-    """Edge of the blocks of an image: a small one is one block, whose edge is a multiple of 16."""
+    """Return the edge of an image's blocks: a small image is one block, whose edge is a multiple of 16."""
     return min(BLOCK, -(-longest // 16) * 16)
 
 
 def _lines(edge: int) -> tuple[Any, ...]:
-    """Scratch of the kernels: a line of pixels and its bytes, differences and their bytes."""
+    """Return scratch arrays of the kernels: a line of pixels and its bytes, differences and their bytes."""
     line, differences = np.empty(edge, np.float32), np.empty(edge, np.uint32)
     return line, line.view(np.uint8), differences, differences.view(np.uint8)
 
@@ -209,7 +209,7 @@ def _dense_block(part: npt.NDArray[np.float32], edge: int) -> bytes | None:
 
 
 def _predicted(block: Pixels) -> npt.NDArray[np.uint8]:
-    """Bytes of a whole block as TIFF's predictors want them: 3 for floats, 2 for bytes."""
+    """Return a whole block encoded by TIFF's predictors: 3 for floats, 2 for bytes."""
     if block.dtype.kind != "f":
         return np.diff(block, axis=1, prepend=block.dtype.type(0))
     out = np.empty(block.nbytes, np.uint8)
@@ -226,13 +226,13 @@ def _blocks_under(places: Iterable[tuple[int, int, int, int]]) -> Iterator[_Plac
 
 @dataclass
 class _Blocks:
-    """Blocks of all levels on their way into a scratch file."""
+    """Blocks of all levels while they are written to a scratch file."""
 
     sizes: list[tuple[int, int]]
     kind: np.dtype[Any]
     stream: BinaryIO
     waiting: Counter[_Place]
-    """Pieces, or blocks of the level below, that are still to come."""
+    """Number of pieces, or blocks of the level below, that are still missing from each block."""
     open: dict[_Place, Pixels] = field(default_factory=dict)
     extents: dict[_Place, tuple[int, int]] = field(default_factory=dict)
 
@@ -245,7 +245,7 @@ class _Blocks:
             below = list(parents)
 
     def paste(self, left: int, top: int, piece: Pixels) -> None:
-        """Put a piece into the blocks that it reaches into."""
+        """Copy a piece into the blocks that it overlaps."""
         height, width = piece.shape
         for place in _blocks_under([(left, top, width, height)]):
             y, x = place[1] * BLOCK, place[2] * BLOCK
@@ -253,7 +253,7 @@ class _Blocks:
             self._add(place, y0 - y, x0 - x, piece[y0 - top : y1 - top, x0 - left : x1 - left])
 
     def stored(self) -> dict[_Place, memoryview]:
-        """Compressed bytes of each block that holds a value."""
+        """Return the compressed bytes of each block with data."""
         self.stream.flush()
         if not self.extents:
             return {}
@@ -286,7 +286,7 @@ class _Blocks:
 
 
 def _halved(block: Pixels) -> Pixels:
-    """Mean of the pixels of each 2 × 2 that hold a value."""
+    """Return the mean of the valid pixels of each 2 × 2."""
     floats = block.dtype.kind == "f"
     parts = np.stack([block[i::2, j::2] for i in (0, 1) for j in (0, 1)]).astype(np.float64)
     known = ~np.isnan(parts) if floats else parts > 0
@@ -301,7 +301,7 @@ def _halved(block: Pixels) -> Pixels:
 
 
 def _layout(image: Image, bands: int, reduced: bool) -> tuple[Tag, ...]:
-    """Tags of an image whose bands have blocks of their own, but for the places of the blocks."""
+    """Return the tags of an image whose bands have separate blocks, without the places of the blocks."""
     floats = image.dtype == "float32"
     return (
         Tag(_NEW_SUBFILE, "I", [int(reduced)]),
@@ -322,7 +322,7 @@ def _layout(image: Image, bands: int, reduced: bool) -> tuple[Tag, ...]:
 
 
 def _description(about: About) -> list[Tag]:
-    """Place on the map, names, units and the rest of the metadata."""
+    """Return tags for georeference, names, units and the other metadata."""
     place = about.transform
     items = [f'<Item name="{name}">{escape(value)}</Item>' for name, value in about.items]
     for number, band in enumerate(about.bands):
@@ -341,7 +341,7 @@ def _description(about: About) -> list[Tag]:
 
 @functools.lru_cache(maxsize=16)
 def _geo_keys(frame: MapFrame) -> tuple[Tag, ...]:
-    """Tags that state the CRS, as GDAL itself writes them into a file with that CRS."""
+    """Return tags that state the CRS, as GDAL writes them into a file with that CRS."""
     profile = {"driver": "GTiff", "width": 1, "height": 1, "count": 1, "dtype": "uint8"}
     with raster_settings(), MemoryFile() as memory:
         with memory.open(**profile, crs=raster_crs(frame), transform=Affine(1, 0, 1, 0, -1, 1)):

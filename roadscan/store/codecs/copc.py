@@ -24,8 +24,8 @@ from roadscan.core.errors import StoreError
 from roadscan.store.codecs.las import VLR_RECORD_ID, VLR_USER_ID, Layout
 
 USER_ID: Final = "copc"
-INFO_ID: Final = 1
-HIERARCHY_ID: Final = 1000
+INFO_ID: Final = 1  # record id of the COPC info (specification, info VLR)
+HIERARCHY_ID: Final = 1000  # record id of the hierarchy
 SPAN: Final = 128
 """Voxels along an edge of a node."""
 
@@ -34,18 +34,18 @@ _INFO: Final = struct.Struct("<5d2Q2d11Q")
 _ENTRY: Final = np.dtype(
     [("level", "<i4"), ("x", "<i4"), ("y", "<i4"), ("z", "<i4"), ("at", "<u8"), ("bytes", "<i4"), ("points", "<i4")]
 )
-_EVLR_HEADER: Final = 60
-_LONGEST_NOTE: Final = 65_535
+_EVLR_HEADER: Final = 60  # bytes of the header of an extended variable-length record (LAS 1.4)
+_LONGEST_NOTE: Final = 65_535  # bytes that the 16-bit length of a variable-length record allows
 _PAGE_NODES: Final = 4096
-"""More nodes than these are told in pages, one a node of the level `_PAGE_LEVEL`."""
-_PAGE_LEVEL: Final = 4
+"""With more nodes, the hierarchy is split into pages, one for each node of the level `_PAGE_LEVEL`."""
+_PAGE_LEVEL: Final = 4  # octree level of the nodes with separate pages
 
 Key = tuple[int, int, int, int]
-"""Level, and number of the node along x, y and z."""
+"""Level, and index of the node along x, y and z."""
 
 
 class CopcWriter:
-    """Writes a COPC file node by node; use it as a context. The same nodes in the same order give the same bytes."""
+    """Writes a COPC file node by node; a context manager. Equal nodes in equal order give equal bytes."""
 
     def __init__(self, path: Path, layout: Layout, offsets: Sequence[float], date: dt.date) -> None:
         """Begin a file.
@@ -75,7 +75,7 @@ class CopcWriter:
         self._stated: dict[str, Any] = {}
 
     def begin(self, corner: Sequence[int], edge: int, facts: Mapping[str, Any]) -> Self:
-        """State the octree's cube (corner and edge in whole steps) and facts of the file; opens it."""
+        """Open the file, and state the octree's cube (corner and edge in whole steps) and facts about the file."""
         self._cube, self._stated = (corner, edge), dict(facts)
         self._stream = self._path.open("wb+")
         self._write_header()
@@ -96,7 +96,7 @@ class CopcWriter:
             self._stream.close()
 
     def add(self, nodes: Sequence[tuple[Key, npt.NDArray[np.void]]]) -> None:
-        """Write nodes with their points (n > 0) as the layout's records; they are compressed side by side."""
+        """Write nodes with their points (n > 0) as records of the layout; they are compressed in parallel."""
         for key, records in nodes:
             self._nodes.append(key)
             self._counts.append(records.size)
@@ -129,7 +129,7 @@ class CopcWriter:
         self._state(end, root_bytes)
 
     def _state(self, hierarchy_at: int, root_bytes: int) -> None:
-        """Write the header again, now that all is known."""
+        """Write the header again, with the final counts."""
         header = self._header
         header.point_count = sum(self._counts)
         header.mins = self._low * header.scales + header.offsets
@@ -150,7 +150,7 @@ class CopcWriter:
         if len(note) > _LONGEST_NOTE:
             raise StoreError(f"{len(note):,} bytes of facts", expected=f"at most {_LONGEST_NOTE:,}", file=self._path)
         header.vlrs.clear()
-        header.vlrs.append(laspy.VLR(USER_ID, INFO_ID, "COPC info", info))  # the first one, as the specification asks
+        header.vlrs.append(laspy.VLR(USER_ID, INFO_ID, "COPC info", info))  # the first one, as specified
         header.vlrs.append(LasZipVlr(self._laz.record_data()))
         header.vlrs.extend(others)
         header.vlrs.append(laspy.VLR(VLR_USER_ID, VLR_RECORD_ID, "survey, sheet", note))
@@ -161,7 +161,7 @@ class CopcWriter:
 def _entries(
     keys: Sequence[Key], counts: Sequence[int], sizes: npt.NDArray[np.int64], start: int
 ) -> npt.NDArray[np.void]:
-    """A row a node, by level and place; nodes without points of their own between them stand with none."""
+    """Return one row per node, by level and place; intermediate nodes without points are included."""
     held = {key: (0, 0, 0) for node in keys for key in _with_parents(node)}
     ends = start + np.cumsum(sizes)
     for key, at, size, count in zip(keys, (ends - sizes).tolist(), sizes.tolist(), counts, strict=True):
@@ -175,9 +175,9 @@ def _with_parents(key: Key) -> list[Key]:
 
 
 def _pages(entries: npt.NDArray[np.void], start: int) -> tuple[bytes, int]:
-    """The hierarchy's bytes from `start` of the file, and how many of them are the root's page.
+    """Return the hierarchy's bytes for offset `start` of the file, and the size of the root page.
 
-    A page below the root begins with the node that stands for it there: with the number of points -1.
+    A page below the root begins with the node that refers to it there, whose number of points is -1.
     """
     if entries.size <= _PAGE_NODES or not (entries["level"] >= _PAGE_LEVEL).any():
         return entries.tobytes(), entries.nbytes

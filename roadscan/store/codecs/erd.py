@@ -1,4 +1,4 @@
-"""ERD, the text form: longitudinal profiles as programs for pavement engineers exchange them.
+"""ERD text files: longitudinal profiles as programs for pavement engineers exchange them.
 
 Sources: the first part of *The ERD File Specification* (University of Michigan Transportation Research Institute: a
 header of text lines, of which the first, the second and an END line are required, then the data), and headers of
@@ -28,22 +28,22 @@ from roadscan.core.errors import FormatError
 Floats = npt.NDArray[np.float64]
 
 MAGIC = "ERDFILEV2.00"
-_TEXT = 5
-_WIDTH = 8
-_MOST_HEADER_LINES = 1000
-_MOST_NUMBERS = 500_000_000
+_TEXT = 5  # format number of text data
+_WIDTH = 8  # letters of header words, names and units
+_MOST_HEADER_LINES = 1000  # lines in which END has to occur
+_MOST_NUMBERS = 500_000_000  # larger files are refused before they are parsed
 
 
 @dataclass(frozen=True)
 class ErdFile:
-    """What an ERD file holds, in its own units."""
+    """Content of an ERD file, in its units."""
 
     step: float
     """Distance between samples."""
     start: float
     """Station of the first sample (XSTART; 0 where it is not stated)."""
     x_unit: str
-    """Unit of stations as it stands there (XUNITS); empty where it is not stated."""
+    """Unit of stations as written (XUNITS); empty where it is not stated."""
     names: tuple[str, ...]
     """Channels (SHORTNAM); numbers from 1 where they are not stated."""
     units: tuple[str, ...]
@@ -55,12 +55,12 @@ class ErdFile:
 
 
 def is_erd(beginning: bytes) -> bool:
-    """True if a file that begins so says that it is one."""
+    """Return True if a file that begins so declares itself to be ERD."""
     return beginning.lstrip().upper().startswith(b"ERDFILE")
 
 
 def parse_erd(text: str) -> ErdFile:
-    """The channels of a file.
+    """Return the channels of a file.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def parse_erd(text: str) -> ErdFile:
 
 
 def erd_text(step_m: float, start_m: float, names: Sequence[str], heights_m: Floats, title: str = "") -> str:
-    """An ERD file of profiles.
+    """Return the text of an ERD file of profiles.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def erd_text(step_m: float, start_m: float, names: Sequence[str], heights_m: Flo
 
 
 def _counts(line: str) -> tuple[int, int, float]:
-    """Channels, samples and step of the second line."""
+    """Return channels, samples and step of the second line."""
     fields = [field for field in re.split(r"[,\s]+", line.strip()) if field]
     if len(fields) < 6:
         raise FormatError(f"{len(fields)} numbers in the second line", expected="six or seven", record=2)
@@ -132,7 +132,7 @@ def _counts(line: str) -> tuple[int, int, float]:
 
 
 def _words(lines: Sequence[str]) -> Mapping[str, str]:
-    """Header words and what stands behind their eight letters."""
+    """Return the header words and the text after their eight letters."""
     found: dict[str, str] = {}
     for line in lines:
         found.setdefault(line[:_WIDTH].strip().upper(), line[_WIDTH:])
@@ -140,12 +140,12 @@ def _words(lines: Sequence[str]) -> Mapping[str, str]:
 
 
 def _fields(line: str, channels: int) -> tuple[str, ...]:
-    """Fields of eight letters."""
+    """Return the fields of eight letters."""
     return tuple(line[_WIDTH * k : _WIDTH * (k + 1)].strip() for k in range(channels))
 
 
 def _numbers(lines: Sequence[str], first_record: int, channels: int, samples: int) -> Floats:
-    """Numbers of the data as (channels, samples)."""
+    """Return the data's numbers as (channels, samples)."""
     read: list[float] = []
     for record, line in enumerate(lines, first_record):
         try:

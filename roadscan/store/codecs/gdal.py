@@ -1,4 +1,4 @@
-"""GDAL, by way of rasterio, as raster products need it."""
+"""Settings of GDAL (through rasterio) for raster products."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from rasterio.errors import NotGeoreferencedWarning
 
 from roadscan.core.crs import MapFrame
 
-_CACHE_BYTES: Final = 64 * 2**20
+_CACHE_BYTES: Final = 64 * 2**20  # block cache of GDAL
 
 
 @functools.lru_cache(maxsize=16)
 def raster_crs(frame: MapFrame) -> CRS:
-    """CRS of the map, compound where a vertical CRS is named, as rasterio holds it."""
+    """Return the CRS of the map for rasterio, compound where a vertical CRS is named."""
     return CRS.from_wkt(frame.wkt())
 
 
 @contextlib.contextmanager
 def raster_settings() -> Iterator[None]:
-    """GDAL with one file a raster, one thread, and a block cache that does not grow."""
+    """Run GDAL with one file per raster, one thread, and a block cache of constant size."""
     with rasterio.Env(GDAL_PAM_ENABLED="NO", GDAL_NUM_THREADS="1", GDAL_CACHEMAX=_CACHE_BYTES):
         yield
 
 
 @contextlib.contextmanager
 def without_place_warning() -> Iterator[None]:
-    """Keep rasterio from warning of a file without georeference: a picture."""
+    """Suppress rasterio's warning about files without georeference, such as pictures."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         yield

@@ -21,25 +21,25 @@ from rasterio.io import MemoryFile
 
 from roadscan.store.codecs.gdal import without_place_warning
 
-DIRECTORY: Final = 34_735
-DOUBLES: Final = 34_736
+DIRECTORY: Final = 34_735  # TIFF tag of the keys (OGC 19-008)
+DOUBLES: Final = 34_736  # TIFF tag of their numbers
 TEXTS: Final = 34_737
 """TIFF tags of the keys, of their numbers and of their texts; LAS gives its records the same numbers."""
 
 _MOST_KEYS: Final = 1_000
-"""The standard defines some 50."""
-_SHORT, _LONG, _DOUBLE, _ASCII = 3, 4, 12, 2
+"""Largest accepted number of keys: the standard defines some 50."""
+_SHORT, _LONG, _DOUBLE, _ASCII = 3, 4, 12, 2  # TIFF field types
 _SAME_PLACE_M: Final = 1e-3
-"""Two CRS that put a point less than a millimetre apart are one: parameters are written with some digits."""
+"""Two CRS are equal if they place a point less than this apart (m): parameters are written with limited digits."""
 
 _SAME_UNIT_M: Final = 1e-12
-"""Units differ in the digits that programs write of them; the foot and the survey foot by 6e-7 m."""
+"""Units are equal within this (m): programs round them; the foot and the survey foot differ by 6e-7 m."""
 
 _FALSE_ORIGIN: Final = ("False easting", "False northing", "Easting at false origin", "Northing at false origin")
 
 
 class KeyedCrs(NamedTuple):
-    """What GeoTIFF keys say."""
+    """CRS stated by GeoTIFF keys."""
 
     crs: pyproj.CRS | None
     """Compound where the keys state a vertical datum, even one without a name; None where they state no CRS."""
@@ -49,12 +49,12 @@ class KeyedCrs(NamedTuple):
 
 
 def short_keys(directory: bytes) -> dict[int, int]:
-    """Values of the keys that hold one short number, by key."""
+    """Return the values of the keys with a single short number, by key."""
     return {key: value for key, at, count, value in _entries(directory) if at == 0 and count == 1}
 
 
 def crs_of_keys(records: Mapping[int, bytes]) -> KeyedCrs:
-    """CRS that keys state.
+    """Return the CRS that keys state.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def crs_of_keys(records: Mapping[int, bytes]) -> KeyedCrs:
 
 
 def known_crs(crs: pyproj.CRS) -> pyproj.CRS | None:
-    """The CRS of an authority's register that a projected one is, by datum, unit and place; None where it is none.
+    """Return the registered CRS equal to a projected one in datum, unit and placement; None where there is none.
 
     Those that PROJ finds alike are tried, and those of its name, such as the one in feet beside the one in metres.
     """
@@ -115,7 +115,7 @@ def _horizontal(crs: pyproj.CRS) -> pyproj.CRS:
 
 
 def _renamed(crs: pyproj.CRS) -> pyproj.CRS:
-    """The CRS as the register has it; one that is in none keeps no code, for its parameters contradict it."""
+    """Return the CRS with its registered name; an unregistered one keeps no code, which would contradict it."""
     if crs.is_compound:
         return CompoundCRS(name=crs.name, components=[_renamed(crs.sub_crs_list[0]), crs.sub_crs_list[1]])
     if not crs.is_projected:
@@ -141,7 +141,7 @@ def _read(picture: bytes, linear_units: str) -> pyproj.CRS | None:
 
 
 def _entries(directory: bytes) -> list[tuple[int, int, int, int]]:
-    """Key, tag of its value, count and value or place, sorted by key; without what is no key."""
+    """Return key, tag of its value, count and value or place, sorted by key, without invalid keys."""
     if len(directory) < 8:
         return []
     claimed = struct.unpack_from("<H", directory, 6)[0]
@@ -151,7 +151,7 @@ def _entries(directory: bytes) -> list[tuple[int, int, int, int]]:
 
 
 def _picture(records: Mapping[int, bytes]) -> bytes | None:
-    """A TIFF of one cell with the keys; None without any."""
+    """Return a TIFF of one cell with the keys; None without any."""
     directory, doubles = records.get(DIRECTORY, b""), records.get(DOUBLES, b"")
     texts = records.get(TEXTS, b"")
     room = {0: 1, DOUBLES: len(doubles) // 8, TEXTS: len(texts)}
@@ -176,9 +176,9 @@ def _picture(records: Mapping[int, bytes]) -> bytes | None:
 
 
 def _tiff(tags: list[tuple[int, int, bytes]]) -> bytes:
-    """A little-endian TIFF of the tags, whose one cell is byte 8."""
+    """Return a little-endian TIFF of the tags, whose one cell is byte 8."""
     sizes = {_SHORT: 2, _LONG: 4, _DOUBLE: 8, _ASCII: 1}
-    body, entries = bytearray(8), b""  # the cell, and room up to an even byte
+    body, entries = bytearray(8), b""  # the cell, padded to an even byte
     for tag, kind, content in tags:
         count = len(content) // sizes[kind]
         if len(content) <= 4:

@@ -1,4 +1,4 @@
-"""Grey pictures of 8 bits as files: PNG (W3C, *Portable Network Graphics*) and BMP, and the world file beside them.
+"""Writes 8-bit grey pictures as PNG (W3C, *Portable Network Graphics*) and BMP, and their world files.
 
 PNG is put together here, because at cell resolution the time goes into compressing, and Pillow compresses with zlib;
 Pillow writes BMP, and reads both back.
@@ -23,17 +23,17 @@ from roadscan.store.codecs.zlib_stream import compressed, crc32
 Grey = npt.NDArray[np.uint8]
 
 _PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
-_NO_FILTER, _UP = 0, 2
-_M_PER_INCH: Final = 0.0254
+_NO_FILTER, _UP = 0, 2  # PNG filter types
+_M_PER_INCH: Final = 0.0254  # metres per inch
 
 
 def write_png(path: Path, grey: Grey, pixel_m: float, texts: Mapping[str, str], *, smooth: bool) -> None:
-    """Write (rows, columns) grey, north up, in which 0 is transparent.
+    """Write (rows, columns) grey, north up, in which 0 is transparent, as PNG.
 
     Parameters
     ----------
     pixel_m : edge of a pixel (m), stated as pixels a metre.
-    texts : what the file says of itself, keyword → text (Latin 1).
+    texts : metadata, keyword → text (Latin 1).
     smooth : True where lines resemble the line above them; they are then stored as differences.
     """
     rows, columns = grey.shape
@@ -63,13 +63,13 @@ def write_bmp(path: Path, grey: Grey, pixel_m: float) -> None:
 
 
 def world_file(transform: Affine) -> str:
-    """Six lines that place a picture: pixel size, rotations, and the centre of the north-west pixel."""
+    """Return the six lines of a world file: pixel size, rotations, and the centre of the north-west pixel."""
     x, y = transform.c + (transform.a + transform.b) / 2, transform.f + (transform.d + transform.e) / 2
     return "".join(f"{v!r}\n" for v in (transform.a, transform.d, transform.b, transform.e, x, y))
 
 
 def check_picture(path: Path, bands: str = "L") -> None:
-    """Decode a PNG or BMP; raise :class:`StoreError` where it is not whole.
+    """Decode a PNG or BMP; raise :class:`StoreError` where it is incomplete.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def check_picture(path: Path, bands: str = "L") -> None:
 
 
 def check_world_file(path: Path) -> None:
-    """Raise :class:`StoreError` unless the file holds six numbers and a pixel of some size."""
+    """Raise :class:`StoreError` unless the file has six numbers and a positive pixel size."""
     try:
         numbers = [float(line) for line in path.read_text("ascii").splitlines()]
     except ValueError as error:
@@ -107,7 +107,7 @@ def _chunk(name: bytes, body: bytes) -> bytes:
 
 
 def _check_chunks(content: bytes) -> None:
-    """Hold every chunk of a PNG against its checksum: Pillow passes some of them over."""
+    """Check every chunk of a PNG against its checksum, because Pillow skips some of them."""
     at = len(_PNG_SIGNATURE)
     while at < len(content):
         (length,) = struct.unpack_from(">I", content, at)

@@ -1,8 +1,8 @@
-"""Size and completeness of JPEG, PNG and TIFF files, told without decoding them.
+"""Checks size and completeness of JPEG, PNG and TIFF files without decoding them.
 
-Decoders fill up what is missing, and allocate what a header claims; so structure is looked at first: what a file cut
+Decoders fill up what is missing, and allocate what a header claims; so the structure is checked first: what a file cut
 short, or filled with zeros at its end, no longer has. Damage inside the compressed pixels stays unseen, as finding it
-means decoding every image. Pillow reads TIFF's tags; it does not say of JPEG and PNG whether they are whole.
+means decoding every image. Pillow reads TIFF's tags; it does not say whether JPEG and PNG are complete.
 
 JPEG: ITU-T T.81, annex B. PNG: W3C PNG (third edition), sections 5 and 11. TIFF: TIFF 6.0, section 2, and BigTIFF.
 """
@@ -24,21 +24,21 @@ PNG: Final = b"\x89PNG\r\n\x1a\n"
 TIFFS: Final = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
-_TAIL_BYTES: Final = 1 << 16
-_BLOCK_BYTES: Final = 1 << 20
-_LARGEST_PX: Final = 1 << 24
+_TAIL_BYTES: Final = 1 << 16  # bytes at the end that are searched first for a marker
+_BLOCK_BYTES: Final = 1 << 20  # bytes that are read at a time
+_LARGEST_PX: Final = 1 << 24  # larger widths and heights are refused
 _WITHOUT_LENGTH: Final = (0x01, *range(0xD0, 0xDA))
-"""JPEG markers: TEM, RST, SOI and EOI."""
-_FILL, _SCAN, _END = 0xFF, 0xDA, 0xD9
+"""JPEG markers without a length: TEM, RST, SOI and EOI."""
+_FILL, _SCAN, _END = 0xFF, 0xDA, 0xD9  # JPEG markers: prefix, start of scan, end of image
 _HUFFMAN_FRAMES: Final = (0xC0, 0xC1, 0xC2)
 """Baseline, extended and progressive Huffman coding."""
-_FRAMES: Final = tuple(m for m in range(0xC0, 0xD0) if m not in (0xC4, 0xC8, 0xCC))
+_FRAMES: Final = tuple(m for m in range(0xC0, 0xD0) if m not in (0xC4, 0xC8, 0xCC))  # JPEG start-of-frame markers (SOF)
 _MOST_SCANS: Final = 32
-"""An encoder writes some ten scans; each costs a walk over the whole image."""
+"""Most scans of a JPEG: an encoder writes some ten, and each costs a pass over the whole image."""
 
 
 class ImageError(Exception):
-    """The file is no complete image; says why."""
+    """The file is no complete image; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class ImageSize:
 
 
 def is_image(head: bytes) -> bool:
-    """True if a file's first bytes are those of a JPEG, PNG or TIFF."""
+    """Return True if a file's first bytes are those of a JPEG, PNG or TIFF."""
     return head.startswith((JPEG, PNG, *TIFFS))
 
 
 def image_size(path: Path) -> ImageSize:
-    """Size of a complete JPEG, PNG or TIFF file.
+    """Return the size of a complete JPEG, PNG or TIFF file.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def image_size(path: Path) -> ImageSize:
 
 
 def jpeg_size(data: bytes) -> tuple[int, int]:
-    """Rows and columns of a JPEG of 8 bits.
+    """Return rows and columns of a JPEG of 8 bits.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def jpeg_size(data: bytes) -> tuple[int, int]:
 
 
 def png_size(data: bytes) -> tuple[int, int]:
-    """Rows and columns of a grey PNG of 8 bits, or :class:`ImageError`."""
+    """Return rows and columns of a grey PNG of 8 bits, or raise :class:`ImageError`."""
     kind, content = _checked_chunks(data)[0]
     if kind != b"IHDR" or len(content) != 13:
         raise ImageError("the PNG does not begin with its header")
@@ -123,7 +123,7 @@ def png_size(data: bytes) -> tuple[int, int]:
 
 
 def plain_png(data: bytes) -> bytes:
-    """The PNG with its header and pixels only, after all its checksums were right, or :class:`ImageError`."""
+    """Return the PNG with only its header and pixels once its checksums are verified, or raise :class:`ImageError`."""
     kept = [(kind, content) for kind, content in _checked_chunks(data) if kind in {b"IHDR", b"IDAT", b"IEND"}]
     return PNG + b"".join(
         struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc32(kind + content))
@@ -135,7 +135,7 @@ def plain_png(data: bytes) -> bytes:
 
 
 def _segments(stream: BinaryIO) -> Iterator[tuple[int, int, int]]:
-    """Marker, place and bytes of the content of each segment up to the first scan's."""
+    """Yield marker, place and content length of each segment up to that of the first scan."""
     at, marker = 2, 0
     while marker != _SCAN:
         stream.seek(at)
@@ -158,7 +158,7 @@ def _segments(stream: BinaryIO) -> Iterator[tuple[int, int, int]]:
 
 
 def _jpeg(stream: BinaryIO, size: int) -> ImageSize:
-    """Follow the segments to the pixels; after them the end-of-image marker has to come.
+    """Follow the segments to the pixels, after which the end-of-image marker has to come.
 
     The coded pixels hold no 0xFF that is not followed by 0x00 or a restart marker, so that the
     marker cannot come from them, nor from a preview image, which stands in a segment before them.
@@ -179,7 +179,7 @@ def _jpeg(stream: BinaryIO, size: int) -> ImageSize:
 
 
 def _holds(stream: BinaryIO, marker: bytes, start: int, size: int) -> bool:
-    """True if `marker` stands behind byte `start`: looked for at the end first, where it belongs."""
+    """Return True if `marker` occurs after byte `start`; the end, where it belongs, is searched first."""
     tail = max(start, size - _TAIL_BYTES)
     stream.seek(tail)
     if marker in stream.read(_TAIL_BYTES):
@@ -200,7 +200,7 @@ def _holds(stream: BinaryIO, marker: bytes, start: int, size: int) -> bool:
 
 
 def _chunks(stream: BinaryIO, size: int) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, place and bytes of the content of each chunk, which have to follow one another up to the last."""
+    """Yield kind, place and content length of each chunk, which have to be contiguous up to the last."""
     at, kind = len(PNG), b""
     while kind != b"IEND":
         stream.seek(at)
@@ -231,7 +231,7 @@ def _png(stream: BinaryIO, size: int) -> ImageSize:
 
 
 def _checked_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
-    """Kind and content of each chunk, whose checksums are right."""
+    """Return kind and content of each chunk after checking its checksum."""
     if data[:8] != PNG:
         raise ImageError("it is no PNG")
     found = []
@@ -254,7 +254,7 @@ def _tiff(stream: BinaryIO, size: int) -> ImageSize:
     head = stream.read(16)
     big = b"+" in head[2:4]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # tags that cannot be read are missing
+        warnings.simplefilter("ignore")  # unreadable tags are missing
         try:
             tags = ImageFileDirectory_v2(head if big else head[:8])
             stream.seek(tags.next)
@@ -272,7 +272,7 @@ def _tiff(stream: BinaryIO, size: int) -> ImageSize:
 
 
 def time_taken(path: Path) -> str:
-    """Time at which an image was taken, as its EXIF tags write it (``2026:05:04 11:30:00``); "" without one."""
+    """Return the time at which an image was taken, as in its EXIF tags (``2026:05:04 11:30:00``); "" without one."""
     from PIL import ExifTags, Image
 
     try:

@@ -1,4 +1,4 @@
-"""How every point product lies in its file: LAS 1.4, its CRS as WKT, coordinates in the CRS's own unit, a digest."""
+"""Writes and checks LAS 1.4 files of point products: CRS as WKT, coordinates in the CRS's unit, a digest."""
 
 from __future__ import annotations
 
@@ -27,42 +27,42 @@ from roadscan.core.errors import CrsError, StoreError
 from roadscan.store.codecs import SOFTWARE
 
 VLR_USER_ID: Final = "roadscan"
-VLR_RECORD_ID: Final = 1
+VLR_RECORD_ID: Final = 1  # record id of roadscan's facts
 
 ONE_OF_ONE: Final = 0x11
 """Return number and number of returns in the byte that holds both."""
 _RETURN_NUMBER: Final = 0x0F
-"""The bits of the return number in it."""
+"""Bits of the return number in that byte."""
 
 _ABOUT_FACTS: Final = "survey, tile, rounding"
-_CHUNK_POINTS: Final = 1_000_000
+_CHUNK_POINTS: Final = 1_000_000  # points that are decoded at a time
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What the files of a product share: kind of points, their steps, the CRS."""
+    """Common layout of a product's files: kind of points, scales, CRS."""
 
     point_format: int
     further: tuple[tuple[str, str, str], ...]
-    """Further dimensions: name, NumPy type, description."""
+    """Extra dimensions: name, NumPy type, description."""
     scales: tuple[float, ...]
-    """Of the three coordinates."""
+    """Scales of the three coordinates."""
     map: MapFrame
     product: str
-    """Named in errors."""
+    """Name of the product in errors."""
     class_names: tuple[tuple[int, str], ...] = ()
     """Names of classes that the file states (LAS 1.4 R15, Classification Lookup); left out without any."""
 
     @property
     def header(self) -> laspy.LasHeader:
-        """A new header of LAS 1.4 without a date or points."""
+        """Return a new header of LAS 1.4 without date or points."""
         header = copy.copy(_header(self))
-        header.vlrs = header.vlrs  # which copies the list, and makes the record of further dimensions anew
+        header.vlrs = header.vlrs  # this copies the list, and rebuilds the record of extra dimensions
         return header
 
     @property
     def records(self) -> np.dtype[np.void]:
-        """A point record as it lies in the file."""
+        """Return the type of a point record as it lies in the file."""
         kind: np.dtype[np.void] = _header(self).point_format.dtype()
         return kind
 
@@ -128,7 +128,7 @@ def write_points(
 
 
 def _state_points(header: laspy.LasHeader, records: npt.NDArray[np.void]) -> None:
-    """State in the header how many points there are, their box, and the extremes of each further dimension."""
+    """Write into the header the number of points, their box, and the extremes of each extra dimension."""
     least, greatest = (
         np.array([getattr(records[axis], which)() for axis in "XYZ"]) * header.scales + header.offsets
         for which in ("min", "max")
@@ -141,19 +141,19 @@ def _state_points(header: laspy.LasHeader, records: npt.NDArray[np.void]) -> Non
 
 
 def _descriptions(header: laspy.LasHeader) -> list[Any]:
-    """What the header says of each further dimension."""
+    """Return the header's descriptions of the extra dimensions."""
     return [one for vlr in header.vlrs.get("ExtraBytesVlr") for one in vlr.extra_bytes_structs]
 
 
 def _state_extremes(description: Any, values: npt.NDArray[Any]) -> None:
-    """State the least and the greatest value of a dimension: laspy 2.7 looks at the first point alone."""
+    """Set the minimum and maximum of a dimension, because laspy 2.7 only uses the first point."""
     kind = {"u": np.uint64, "i": np.int64, "f": np.float64}[values.dtype.kind]
     np.frombuffer(description._min, kind)[0] = values.min()
     np.frombuffer(description._max, kind)[0] = values.max()
 
 
 def check_points(path: Path) -> None:
-    """Decode every point and compare number, box and digest with what the header states."""
+    """Decode every point and compare number, box and digest with the header."""
     try:
         with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
             _check_points(reader, path)
@@ -174,7 +174,7 @@ def _wkt1(frame: MapFrame, product: str) -> str:
 
 
 class _Digest:
-    """BLAKE3 (128 bits) of point records as they lie in a LAS file, and of what gives them their place.
+    """BLAKE3 (128 bits) of point records as they lie in a LAS file, and of the scales and offsets that place them.
 
     Files of older versions state BLAKE2b.
     """

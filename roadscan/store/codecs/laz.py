@@ -1,6 +1,6 @@
-"""Points of LAZ files from a process of their own, which damaged bytes may crash without harm.
+"""Decompresses points of LAZ files in a separate process, which damaged bytes may crash without harm.
 
-A decompressor allocates what the file claims; so the chunk table and the sizes inside the chunks are first held
+A decompressor allocates what the file claims; so the chunk table and the sizes inside the chunks are first checked
 against the file's size (LASzip 2.2).
 """
 
@@ -19,12 +19,12 @@ from roadscan.store.codecs.child import Child, ChildError
 Int64 = npt.NDArray[np.int64]
 
 _REQUEST: Final = struct.Struct("<qq")
-_LONGEST_S: Final = 120.0
-_LASZIP_HEAD: Final = 34
-_MOST_CHUNK_POINTS: Final = 1 << 32
+_LONGEST_S: Final = 120.0  # longest time for one request (s)
+_LASZIP_HEAD: Final = 34  # bytes of the LASzip record before its items
+_MOST_CHUNK_POINTS: Final = 1 << 32  # larger chunks count as damage (points)
 _LAYERS: Final = {10: 9, 11: 1, 12: 2, 13: 1}
 """Layers of a chunk by type of LASzip item: point, RGB, RGB and near infrared, wave packet of formats 6–10."""
-_EXTRA_BYTES_ITEM: Final = 14
+_EXTRA_BYTES_ITEM: Final = 14  # type of the LASzip item of extra bytes, which has one layer per byte
 
 
 LazError = ChildError
@@ -32,7 +32,7 @@ LazError = ChildError
 
 
 class Laz(Child):
-    """An open LAZ file; use as a context manager.
+    """An open LAZ file; a context manager.
 
     Parameters
     ----------
@@ -44,11 +44,11 @@ class Laz(Child):
         super().__init__("laz_worker", str(path), str(offset), laszip.hex())
 
     def table(self) -> Int64:
-        """(n, 2) int64: points and bytes of each chunk; LazError if the table is damaged."""
+        """Return (n, 2) int64: points and bytes of each chunk; LazError if the table is damaged."""
         return np.frombuffer(self.points(0, 0), dtype="<i8").reshape(-1, 2)
 
     def points(self, first: int, count: int) -> bytes:
-        """Records of `count` > 0 points from `first` on, as they would stand in a LAS file.
+        """Return the records of `count` > 0 points from `first` on, as in a LAS file.
 
         Raises
         ------
@@ -60,14 +60,14 @@ class Laz(Child):
 
 @dataclass(frozen=True)
 class LazChunks:
-    """Chunks of a LAZ file: damage in one costs no other."""
+    """Chunks of a LAZ file: damage in one affects no other."""
 
     ends: Int64
     """(n,) number of the first point after each chunk."""
     sound: npt.NDArray[np.bool_]
-    """(n,) whether the sizes inside a chunk fit into it; others are not decompressed."""
+    """(n,) whether the sizes inside a chunk fit into it; other chunks are not decompressed."""
     least: int
-    """Points that the chunks hold at least: of point formats 0 to 5, the table says too much of the last one."""
+    """Least number of points in the chunks: for point formats 0 to 5, the table counts too many in the last one."""
 
     @classmethod
     def of(cls, laz: Laz, stream: BinaryIO, offset: int, record_bytes: int, laszip: bytes) -> Self:
@@ -88,7 +88,7 @@ class LazChunks:
             raise LazError("the LASzip record does not fit the points")
         size = stream.seek(0, 2)
         table_at, claimed = _table_claim(stream, offset, size)
-        # Each chunk holds at least its first point; a table that claims more would be allocated before it is read.
+        # Each chunk has at least its first point; a table that claims more would be allocated before it is read.
         if not 0 < claimed <= (table_at - offset) // max(1, record_bytes):
             raise LazError("the table of LAZ chunks is missing or damaged")
         points, lengths = laz.table().T
@@ -100,14 +100,14 @@ class LazChunks:
             end <= table_at and _layers_fit(stream, start + record_bytes, end, layers)
             for start, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True)
         ]
-        if layers and sound[-1]:  # such a chunk says how many points it holds; the table says how many it may
+        if layers and sound[-1]:  # such a chunk states its number of points; the table states the most it may have
             points = np.append(points[:-1], min(_points_of_chunk(stream, int(starts[-2]) + record_bytes), points[-1]))
         ends = np.cumsum(points)
         return cls(ends, np.array(sound), int(ends[-1] if layers else ends[-1] - points[-1] + 1))
 
 
 def _table_claim(stream: BinaryIO, offset: int, size: int) -> tuple[int, int]:
-    """Where the chunk table stands and how many chunks it claims, 0 where there is none."""
+    """Return the place of the chunk table and its claimed number of chunks, 0 where there is none."""
     stream.seek(offset)
     table_at = int.from_bytes(stream.read(8), "little", signed=True)
     if table_at == -1:
@@ -120,13 +120,13 @@ def _table_claim(stream: BinaryIO, offset: int, size: int) -> tuple[int, int]:
 
 
 def _points_of_chunk(stream: BinaryIO, at: int) -> int:
-    """Points of a chunk with layers, which says how many they are; 1 where it does not."""
+    """Return the points of a chunk with layers, as it states them; 1 where it does not."""
     stream.seek(at)
     return max(1, int.from_bytes(stream.read(4), "little"))
 
 
 def _layers_fit(stream: BinaryIO, at: int, end: int, layers: int) -> bool:
-    """True if a chunk's layers (point formats 6 and up) fit into it: at `at` stand their count and sizes."""
+    """Return True if a chunk's layers (point formats 6 and up) fit into it: at `at` stand their count and sizes."""
     if not layers:
         return True
     stream.seek(at + 4)

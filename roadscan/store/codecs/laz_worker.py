@@ -15,7 +15,7 @@ REQUEST = struct.Struct("<qq")
 
 
 class Decompressor:
-    """Points and chunk table of one LAZ file."""
+    """Decompresses points and chunk table of one LAZ file."""
 
     def __init__(self, stream: BinaryIO, offset: int, laszip: bytes) -> None:
         self._stream = stream
@@ -25,18 +25,18 @@ class Decompressor:
         self._at = 0
 
     def answer(self, request: bytes) -> bytes:
-        """Reply to a request."""
+        """Return the reply to a request."""
         first, count = REQUEST.unpack(request)
         return self.points(first, count) if count else self.table()
 
     def table(self) -> bytes:
-        """(n, 2) int64: points and bytes of each chunk."""
+        """Return (n, 2) int64: points and bytes of each chunk."""
         self._stream.seek(self._offset)
         table = lazrs.read_chunk_table(self._stream, lazrs.LazVlr(self._laszip))
         return b"".join(struct.pack("<qq", min(points, 2**62), min(size, 2**62)) for points, size in table)
 
     def points(self, first: int, count: int) -> bytes:
-        """Records of points as they would stand in a LAS file."""
+        """Return records of points as in a LAS file."""
         if self._decompressor is None:
             self._stream.seek(self._offset)
             self._decompressor = lazrs.LasZipDecompressor(self._stream, self._laszip)
@@ -54,5 +54,5 @@ class Decompressor:
 
 
 def opened(file: str, offset: str, laszip: str) -> Callable[[bytes], bytes]:
-    """Answer for a LAZ file, the byte at which its points start, and the LASzip record in hexadecimal."""
+    """Return the answers of a LAZ file, given the byte at which its points start and the LASzip record (hex)."""
     return Decompressor(open(file, "rb"), int(offset), bytes.fromhex(laszip)).answer  # noqa: PTH123

@@ -1,4 +1,4 @@
-"""Files of a triangle mesh: binary glTF and PLY."""
+"""Writes and checks triangle meshes as binary glTF and PLY."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from blake3 import blake3
 
 from roadscan.core.errors import StoreError
 
-_GLTF: Final = 0x46546C67
-_JSON: Final = 0x4E4F534A
-_BIN: Final = 0x004E4942
+_GLTF: Final = 0x46546C67  # "glTF", magic number of the file
+_JSON: Final = 0x4E4F534A  # "JSON", type of a chunk
+_BIN: Final = 0x004E4942  # "BIN", type of a chunk
 _DIGEST: Final = "blake3"
 _UNLIT: Final = "KHR_materials_unlit"
 
@@ -29,7 +29,7 @@ class Mesh:
     vertices_m: npt.NDArray[np.float32]
     """(n, 3) east, north, up from the mesh's origin (m)."""
     colour: npt.NDArray[np.uint8]
-    """(n,) grey of an intensity, or (n, 3) red, green, blue as a picture has them (sRGB)."""
+    """(n,) grey of an intensity, or (n, 3) red, green, blue of a picture (sRGB)."""
     triangles: npt.NDArray[np.uint32]
     """(m, 3) vertices, counter-clockwise as seen from above."""
 
@@ -43,7 +43,7 @@ def write_glb(path: Path, mesh: Mesh, about: Mapping[str, Any], generator: str) 
 
     Parameters
     ----------
-    about : what `asset.extras` says of the mesh, beside the digest of the arrays.
+    about : content of `asset.extras`, beside the digest of the arrays.
     """
     upright = mesh.vertices_m[:, [0, 2, 1]] * np.array([1, 1, -1], np.float32)
     arrays = [upright.astype("<f4").tobytes(), _linear(mesh.colour).tobytes(), mesh.triangles.astype("<u4").tobytes()]
@@ -68,7 +68,7 @@ def write_glb(path: Path, mesh: Mesh, about: Mapping[str, Any], generator: str) 
 
 
 def _linear(colour: npt.NDArray[np.uint8]) -> npt.NDArray[np.unsignedinteger[Any]]:
-    """Linear red, green, blue and opacity (n, 4): uint8 of greys (n,), uint16 of colours (n, 3).
+    """Return linear red, green, blue and opacity (n, 4): uint8 of greys (n,), uint16 of colours (n, 3).
 
     sRGB to linear: IEC 61966-2-1, section 5.2.
     """
@@ -84,7 +84,7 @@ def _linear(colour: npt.NDArray[np.uint8]) -> npt.NDArray[np.unsignedinteger[Any
 
 
 def _described(mesh: Mesh, upright: npt.NDArray[np.float32], sizes: list[int]) -> dict[str, Any]:
-    """Scene, mesh and arrays of the file."""
+    """Return scene, mesh and arrays of the file as JSON values."""
     vertices, colours, triangles = sizes
     views = [
         {"buffer": 0, "byteOffset": 0, "byteLength": vertices, "target": 34962},
@@ -113,7 +113,7 @@ def _described(mesh: Mesh, upright: npt.NDArray[np.float32], sizes: list[int]) -
 
 
 def check_glb(path: Path) -> None:
-    """Raise :class:`StoreError` unless the file is whole and its arrays are those that were written."""
+    """Raise :class:`StoreError` unless the file is complete and its arrays are those that were written."""
     content = path.read_bytes()
     try:
         magic, version, size, length, kind = struct.unpack_from("<IIIII", content)
@@ -127,7 +127,7 @@ def check_glb(path: Path) -> None:
 
 
 def stated_in_glb(content: bytes) -> dict[str, Any]:
-    """What a glTF file states of its mesh (`asset.extras`)."""
+    """Return what a glTF file states about its mesh (`asset.extras`)."""
     try:
         described = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
         stated: dict[str, Any] = described["asset"]["extras"]
@@ -164,7 +164,7 @@ def write_ply(path: Path, mesh: Mesh, about: Mapping[str, Any]) -> None:
 
 
 def check_ply(path: Path) -> None:
-    """Raise :class:`StoreError` unless the file is whole and its arrays are those that were written."""
+    """Raise :class:`StoreError` unless the file is complete and its arrays are those that were written."""
     head, end, content = path.read_bytes().partition(b"end_header\n")
     stated = f'comment {_DIGEST} "{blake3(content).hexdigest(length=16)}"'.encode()
     if not head.startswith(b"ply\n") or not end or stated not in head.split(b"\n"):

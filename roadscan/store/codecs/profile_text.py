@@ -1,4 +1,4 @@
-"""Profiles as columns of text: a station and heights to a line, below any lines that are no numbers."""
+"""Reads profiles as columns of text: a station and heights per line, after any lines without numbers."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _UNIT = re.compile(r"[(\[]\s*([^)\]]+?)\s*[)\]]\s*$|_(mm|cm|km|m|ft|in|mil)$", r
 
 _COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")
-"""A number whose commas may as well part the thousands."""
+"""A number whose commas may also separate thousands."""
 
 
 @dataclass(frozen=True)
 class TextColumns:
-    """Columns of a text file, in its own units."""
+    """Columns of a text file, in its units."""
 
     names: tuple[str, ...]
     """Names of the columns; numbers from 1 where there are none."""
@@ -39,7 +39,7 @@ class TextColumns:
 
 
 def parse_columns(text: str) -> TextColumns:
-    """Columns of the lines of numbers.
+    """Return the columns of the lines of numbers.
 
     Columns are separated by commas, semicolons, tabs or blanks, whichever the first line of numbers has; where it is
     not commas, these may be decimal marks. A line below it with another number of columns, or one that is no number,
@@ -84,7 +84,7 @@ def parse_columns(text: str) -> TextColumns:
 
 
 def _with_points(lines: list[str]) -> list[str]:
-    """Lines whose decimal commas are points, where commas do not separate columns.
+    """Return lines with points for decimal commas, where commas do not separate columns.
 
     Raises
     ------
@@ -104,10 +104,10 @@ def _with_points(lines: list[str]) -> list[str]:
 
 
 def _separator(line: str) -> str | None:
-    """What separates columns in a line: None for blanks."""
+    """Return the column separator of a line: None for blanks."""
     words = line.split()
     if len(words) > 1 and all(_COMMA_NUMBER.fullmatch(word) for word in words) and "\t" not in line:
-        return None  # the commas are decimal marks
+        return None  # these commas are decimal marks
     return next((mark for mark in ("\t", ";", ",") if mark in line), None)
 
 
@@ -117,7 +117,7 @@ def _cells(line: str, separator: str | None) -> list[str]:
 
 
 def _numbers(cells: Sequence[str]) -> list[float] | None:
-    """The numbers of a line, NaN for what is missing; None where it is no line of two numbers or more."""
+    """Return the numbers of a line, NaN for missing ones; None for a line of fewer than two numbers."""
     if len(cells) < 2 or cells[0].lower() in _MISSING:
         return None
     try:
@@ -127,7 +127,7 @@ def _numbers(cells: Sequence[str]) -> list[float] | None:
 
 
 def _names(line: str, separator: str | None, width: int) -> tuple[str, ...]:
-    """Names of columns in the line above the first numbers, where it has as many."""
+    """Return column names from the line above the first numbers, if it has as many."""
     cells = _cells(line.lstrip("#% "), separator)
     if len(cells) != width and separator is not None:
         cells = re.split(r"[\t;,]", line.lstrip("#% "))

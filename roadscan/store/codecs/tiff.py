@@ -1,7 +1,7 @@
-"""A cloud-optimised TIFF from blocks that are compressed already (TIFF 6.0; BigTIFF where 4 GB do not do).
+"""Writes cloud-optimised TIFFs from compressed blocks (TIFF 6.0; BigTIFF where 4 GB are not enough).
 
 First come all directories, then the blocks: those of the smallest overview first, those of the image last. Each has
-its size before it and its last four bytes again behind it, as GDAL's own cloud-optimised files do. A block that holds
+its size before it and its last four bytes again behind it, as GDAL's cloud-optimised files do. A block that holds
 nothing is left out (offset and size 0), as GDAL reads sparse files.
 """
 
@@ -19,9 +19,9 @@ from blake3 import blake3
 from roadscan.core.errors import StoreError
 
 DIGEST_ITEM: Final = "ROADSCAN_FILE_BLAKE3"
-"""Metadata item with the BLAKE3 digest (128 bits, hexadecimal) of the whole file, this digest's characters as 0."""
+"""Metadata item with the BLAKE3 digest (128 bits, hexadecimal) of the file with this digest's characters as 0."""
 
-_NO_DIGEST: Final = b"0" * 32
+_NO_DIGEST: Final = b"0" * 32  # placeholder of the digest while it is computed
 _DIGEST: Final = re.compile(rb'<Item name="' + DIGEST_ITEM.encode() + rb'">([0-9a-f]{32})</Item>')
 _STRUCTURE: Final = b"""LAYOUT=IFDS_BEFORE_DATA
 BLOCK_ORDER=ROW_MAJOR
@@ -30,43 +30,43 @@ BLOCK_TRAILER=LAST_4_BYTES_REPEATED
 KNOWN_INCOMPATIBLE_EDITION=NO
  """
 _GHOST: Final = b"GDAL_STRUCTURAL_METADATA_SIZE=%06d bytes\n" % len(_STRUCTURE) + _STRUCTURE
-"""What GDAL knows a cloud-optimised file by (GDAL, COG driver: header ghost area)."""
-_KINDS: Final = {"s": 2, "H": 3, "I": 4, "d": 12, "Q": 16}
-_LEADER: Final = 4
-_CLASSIC_END: Final = 2**32 - 2**20
+"""Mark by which GDAL recognises a cloud-optimised file (GDAL, COG driver: header ghost area)."""
+_KINDS: Final = {"s": 2, "H": 3, "I": 4, "d": 12, "Q": 16}  # TIFF field types by `struct` code
+_LEADER: Final = 4  # bytes before and after each block, as in GDAL's files
+_CLASSIC_END: Final = 2**32 - 2**20  # larger files (bytes) are BigTIFF
 
 
 @dataclass(frozen=True)
 class Tag:
-    """One entry of a directory: values of a `struct` kind, text as bytes of the kind ``s``."""
+    """One entry of a directory: values of a `struct` kind, or text as bytes of kind ``s``."""
 
     number: int
     kind: str
     values: Sequence[Any]
 
     def packed(self) -> bytes:
-        """Values as the file holds them; text ends with a zero byte."""
+        """Return the values as bytes of the file; text ends with a zero byte."""
         if self.kind == "s":
             return b"".join(self.values) + b"\0"
         return struct.pack(f"<{len(self.values)}{self.kind}", *self.values)
 
     @property
     def count(self) -> int:
-        """Values of the entry."""
+        """Number of values of the entry."""
         return len(self.packed()) if self.kind == "s" else len(self.values)
 
 
 @dataclass(frozen=True)
 class Page:
-    """An image or one of its overviews: its tags but for the places of the blocks, and the blocks."""
+    """An image or one of its overviews: its blocks, and its tags without the places of the blocks."""
 
     tags: tuple[Tag, ...]
     blocks: Sequence[Any]
-    """Buffers, None where nothing lies; by band, then row by row."""
+    """Compressed blocks, None for empty ones; by band, then row by row."""
 
 
 def tiff_parts(pages: Sequence[Page]) -> list[Any]:
-    """Buffers of the file: directories, then blocks. The image comes first in `pages`, then overviews, falling."""
+    """Return the file's buffers: directories, then blocks. `pages`: the image, then overviews, largest first."""
     sizes = [[0 if b is None else len(b) for b in page.blocks] for page in pages]
     entries = sum(len(s) for s in sizes)
     big = sum(map(sum, sizes)) + 40 * entries > _CLASSIC_END
@@ -97,7 +97,7 @@ def tiff_parts(pages: Sequence[Page]) -> list[Any]:
 
 
 def digest_item() -> str:
-    """The metadata item that `tiff_parts` fills in; it belongs into the metadata of the first page, once."""
+    """Return the metadata item that `tiff_parts` fills in; the metadata of the first page must contain it once."""
     return f'<Item name="{DIGEST_ITEM}">{_NO_DIGEST.decode()}</Item>'
 
 
@@ -130,7 +130,7 @@ def _tags(page: Page, places: Sequence[int], sizes: Sequence[int], word: str) ->
 
 
 def _directory(tags: Sequence[Tag], start: int, following: int, big: bool) -> bytes:
-    """Directory that lies at `start`, with the values that do not fit into its entries behind it."""
+    """Return the directory for byte `start`, followed by the values that do not fit into its entries."""
     word, room = ("Q", 8) if big else ("I", 4)
     end = start + (8 if big else 2) + len(tags) * (4 + 2 * room) + room
     entries, values = struct.pack("<Q" if big else "<H", len(tags)), b""

@@ -1,4 +1,4 @@
-"""Looks into a video for `formats/cameras/video.py`: damaged bytes can crash or stall the libraries that do it.
+"""Examines a video for `formats/cameras/video.py`: damaged bytes can crash or stall the libraries for that.
 
 The one request is empty. The reply: frames per second, frames that the header claims, width and height as float64;
 number of packets n, number of decoded frames m (−1 where the video was not decoded) as int64; n and m float64 times in
@@ -16,13 +16,13 @@ from typing import Any
 
 
 def open_video(cv2: Any, file: str, *, packets: bool) -> Any:
-    """Open a video for its packets as they are, or for its decoded frames."""
+    """Open a video for its packets, or for its decoded frames."""
     settings = [cv2.CAP_PROP_FORMAT, -1] if packets else []
     return cv2.VideoCapture(file, cv2.CAP_FFMPEG, settings)
 
 
 def packet_times_ms(cv2: Any, video: Any, most: int) -> array[float]:
-    """Times of the packets, in the file's own order; one more than `most` where there are too many."""
+    """Return the times of the packets in file order; one more than `most` where there are too many."""
     found = array("d")
     while len(found) <= most and video.grab():
         found.append(video.get(cv2.CAP_PROP_POS_MSEC))
@@ -30,12 +30,12 @@ def packet_times_ms(cv2: Any, video: Any, most: int) -> array[float]:
 
 
 def frame_times_ms(cv2: Any, video: Any, packets: int) -> array[float]:
-    """Times of the frames that can be decoded; behind one that cannot, the next is tried."""
+    """Return the times of decodable frames; after one that fails, the next is tried."""
     return array("d", [video.get(cv2.CAP_PROP_POS_MSEC) for _ in range(packets) if video.grab()])
 
 
 def described(file: str, most: int, largest_decoded_bytes: int) -> bytes:
-    """What a video holds."""
+    """Return the reply about a video."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -62,5 +62,5 @@ def described(file: str, most: int, largest_decoded_bytes: int) -> bytes:
 
 
 def opened(file: str, most: str, largest_decoded_bytes: str) -> Callable[[bytes], bytes]:
-    """Answer for a video, the most frames it can hold, and the largest file (bytes) that is decoded as a whole."""
+    """Return the function that answers for a video; it gets the most frames and the largest file (bytes) to decode."""
     return lambda _: described(file, int(most), int(largest_decoded_bytes))

@@ -1,4 +1,4 @@
-"""zlib's streams (RFC 1950, 1951) and its CRC-32; zlib is their oracle and their stand-in.
+"""Compresses zlib streams (RFC 1950, 1951) and computes CRC-32; zlib is their test reference and fallback.
 
 CRC-32 is ISA-L's. Its compressor is nearly as fast as the kernel here, but two runs of one survey got different bytes
 from it (isal 1.9.1). The kernel finds runs and no other repetitions: measured rasters have none.
@@ -17,17 +17,17 @@ from isal import isal_zlib
 from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.kernels.deflate import PAIRS, SEGMENT, deflate, room_words
 
-_LEVEL = 1
+_LEVEL = 1  # zlib's fastest level
 _KEPT = threading.local()
 
 
 def crc32(data: Any, before: int = 0) -> int:
-    """CRC-32 of a contiguous buffer that follows bytes whose CRC-32 is `before`."""
+    """Return the CRC-32 of a contiguous buffer that follows bytes whose CRC-32 is `before`."""
     return zlib.crc32(data, before) if LIBRARY else isal_zlib.crc32(data, before)
 
 
 def compressed(data: npt.NDArray[np.uint8]) -> bytes:
-    """Zlib stream of contiguous bytes, in little time."""
+    """Return contiguous bytes as a zlib stream, favouring speed."""
     if LIBRARY:
         return zlib.compress(data.data, _LEVEL)
     flat = data.reshape(-1)
@@ -37,7 +37,7 @@ def compressed(data: npt.NDArray[np.uint8]) -> bytes:
 
 
 def _scratch(segments: int, words: int) -> tuple[npt.NDArray[Any], ...]:
-    """The thread's own: fresh memory is dear."""
+    """Return scratch arrays of the thread, because allocating fresh memory is slow."""
     kept: tuple[npt.NDArray[Any], ...] | None = getattr(_KEPT, "scratch", None)
     if kept is None or kept[0].size < segments or kept[2].size < words:
         kept = np.empty(segments, np.int32), np.empty(PAIRS, np.uint32), np.empty(words, np.uint64)

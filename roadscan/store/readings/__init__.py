@@ -1,1 +1,1 @@
-"""Ingested readings out of the store, into arrays that are used again."""
+"""Reads ingested readings from the store into reused arrays."""

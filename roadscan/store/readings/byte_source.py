@@ -1,4 +1,4 @@
-"""Bytes of a file of the store, some of them on their way before they are needed.
+"""Reads bytes of a file of the store, some of them ahead of their use.
 
 A folder's files are announced to the system, which reads them into its cache while kernels compute. Spans of an
 object are fetched by threads, several at a time, because each request waits for the network.
@@ -24,17 +24,17 @@ class LocalBytes:
         weakref.finalize(self, self.stream.close)
 
     def expect(self, start: int, end: int) -> None:
-        """Let bytes `start` to `end` come into the system's cache."""
+        """Announce bytes `start` to `end`, so that the system reads them into its cache."""
         if hasattr(os, "posix_fadvise"):
             os.posix_fadvise(self.stream.fileno(), start, end - start, os.POSIX_FADV_WILLNEED)
 
     def read_into(self, start: int, room: memoryview) -> bool:
-        """Fill `room` with the bytes from `start` on; False where the file is too short."""
+        """Fill `room` with the bytes from `start` on; return False where the file is too short."""
         return _filled(self.stream, start, room)
 
 
 class RemoteBytes:
-    """An object of any fsspec file system. What is expected and not read yet stays in memory."""
+    """An object of any fsspec file system. Announced bytes that are not read yet stay in memory."""
 
     def __init__(self, store: Store, path: str) -> None:
         self.stream: Any = store.fs.open(path, "rb")
@@ -45,13 +45,13 @@ class RemoteBytes:
         self._start, self._held = 0, b""
 
     def expect(self, start: int, end: int) -> None:
-        """Begin to fetch bytes `start` to `end`, in one request."""
+        """Start to fetch bytes `start` to `end` in one request."""
         if (start, end) not in self._expected:
             self._expected.append((start, end))
             self._ahead.begin((start, end), functools.partial(self._fetch, start=start, end=end))
 
     def read_into(self, start: int, room: memoryview) -> bool:
-        """Fill `room` with the bytes from `start` on; False where the object is too short."""
+        """Fill `room` with the bytes from `start` on; return False where the object is too short."""
         end = start + len(room)
         for span in self._expected:
             if span[0] <= start and end <= span[1]:
@@ -65,7 +65,7 @@ class RemoteBytes:
 
 
 def opened(store: Store, path: str) -> LocalBytes | RemoteBytes:
-    """A file of a store, by its full path."""
+    """Open a file of a store by its full path."""
     return LocalBytes(path) if store.is_folder else RemoteBytes(store, path)
 
 

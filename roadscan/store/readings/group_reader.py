@@ -1,4 +1,4 @@
-"""Reads row groups of ingested readings, as roadscan itself writes them or by Arrow, and says what is damaged."""
+"""Reads row groups of ingested readings, from roadscan's pages or by Arrow, and reports damage."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _DAMAGE: Final = (OSError, ValueError, pa.ArrowException, DamageError)
 
 
 class GroupReader(ABC, Generic[Rows, Pages]):
-    """Row groups of a file, into buffers that are reused; one a thread.
+    """Reads row groups of a file into reused buffers; use one per thread.
 
     Raises
     ------
@@ -32,9 +32,9 @@ class GroupReader(ABC, Generic[Rows, Pages]):
     """
 
     what: ClassVar[str]
-    """Its readings, as errors name them."""
+    """Name of its readings in errors."""
     columns: ClassVar[Sequence[str]]
-    """Those that are read."""
+    """Columns that are read."""
 
     def __init__(self, store: Store, file: str) -> None:
         self._file = file
@@ -49,13 +49,13 @@ class GroupReader(ABC, Generic[Rows, Pages]):
             raise self._error(error) from error
 
     def expect(self, groups: Sequence[int]) -> None:
-        """Let row groups be on their way that will be read soon; what is wrong with them is said when they are read."""
+        """Start to read row groups ahead; their faults are reported when they are read."""
         if self._packed is not None:
             with contextlib.suppress(*_DAMAGE):
                 self._packed.expect([k for k in groups if 0 <= k < self._metadata.num_row_groups], self.columns)
 
     def read(self, groups: Sequence[int]) -> Rows:
-        """Readings of row groups, in the order given; the arrays are valid until the next read of this reader."""
+        """Return the readings of row groups, in the given order; the arrays are valid until the next read."""
         try:
             if any(not 0 <= k < self._metadata.num_row_groups for k in groups):
                 raise DamageError(f"it has {self._metadata.num_row_groups} row groups")
@@ -67,19 +67,19 @@ class GroupReader(ABC, Generic[Rows, Pages]):
 
     @abstractmethod
     def _suits(self, schema: pa.Schema) -> bool:
-        """True if the columns have the types that are stored today; DamageError where one is missing."""
+        """Return True if the columns have the current storage types; DamageError where one is missing."""
 
     @abstractmethod
     def _pages(self) -> Pages:
-        """The file's pages, which roadscan wrote."""
+        """Return the file's pages, which roadscan wrote."""
 
     @abstractmethod
     def _decoded(self, packed: Pages, groups: Sequence[int]) -> Rows:
-        """Row groups out of roadscan's own pages."""
+        """Return row groups from roadscan's pages."""
 
     @abstractmethod
     def _from_table(self, rows: pa.Table) -> Rows:
-        """Row groups as Arrow reads them."""
+        """Return row groups as Arrow reads them."""
 
     def _arrow(self, groups: Sequence[int]) -> pa.Table:
         file = pq.ParquetFile(self._source.stream, metadata=self._metadata, page_checksum_verification=True)

@@ -1,6 +1,6 @@
-"""Profiles of a line scanner out of the store, into arrays that are used again.
+"""Reads profiles of a line scanner from the store into reused arrays.
 
-Files of roadscan's own pages are decoded by `codecs/parquet`; those of other writers, and of older stores, by Arrow.
+Files with roadscan's pages are decoded by `codecs/parquet`; those of other writers, and of older stores, by Arrow.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Profiles:
 
 
 class ProfileReader(GroupReader[Profiles, ListTableFile]):
-    """Row groups of a file of scans; errors as of :class:`GroupReader`."""
+    """Reads row groups of a file of scans; errors as of :class:`GroupReader`."""
 
     what = "profiles"
     columns = _COLUMNS
@@ -91,7 +91,7 @@ class ProfileReader(GroupReader[Profiles, ListTableFile]):
 
 
 def _list_size(schema: pa.Schema) -> int | None:
-    """Readings a profile in a table of the stored types; None for other types that may serve."""
+    """Return the readings per profile of a table of the stored types; None for other, convertible types."""
     for name in _COLUMNS:
         if schema.get_field_index(name) < 0:
             raise DamageError(f"it has no column '{name}'")
@@ -104,7 +104,7 @@ def _list_size(schema: pa.Schema) -> int | None:
 
 
 def _readings(lists: pa.ChunkedArray, kind: pa.DataType) -> npt.NDArray[Any]:
-    """(n, m) values of lists without nulls."""
+    """Return (n, m) values of lists without nulls."""
     sizes = pa.compute.list_value_length(lists).unique()
     if len(sizes) > 1:
         raise DamageError("its profiles differ in their numbers of readings")

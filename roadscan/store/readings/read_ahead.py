@@ -1,4 +1,4 @@
-"""Reads begun before their results are asked for, so that waiting for a disk or a network overlaps with computing."""
+"""Starts reads before their results are needed, so that waiting for a disk or a network overlaps with computing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 class ReadAhead(Generic[T]):
-    """Results by key. Each read has a thread that ends with it; what a read raises is raised where it is taken.
+    """Results by key. Each read has a temporary thread; its exceptions are raised where its result is taken.
 
     Nothing is read twice, and memory holds what was begun and not taken: who begins reads bounds it. Objects are used
     by one thread.
@@ -20,12 +20,12 @@ class ReadAhead(Generic[T]):
         self._begun: dict[Hashable, Future[T]] = {}
 
     def begin(self, key: Hashable, read: Callable[[], T]) -> None:
-        """Begin a read, unless one of this key is begun and not taken."""
+        """Start a read, unless one with this key is pending."""
         if key not in self._begun:
             thread = ThreadPoolExecutor(1, thread_name_prefix="read ahead")
             self._begun[key] = thread.submit(read)
             thread.shutdown(wait=False)
 
     def take(self, key: Hashable) -> T:
-        """Result of a read that is begun, once it is there."""
+        """Wait for a started read and return its result."""
         return self._begun.pop(key).result()

@@ -1,6 +1,6 @@
-"""Returns of a lidar out of the store, into arrays that are used again.
+"""Reads returns of a lidar from the store into reused arrays.
 
-Files of roadscan's own pages are decoded by `codecs/parquet`; those of other writers, and of older stores, by Arrow.
+Files with roadscan's pages are decoded by `codecs/parquet`; those of other writers, and of older stores, by Arrow.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Returns:
     """Returns as stored, (n,) each."""
 
     epoch_gps_ns: Int64
-    """GPS time at which each was measured."""
+    """GPS time of each measurement."""
     pose_epoch_gps_ns: Int64
-    """GPS time of the pose that places it; the very same array where the two are equal."""
+    """GPS time of the pose that places it; the same array object where the two are equal."""
     x_sensor_m: Float32
     y_sensor_m: Float32
     z_sensor_m: Float32
@@ -46,7 +46,7 @@ class Returns:
 
 
 class ReturnsReader(GroupReader[Returns, NumberFile]):
-    """Row groups of a file of returns; errors as of :class:`GroupReader`."""
+    """Reads row groups of a file of returns; errors as of :class:`GroupReader`."""
 
     what = "returns"
     columns = _COLUMNS
@@ -95,6 +95,6 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
 
 
 def _as_stored(schema: pa.Schema) -> bool:
-    """True if the columns have the types that are stored today."""
+    """Return True if the columns have the current storage types."""
     kinds = (schema.field(name) for name in _COLUMNS)
     return all(f.type == pa.from_numpy_dtype(_KINDS[f.name]) and not f.nullable for f in kinds)

@@ -1,4 +1,4 @@
-"""Row groups of a data file as an Arrow table."""
+"""Reads row groups of a data file as an Arrow table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from roadscan.store.store import Store
 
 
 def read_groups(store: Store, file: str, groups: Sequence[int], columns: list[str] | None = None) -> pa.Table:
-    """Row groups of a data file."""
+    """Return row groups of a data file."""
     try:
         with store.fs.open(store.path(file), "rb") as stream:
             opened = pq.ParquetFile(stream, page_checksum_verification=True)

@@ -1,1 +1,1 @@
-"""Loops over bytes: delta packing, byte planes, DEFLATE, blocks of rasters."""
+"""Kernels over bytes: delta packing, byte planes, DEFLATE, blocks of rasters."""

@@ -1,4 +1,4 @@
-"""Bits of any number put one behind the other into words of 64 bits, the lowest first."""
+"""Packs bit fields of any width into 64-bit words, lowest bits first."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _U = np.uint64
 
 @inlined
 def appended(word, used, bits, count):
-    """Put `count` bits behind the `used` ones of a word: (that word, the word to go on with, its bits, 1 if it is new).
+    """Append `count` bits to the `used` bits of a word; return (first word, current word, its bits, 1 if it is new).
 
     A new word follows where the old one is full.
     """

@@ -7,7 +7,7 @@ import numpy as np
 from roadscan.compute.kernel_options import kernel
 
 _AT_ONCE = 2048
-"""Values that stay in the fastest cache while their planes are written."""
+"""Values per round, which stay in the fastest cache while their planes are written."""
 
 
 @kernel
@@ -36,7 +36,7 @@ def _round(values, per_step, step, rounded):
 
 @kernel
 def split_rounded(values, per_step, step, line, bits, planes):
-    """Write the planes of (n,) floats, each rounded to a multiple of `step`, in their own arithmetic.
+    """Write the planes of (n,) floats, each rounded to a multiple of `step`, in the values' arithmetic.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def split_rounded(values, per_step, step, line, bits, planes):
 
 @kernel
 def join(first, second, third, fourth, values):
-    """Write (n,) values of 32 bits, unsigned, of their planes (n,) each, the lowest bytes first."""
+    """Write (n,) unsigned 32-bit values from their planes (n,), lowest bytes first."""
     for i in range(values.size):
         low = np.uint32(first[i]) | (np.uint32(second[i]) << np.uint32(8))
         values[i] = low | (np.uint32(third[i]) << np.uint32(16)) | (np.uint32(fourth[i]) << np.uint32(24))
@@ -62,6 +62,6 @@ def join(first, second, third, fourth, values):
 
 @kernel
 def join_low(first, second, values):
-    """Write (n,) values of 16 bits, unsigned, of their planes (n,), whatever those above may hold."""
+    """Write (n,) unsigned 16-bit values from their planes (n,), ignoring higher planes."""
     for i in range(values.size):
         values[i] = np.uint16(first[i]) | (np.uint16(second[i]) << np.uint16(8))

@@ -1,8 +1,8 @@
-"""zlib's format (RFC 1950, 1951) at the speed of memory, for rasters: runs of one byte, and Huffman codes for the rest.
+"""DEFLATE in zlib's format (RFC 1950, 1951) for rasters: runs of one byte, and Huffman codes for everything else.
 
 Measured heights and intensities hold no repetitions but runs, and looking for them is what takes a compressor's time.
-The data are looked at in segments of 16 bytes: one that goes on with the byte before it belongs to a run (a match at
-distance 1), the bytes of all others are coded one by one. A sample of them tells the code's lengths.
+The data are divided into segments of 16 bytes: one that repeats the byte before it belongs to a run (a match at
+distance 1), the bytes of all others are coded one by one. A sample of them gives the code's lengths.
 """
 
 from __future__ import annotations
@@ -14,35 +14,35 @@ import numpy as np
 from roadscan.compute.kernel_options import bare, bare_inlined, kernel
 from roadscan.store.codecs.kernels.bit_words import appended
 
-SEGMENT = 16
+SEGMENT = 16  # bytes that are examined together
 _SHORTEST_GAP = 4
-"""Segments of zeros; shorter runs are coded byte by byte."""
+"""Segments of zeros from which a run is coded; shorter runs are coded byte by byte."""
 _SAMPLE = 1024
-"""About so many segments are counted for the code."""
-SYMBOLS, END, _LONGEST = 286, 256, 285
+"""Approximate number of segments from which the code is estimated."""
+SYMBOLS, END, _LONGEST = 286, 256, 285  # literal and length symbols; end of block; the longest match (RFC 1951)
 _DISTANCE = np.ones(1, np.uint8)
-"""Bits of the code of a distance: there is one, 1."""
+"""Code length (bits) of a distance: there is one distance, 1."""
 _MOST_BITS = 13
-"""Of a code: two of them and their length fit in 32 bits."""
-_PAIR_BITS = 27
-PAIRS = 1 << 16
-_PAIR, _PAIR_MASK = np.uint64(0xFFFF), np.uint32((1 << _PAIR_BITS) - 1)
-_LONGEST_RUN = 258
-ADLER = 65_521
+"""Longest code (bits): two of them and their length fit in 32 bits."""
+_PAIR_BITS = 27  # bits of the codes of a pair, below their length
+PAIRS = 1 << 16  # pairs of bytes
+_PAIR, _PAIR_MASK = np.uint64(0xFFFF), np.uint32((1 << _PAIR_BITS) - 1)  # masks of a pair of bytes, and of its codes
+_LONGEST_RUN = 258  # longest match (RFC 1951)
+ADLER = 65_521  # modulus of Adler-32 (RFC 1950)
 _U = np.uint64
-_LANES, _ONES = _U(0x00FF_00FF_00FF_00FF), _U(0x0001_0001_0001_0001)
+_LANES, _ONES = _U(0x00FF_00FF_00FF_00FF), _U(0x0001_0001_0001_0001)  # every other byte; adds up 16-bit lanes
 _FALLING_EVEN, _FALLING_ODD = _U(0x0008_0006_0004_0002), _U(0x0007_0005_0003_0001)
-"""What the bytes of a word, from the first one, count in the second sum of Adler-32."""
+"""Weights of a word's even and odd bytes, counted from the first, in the second sum of Adler-32."""
 
 
 def room_words(size: int) -> int:
-    """64-bit words that `size` bytes may take."""
+    """Return the 64-bit words that `size` bytes may take."""
     return (size * _MOST_BITS // 8 + 512) // 8
 
 
 @bare
 def _segments(words, rest, literals):
-    """List the segments whose bytes are coded one by one; returns how many, and Adler-32's two sums over all bytes.
+    """List the segments whose bytes are coded one by one; return how many, and Adler-32's two sums over all bytes.
 
     Sums of a word's bytes are those of 16-bit lanes, added up by a multiplication.
     """
@@ -83,7 +83,7 @@ def _segments(words, rest, literals):
 
 @bare_inlined
 def length_symbol(run):
-    """Symbol of a match of 3 to 258 bytes, its further bits, and how many these are."""
+    """Return the symbol of a match of 3 to 258 bytes, its extra bits, and their number."""
     if run == _LONGEST_RUN:
         return _LONGEST, 0, 0
     above = run - 3
@@ -98,7 +98,7 @@ def length_symbol(run):
 @kernel
 def _count(data, literals, counts):
     """Count the symbols of a sample, at least one of each."""
-    four = np.zeros((4, 256), np.int64).ravel()  # one after another, equal bytes would wait for each other
+    four = np.zeros((4, 256), np.int64).ravel()  # consecutive equal bytes would wait for each other
     counts[:] = 0
     step = 1 + literals.size // _SAMPLE
     for j in range(0, literals.size, step):
@@ -160,18 +160,18 @@ def code(counts, entries):
 
 @bare
 def head(entries, distances, words):
-    """Write zlib's header and the block's code: (word to go on with, its index, its bits).
+    """Write zlib's header and the block's code; return (current word, its index, its bits).
 
     distances : (codes,) uint8, lengths of the codes of distances, 0 or 1 bit.
     """
     word, used, to = _U(0), _U(0), _U(0)
     for k in range(6 + 19 + SYMBOLS + distances.size):
         if k == 0:
-            bits, count = _U(0x0178), _U(16)  # deflate, a window of 32 KiB, fast
+            bits, count = _U(0x0178), _U(16)  # deflate with a window of 32 KiB, fastest level
         elif k == 1:
-            bits, count = _U(1), _U(1)  # the last block,
+            bits, count = _U(1), _U(1)  # last block,
         elif k == 2:
-            bits, count = _U(2), _U(2)  # with its own code
+            bits, count = _U(2), _U(2)  # dynamic Huffman code
         elif k == 3:
             bits, count = _U(SYMBOLS - 257), _U(5)
         elif k == 4:
@@ -179,7 +179,7 @@ def head(entries, distances, words):
         elif k == 5:
             bits, count = _U(19 - 4), _U(4)
         elif k < 6 + 3:
-            bits, count = _U(0), _U(3)  # no repetitions of lengths
+            bits, count = _U(0), _U(3)  # repetition codes are not used
         elif k < 6 + 19:
             bits, count = _U(4), _U(3)
         else:
@@ -212,21 +212,21 @@ def _pair_up(entries, pairs):
 
 @bare_inlined
 def coded(entries, symbol):
-    """A symbol's code, first bit lowest, and how many bits it has."""
+    """Return a symbol's code, first bit lowest, and its length in bits."""
     entry = _U(entries[symbol])
     return entry & _U(0xFFFF), entry >> _U(16)
 
 
 @bare
 def _run(run, entries, words, word, to, used):
-    """Write zeros, which follow a zero."""
+    """Write zeros that follow a zero."""
     while run > 2:
         piece = min(run, _LONGEST_RUN)
         run -= piece
         symbol, more, count = length_symbol(piece)
         bits, size = coded(entries, symbol)
         words[to], word, used, full = appended(word, used, bits | (_U(more) << size), size + _U(count) + _U(1))
-        to += full  # the distance of 1 is a single bit, 0
+        to += full  # the distance 1 is a single bit, 0
     for _ in range(run):
         bits, size = coded(entries, 0)
         words[to], word, used, full = appended(word, used, bits, size)
@@ -236,7 +236,7 @@ def _run(run, entries, words, word, to, used):
 
 @bare
 def _pack(data, pixels, literals, entries, distances, pairs, words):
-    """Write the head, all bytes and the block's end; returns the bits written."""
+    """Write the head, all bytes and the block's end; return the bits written."""
     word, to, used = head(entries, distances, words)
     following = 0
     for j in range(literals.size):
@@ -265,7 +265,7 @@ def _pack(data, pixels, literals, entries, distances, pairs, words):
 
 
 def deflate(data: Any, words: Any, segments: Any, pairs: Any, out: Any) -> bytes:
-    """Make a zlib stream. Its parts are called from here: as one kernel they take twice as long to compile.
+    """Return a zlib stream. Its parts are called from here: as one kernel they take twice as long to compile.
 
     Parameters
     ----------

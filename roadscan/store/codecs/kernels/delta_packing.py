@@ -22,15 +22,15 @@ from roadscan.compute.kernel_options import inlined, inner, kernel
 from roadscan.store.codecs.kernels.bit_words import appended
 from roadscan.store.codecs.kernels.wide_unpacking import NOT_KNOWN, READ_AHEAD_BYTES, unpack_blocks
 
-BLOCK = 128
-MINIBLOCKS = 4
+BLOCK = 128  # values of a block
+MINIBLOCKS = 4  # miniblocks of a block
 MINIBLOCK = 32
-"""Layout of the pages written here, which is that of the common writers."""
+"""Values of a miniblock; this is the layout of the common writers."""
 SLACK_BYTES = READ_AHEAD_BYTES
-"""Bytes that have to follow a page in its buffer; they may hold anything."""
+"""Bytes that must follow a page in its buffer; their content does not matter."""
 
 WHOLE, NO_BUFFER, BAD_HEADER, OTHER_COUNT, CUT_SHORT, BAD_WIDTH, LEFT_OVER = range(7)
-"""What decoding found."""
+"""Results of decoding."""
 FAULTS = (
     "",
     "the page lies outside its buffer",
@@ -42,11 +42,11 @@ FAULTS = (
 )
 
 _WIDEST = 32
-"""Bits of the numbers that Parquet packs: those here lie in it as 32-bit ones."""
-_LONGEST_BLOCK = 1 << 20
+"""Most bits of the numbers that Parquet packs: it stores the types used here as 32-bit numbers."""
+_LONGEST_BLOCK = 1 << 20  # larger blocks count as damage
 
 _U = np.uint64
-_BYTE = _U(127)
+_BYTE = _U(127)  # value bits of a varint's byte
 
 
 @inlined
@@ -56,13 +56,13 @@ def _signed(zigzag):
 
 @inlined
 def _joined(low, high, bit):
-    """64 bits from bit `bit` (0 to 63) of two words on."""
+    """Return 64 bits from bit `bit` (0 to 63) of two words on."""
     return (low >> bit) | (high << _U(1) << (_U(63) - bit))
 
 
 @kernel
 def _varints(data, at, end, found):
-    """Read as many unsigned varints as `found` has room for; returns where they end, −1 where they do not."""
+    """Read as many unsigned varints as `found` has room for; return where they end, −1 where they do not."""
     for k in range(found.size):
         value, shift, more = _U(0), _U(0), True
         while more:
@@ -79,7 +79,7 @@ def _varints(data, at, end, found):
 
 @kernel
 def _miniblocks(data, at, end, miniblocks, per_miniblock, offsets, widths, steps):
-    """List where the miniblocks of a page start (byte), their bit widths and least differences; returns (fault, end).
+    """List where the miniblocks of a page start (byte), their bit widths and least differences; return (fault, end).
 
     A last block may leave out miniblocks without values, not the rest of its last one.
     """
@@ -153,7 +153,7 @@ def _unpack(words, per_miniblock, offsets, widths, steps, zigzag, values):
 
 
 def decode(data: Any, words: Any, start: int, end: int, values: Any) -> int:
-    """Write the values of the page in bytes `start` to `end` of a buffer; returns one of the faults, WHOLE where none.
+    """Write the values of the page in bytes `start` to `end` of a buffer; return one of the faults, WHOLE where none.
 
     Parameters
     ----------
@@ -189,14 +189,14 @@ def decode(data: Any, words: Any, start: int, end: int, values: Any) -> int:
 
 
 def room_words(count: int) -> int:
-    """64-bit words that the page of `count` numbers of 16 bits may take."""
+    """Return the 64-bit words that the page of `count` numbers of 16 bits may take."""
     blocks = -(-count // BLOCK)
     return 8 + blocks * (8 + MINIBLOCKS + BLOCK // 8 * 17) // 8
 
 
 @inlined
 def varint_bits(number):
-    """A number below 2⁴⁹ as the bytes of a varint, the first one lowest, and their bits."""
+    """Return a number below 2⁴⁹ as the bytes of a varint, the first one lowest, and their bits."""
     bits, size = number & _BYTE, _U(8)
     rest = number >> _U(7)
     while rest > 0:
@@ -208,7 +208,7 @@ def varint_bits(number):
 
 @inner
 def pack_block(above, widths, words, to, word, used):
-    """Write the miniblocks of a block behind what words hold: (word to go on with, its index, its bits)."""
+    """Append the miniblocks of a block to the words; return (current word, its index, its bits)."""
     for k in range(MINIBLOCKS):
         width, own = (widths >> _U(8 * k)) & _U(255), _U(MINIBLOCK * k)
         at_once = 8 if width <= 8 else 4 if width <= 16 else 2
@@ -223,7 +223,7 @@ def pack_block(above, widths, words, to, word, used):
 
 @inner
 def widths_of(above):
-    """Bit widths of a block's miniblocks, one a byte, the first one lowest."""
+    """Return the bit widths of a block's miniblocks, one per byte, the first one lowest."""
     widths = _U(0)
     for k in range(MINIBLOCKS):
         union, width = np.int32(0), _U(0)
@@ -238,7 +238,7 @@ def widths_of(above):
 
 @kernel
 def encode(values, words):
-    """Write whole numbers of up to 16 bits, contiguous, as a page's values; returns its bytes.
+    """Write contiguous integers of up to 16 bits as a page's values; return its bytes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""DELTA_BINARY_PACKED of 64-bit numbers that follow one another closely: epochs. `delta_packing.decode` reads them."""
+"""DELTA_BINARY_PACKED of 64-bit numbers with small differences: epochs. `delta_packing.decode` reads them."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from roadscan.store.codecs.kernels.bit_words import appended
 from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCKS, pack_block, varint_bits, widths_of
 
 TOO_FAR = -1
-"""Differences of numbers are too large to be packed."""
+"""Result where differences are too large to be packed."""
 
 _WIDEST = 1 << 31
-"""Differences within a block are less than this apart."""
+"""Differences within a block must be less than this apart."""
 _FARTHEST = 1 << 47
-"""No difference is as large as this; numbers wrap."""
+"""Differences must be smaller than this, because the arithmetic wraps."""
 _U = np.uint64
 
 
 @kernel
 def encode_long(values, words):
-    """Write the blocks of a page; the page's header goes before them.
+    """Write the blocks of a page, which follow the page's header.
 
     Parameters
     ----------
@@ -57,6 +57,6 @@ def encode_long(values, words):
 
 
 def room_words(count: int) -> int:
-    """64-bit words that the blocks of `count` numbers may take."""
+    """Return the 64-bit words that the blocks of `count` numbers may take."""
     blocks = -(-count // BLOCK)
     return 8 + blocks * (16 + MINIBLOCKS + BLOCK // 8 * 32) // 8

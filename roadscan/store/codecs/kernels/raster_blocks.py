@@ -1,4 +1,4 @@
-"""Pixels or sparse cells → the bytes of a raster's block, ready for a compressor.
+"""Encodes pixels or sparse cells as the predicted bytes of a raster's block, before compression.
 
 TIFF's floating-point predictor (TIFF Technical Note 3): of each line of pixels the most significant bytes come first,
 then the next, down to the least; then every byte but the line's first is replaced by its difference from the byte
@@ -13,12 +13,12 @@ from roadscan.compute.kernel_options import bare, bare_inner
 from roadscan.compute.kernels.copies import copy_values
 
 EMPTY_LINE = (0x7F, 0xC0 - 0x7F, 0x100 - 0xC0, 0)
-"""Where the planes of a line of NaN begin; all else in it is 0."""
+"""Bytes at the start of each plane of a line of NaN; all its other bytes are 0."""
 
 
 @bare
 def cut_lines(column, starts, width, cuts):
-    """Find the first cell of each line at or beyond the west of each block of `width` columns.
+    """Find the first cell of each line at or east of the west edge of each block of `width` columns.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def cut_lines(column, starts, width, cuts):
 
 @bare
 def round_values(values, per_step, step, rounded):
-    """Round (n,) values of any kind to multiples of `step`; rounded (n,) float32, out."""
+    """Round (n,) values of any type to multiples of `step`; rounded (n,) float32, out."""
     for k in range(rounded.size):
         rounded[k] = np.rint(values[k] * per_step) * step
 
@@ -60,7 +60,7 @@ def _subtract(bytes_, before, differences):
 
 @bare
 def _pick(words, shift, plane):
-    """One byte of each word."""
+    """Write one byte of each word."""
     for x in range(plane.size):
         plane[x] = np.uint8((words[x] >> shift) & np.uint32(255))
 
@@ -77,7 +77,7 @@ def _encode_line(pixels, differences, by_byte, coded):
 
 @bare
 def encode_block(block, out, line, pixels, differences, by_byte):
-    """Write a block of float32 pixels (lines, width) as the predictor wants it; the rest as of `encode_cells`."""
+    """Write a block of float32 pixels (lines, width) with the predictor; other arguments as of `encode_cells`."""
     width = line.size
     for y in range(block.shape[0]):
         copy_values(block[y], line)
@@ -86,7 +86,7 @@ def encode_block(block, out, line, pixels, differences, by_byte):
 
 @bare
 def encode_cells(column, values, first, last, west, out, line, pixels, differences, by_byte):
-    """Write one block of float32 pixels as the predictor wants it; NaN where no cell lies.
+    """Write one block of float32 pixels with the predictor; NaN where no cell is.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Differences packed a register at a time: blocks of DELTA_BINARY_PACKED, the other way of `wide_unpacking`.
+"""Packs the blocks of DELTA_BINARY_PACKED a register at a time: the reverse of `wide_unpacking`.
 
 A miniblock's 32 numbers are shifted together in pairs, the pairs in pairs, and again, which gives four runs of eight
 numbers, as many bytes long as a number has bits. They are written one over the end of the other.
@@ -17,16 +17,16 @@ from roadscan.compute.kernels.vectors import I32, I64, constant, everywhere, ins
 from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCK, MINIBLOCKS, widths_of
 
 THERE = compiles_for("avx512f", "avx512bw", "avx512vl")
-"""Whether the processor can do it."""
+"""Whether the processor has the instructions."""
 
-_LANES, _WIDEST = 16, 16
+_LANES, _WIDEST = 16, 16  # 32-bit lanes of a register; bits of a number up to which `pack_block` packs
 _U = np.uint64
-_NUMBERS, _QUADS = ir.VectorType(I32, _LANES), ir.VectorType(I64, 8)
+_NUMBERS, _QUADS = ir.VectorType(I32, _LANES), ir.VectorType(I64, 8)  # a register as 32-bit and as 64-bit lanes
 
 
 @intrinsic
 def _differences(typingctx, values, at, above):
-    """Write to `above` (128,) int32 how far the differences before 128 values are above the least one.
+    """Write to `above` (128,) int32 how far the differences before 128 values exceed the least one.
 
     Returns that one in the low 32 bits, and above them the bit widths of the miniblocks, a byte each.
     """
@@ -61,7 +61,7 @@ def _differences(typingctx, values, at, above):
 
 @intrinsic
 def pack_block(typingctx, above, first, width, data, to):
-    """Write 32 numbers of up to 16 bits from byte `to` on; some bytes behind them are set to 0."""
+    """Write 32 numbers of up to 16 bits from byte `to` on; some bytes after them are set to 0."""
 
     def write(context, builder, signature, arguments):
         numbers = builder.gep(start(context, builder, signature, arguments, 0), [arguments[1]])
@@ -108,7 +108,7 @@ def _pack_wide(above, first, width, data, to):
 
 @inner
 def _put(data, to, number):
-    """Write a number as a varint; returns the byte behind it."""
+    """Write a number as a varint; return the byte after it."""
     while number > _U(127):
         data[to] = (number & _U(127)) | _U(128)
         number >>= _U(7)
@@ -119,7 +119,7 @@ def _put(data, to, number):
 
 @inner
 def _last_differences(values, first, above):
-    """`_differences` of fewer than 128 values that are left; the others are as the least one."""
+    """Compute `_differences` for the last, fewer than 128 values; the missing ones count as the least difference."""
     least = np.int32(1 << 30)
     for k in range(values.size - first):
         above[k] = np.int32(values[first + k]) - np.int32(values[first + k - 1])
@@ -131,7 +131,7 @@ def _last_differences(values, first, above):
 
 @kernel
 def encode(values, words):
-    """What `delta_packing.encode` writes, several times as fast, on processors that can do it."""
+    """Write the same as `delta_packing.encode`, several times as fast, on processors with the instructions."""
     data, count, to = words.view(np.uint8), values.size, _U(0)
     first = _U(values[0]) if count > 0 else _U(0)
     for number in (_U(BLOCK), _U(MINIBLOCKS), _U(count), first << _U(1)):

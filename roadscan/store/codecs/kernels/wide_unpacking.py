@@ -1,4 +1,4 @@
-"""Packed differences a register at a time: the blocks of DELTA_BINARY_PACKED in the layout that all common writers use.
+"""Unpacks the blocks of DELTA_BINARY_PACKED a register at a time, in the layout of all common writers.
 
 A miniblock's 32 numbers are brought to their 16-bit lanes by a permutation of its bytes and a shift of each lane, both
 taken from a table by bit width; then they are summed up in the register, in steps of 1, 2, 4 … lanes. Numba has no such
@@ -32,19 +32,19 @@ from roadscan.compute.kernels.vectors import (
 )
 
 READ_AHEAD_BYTES = 128
-"""Bytes behind a page that are looked at; they may hold anything."""
+"""Bytes after a page that are read; their content does not matter."""
 NOT_KNOWN = -1
-"""Where a page ends that these kernels do not read: it is damaged, or there is something rare in it."""
+"""Result for a page that these kernels cannot read: it is damaged, or has something rare in it."""
 
-_BLOCK, _MINIBLOCK, _MINIBLOCKS = 128, 32, 4
-_WIDEST = 32
-_REGISTER_BYTES = 64
-_BYTES, _LANES, _QUADS = ir.VectorType(I8, 64), ir.VectorType(I16, 32), ir.VectorType(I64, 8)
+_BLOCK, _MINIBLOCK, _MINIBLOCKS = 128, 32, 4  # values of a block and of a miniblock; miniblocks of a block
+_WIDEST = 32  # largest bit width
+_REGISTER_BYTES = 64  # bytes of an AVX-512 register
+_BYTES, _LANES, _QUADS = ir.VectorType(I8, 64), ir.VectorType(I16, 32), ir.VectorType(I64, 8)  # a register
 _U = np.uint64
 
 
 def _table():
-    """(33, 3, 64) uint8: by bit width, of 32 lanes of 16 bits: their two bytes, their shifts, their masks."""
+    """Return (33, 3, 64) uint8: by bit width, for 32 lanes of 16 bits, their two bytes, their shifts, their masks."""
     table = np.zeros((_WIDEST + 1, 3, _REGISTER_BYTES), np.uint8)
     for width in range(_WIDEST + 1):
         bits = np.arange(_MINIBLOCK) * width
@@ -58,7 +58,7 @@ _TABLE = _table()
 
 
 def _lanes(builder, data, row):
-    """The numbers of a miniblock in their lanes; `row` is that of its width in the table."""
+    """Return the numbers of a miniblock in their lanes; `row` is that of its width in the table."""
     halves = [load(builder, builder.gep(data, [I64(k)]), _BYTES) for k in (0, _REGISTER_BYTES)]
     low = load(builder, row, _BYTES)
     high = builder.add(low, constant(_BYTES, [2] * 64))
@@ -72,7 +72,7 @@ def _lanes(builder, data, row):
 
 
 def _sums(builder, lanes):
-    """Of each lane the sum of those up to it."""
+    """Return prefix sums of the lanes."""
     for bits in (16, 32):
         shifted = builder.shl(builder.bitcast(lanes, _QUADS), constant(_QUADS, [bits] * 8))
         lanes = builder.add(lanes, builder.bitcast(shifted, _LANES))
@@ -85,7 +85,7 @@ def _sums(builder, lanes):
 
 @intrinsic
 def _unpack_block(typingctx, data, at, widths, step, value, table, values, to):
-    """Write 128 values that follow `value`; widths are a byte a miniblock. Returns the last value."""
+    """Write 128 values that follow `value`; widths are one byte per miniblock. Returns the last value."""
 
     def write(context, builder, signature, arguments):
         at, widths, step, value = arguments[1:5]
@@ -109,7 +109,7 @@ def _unpack_block(typingctx, data, at, widths, step, value, table, values, to):
 
 @intrinsic
 def _word(typingctx, data, at):
-    """64 bits from byte `at` on."""
+    """Return 64 bits from byte `at` on."""
 
     def write(context, builder, signature, arguments):
         return load(builder, builder.gep(start(context, builder, signature, arguments, 0), [arguments[1]]), I64)
@@ -141,9 +141,9 @@ def _unpack_blocks(data, at, end, zigzag, values):
         at += size + _U(_MINIBLOCKS)
         if at > end:
             return NOT_KNOWN
-        if left < _BLOCK:  # miniblocks without values may state any width, and have no bytes
+        if left < _BLOCK:  # miniblocks without values may have any width, and have no bytes
             widths &= (_U(1) << (_U(8) * _U((left + _MINIBLOCK - 1) // _MINIBLOCK))) - _U(1)
-        if (((widths & _U(0x7F7F_7F7F)) + _U(0x5F5F_5F5F)) | widths) & _U(0x8080_8080):  # one above 32
+        if (((widths & _U(0x7F7F_7F7F)) + _U(0x5F5F_5F5F)) | widths) & _U(0x8080_8080):  # a width above 32
             return NOT_KNOWN
         following = at + _U(_MINIBLOCK // 8) * (((widths * _U(0x0101_0101)) >> _U(24)) & _U(255))
         if following > end:
@@ -169,7 +169,7 @@ def _chosen() -> Kernel:
 
 
 unpack_blocks = _chosen()
-"""Write the values of blocks of 128 numbers in 4 miniblocks; returns the byte behind the last one, or NOT_KNOWN.
+"""Write the values of blocks of 128 numbers in 4 miniblocks; return the byte after the last one, or NOT_KNOWN.
 
 Its arguments: data (b,) uint8, the page's buffer, READ_AHEAD_BYTES longer than the page; at, end: bytes where the first
 block begins and where the page ends; zigzag: the first value as the page states it, uint64; values (n,) uint16 or

@@ -1,6 +1,6 @@
-"""Page headers of Parquet files, held against the counts in the file's footer before a row group is read.
+"""Checks page headers of Parquet files against the counts in the file's footer before a row group is read.
 
-Arrow passes over a page whose type it does not know. Damage in that one number makes a column shorter, and its later
+Arrow skips a page whose type it does not know. Damage in that one number makes a column shorter, and its later
 rows move up beside those of other columns. Here every page has to be of a known type, and the pages of a column have
 to hold as many values as the footer says. The footer is read here too: pyarrow (26) ends the process when it is asked
 for a column chunk with damaged statistics.
@@ -16,22 +16,22 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 _HEADER_BYTES: Final = 1 << 16
-"""A page's header, with its statistics, is shorter."""
-_LARGEST_FOOTER: Final = 1 << 25
+"""Most bytes of a page's header with its statistics."""
+_LARGEST_FOOTER: Final = 1 << 25  # larger footers count as damage (bytes)
 _LONGEST_WORD: Final = 1 << 10
-"""Longer texts are no names and are not kept."""
-_MOST_NESTED: Final = 12
+"""Longer texts are no names and are skipped (bytes)."""
+_MOST_NESTED: Final = 12  # deeper nesting of structs counts as damage
 
-_FILE_ROW_GROUPS, _GROUP_COLUMNS, _CHUNK_METADATA = 4, 1, 3
+_FILE_ROW_GROUPS, _GROUP_COLUMNS, _CHUNK_METADATA = 4, 1, 3  # field numbers (parquet.thrift)
 _PATH, _VALUES, _BYTES, _DATA_OFFSET, _DICTIONARY_OFFSET = 3, 5, 7, 9, 11
 """Fields of a column's metadata."""
 
-_DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3
-_PAGE_TYPE, _PAGE_BYTES = 1, 3
+_DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3  # page types (parquet.thrift)
+_PAGE_TYPE, _PAGE_BYTES = 1, 3  # fields of a page header (parquet.thrift)
 _VALUES_IN: Final = {_DATA: 5, _DATA_V2: 8}
-"""Field of a page's header that describes its data, by type of page; field 1 of it is the number of values."""
+"""By type of page, the header's field that describes its data; field 1 of that is the number of values."""
 
-_TRUE, _FALSE, _BYTE, _I16, _I32, _I64, _DOUBLE, _BINARY, _LIST, _SET, _MAP, _STRUCT = range(1, 13)
+_TRUE, _FALSE, _BYTE, _I16, _I32, _I64, _DOUBLE, _BINARY, _LIST, _SET, _MAP, _STRUCT = range(1, 13)  # Thrift types
 
 _DAMAGE: Final = (LookupError, ValueError, TypeError)
 
@@ -53,11 +53,11 @@ class ParquetPages:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._groups: list[list[_Chunk]] = []
-        with suppress(*_DAMAGE):  # without them, each row group is at fault
+        with suppress(*_DAMAGE):  # without them, each row group is faulty
             self._groups = _row_groups(path)
 
     def fault(self, row_group: int, columns: list[str]) -> str:
-        """What is wrong with the pages of top-level columns of a row group, "" where nothing is."""
+        """Return what is wrong with the pages of top-level columns of a row group, "" where nothing is."""
         if row_group >= len(self._groups):
             return "the footer is damaged"
         with self._path.open("rb") as stream:
@@ -74,7 +74,7 @@ class ParquetPages:
 
 
 def _row_groups(path: Path) -> list[list[_Chunk]]:
-    """Column chunks of each row group; one of `_DAMAGE` where the footer is damaged."""
+    """Return the column chunks of each row group; raises one of `_DAMAGE` where the footer is damaged."""
     with path.open("rb") as stream:
         size = stream.seek(0, 2)
         stream.seek(max(0, size - 8))
@@ -138,15 +138,15 @@ def _count(page: Any) -> int:
 
 
 class _Compact:
-    """Reads Thrift's compact protocol; one of `_DAMAGE` at damage."""
+    """Decoder of Thrift's compact protocol; raises one of `_DAMAGE` at damage."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
         self.at = 0
-        """Bytes read."""
+        """Position in bytes."""
 
     def struct(self, depth: int = 0) -> dict[int, Any]:
-        """Fields by number: whole numbers, structs, lists and texts; None for anything else."""
+        """Return fields by number: integers, structs, lists and texts; None for anything else."""
         if depth > _MOST_NESTED:
             raise ValueError("nested too deeply")
         fields: dict[int, Any] = {}
@@ -174,7 +174,7 @@ class _Compact:
     def _list(self, depth: int) -> list[Any]:
         head = self._byte()
         count = head >> 4 if head >> 4 < 15 else self._varint()
-        if count > len(self._data) - self.at:  # each takes a byte or more
+        if count > len(self._data) - self.at:  # each element takes a byte or more
             raise ValueError("a list longer than the data")
         return [self._value(head & 15, depth) for _ in range(count)]
 

@@ -1,4 +1,4 @@
-"""Reads Parquet files as `list_table` writes them; anything else in such a file is damage."""
+"""Reads Parquet files that `list_table` wrote; any other content counts as damage."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class ListTableFile(PageFile):
     """Columns of row groups."""
 
     def flat(self, name: str, values: Array) -> None:
-        """Write a loaded column of int64 that is never null to (n,) `values`."""
+        """Write a loaded column of non-null int64 to (n,) `values`."""
         data, at, end, _ = self.page(name, pages.PLAIN)
         if self._chunks[name].nullable or end - at != values.nbytes:
             raise DamageError(f"column '{name}' does not hold {values.size} values")
         values[:] = data[at:end].view("<i8")
 
     def lists(self, name: str, values: Array) -> bool:
-        """Write a loaded column of lists to (n, m) `values`; False, and nothing written, where a list is null."""
+        """Write a loaded column of lists to (n, m) `values`; return False, without writing, where a list is null."""
         chunk = self._chunks[name]
         data, at, end, _ = self.page(name, pages.DELTA_BINARY_PACKED)
         rows, size = values.shape

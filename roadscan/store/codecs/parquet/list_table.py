@@ -1,6 +1,6 @@
 """Writes Parquet files of tables with fixed-size lists of numbers.
 
-General writers look at each value's place in its list; here lists have one size, and only the values are looked at.
+General writers examine each value's place in its list; here lists have one size, and only the values are read.
 Any reader of Parquet reads the file: lists are DELTA_BINARY_PACKED, the rest is PLAIN, nothing is compressed further
 (differences of a surface's ranges do not compress). Each page has its CRC-32, and so has the footer: see `sealed`.
 """
@@ -28,41 +28,41 @@ from roadscan.store.codecs.zlib_stream import crc32
 
 MAGIC: Final = b"PAR1"
 _MOST_VALUES: Final = 1 << 28
-"""Of a page, whose size is stated in 32 bits."""
-_VERSION: Final = 2
+"""Most values of a page, whose size is stated in 32 bits."""
+_VERSION: Final = 2  # format version in the footer
 _WRITER: Final = "roadscan"
-_INT32, _INT64, _FLOAT, _DOUBLE = 1, 2, 4, 5
-_REQUIRED, _OPTIONAL, _REPEATED = 0, 1, 2
-_CONVERTED_LIST: Final = 3
-_LOGICAL_LIST, _LOGICAL_INTEGER = 3, 10
-_UNCOMPRESSED: Final = 0
-_LZ4_RAW: Final = 7
+_INT32, _INT64, _FLOAT, _DOUBLE = 1, 2, 4, 5  # physical types (parquet.thrift)
+_REQUIRED, _OPTIONAL, _REPEATED = 0, 1, 2  # repetition types of a schema element (parquet.thrift)
+_CONVERTED_LIST: Final = 3  # converted type LIST (parquet.thrift)
+_LOGICAL_LIST, _LOGICAL_INTEGER = 3, 10  # logical types LIST and INTEGER (parquet.thrift)
+_UNCOMPRESSED: Final = 0  # compression codec (parquet.thrift)
+_LZ4_RAW: Final = 7  # compression codec (parquet.thrift)
 _SEAL: Final = b"roadscan.footer_crc32"
-_SEAL_DIGITS: Final = 8
+_SEAL_DIGITS: Final = 8  # hexadecimal digits of the footer's CRC-32
 _ENCODE: Final = wide_packing.encode if wide_packing.THERE else delta_packing.encode
 _SEALED: Final = re.compile(_SEAL + rb"\x18\x08(.{8})", re.DOTALL)
 
 
 class Kind(NamedTuple):
-    """How Parquet holds a type of numbers."""
+    """Parquet representation of a type of numbers."""
 
     physical: int
     stored: str
     """NumPy type of a PLAIN value."""
     bits: int = 0
-    """Of an integer."""
+    """Bits of an integer."""
     signed: bool = True
     converted: int = 0
 
     def fields(self) -> dict[int, Value]:
-        """What a schema element says of it beside its physical type."""
+        """Return the fields of a schema element, beside its physical type."""
         if not self.bits:
             return {}
         integer = struct({1: i8(self.bits), 2: boolean(self.signed)})
         return {6: i32(self.converted), 10: struct({_LOGICAL_INTEGER: integer})}
 
 
-KINDS: Final = {
+KINDS: Final = {  # Parquet representation by Arrow type
     pa.uint8(): Kind(_INT32, "<u4", 8, False, 11),
     pa.uint16(): Kind(_INT32, "<u4", 16, False, 12),
     pa.uint32(): Kind(_INT32, "<u4", 32, False, 13),
@@ -75,7 +75,7 @@ _LIST_TYPES: Final = (pa.uint8(), pa.uint16())
 
 
 def is_list_table(schema: pa.Schema) -> bool:
-    """True if the table has fixed-size lists and nothing that this writer does not know."""
+    """Return True if the table has fixed-size lists and nothing that this writer does not know."""
     lists = [f.type for f in schema if pa.types.is_fixed_size_list(f.type)]
     flat = [f.type for f in schema if not pa.types.is_fixed_size_list(f.type)]
     known = all(t.value_type in _LIST_TYPES and not t.value_field.nullable and t.list_size for t in lists)
@@ -83,7 +83,7 @@ def is_list_table(schema: pa.Schema) -> bool:
 
 
 def write_list_table(path: Path, rows: pa.Table, group_rows: int) -> None:
-    """Write rows in row groups of `group_rows`; same rows, same bytes. The table is one of `is_list_table`."""
+    """Write rows in row groups of `group_rows`; equal rows give equal bytes. The table satisfies `is_list_table`."""
     if LIBRARY:
         _write_by_arrow(path, rows, group_rows)
         return
@@ -96,9 +96,9 @@ def write_list_table(path: Path, rows: pa.Table, group_rows: int) -> None:
 
 
 def sealed(footer: bytes) -> bool | None:
-    """True if a footer is as this writer left it, False if it is damaged, None if another program wrote it.
+    """Return True if a footer is as this writer left it, False if it is damaged, None if another program wrote it.
 
-    The last of the footer's own entries is the CRC-32 of the footer with the CRC's digits set to 0.
+    The last of the footer's entries is the CRC-32 of the footer with the CRC's digits set to 0.
     """
     found = list(_SEALED.finditer(footer))
     if not found:
@@ -112,7 +112,7 @@ def _with_digits(footer: bytes, at: int, digits: bytes) -> bytes:
 
 
 class Writer:
-    """Writes pages one behind the other, and the footer that says where they are."""
+    """Writes consecutive pages, and the footer with their places."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -121,7 +121,7 @@ class Writer:
         self._codec = pa.Codec("lz4_raw")
 
     def group(self, rows: pa.Table, number: int) -> Value:
-        """Write a row group; returns its part of the footer."""
+        """Write a row group; return its part of the footer."""
         columns = [
             self._lists(field, _whole(rows.column(k)))
             if pa.types.is_fixed_size_list(field.type)
@@ -131,7 +131,7 @@ class Writer:
         return self.row_group(columns, rows.num_rows, number)
 
     def row_group(self, columns: list[Value], rows: int, number: int) -> Value:
-        """What the footer says of the row group whose columns were written last."""
+        """Return the footer's entry of the row group whose columns were written last."""
         start, size = self._group, self._at - self._group
         self._group = self._at
         about = {1: listed(columns), 2: i64(size), 3: i64(rows), 5: i64(start), 6: i64(size)}
@@ -181,14 +181,14 @@ class Writer:
     def compressed(
         self, field: pa.Field, encoding: int, content: npt.NDArray[np.uint8], count: int, more: dict[int, Value]
     ) -> Value:
-        """Write a column of numbers that are always there as a page under LZ4; returns its part of the footer."""
+        """Write a column of non-null numbers as a page under LZ4; return its part of the footer."""
         packed = np.frombuffer(self._codec.compress(content), np.uint8)
         at, size = self.page(b"", packed, count, encoding, content.size)
         raw = size - packed.size + content.size
         return chunk(KINDS[field.type], (field.name,), encoding, count, Page(at, size, raw), more)
 
     def page(self, levels: bytes, values: Any, count: int, encoding: int, raw: int | None = None) -> tuple[int, int]:
-        """Write a page, of `raw` bytes before it was compressed; returns where it starts, and its whole size."""
+        """Write a page, of `raw` bytes before compression; return where it starts, and its whole size."""
         start = self._at
         crc = crc32(values, crc32(levels))
         self._at += self._stream.write(pages.page_header(len(levels) + values.size, crc, count, encoding, raw) + levels)
@@ -197,30 +197,30 @@ class Writer:
 
 
 def _valid(field: pa.Field, column: pa.Array) -> pages.Bools | None:
-    """Which values are there; None for a column that has no nulls ever."""
+    """Return which values are present; None for a column that is never null."""
     if not field.nullable:
         return None
     return np.asarray(column.is_valid()) if column.null_count else np.ones(len(column), np.bool_)
 
 
 def _whole(column: pa.ChunkedArray) -> pa.Array:
-    """The column in one piece, without a copy where it is that already."""
+    """Return the column as one array, without a copy where it already is one."""
     return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
 
 
 class Page(NamedTuple):
-    """Where the one page of a column chunk lies in the file."""
+    """Place of the one page of a column chunk in the file."""
 
     at: int
     """Its first byte."""
     size: int
-    """Bytes that it has there."""
+    """Its bytes in the file."""
     raw: int | None = None
-    """Bytes that it had before it was compressed; None where it was not."""
+    """Its bytes before compression; None where it is not compressed."""
 
 
 def chunk(kind: Kind, path: tuple[str, ...], encoding: int, count: int, page: Page, more: dict[int, Value]) -> Value:
-    """What the footer says of a column chunk of one page."""
+    """Return the footer's entry of a column chunk of one page."""
     start, length = i64(page.at), i64(page.size)
     before, codec = (length, _UNCOMPRESSED) if page.raw is None else (i64(page.raw), _LZ4_RAW)
     metadata = _about(kind, path, encoding, codec) | {5: i64(count), 6: before, 7: length, 9: start}
@@ -229,7 +229,7 @@ def chunk(kind: Kind, path: tuple[str, ...], encoding: int, count: int, page: Pa
 
 @functools.lru_cache(maxsize=64)
 def _about(kind: Kind, path: tuple[str, ...], encoding: int, codec: int) -> dict[int, Value]:
-    """What all chunks of a column say."""
+    """Return the common metadata of all chunks of a column."""
     return {
         1: i32(kind.physical),
         2: listed([i32(pages.RLE), i32(encoding)]),
@@ -239,7 +239,7 @@ def _about(kind: Kind, path: tuple[str, ...], encoding: int, codec: int) -> dict
 
 
 def _elements(schema: pa.Schema) -> Iterator[Value]:
-    """The schema as Parquet lists it, depth first."""
+    """Yield the schema elements as Parquet lists them, depth first."""
     yield struct({3: i32(_REQUIRED), 4: binary("schema"), 5: i32(len(schema))})
     for field in schema:
         own = {3: i32(_OPTIONAL if field.nullable else _REQUIRED), 4: binary(field.name)}

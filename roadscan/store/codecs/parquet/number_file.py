@@ -1,4 +1,4 @@
-"""Reads Parquet files as `number_table` writes them; anything else in such a file is damage."""
+"""Reads Parquet files that `number_table` wrote; any other content counts as damage."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from roadscan.store.codecs.kernels.delta_packing import FAULTS, SLACK_BYTES, WHO
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile
 
-_PLANES: Final = 4
-_WORD: Final = 8
+_PLANES: Final = 4  # byte planes of a 32-bit number
+_WORD: Final = 8  # bytes of a 64-bit word
 _ENCODINGS: Final = {
     "PLAIN": pages.PLAIN,
     "DELTA_BINARY_PACKED": pages.DELTA_BINARY_PACKED,
@@ -35,11 +35,11 @@ class NumberFile(PageFile):
         self._unpacked = np.empty(0, np.uint64)
 
     def same(self, name: str, other: str) -> bool:
-        """True if two loaded columns are stored in the same bytes."""
+        """Return True if two loaded columns are stored in the same bytes."""
         return np.array_equal(self.content(name), self.content(other))
 
     def numbers(self, name: str, values: Array) -> None:
-        """Write a loaded column to (n,) `values`, of the column's type."""
+        """Write a loaded column to (n,) `values` of the column's type."""
         encoding = _ENCODINGS.get(self.encoding(name), -1)
         data, at, end, size = self.page(name, encoding)
         if not 0 <= size <= _most_bytes(values.size):
@@ -70,5 +70,5 @@ class NumberFile(PageFile):
 
 
 def _most_bytes(count: int) -> int:
-    """Bytes that an unpacked page of so many numbers may take."""
+    """Return the bytes that an unpacked page of this many numbers may take."""
     return _WORD * count + count // 4 + 1024

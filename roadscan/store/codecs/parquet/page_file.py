@@ -1,4 +1,4 @@
-"""Reads the pages of Parquet files as `list_table.Writer` writes them; anything else in such a file is damage."""
+"""Reads pages of Parquet files that `list_table.Writer` wrote; any other content counts as damage."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from roadscan.store.codecs.parquet.list_table import MAGIC, sealed
 from roadscan.store.codecs.zlib_stream import crc32
 
 TAIL_BYTES: Final = 8
-"""Length of the footer, and the mark that ends a Parquet file."""
-_WORD: Final = 8
+"""Bytes of the footer's length and of the mark that ends a Parquet file."""
+_WORD: Final = 8  # bytes of a 64-bit word
 _LISTED: Final = ".list.element"
 
 
 class DamageError(Exception):
-    """What is wrong with a file."""
+    """Damage of a file; the message says what is wrong."""
 
 
 class ByteSource(Protocol):
-    """Where a file's bytes come from."""
+    """Source of a file's bytes."""
 
     stream: Any
 
     def expect(self, start: int, end: int) -> None:
-        """Let bytes `start` to `end` be on their way."""
+        """Start to read bytes `start` to `end` ahead."""
 
     def read_into(self, start: int, room: memoryview) -> bool:
-        """Fill `room` with the bytes from `start` on; False where the file is too short."""
+        """Fill `room` with the bytes from `start` on; return False where the file is too short."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class _Chunk:
     """A column of a row group."""
 
     start: int
-    """Byte of the file."""
+    """First byte in the file."""
     size: int
     values: int
     nullable: bool
@@ -53,7 +53,7 @@ class _Chunk:
 
 
 def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
-    """The footer of a Parquet file, and whether `list_table` wrote it; DamageError where it is damaged."""
+    """Return the footer of a Parquet file, and whether `list_table` wrote it; DamageError where it is damaged."""
     size = stream.seek(0, os.SEEK_END)
     tail = _read(stream, max(size - TAIL_BYTES, 0), size)
     length = int.from_bytes(tail[:4], "little")
@@ -72,9 +72,9 @@ def _read(stream: Any, start: int, end: int) -> bytes:
 
 
 class PageFile:
-    """Pages of row groups, one row group at a time; holds its buffer, so one a thread.
+    """Pages of row groups, one row group at a time; it owns its buffer, so use one per thread.
 
-    Bytes are read at once for all columns wanted; each page is held against its CRC-32 before it is looked at.
+    Bytes are read at once for all columns wanted; the CRC-32 of each page is verified before it is decoded.
     """
 
     def __init__(self, source: ByteSource, metadata: pq.FileMetaData) -> None:
@@ -89,7 +89,7 @@ class PageFile:
         self._origin = 0
 
     def load(self, group: int, names: Sequence[str]) -> None:
-        """Bring columns of a row group into the buffer."""
+        """Read columns of a row group into the buffer."""
         self._chunks = {name: self._located(group, name) for name in names}
         self._origin, end = _span(self._chunks.values())
         words = -(-(end - self._origin + SLACK_BYTES) // _WORD)
@@ -100,21 +100,21 @@ class PageFile:
             raise DamageError("it is cut short")
 
     def expect(self, groups: Sequence[int], names: Sequence[str]) -> None:
-        """Let the bytes of row groups be on their way that will be loaded soon; groups in a row in one piece."""
+        """Start to read row groups ahead that will be loaded soon; consecutive groups in one piece."""
         for _, run in groupby(enumerate(groups), lambda pair: pair[1] - pair[0]):
             self._source.expect(*_span([self._located(group, name) for _, group in run for name in names]))
 
     def encoding(self, name: str) -> str:
-        """Encoding of a loaded column's values, as Parquet calls it."""
+        """Return Parquet's name for the encoding of a loaded column's values."""
         return self._chunks[name].encoding
 
     def content(self, name: str) -> npt.NDArray[np.uint8]:
-        """Bytes of a loaded column, as they are stored."""
+        """Return the stored bytes of a loaded column."""
         chunk, data = self._chunks[name], self.words.view(np.uint8)
         return data[chunk.start - self._origin : chunk.start - self._origin + chunk.size]
 
     def page(self, name: str, encoding: int) -> tuple[npt.NDArray[np.uint8], int, int, int]:
-        """The buffer, where in it a loaded column's page begins and ends, and its bytes once it is unpacked.
+        """Return the buffer, the begin and end of a loaded column's page in it, and the page's unpacked bytes.
 
         The page has its checksum.
         """
@@ -144,13 +144,13 @@ class PageFile:
 
 
 def _span(chunks: Iterable[_Chunk]) -> tuple[int, int]:
-    """First byte of some chunks, and the one behind the last."""
+    """Return the first byte of some chunks, and the one after the last."""
     ends = [(c.start, c.start + c.size) for c in chunks]
     return min(start for start, _ in ends), max(end for _, end in ends)
 
 
 def _columns(metadata: pq.FileMetaData) -> dict[str, tuple[int, bool]]:
-    """Number of each column by its name, and whether it may hold nulls."""
+    """Return each column's number by its name, and whether it may have nulls."""
     found = {}
     for k in range(metadata.num_columns):
         column = metadata.schema.column(k)

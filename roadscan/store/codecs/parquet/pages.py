@@ -1,6 +1,6 @@
-"""Data pages (version 1) of whole numbers and of fixed-size lists of them.
+"""Data pages (version 1) of integers and of fixed-size lists of them.
 
-A page is a header, then repetition levels (0 begins a list, 1 goes on with it), then definition levels (how much of
+A page is a header, then repetition levels (0 begins a list, 1 continues it), then definition levels (how much of
 the value's path is there), then the values. Lists of a fixed size have levels that can be stated without looking at the
 values, so a page's levels are compared with those that it has to have, instead of being decoded.
 
@@ -19,25 +19,25 @@ import numpy.typing as npt
 
 from roadscan.store.codecs.parquet import thrift
 
-PLAIN, RLE, DELTA_BINARY_PACKED, BYTE_STREAM_SPLIT = 0, 3, 5, 9
+PLAIN, RLE, DELTA_BINARY_PACKED, BYTE_STREAM_SPLIT = 0, 3, 5, 9  # encodings (parquet.thrift)
 _NUMBER: Final = b"\x15"
-"""The next field, a number of 32 bits."""
+"""Compact-protocol header of the next field, if that is a 32-bit number."""
 _DATA_PAGE: Final = _NUMBER + b"\x00"
-"""The first field of a page's header: its type."""
-_LENGTH_BYTES: Final = 4
+"""First field of a page's header: its type, a data page."""
+_LENGTH_BYTES: Final = 4  # bytes of the length before encoded levels
 _SIZES_AND_CRC: Final = re.compile(
     rb"\x15\x00" + 3 * rb"\x15((?:[\x80-\xFF]{0,3}[\x80-\xFF](?=[^\x00]))?[\x00-\x7F])", re.DOTALL
 )
-"""A page's type, its bytes before and after it was compressed, its CRC, each behind the byte that names the field."""
-_LONGEST_HEADER: Final = 64
+"""A page's type, its uncompressed and compressed bytes, its CRC, each after the byte that names the field."""
+_LONGEST_HEADER: Final = 64  # bytes in which the header of a page has to end
 _LIMIT: Final = 1 << 31
-"""Of a number of 32 bits."""
+"""Exclusive limit of a 32-bit number."""
 
 Bools = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 def flat_levels(valid: npt.NDArray[np.bool_] | None) -> bytes:
-    """Levels of (n,) values; None for a column without nulls, which has none."""
+    """Return the encoded levels of (n,) values; None for a column without nulls, which has none."""
     if valid is None:
         return b""
     if valid.all():
@@ -46,7 +46,7 @@ def flat_levels(valid: npt.NDArray[np.bool_] | None) -> bytes:
 
 
 def list_levels(rows: int, size: int, valid: npt.NDArray[np.bool_] | None) -> bytes:
-    """Levels of lists of `size` (1 or more) values, which are never null; `valid` is None for lists that never are."""
+    """Return the levels of non-null lists of `size` (1 or more) values; `valid` is None where no value is null."""
     own = _run(1, 0) + (_run(size - 1, 1) if size > 1 else b"")
     if valid is None or valid.all():
         repetition = own * rows if size > 1 else _run(rows, 0)
@@ -57,7 +57,7 @@ def list_levels(rows: int, size: int, valid: npt.NDArray[np.bool_] | None) -> by
 
 
 def page_header(size: int, crc: int, values: int, encoding: int, raw: int | None = None) -> bytes:
-    """Header of a page of `size` bytes, `raw` ones before they were compressed, and of `values` levels.
+    """Return the header of a page of `size` bytes (`raw` before compression) and `values` levels.
 
     The CRC-32 is over levels and values as they are stored.
     """
@@ -68,23 +68,23 @@ def page_header(size: int, crc: int, values: int, encoding: int, raw: int | None
 
 @functools.lru_cache(maxsize=64)
 def _about(values: int, encoding: int) -> bytes:
-    """What ends the header of a page: its fifth field, a struct, and the mark that no field follows."""
+    """Return the end of a page's header: its fifth field, a struct, and the stop mark."""
     own = thrift.struct({k: thrift.i32(v) for k, v in {1: values, 2: encoding, 3: RLE, 4: RLE}.items()})
     return thrift.struct({1: own}).content
 
 
 class PageHeader(NamedTuple):
-    """What the header of a column chunk's one page says."""
+    """Fields of the header of a column chunk's one page."""
 
     length: int
-    """Bytes of the header itself."""
+    """Bytes of the header."""
     crc: int
     raw: int
-    """Bytes of the page before it was compressed."""
+    """Bytes of the page before compression."""
 
 
 def read_page_header(chunk: npt.NDArray[np.uint8], values: int, encoding: int) -> PageHeader | None:
-    """Header of the one page of a column chunk; None if it is not as `page_header` writes it."""
+    """Return the header of the one page of a column chunk; None if it is not as `page_header` writes it."""
     head = chunk[:_LONGEST_HEADER].tobytes()
     found = _SIZES_AND_CRC.match(head)
     if found is None:
@@ -99,7 +99,7 @@ def read_page_header(chunk: npt.NDArray[np.uint8], values: int, encoding: int) -
 
 
 def _number(varint: bytes) -> int:
-    """A signed number of its varint."""
+    """Return the signed number of a varint."""
     value = 0
     for byte in reversed(varint):
         value = value << 7 | byte & 127
@@ -111,5 +111,5 @@ def _section(runs: bytes) -> bytes:
 
 
 def _run(count: int, level: int) -> bytes:
-    """A level `count` times, of a column whose levels fit in a byte."""
+    """Return a level repeated `count` times, for a column whose levels fit in a byte."""
     return thrift.varint(count << 1) + bytes([level])

@@ -89,6 +89,12 @@ def heights_of(crs: pyproj.CRS) -> StatedHeights:
     parts = crs.sub_crs_list or [crs]  # a compound CRS calls itself vertical
     vertical = next((part for part in parts if part.is_vertical), None)
     if vertical is not None:
+        if vertical.axis_info[-1].direction == "down":
+            raise CrsError(
+                f"'{vertical.name}' counts depths, downward",
+                expected="heights, upward",
+                change="convert the values to heights, and state their CRS",
+            )
         unit_m = float(vertical.axis_info[-1].unit_conversion_factor)
         datum = vertical.datum.name if vertical.datum is not None else ""
         name = vertical.name or datum

@@ -12,6 +12,7 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
+from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from roadscan.core.crs import Geoid
 from roadscan.core.errors import ConfigError, CrsError, FormatError, TimeSystemError
@@ -258,6 +259,21 @@ def test_two_crs_are_refused(tmp_path: Path) -> None:
     log = read("las", path, {"ignore_file_crs": True}, crs="EPSG:25833")
     assert log.attributes["crs"] == "EPSG:25833"
     assert read("las", path, crs="EPSG:25832").attributes["crs"] == UTM
+
+
+def test_wkt_and_keys_of_two_places_are_refused(tmp_path: Path) -> None:
+    """A stale WKT beside the keys of the zone next to it: 447 km at 52° north."""
+    path = cloud(tmp_path / "keys.las", version="1.2", point_format=1)
+    own = laspy.read(path)
+    own.header.vlrs.append(WktCoordinateSystemVlr(pyproj.CRS("EPSG:25831").to_wkt("WKT1_GDAL")))
+    own.write(tmp_path / "both.las")
+    with pytest.raises(CrsError, match=r"two CRS: its WKT says .*31N.*keys .*32N.*km apart"):
+        read("las", tmp_path / "both.las")
+
+
+def test_depths_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(CrsError, match="counts depths, downward"):
+        read("las", cloud(tmp_path / "a.las", crs="EPSG:25832+5715"))  # MSL depth
 
 
 def test_feet_become_metres(tmp_path: Path) -> None:

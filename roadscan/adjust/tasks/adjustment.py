@@ -77,6 +77,8 @@ Float64 = npt.NDArray[np.float64]
 _BUNDLE_BYTES: Final = 20_000_000.0
 """Approximate compressed bytes that a task reads."""
 _BUNDLE_POINTS: Final = 8  # Control points of a task.
+_LANE_BESIDE_M: Final = 8.0
+"""A control point this near to a track (m) may lie on a lane beside it that nobody drove, and is no fault."""
 
 
 @dataclass(frozen=True)
@@ -378,13 +380,15 @@ def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[Finding]:
 
 
 def _beside(work: Work, sightings: Sequence[Sighting]) -> list[str]:
-    """Returns points that no pass saw, and their distance from the path of the nearest sensor."""
+    """Returns points that no pass saw, but for those of a lane beside the track, and their distance from the track."""
     seen = {one.point.number for one in sightings if one.status != "unseen"}
     unseen = [one for one in work.own_points if one.number not in seen]
     ways = np.concatenate([np.zeros((0, 2)), *(np.stack([t.easting_m, t.northing_m], axis=-1) for t in work.tracks)])
+    away_m = [float(np.hypot(*(ways - [one.easting_m, one.northing_m]).T).min()) for one in unseen]
     return [
-        f"{one.name} ({np.hypot(*(ways - [one.easting_m, one.northing_m]).T).min():,.1f} m from the nearest track)"
-        for one in unseen
+        f"{one.name} ({far:,.1f} m from the nearest track)"
+        for one, far in zip(unseen, away_m, strict=True)
+        if far > _LANE_BESIDE_M
     ]
 
 

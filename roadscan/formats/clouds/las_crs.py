@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, Self, TypeAlias
 
+import numpy as np
 import pyproj
 from pyproj.exceptions import CRSError as ProjCrsError
 
@@ -37,6 +38,9 @@ _UNIT_WORDS: Final = (("survey", 1200 / 3937), ("metre", 1.0), ("meter", 1.0), (
 """Words in names of units, with their lengths (m); the first match counts."""
 _VERTICAL_UNIT: Final = Missing("options.vertical_unit", choices=("metre", "foot", "us_survey_foot"))
 _IGNORED: Final = Missing("options.ignore_file_crs", True)
+_WORLD: Final = "EPSG:4326"
+_ONE_PLACE_M: Final = 5.0
+"""Two statements of one CRS may differ by this much (m): datum shifts that one of them leaves out."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,7 @@ class _Written:
         try:
             if wkt:
                 crs = pyproj.CRS.from_wkt(wkt)
+                _check_one_crs(source, cloud, crs, records)
                 heights = heights_of(crs)
                 if heights.kind is None and (nested := _nested_vertical(wkt)):
                     heights = heights_of(pyproj.CRS.from_wkt(nested))
@@ -132,6 +137,32 @@ class _Written:
         if by_key is not None:
             units.append((f"GeoTIFF key {_VERTICAL_UNIT_KEY}", by_key))
         return cls(keyed.crs, heights, _EPSG_UNIT_M.get(keys.get(_LINEAR_UNIT_KEY, 0)), tuple(units))
+
+
+def _check_one_crs(source: LogSource, cloud: Cloud, crs: pyproj.CRS, records: Mapping[int, bytes]) -> None:
+    """Refuse a file whose WKT and GeoTIFF keys put its points at two places."""
+    try:
+        keyed = crs_of_keys(dict(records)).crs if records else None
+    except (ProjCrsError, CrsError, *UNREADABLE):
+        return  # keys beside a WKT that holds are often rests of another program
+    corner = np.asarray(cloud.reader.header.mins[:2], np.float64)
+    if keyed is None or not np.isfinite(corner).all():
+        return
+    places = [
+        pyproj.Transformer.from_crs(one.to_2d(), _WORLD, always_xy=True).transform(*corner) for one in (crs, keyed)
+    ]
+    if not np.isfinite(places).all():
+        return
+    apart_m = pyproj.Geod(ellps="WGS84").inv(*places[0], *places[1])[2]
+    if apart_m > _ONE_PLACE_M:
+        raise CrsError(
+            f"the file states two CRS: its WKT says {crs.name}, its GeoTIFF keys {keyed.name}; its points would lie "
+            f"{apart_m / 1000:,.3f} km apart",
+            expected="one CRS",
+            change='state crs = "EPSG:…" and options.ignore_file_crs = true',
+            file=source.path,
+            missing=_IGNORED,
+        )
 
 
 def _units_named(heights: StatedHeights) -> Iterator[tuple[str, float]]:

@@ -6,6 +6,7 @@ import datetime as dt
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -260,6 +261,16 @@ def trajectory_source(run: str, records: Sequence[LogRecord]) -> TrajectorySourc
             f"run '{run}' has " + ("no trajectory" if not worlds else "trajectories in different world frames"),
             expected="one trajectory log, or several in one datum; or logs of GNSS and IMU with navigation.solve",
         )
+    ordered = sorted(own, key=lambda r: r.span("trajectory") or (0, 0))
+    for before, after in pairwise(ordered):
+        (_, last), (first, _) = before.span("trajectory") or (0, 0), after.span("trajectory") or (0, 0)
+        if first < last:
+            raise ConfigError(
+                f"run '{run}' has two trajectories of one time: {before.path} and {after.path} overlap from "
+                f"{iso_from_gps_ns(first)} on, and nothing says which of them holds",
+                expected="one trajectory log, or several that follow one another",
+                change="leave one of them out of the survey file, or list it in a run of its own",
+            )
     files = tuple(f for r in own for f in r.tables["trajectory"])
     return TrajectorySource(run, worlds.pop(), files)
 

@@ -12,6 +12,7 @@ from roadscan.core.gpstime import TimeSystem
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.ingest.epoch_order import EpochOrder
+from roadscan.ingest.far_returns import FarReturns
 from roadscan.ingest.laser_ranges import LaserRanges
 from roadscan.ingest.log_check import LogCheck, Refuses
 from roadscan.ingest.motion_checks import MotionCheck
@@ -282,6 +283,7 @@ def _checks(source: LogSource, header: LogHeader) -> list[LogCheck]:
         StandingClock(),
         EpochOrder(free=free),
         RepeatedProfiles(),
+        FarReturns(),
         poses,
         CloudPoints(),
         LaserRanges(in_sensor_frame=header.attributes.get("frame") == "sensor"),

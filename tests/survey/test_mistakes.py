@@ -331,6 +331,20 @@ def test_rows_of_a_clock_that_stands_for_a_while_are_left_out(tmp_path: Path) ->
     assert "680, of which kept 680" in text
 
 
+def test_two_trajectories_of_one_time_are_refused(tmp_path: Path) -> None:
+    """The second is the same drive, a metre higher: nothing says which of them holds."""
+    text = (changed(tmp_path) / "SURVEY.toml").read_text()
+    block = text[text.index('[[runs.logs]]\npath = "poses.csv"') :].split("\n\n")[0]
+    changed(tmp_path, (block, block + "\n\n" + block.replace("poses.csv", "higher.csv")))
+    lines = (tmp_path / "poses.csv").read_text().splitlines()
+    at = lines[0].split(",").index("height_m")
+    rows = [line.split(",") for line in lines[1:]]
+    higher = [",".join([*row[:at], f"{float(row[at]) + 1:.4f}", *row[at + 1 :]]) for row in rows]
+    (tmp_path / "higher.csv").write_text("\n".join([lines[0], *higher]) + "\n")
+    code, words = run(tmp_path)
+    assert code != 0 and "two trajectories of one time: poses.csv and higher.csv" in words, words
+
+
 def test_a_longer_vehicle_is_stated(tmp_path: Path) -> None:
     arm = ("lever_arm_body_m = [0.0, 0.0, 0.0]", "lever_arm_body_m = [-12.5, 0.0, 0.0]")
     changed(tmp_path, arm)

@@ -19,8 +19,11 @@ DEADLY = 7
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[OnDask]:
-    with embedded(2) as opened:
-        yield opened
+    """Two workers. A cluster that another test started in this process has left its settings in the environment."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("MALLOC_TRIM_THRESHOLD_", raising=False)
+        with embedded(2) as opened:
+            yield opened
 
 
 def test_only_the_task_that_kills_its_worker_is_lost(cluster: OnDask) -> None:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import scipy
 
 from roadscan.compute.kernels.curved_grid import thin_path
-from roadscan.compute.ways import way_along
+from roadscan.compute.ways import smoothed_knots, way_along
 from roadscan.core.errors import NavigationError
 
 Float64 = npt.NDArray[np.float64]
@@ -69,11 +69,7 @@ class ReferenceLine:
                 expected=f"at least {max(LEAST_KNOTS * KNOT_M, 2 * step_m):g} m",
                 change="choose another pass",
             )
-        at = np.linspace(0.0, along[-1], count)
-        knots = np.column_stack([np.interp(at, along, path[:, a]) for a in range(2)])
-        window = min(2 * round(smoothing_m / KNOT_M / 2) + 1, count - 1 + count % 2)
-        if window > 3:
-            knots = scipy.signal.savgol_filter(knots, window, 2, axis=0, mode="interp")
+        at, knots = smoothed_knots(path, KNOT_M, smoothing_m)
         way = way_along(knots)
         stations = step_m * np.arange(int(way[-1] / step_m) + 1)
         steps = np.diff(scipy.interpolate.CubicSpline(way, knots)(stations), axis=0)

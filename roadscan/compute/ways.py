@@ -1,9 +1,10 @@
-"""Distances along a sequence of places."""
+"""Distances along a sequence of places, and the smooth way through them."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 Float64 = npt.NDArray[np.float64]
 
@@ -11,3 +12,21 @@ Float64 = npt.NDArray[np.float64]
 def way_along(places_m: Float64) -> Float64:
     """Return (n,) horizontal distances (m) from the first of places (n, ≥ 2) along the line through them."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places_m[:, :2], axis=0).T))])
+
+
+def smoothed_knots(path_m: Float64, knot_m: float, smoothing_m: float) -> tuple[Float64, Float64]:
+    """Return (k,) distances (m) along a path and (k, 2) knots, smoothed by local parabolas (Savitzky and Golay 1964).
+
+    Parameters
+    ----------
+    path_m : (n, ≥ 2) places in the order of travel.
+    knot_m : distance between knots, about. smoothing_m : length of the way that a parabola follows.
+    """
+    along = way_along(path_m)
+    count = int(along[-1] / knot_m) + 1
+    at = np.linspace(0.0, along[-1], count)
+    knots = np.column_stack([np.interp(at, along, path_m[:, a]) for a in range(2)])
+    window = min(2 * round(smoothing_m / knot_m / 2) + 1, count - 1 + count % 2)
+    if window > 3:
+        knots = scipy.signal.savgol_filter(knots, window, 2, axis=0, mode="interp")
+    return at, knots

@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
 from roadscan.compute.kernels.curved_grid import thin_path
-from roadscan.compute.ways import way_along
+from roadscan.compute.ways import smoothed_knots, way_along
 from roadscan.condition.road_line import NODE_M, Lane, RoadLine
 from roadscan.condition.settings import ConditionConfig
 
@@ -105,15 +105,9 @@ def nodes_along(path_m: Float64, smoothing_m: float) -> Float64:
     if len(path_m):
         thin_path(np.ascontiguousarray(path_m), _KNOT_M, kept)
     path = path_m[kept]
-    along = way_along(path)
-    count = int(along[-1] / _KNOT_M) + 1 if len(path) else 0
-    if count < 8:
+    if not len(path) or int(way_along(path)[-1] / _KNOT_M) + 1 < 8:
         return np.zeros((0, 2))
-    at = np.linspace(0.0, along[-1], count)
-    knots = np.column_stack([np.interp(at, along, path[:, a]) for a in range(2)])
-    window = min(2 * round(smoothing_m / _KNOT_M / 2) + 1, count - 1 + count % 2)
-    if window > 3:
-        knots = scipy.signal.savgol_filter(knots, window, 2, axis=0, mode="interp")
+    _, knots = smoothed_knots(path, _KNOT_M, smoothing_m)
     way = way_along(knots)
     nodes: Float64 = scipy.interpolate.CubicSpline(way, knots)(NODE_M * np.arange(int(way[-1] / NODE_M) + 1))
     return nodes

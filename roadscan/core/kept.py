@@ -25,24 +25,32 @@ def kept(name: str, make: Callable[[], str]) -> str:
         return make()
     file = folder / hashlib.blake2b(name.encode(), digest_size=12).hexdigest()
     with contextlib.suppress(OSError):
-        return file.read_text(encoding="utf-8")
+        sources, _, text = file.read_text(encoding="utf-8").partition("\n")
+        if sources == _sources():
+            return text
     text = make()
     scratch = file.with_suffix(f".{secrets.token_hex(4)}")
     with contextlib.suppress(OSError):
-        scratch.write_text(text, encoding="utf-8")
+        scratch.write_text(f"{_sources()}\n{text}", encoding="utf-8")
         scratch.replace(file)
     return text
 
 
 @functools.cache
-def _folder() -> Path | None:
-    """Folder of what was kept of these sources; None where it cannot be written, or others could write to it."""
+def _sources() -> str:
+    """Digest of the sources, and of Python's version."""
     library = Path(__file__).parents[1]
     digest = hashlib.blake2b(sys.version.encode(), digest_size=8)
     for file in sorted(library.rglob("*.py")):
         content = file.read_bytes()
         digest.update(f"{file.relative_to(library).as_posix()}\0{len(content)}\0".encode() + content)
-    folder = cache_place() / f"of-sources-{digest.hexdigest()}"
+    return digest.hexdigest()
+
+
+@functools.cache
+def _folder() -> Path | None:
+    """Folder of what was kept; None where it cannot be written, or others could write to it."""
+    folder = cache_place() / "of-sources"
     try:
         make_private(folder)
         check_private(folder)

@@ -96,11 +96,6 @@ def index_footprints(
     return [(task.slice.file, reason) for task, reason in failed]
 
 
-def stale_footprints(plan: SurveyPlan, manifest: Manifest) -> list[FootprintTask]:
-    """Return a task for each data file whose footprints are missing or stale."""
-    return _stale(_tasks(plan), manifest)
-
-
 def footprint_state(plan: SurveyPlan, manifest: Manifest, workers: int) -> StageState:
     """Data files of which it is known, or not known any more, which tiles they touch."""
     tasks = _tasks(plan)

@@ -39,6 +39,7 @@ from roadscan.poses.mounting_change import MountingChange
 from roadscan.poses.movement import NO_CORRECTION, Allowance
 from roadscan.poses.trajectory import Trajectory
 from roadscan.store.logs import DataFile
+from roadscan.store.readings.returns import distances_m
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.small_tables import read_small
@@ -337,8 +338,7 @@ def _chunks(one: RawSlice) -> Iterator[list[int]]:
 def farthest_m(batch: pa.RecordBatch, geometry: ScanGeometry | None) -> float:
     """Greatest distance (m) of readings from the sensor, in rows of ``scans`` or (without `geometry`) ``returns``."""
     if geometry is None:
-        xyz = [batch.column(f"{axis}_sensor_m").to_numpy(zero_copy_only=False).astype(np.float64) for axis in "xyz"]
-        return float(np.sqrt(sum(x * x for x in xyz)).max(initial=0.0))
+        return float(distances_m(batch).max(initial=0.0))
     raw = int(batch.column("range").flatten().to_numpy(zero_copy_only=False).max(initial=0))
     across = max(abs(geometry.first), abs(geometry.first + geometry.step * (geometry.readings - 1)))
     along = geometry.range_offset_m + geometry.range_step_m * raw

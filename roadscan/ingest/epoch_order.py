@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.witness import Finding, Witness
-from roadscan.ingest.log_check import LogCheck
+from roadscan.ingest.log_check import LogCheck, epochs_in
 from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.ingest.reading.records import LEAP_NS
 from roadscan.store.writer import LogWriter
@@ -299,15 +299,13 @@ class EpochOrder(LogCheck):
         batch = rows.batch
         if rows.table == "returns" and batch.num_rows:
             self._returns.take(batch)
-        if rows.table not in _ORDERED or not batch.num_rows or "epoch_gps_ns" not in batch.schema.names:
+        epochs = epochs_in(rows, _ORDERED)
+        if epochs is None:
             return []
-        column = batch.column("epoch_gps_ns")
-        if column.null_count or not pa.types.is_int64(column.type):
-            return []  # the schema's rules for columns reject them
         wheel = str(batch.column("wheel")[0]) if "wheel" in batch.schema.names else ""
         key = (rows.table, rows.file, wheel)
         series = self._series.setdefault(key, _Series(self.free, rows.table in _EVEN))
-        return series.take(column.to_numpy(), batch, rows.first_record)
+        return series.take(epochs, batch, rows.first_record)
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
         """Report what is doubtful about the log's time."""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from roadscan.core.witness import Witness
 from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.reading.format import LogHeader, Rows
+from roadscan.store.readings.returns import distances_m
 from roadscan.store.writer import LogWriter
 
 FAR_RETURNS: Final = Witness(
@@ -40,10 +41,7 @@ class FarReturns(LogCheck):
         """Take the next rows of the table `returns`."""
         if rows.table != "returns" or not rows.batch.num_rows:
             return
-        xyz = [
-            rows.batch.column(f"{axis}_sensor_m").to_numpy(zero_copy_only=False).astype(np.float64) for axis in "xyz"
-        ]
-        distance_m = np.nan_to_num(np.sqrt(sum(one * one for one in xyz)), nan=0.0, posinf=0.0)
+        distance_m = np.nan_to_num(distances_m(rows.batch), nan=0.0, posinf=0.0)
         self._count += distance_m.size
         self._far += int((distance_m > FARTHEST_M).sum())
         self._farthest_m = max(self._farthest_m, float(distance_m.max()))

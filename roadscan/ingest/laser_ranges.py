@@ -15,6 +15,7 @@ from roadscan.compute.robust import scatter_about
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.reading.format import LogHeader, Rows
+from roadscan.store.readings.returns import sensor_xyz_m
 from roadscan.store.writer import LogWriter
 
 Float64 = npt.NDArray[np.float64]
@@ -69,7 +70,7 @@ class LaserRanges(LogCheck):
         if "laser" not in batch.schema.names or batch.column("laser").null_count:
             return
         laser = batch.column("laser").to_numpy(zero_copy_only=False).astype(np.int64)
-        xyz = np.stack([np.asarray(batch.column(f"{a}_sensor_m"), dtype=np.float64) for a in "xyz"], axis=-1)
+        xyz = np.stack(sensor_xyz_m(batch), axis=-1)
         firing = np.cumsum(np.diff(laser, prepend=-1) <= 0)
         if laser.size < _LEAST or laser.max() > 255 or laser.size < 4 * (firing[-1] + 1):
             return

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
 from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.store.writer import LogWriter
@@ -40,3 +41,14 @@ class Refuses(LogCheck):
     def refused(self, rows: Rows) -> Sequence[Refused]:
         """Return the rows of a chunk that are left out."""
         return self.judge(rows)
+
+
+def epochs_in(rows: Rows, tables: Collection[str]) -> Int64 | None:
+    """Return the epochs (n,), n > 0, of a chunk of one of these tables; None for others, and where one is not whole.
+
+    The schema's rules for columns reject epochs that are not whole.
+    """
+    if rows.table not in tables or not rows.batch.num_rows or "epoch_gps_ns" not in rows.batch.schema.names:
+        return None
+    column = rows.batch.column("epoch_gps_ns")
+    return None if column.null_count or not pa.types.is_int64(column.type) else column.to_numpy()

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-import pyarrow as pa
 
 from roadscan.core.counted import counted
 from roadscan.core.errors import TimeSystemError
 from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.core.witness import Finding, Witness
-from roadscan.ingest.log_check import LogCheck, Refused
+from roadscan.ingest.log_check import LogCheck, Refused, epochs_in
 from roadscan.ingest.overlap import Fault
 from roadscan.ingest.reading.format import Rows
 from roadscan.store.logs import LogRecord
@@ -47,12 +46,9 @@ class StandingClock(LogCheck):
 
     def refused(self, rows: Rows) -> list[Refused]:
         """Return the rows of a chunk (by index) that are left out."""
-        if rows.table not in STAMPED or not rows.batch.num_rows or "epoch_gps_ns" not in rows.batch.schema.names:
+        epochs = epochs_in(rows, STAMPED)
+        if epochs is None:
             return []
-        column = rows.batch.column("epoch_gps_ns")
-        if column.null_count or not pa.types.is_int64(column.type):
-            return []  # the schema's rules for columns reject them
-        epochs = column.to_numpy()
         epoch, before = self._before.get((rows.table, rows.file), (int(epochs[0]), 0))
         starts = np.flatnonzero(np.diff(epochs, prepend=epoch - 1))  # the first row follows none
         lengths = np.diff(starts, append=epochs.size)

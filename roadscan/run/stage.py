@@ -110,8 +110,9 @@ class Stage(ABC):
 
     def is_asked(self, survey: Survey) -> bool:
         """True unless the survey file has no section for it, or switches that off."""
-        settings = getattr(survey.config, self.section) if self.section else survey
-        return settings is not None and getattr(settings, "on", True)
+        if not self.section:
+            return True
+        return survey.has(self.section) and getattr(getattr(survey.config, self.section), "on", True)
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """What the witnesses of its inputs said: told during a run, in the summary, by `status` and in the report.

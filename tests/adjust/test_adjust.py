@@ -12,8 +12,8 @@ import pytest
 import rasterio
 
 from roadscan.core.survey import Survey
-from roadscan.footprints.footprints import load_ranges, stale_footprints
-from roadscan.georeference.plan.plan import plan_of, plan_survey
+from roadscan.footprints.footprints import FootprintTask, _stale, _tasks, load_ranges
+from roadscan.georeference.plan.plan import SurveyPlan, plan_of, plan_survey
 from roadscan.report.blocks import Picture, Table
 from roadscan.report.section import Material
 from roadscan.report.sections.adjustment import Adjustment
@@ -21,13 +21,14 @@ from roadscan.run.engine.compute import Done, Inline
 from roadscan.run.engine.embedded import embedded
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
+from roadscan.simulate.surface import Surface
 from roadscan.store.manifest import Manifest
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status
 from roadscan.tiles.tasks.tile_plan import plan_tiles
-from tests.adjust.adjusted_site import CIRCLES, NO_FILES, TARGETS, adjust, cell_errors, corrections, rows
+from tests.adjust.adjusted_site import CIRCLES, NO_FILES, TARGETS, adjust, cell_errors, corrections, rows, site
 from tests.surveys import Lines, Simulated, changed
 
 
@@ -166,6 +167,10 @@ def adjustment_files(store: Store) -> dict[str, bytes]:
     return {path: store.read_bytes(path) for path in [*paths, small_path("corrections")]}
 
 
+def stale_footprints(plan: SurveyPlan, manifest: Manifest) -> list[FootprintTask]:
+    return _stale(_tasks(plan), manifest)
+
+
 def test_corrections_leave_footprints_current_and_switching_off_takes_them_away(
     adjusted: Simulated, tmp_path: Path
 ) -> None:
@@ -299,6 +304,21 @@ def test_one_point_in_another_crs_is_named_and_so_are_heights_exchanged_that_are
     assert [line for line in lines if "1 of 6 control points lie where no pass saw the road: G003 (469," in line]
     assert len([line for line in lines if "from the road that was measured; it is in another" in line]) == 2
     assert [line for line in lines if "the heights of G001 and G005 look exchanged" in line]
+
+
+def test_a_point_of_the_lane_beside_that_nobody_drove_is_no_fault(adjusted: Simulated, tmp_path: Path) -> None:
+    """The rightmost head passes 3.25 m right of the road's axis; no head sees 7 m beside it."""
+
+    def beside(points: dict[str, dict[str, str]]) -> None:
+        for name, station, offset in (("G003", 11.0, 3.25 + 7.0), ("G005", 19.0, 3.25 + 12.0)):
+            easting, northing, _ = Surface(site()).place(station, offset)
+            points[name] |= {"easting_m": f"{easting.item():.4f}", "northing_m": f"{northing.item():.4f}"}
+
+    copy = with_control(adjusted, tmp_path / "survey", beside)
+    lines = adjust(copy, stages=("ingest", "navigate", "footprints", "adjust")).reporter.lines
+    (found,) = (line for line in lines if "lie where no pass saw the road" in line)
+    assert "1 of 6 control points" in found and "G005 (12.0 m from the nearest track)" in found
+    assert any("4 of 6 control points seen" in line for line in lines)
 
 
 @pytest.mark.parametrize("mode", ["each_pass", "vertical", "helmert"])

@@ -9,7 +9,7 @@ import pytest
 import scipy.ndimage
 import shapely
 
-from roadscan.condition.roughness_regions.intensity import normalised_intensity, range_and_incidence, three_classes
+from roadscan.condition.roughness_regions.intensity import normalised_intensity, three_classes
 from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rotated_back
 from roadscan.condition.roughness_regions.raster import closed
 from roadscan.condition.roughness_regions.regions import SectionRegions, find_regions
@@ -74,9 +74,9 @@ def test_intensity_that_falls_with_range_is_normalised() -> None:
     section = Section(patches=ALL, sensor_y_m=2.0)
     *points, xy = section.points()
     zero = np.zeros(len(xy))
-    reach, angle = range_and_incidence(
-        np.column_stack([xy, zero]), np.column_stack([xy[:, 0], zero + 2.0, zero + 2.2]), np.array([0.0, 0.0, 1.0])
-    )
+    beams = np.column_stack([xy[:, 0], zero + 2.0, zero + 2.2]) - np.column_stack([xy, zero])
+    reach = np.linalg.norm(beams, axis=1)
+    angle = np.arccos(beams[:, 2] / reach)
     level = normalised_intensity(points[3], reach, angle, 5.0)
     at = find_regions(RoadPoints.of(*points[:3], level), ORIGIN, section.heading_rad, SETTINGS)
     assert len(at.regions) == len(ALL)

@@ -19,6 +19,7 @@ from roadscan.georeference.sources import ReadingSource, geometry_of, read_rows
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.poses.trajectory import Trajectory
 from roadscan.store.logs import DataFile
+from roadscan.store.readings.returns import sensor_xyz_m
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -199,7 +200,7 @@ def _sensor_points(
     limits = (source.range_min_m, source.range_max_m)
     if geometry is None:
         epochs = batch.column("pose_epoch_gps_ns").to_numpy()
-        xyz = np.stack([batch.column(f"{a}_sensor_m").to_numpy() for a in "xyz"], axis=-1).astype(np.float64)
+        xyz = np.stack(sensor_xyz_m(batch), axis=-1)
         distance = np.linalg.norm(xyz, axis=1)
         kept = (epochs >= span[0]) & (epochs <= span[1]) & (distance >= limits[0]) & (distance <= limits[1])
         kept[np.arange(kept.size) % every > 0] = False

@@ -30,19 +30,6 @@ def normalised_intensity(
     return normalised
 
 
-def range_and_incidence(points_m: Float64, sensor_m: Float64, normal: Float64) -> tuple[Float64, Float64]:
-    """Return ranges (n,) (m) and angles of incidence (n,) (rad) of points seen from sensors.
-
-    Parameters
-    ----------
-    points_m, sensor_m : (n, 3) in one frame; normal : (3,) or (n, 3) unit normals of the surface.
-    """
-    beam = sensor_m - points_m
-    length = np.sqrt(np.sum(beam * beam, axis=1))
-    cosine = np.abs(np.sum(beam * normal, axis=1)) / np.maximum(length, 1e-9)
-    return length, np.arccos(np.clip(cosine, 0.0, 1.0))
-
-
 def three_classes(values: npt.NDArray[np.uint8]) -> tuple[int, int] | None:
     """Return two thresholds t₁ < t₂ that divide 8-bit values into ≤ t₁, ≤ t₂ and above (Otsu 1979, three classes).
 

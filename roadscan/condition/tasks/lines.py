@@ -95,7 +95,7 @@ def find_lines(plan: SurveyPlan, config: ConditionConfig) -> Roads:
 
 def roads_key(plan: SurveyPlan) -> str:
     """Return the key of the lines and lanes of :func:`survey_roads`."""
-    return lines_key(plan, ConditionConfig.stated(plan.survey) or ConditionConfig())
+    return lines_key(plan, ConditionConfig.of(plan.survey))
 
 
 def survey_roads(plan: SurveyPlan, manifest: Manifest) -> tuple[Roads, str]:
@@ -103,7 +103,7 @@ def survey_roads(plan: SurveyPlan, manifest: Manifest) -> tuple[Roads, str]:
 
     A survey without a section `[condition]` has those of its drives.
     """
-    config, key = ConditionConfig.stated(plan.survey) or ConditionConfig(), roads_key(plan)
+    config, key = ConditionConfig.of(plan.survey), roads_key(plan)
     if current_lines(manifest, key):
         return load_roads(plan.store, manifest, product_context(plan)), key
     return find_lines(plan, config), key

@@ -23,6 +23,7 @@ from roadscan.core.witness import Finding
 from roadscan.ingest.reading.format import Item, LogHeader, Reject, Rows
 from roadscan.ingest.reading.future_times import FutureTimes
 from roadscan.poses.leaps import FASTEST_M_PER_S
+from roadscan.store.readings.returns import distances_m
 from roadscan.store.schema import TableSchema, table_schema
 
 Float64 = npt.NDArray[np.float64]
@@ -344,9 +345,8 @@ class TableFigures:
             self.readings.total += raw.size - ends.size
             self.readings.no_return += raw.size - got.size
         elif "x_sensor_m" in batch.schema.names:
-            xyz = np.stack([batch.column(f"{a}_sensor_m").to_numpy() for a in "xyz"]).astype(np.float64)
             self.readings = self.readings or Readings()
-            self.readings.take(np.linalg.norm(xyz, axis=0), batch.num_rows)
+            self.readings.take(distances_m(batch), batch.num_rows)
 
 
 class LogFigures:

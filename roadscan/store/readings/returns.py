@@ -29,6 +29,7 @@ _COLUMNS: Final = list(_KINDS)
 Array = npt.NDArray[Any]
 Int64 = npt.NDArray[np.int64]
 Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,17 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
         if any(rows.column(name).null_count for name in _COLUMNS):
             raise DamageError("a return is not whole")
         return Returns(*(np.array(rows.column(name).to_numpy(), kind) for name, kind in _KINDS.items()))
+
+
+def sensor_xyz_m(batch: pa.RecordBatch) -> list[Float64]:
+    """Return x, y and z (n,) in the sensor's frame of a batch of ``returns``; missing coordinates are NaN."""
+    return [batch.column(f"{axis}_sensor_m").to_numpy(zero_copy_only=False).astype(np.float64) for axis in "xyz"]
+
+
+def distances_m(batch: pa.RecordBatch) -> Float64:
+    """Return distances (n,) from the sensor of a batch of ``returns``; NaN where a coordinate is missing."""
+    x, y, z = sensor_xyz_m(batch)
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def _as_stored(schema: pa.Schema) -> bool:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import typer.testing
 from hypothesis import settings
 
 from tests.pictures import blank
@@ -36,6 +38,10 @@ os.environ.setdefault("OGR_SQLITE_SYNCHRONOUS", "OFF")
 settings.register_profile("ci", derandomize=True)
 if os.environ.get("CI"):
     settings.load_profile("ci")
+
+
+# The command line is put together once a process, as it is for a user, and not at each of two thousand commands.
+typer.testing._get_command = functools.cache(typer.testing._get_command)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

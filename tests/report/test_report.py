@@ -23,6 +23,7 @@ from roadscan.run.session import Session
 from roadscan.site.report_copy import linked_report
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest, write_failures
+from tests.pictures import drawn
 from tests.surveys import Simulated
 
 BROWSERS_OWN = re.compile(r"^https?://([\w-]+\.)*(google\.com|googleapis\.com|gvt1\.com)/")
@@ -77,6 +78,7 @@ def test_a_run_writes_a_page_that_needs_nothing_else(finished: Simulated) -> Non
     assert len(read.of("rect")) == sum(1 for r in Manifest(finished.store()).of("tile").values() if r.path)
 
 
+@drawn()
 def test_the_same_store_gives_the_same_page(finished: Simulated) -> None:
     session = Session.open(finished.survey_file)
     before = session.store.fs.modified(session.store.path(PATH))
@@ -101,6 +103,7 @@ def test_names_are_shown_as_text(finished: Simulated, tmp_path: Path) -> None:
     assert "One unit failed" in read.text
 
 
+@drawn()
 def test_small_pictures_show_the_products(finished: Simulated) -> None:
     page = Reader(finished.store().read_bytes(PATH).decode("utf-8"))
     pictures = [Image.open(io.BytesIO(base64.b64decode((i["src"] or "").split(",")[1]))) for i in page.of("img")]

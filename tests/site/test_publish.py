@@ -58,6 +58,7 @@ from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 from tests.inventory.streets import EAST, NORTH, asset, found
+from tests.pictures import drawn
 from tests.surveys import Lines, Simulated, small_scene
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "viewer.md"
@@ -759,6 +760,7 @@ def test_heights_of_a_table_are_metres_once(survey_file: Path, tmp_path: Path) -
     assert shapely.get_coordinates(held.shapes_m, include_z=True) == pytest.approx(np.array([[30.0, 60.0, 90.0]]))
 
 
+@drawn()
 def test_a_thumbnail_shows_the_map(survey_file: Path, tmp_path: Path) -> None:
     material = Material(opened(survey_file))
     west, south, east, north = material.extent_m or (0.0,) * 4

@@ -22,6 +22,7 @@ from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status, verify_store
+from tests.pictures import drawn
 from tests.surveys import Simulated, changed, outputs
 
 MAKE = {"products__make": ["las", "geotiff", "mosaic", "kilometre", "tile_table"]}
@@ -77,6 +78,7 @@ def test_damaged_records_are_told_in_one_go_and_mended(finished: Simulated, tmp_
     assert len(store.files("damaged")) == 3
 
 
+@drawn()
 def test_a_log_whose_record_is_lost_is_asked_for(finished: Simulated, tmp_path: Path) -> None:
     """Where its raw log was archived, and the copy of its record is damaged as well."""
     copy = finished.copy_with_store_to(tmp_path / "survey")

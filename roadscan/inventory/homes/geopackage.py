@@ -77,6 +77,7 @@ class GeoPackage(Home):
 
         if not self.file.exists():
             return None
+        self._check_not_locked(None)  # at once: OGR would wait five seconds at each of its attempts
         try:
             layers = {str(name) for name, _ in pyogrio.list_layers(self.file)}
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
@@ -278,8 +279,8 @@ class GeoPackage(Home):
         except sqlite3.DatabaseError as error:
             raise self._held_open(error) from error
 
-    def _check_not_locked(self, cause: Exception) -> None:
-        """Raise HomeError if a file could not be read or written because another program has locked it."""
+    def _check_not_locked(self, cause: Exception | None) -> None:
+        """Raise HomeError while another program has locked the file: the cause of a failed reading or writing."""
         try:
             with contextlib.closing(sqlite3.connect(self.file, timeout=_WAIT_S, isolation_level=None)) as connection:
                 connection.execute("SELECT count(*) FROM sqlite_master").fetchall()

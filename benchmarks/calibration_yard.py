@@ -23,11 +23,14 @@ from roadscan.simulate import Scene, simulate
 from roadscan.simulate.caster import World, ray_key
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
+from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import Mount
 from roadscan.simulate.sensors import lidar, profiler
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import objects_of
+
+HDL32E = lidar_model("HDL-32E")
 
 Float64 = npt.NDArray[np.float64]
 
@@ -198,16 +201,16 @@ def _returns(scene: Scene, even_to_m: float, rng: np.random.Generator) -> list[R
     surface, ride = Surface(scene), Surface(scene, ride=True)
     world = World(scene, surface)
     origin, enu = _local_frame(scene, surface, earth)
-    beams = lidar.hdl32e_beams()
+    beams = HDL32E
     elevation = np.radians(beams.elevation_deg)
     found = []
     for drive in drives_of(scene, earth, ride):
         points, epochs = [], []
         for block in _some_packets(scene, world, drive):
-            kept = np.square(lidar.RANGE_STEP_M / even_to_m * block.ranges)
+            kept = np.square(HDL32E.figures.range_step_m / even_to_m * block.ranges)
             seen = (block.ranges > 0) & (rng.random(block.ranges.shape) < kept)
             laser, azimuth = np.nonzero(seen)[2], np.radians(block.azimuth_deg[seen])
-            ranges = lidar.RANGE_STEP_M * block.ranges[seen]
+            ranges = HDL32E.figures.range_step_m * block.ranges[seen]
             flat = ranges * np.cos(elevation[laser])
             up = ranges * np.sin(elevation[laser]) + beams.rise_m[laser]
             points.append(np.stack([flat * np.cos(azimuth), -flat * np.sin(azimuth), up], axis=-1))
@@ -228,11 +231,11 @@ def _returns(scene: Scene, even_to_m: float, rng: np.random.Generator) -> list[R
 def _some_packets(scene: Scene, world: World, drive: Drive) -> Iterator[lidar.Packets]:
     """One block of packets in `_EVERY`, 71 ms of each 0.42 s: casting all beams would take most of the time."""
     span_ns = drive.recorded_span_gps_ns[1] - lidar.starts_gps_ns(drive)
-    blocks = int(span_ns // (lidar.BLOCK_PACKETS * lidar.PACKET_NS))
+    blocks = int(span_ns // (lidar.BLOCK_PACKETS * HDL32E.block_ns))
     for block in range(0, blocks, _EVERY):
         numbers = block * lidar.BLOCK_PACKETS + np.arange(lidar.BLOCK_PACKETS)
-        epochs = lidar.starts_gps_ns(drive) + numbers * lidar.PACKET_NS
-        key = ray_key(scene, drive, "lidar") + int(numbers[0]) * lidar.CYCLES * lidar.LASERS
+        epochs = lidar.starts_gps_ns(drive) + numbers * HDL32E.block_ns
+        key = ray_key(scene, drive, "lidar") + int(numbers[0]) * HDL32E.figures.cycles * HDL32E.lasers
         yield lidar._measure_block(scene, world, drive, epochs, lidar._azimuths(scene, 0.0, numbers), key, block)
 
 

@@ -14,13 +14,13 @@ import numpy.typing as npt
 from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.imu import ImuErrors, ImuGrade
 from roadscan.simulate.earth import Earth
+from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.logs import SimulatedLog
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Camera, Mount, MountError, Scene
 from roadscan.simulate.sensors import sick
 from roadscan.simulate.sensors.imu import AT_BODY, head_imus
 from roadscan.simulate.sensors.lens import Lens
-from roadscan.simulate.sensors.lidar import RANGE_MIN_M
 from roadscan.simulate.sensors.profiler import Head, heads
 from roadscan.simulate.surface import Surface
 
@@ -67,8 +67,9 @@ def write_rig(scene: Scene, file: Path, *, nominal: bool = True) -> None:
             head.name, "profiler", "laser-triangulation head", "frd", mounted(head.mount), _profiler_limits(head)
         )
     if scene.lidar.on:
-        limits = (RANGE_MIN_M, scene.lidar.range_max_m + 1.0)
-        lines += _sensor("lidar", "lidar", "Velodyne HDL-32E", "flu", mounted(scene.lidar.mount), limits)
+        figures = lidar_model(scene.lidar.model).figures
+        limits = (figures.range_min_m, scene.lidar.range_max_m + 1.0)
+        lines += _sensor("lidar", "lidar", figures.title, "flu", mounted(scene.lidar.mount), limits)
     if scene.sick.on:
         limits = (sick.RANGE_MIN_M, scene.sick.range_max_m + 1.0)
         lines += _sensor("sick", "lidar", "SICK LMS 200", "frd", mounted(scene.sick.mount), limits)
@@ -78,8 +79,8 @@ def write_rig(scene: Scene, file: Path, *, nominal: bool = True) -> None:
         )
         lines += _interior(scene.camera)
     if scene.imu.on:
-        own = scene.imu.errors is not None
-        lines += _sensor("imu", "imu", f"IMU, {'own' if own else scene.imu.grade} grade", "frd", mounted(AT_BODY))
+        own, axes = scene.imu.errors is not None, "flu" if scene.bag.on else "frd"
+        lines += _sensor("imu", "imu", f"IMU, {'own' if own else scene.imu.grade} grade", axes, mounted(AT_BODY))
         lines.append(_imu_errors(scene.imu.errors or scene.imu.grade))
     for imu in head_imus(scene):
         lines += _sensor(imu.name, "imu", "IMU of a profiler head", "frd", mounted(imu.mount))

@@ -15,7 +15,7 @@ from roadscan.simulate import trajectory
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.scene import ClockError, Scene
-from roadscan.simulate.sensors import encoder, gnss, imu, lidar, sick
+from roadscan.simulate.sensors import bag, encoder, gnss, imu, lidar, sick
 from roadscan.simulate.sensors.camera import write_camera
 from roadscan.simulate.sensors.clock import SensorClock
 from roadscan.simulate.sensors.profiler import Head, heads, write_profiles
@@ -79,10 +79,8 @@ class Pass:
         ConfigError
             where a sensor needs the Earth, and the scene lies in a local frame.
         """
-        makers = (
-            self._camera, self._profilers, self._lidar, self._sick, self._trajectory, self._imus, self._gnss,
-            self._encoder,
-        )  # fmt: skip
+        in_bag = (self._bag,) if self.scene.bag.on else (self._lidar, self._imus, self._gnss)
+        makers = (self._camera, self._profilers, *in_bag, self._sick, self._trajectory, self._encoder)
         return [log for make in makers for log in make()]
 
     def _trajectory(self) -> Iterator[SimulatedLog]:
@@ -97,6 +95,9 @@ class Pass:
             yield SimulatedLog(name, write, "poses", "pose_quaternions", None, clock, "local", options)
             return
         right = SensorClock.of(scene, ClockError(), TimeSystem.GPS_WEEK)
+        if scene.bag.on:  # a rig that records a bag has no office's trajectory: this one is for the truth
+            yield SimulatedLog(name, write, "poses")
+            return
         clock = right.toml(None, trajectory.first_gps_ns(scene, drive))
         companion = "trajectory.smrmsg"
         accuracy = f'{{ accuracy = "{companion}" }}' if scene.trajectory.accuracy else None
@@ -135,6 +136,27 @@ class Pass:
             hour = f"{{ hour = {utc_from_gps_ns(shown).hour} }}"
         stated = clock.toml(None, first)
         yield SimulatedLog(name, write, "returns", "velodyne_pcap", "lidar", stated, options=hour)
+
+    def _bag(self) -> Iterator[SimulatedLog]:
+        scene, world = self.scene, self.world
+        self._need_earth("bag", "its positions are latitude and longitude")
+        name = bag.file_name(scene)
+        stated = {
+            "ros_points": ("lidar", scene.lidar.on, scene.lidar.clock, None),
+            "ros_imu": ("imu", scene.imu.on, scene.imu.clock, None),
+            "ros_gnss": ("gnss", scene.gnss.on, ClockError(), self.drive.earth.geographic_crs),
+        }
+        listed = [(form, *one) for form, one in stated.items() if one[1]]
+        for form, sensor, _, error, crs in listed:
+            clock = SensorClock.of(scene, error.model_copy(update={"system": None}), TimeSystem.UNIX_UTC)
+
+            def write(is_first: bool = form == listed[0][0]) -> Iterator[int]:
+                yield from (
+                    bag.write_bag(scene, world, self.drive, self.raw / name, self.hits("lidar")) if is_first else ()
+                )
+
+            content: Content = "returns" if form == listed[0][0] else "other"
+            yield SimulatedLog(name, write, content, form, sensor, clock.toml(None, self.drive.start_gps_ns), crs)
 
     def _sick(self) -> Iterator[SimulatedLog]:
         world = self.world

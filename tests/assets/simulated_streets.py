@@ -15,10 +15,13 @@ from roadscan.assets.scene import Box, Scene
 from roadscan.simulate.caster import World, ray_key
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
+from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Scene as SimulatedScene
 from roadscan.simulate.sensors import lidar
 from roadscan.simulate.surface import Surface
+
+HDL32E = lidar_model("HDL-32E")
 
 Float64 = npt.NDArray[np.float64]
 
@@ -99,19 +102,19 @@ def _seen(
     """Columns of the returns of a pass within the window."""
     first = lidar.starts_gps_ns(drive)
     group = lidar.GROUP_PACKETS
-    count = group * math.ceil((drive.duration_s + lidar.RUN_UP_S) * 1e9 / (group * lidar.PACKET_NS))
+    count = group * math.ceil((drive.duration_s + lidar.RUN_UP_S) * 1e9 / (group * HDL32E.block_ns))
     start_deg = float(stream(scene.seed, drive.number, "lidar head").integers(0, 36_000)) / 100.0
     key = ray_key(scene, drive, "lidar")
     parts = []
     for block, packet in enumerate(range(0, count, lidar.BLOCK_PACKETS)):
         numbers = np.arange(packet, min(packet + lidar.BLOCK_PACKETS, count))
-        epochs = first + numbers * lidar.PACKET_NS
+        epochs = first + numbers * HDL32E.block_ns
         stations = drive.station_m(epochs[[0, -1]])
         if max(stations) < span_m[0] or min(stations) > span_m[1]:
             continue
         azimuths = lidar._azimuths(scene, start_deg, numbers)
         found = lidar._measure_block(
-            scene, world, drive, epochs, azimuths, key + packet * lidar.CYCLES * lidar.LASERS, block
+            scene, world, drive, epochs, azimuths, key + packet * HDL32E.figures.cycles * HDL32E.lasers, block
         )
         parts.append(_columns(scene, drive, found, window, corner))
     return {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
@@ -125,12 +128,12 @@ def _columns(
     at, _ = drive.poses(packets.epoch_gps_ns).sensor(scene.lidar.mount, lidar.BODY_FROM_AXES)
     sensor = np.repeat(drive.earth.map_from_ecef(at)[:, None], seen.shape[1], axis=1)[seen]
     hit = packets.found.enh_m[seen]
-    share = packets.ranges.reshape(seen.shape)[seen] * lidar.RANGE_STEP_M / packets.found.range_m[seen]
+    share = packets.ranges.reshape(seen.shape)[seen] * HDL32E.figures.range_step_m / packets.found.range_m[seen]
     place = sensor + (hit - sensor) * share[:, None]
     x, y = place[:, 0] - corner[0], place[:, 1] - corner[1]
     inside = window.holds(x, y)
     n = int(inside.sum())
-    laser = np.broadcast_to(np.arange(lidar.LASERS), packets.ranges.shape).reshape(seen.shape)[seen]
+    laser = np.broadcast_to(np.arange(HDL32E.lasers), packets.ranges.shape).reshape(seen.shape)[seen]
     return {
         "x_m": x[inside], "y_m": y[inside], "height_m": place[inside, 2],
         "intensity": packets.intensity.reshape(seen.shape)[seen][inside].astype(np.float32),

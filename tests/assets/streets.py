@@ -12,7 +12,7 @@ from roadscan.simulate import Scene
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import drives_of
 from roadscan.simulate.earth import Earth
-from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, RANGE_STEP_M, measure
+from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, measure
 from roadscan.simulate.surface import Surface
 
 
@@ -50,7 +50,7 @@ def street(scene: Scene) -> Street:
             share = ((epoch - block.epoch_gps_ns[row]) / 600_000)[:, None]
             sensor = first[row] + share * (last[row] - first[row])
             hit = block.found.enh_m[flat]
-            scale = block.ranges[seen] * RANGE_STEP_M / block.found.range_m[flat]
+            scale = block.ranges[seen] * block.model.figures.range_step_m / block.found.range_m[flat]
             place = sensor + (hit - sensor) * scale[:, None]
             laser = np.broadcast_to(np.arange(32, dtype=np.uint16), seen.shape)[seen]
             number = np.full(len(epoch), drive.number + 1, np.uint16)

@@ -18,8 +18,9 @@ from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.earth import Earth
+from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.run import SimulatedSurvey
-from roadscan.simulate.sensors.lidar import hdl32e_beams, measure
+from roadscan.simulate.sensors.lidar import measure
 from roadscan.simulate.surface import Surface
 from tests.simulate.chain import WEEK_NS, Chain
 
@@ -81,7 +82,7 @@ def _laser_rows(text: str) -> list[tuple[str, str, str]]:
 
 def test_beams_are_the_decoders():
     rows = _laser_rows(vd.Calibration.default_calibs[vd.Model.HDL32E].to_string())
-    beams = hdl32e_beams()
+    beams = lidar_model("HDL-32E")
     np.testing.assert_allclose(np.radians(beams.elevation_deg), [float(r[1]) for r in rows], atol=1e-7)
     np.testing.assert_allclose(beams.rise_m, [float(r[2]) for r in rows], atol=1e-8)
 
@@ -148,7 +149,7 @@ def test_no_beam_passes_through_a_wall():
         epochs = block.firing_gps_ns().reshape(seen.shape)[seen][inside]
         laser = np.broadcast_to(np.tile(np.arange(32), 12), seen.shape)[seen][inside]
         origins, rotations = drive.poses(epochs).sensor(scene.lidar.mount, np.diag([1.0, -1.0, -1.0]))
-        origins += rotations[:, :, 2] * hdl32e_beams().rise_m[laser, None]
+        origins += rotations[:, :, 2] * lidar_model("HDL-32E").rise_m[laser, None]
         for origin, hit in zip(drive.earth.map_from_ecef(origins)[::5], points[inside][::5], strict=True):
             way = origin + np.linspace(0.0, 0.999, 400)[:, None] * (hit - origin)
             over = way[:, 2] - surface.height_m(way[:, 0], way[:, 1])
@@ -218,7 +219,7 @@ def test_wide_beams_mix_beside_edges_only():
     for before, now in zip(thin[:2], wide[:2], strict=True):
         np.testing.assert_array_equal(now[~is_mixed], before[~is_mixed])
     assert 0.001 < is_mixed[np.isfinite(wide[0])].mean() < 0.03
-    order = np.argsort(hdl32e_beams().elevation_deg)
+    order = np.argsort(lidar_model("HDL-32E").elevation_deg)
     grid = thin[1].reshape(-1, 32)[:, order]
     padded = np.pad(grid, 1, constant_values=-2)
     around = [padded[2:, 1:-1], padded[:-2, 1:-1], padded[1:-1, 2:], padded[1:-1, :-2]]

@@ -13,8 +13,9 @@ import pytest
 from roadscan.simulate.caster import SLOT_NS, Hits, Pattern, World
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.earth import Earth
+from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.scene import Mount, Scene
-from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, hdl32e_beams, measure
+from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, measure
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import objects_of, objects_table
 from tests.simulate import solids
@@ -356,7 +357,7 @@ def over_ground(surface: Surface, way: np.ndarray, share: np.ndarray) -> np.ndar
 def test_every_hit_is_the_first_thing_in_the_way():
     """500 rays of a lidar, each walked in steps of a millimetre over the road, and past every body on its own."""
     scene, world, drive = urban()
-    surface, beams = world.surface, hdl32e_beams()
+    surface, beams = world.surface, lidar_model("HDL-32E")
     rng = np.random.default_rng(4)
     rows = world.arrays.bodies
     counted = {"road": 0, "body": 0, "nothing": 0}

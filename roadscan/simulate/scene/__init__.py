@@ -17,6 +17,7 @@ from pydantic import BaseModel, Field, model_validator
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.strict import NAME_PATTERN, Strict, load_toml
 from roadscan.simulate.scene.rig import (
+    Bag,
     Camera,
     ClockError,
     Control,
@@ -36,6 +37,7 @@ from roadscan.simulate.scene.roadside import Barrier, Roadside
 from roadscan.simulate.scene.vehicle import PassScene, Route, Vehicle
 
 __all__ = [
+    "Bag",
     "Camera",
     "ClockError",
     "Control",
@@ -120,6 +122,8 @@ class Scene(Strict):
     """Wheel encoder."""
     camera: Camera = Camera()
     """Camera."""
+    bag: Bag = Bag()
+    """Recording in one ROS bag."""
     noise: Noise = Noise()
     """Errors; all 0 where left out."""
     control: Control = Control()
@@ -139,6 +143,8 @@ class Scene(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.lidar.on and self.lidar.model != "HDL-32E" and not self.bag.on:
+            raise ValueError(f"lidar.model '{self.lidar.model}' is recorded in a bag: set bag.on = true")
         for one in self.passes:
             if one.route is None and one.lane > self.road.lanes:
                 raise ValueError(f"a pass drives lane {one.lane} of a road with {self.road.lanes}")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from roadscan.core.gpstime import TimeSystem
 from roadscan.core.imu import ImuErrors, ImuGrade
 from roadscan.core.strict import Strict
+from roadscan.simulate.lidar_model import lidar_model_names
 
 
 class ClockError(Strict):
@@ -104,10 +105,13 @@ class Profilers(Strict):
 
 
 class Lidar(Strict):
-    """The spinning lidar, a Velodyne HDL-32E."""
+    """The spinning lidar."""
 
     on: bool = True
     """Whether the rig carries it."""
+    model: str = "HDL-32E"
+    """Its model (HDL-32E, OS1-128, VLP-16, XT32): a file of figures with elevations, firing times, unit of ranges and
+    width of the beams. Any other than the HDL-32E needs a bag (`bag.on`)."""
     turns_per_s: float = Field(default=10.0, ge=5.0, le=20.0)
     """Turns of the head a second."""
     range_max_m: float = Field(default=20.0, gt=2.0, le=100.0)
@@ -115,8 +119,9 @@ class Lidar(Strict):
     on_azimuth_grid: bool = False
     """Turn a whole number of hundredths of a degree a cycle, so that the azimuths which the packets state are exact;
     otherwise they are rounded by up to 0.005 degrees."""
-    divergence_deg: float = Field(default=0.0, ge=0.0, le=0.5)
-    """Width of a beam (degrees): where two of its edges meet things at different ranges, the range is a mixture."""
+    divergence_deg: Annotated[float, Field(ge=0.0, le=0.5)] | Literal["data sheet"] = 0.0
+    """Width of a beam (degrees): where two of its edges meet things at different ranges, the range is a mixture.
+    "data sheet": that of the model."""
     mount: Mount = Mount(lever_arm_body_m=(-1.72, 0.06, -1.36), roll_deg=1.2, pitch_deg=18.0, heading_deg=-2.5)
     """Mounting of the head (axes flu); it leans back, so that the road behind is seen."""
     clock: ClockError = ClockError()
@@ -126,6 +131,8 @@ class Lidar(Strict):
     def _check(self) -> Self:
         if self.clock.system not in {None, TimeSystem.UTC_HOUR}:
             raise ValueError(f"clock.system '{self.clock.system}', but its packets count from the full UTC hour")
+        if self.model not in lidar_model_names():
+            raise ValueError(f"model '{self.model}', expected one of: {', '.join(lidar_model_names())}")
         return self
 
 
@@ -316,6 +323,17 @@ class Trajectory(Strict):
     """Poses a second."""
     accuracy: bool = True
     """Write the companion SMRMSG (σ of position, velocity, attitude, once a second) and name it in the survey file."""
+
+
+class Bag(Strict):
+    """The recording of a low-cost rig: one ROS bag with the lidar's clouds, the IMU and the receiver's positions."""
+
+    on: bool = False
+    """Whether lidar, IMU and receiver are recorded in a bag, in place of logs of their own."""
+    container: Literal["mcap", "sqlite", "ros1"] = "mcap"
+    """A ROS 2 bag of MCAP or SQLite, or a bag of ROS 1."""
+    delay_s: float = Field(default=0.01, ge=0.0)
+    """Mean time from a stamp to the message's arrival at the recording computer; single ones vary by its half (s)."""
 
 
 class Control(Strict):

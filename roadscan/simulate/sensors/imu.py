@@ -77,20 +77,25 @@ def head_imus(scene: Scene) -> list[ImuOnRig]:
 
 def write_imu(scene: Scene, drive: Drive, imu: ImuOnRig, clock: SensorClock, file: Path) -> Iterator[int]:
     """Write the samples of one pass, a chunk a step; yields the samples of each."""
+    schema = pa.schema([(c, pa.int64() if c == "time_ns" else pa.float64()) for c in COLUMNS])
+    options = pa_csv.WriteOptions(quoting_style="none")
+    with pa_csv.CSVWriter(file, schema, write_options=options) as writer:
+        for epochs, rate, force in samples(scene, drive, imu):
+            columns = [clock.stamps_ns(epochs), *np.round(rate, 9).T, *np.round(force, 8).T]
+            writer.write_batch(pa.RecordBatch.from_arrays([pa.array(c) for c in columns], schema=schema))
+            yield epochs.size
+
+
+def samples(scene: Scene, drive: Drive, imu: ImuOnRig) -> Iterator[tuple[Int64, Float64, Float64]]:
+    """Yield epochs (n,), angular rates (n, 3; rad/s) and specific forces (n, 3; m/s²) of one pass, a chunk a step."""
     step, stride = imu.step_ns, imu.stride
     begins, last = first_gps_ns(drive, imu), drive.recorded_span_gps_ns[1] - 2 * stride * step
     errors = _SensorErrors(
         imu, stream(scene.seed, drive.number, imu.name), stream(scene.seed, drive.number, f"{imu.name} bias")
     )
-    schema = pa.schema([(c, pa.int64() if c == "time_ns" else pa.float64()) for c in COLUMNS])
-    options = pa_csv.WriteOptions(quoting_style="none")
-    with pa_csv.CSVWriter(file, schema, write_options=options) as writer:
-        for begin in range(begins, last + 1, step * CHUNK):
-            epochs = np.arange(begin, min(begin + step * CHUNK, last + 1), step)
-            rate, force = errors.applied(*felt(drive, imu.mount, epochs, step, stride))
-            columns = [clock.stamps_ns(epochs), *np.round(rate, 9).T, *np.round(force, 8).T]
-            writer.write_batch(pa.RecordBatch.from_arrays([pa.array(c) for c in columns], schema=schema))
-            yield epochs.size
+    for begin in range(begins, last + 1, step * CHUNK):
+        epochs = np.arange(begin, min(begin + step * CHUNK, last + 1), step)
+        yield epochs, *errors.applied(*felt(drive, imu.mount, epochs, step, stride))
 
 
 def felt(drive: Drive, mount: Mount, epochs: Int64, step_ns: int, stride: int = 2) -> tuple[Float64, Float64]:

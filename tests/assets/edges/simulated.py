@@ -11,9 +11,12 @@ from roadscan.simulate import Scene
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import drives_of
 from roadscan.simulate.earth import Earth
+from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.sensors import lidar
 from roadscan.simulate.surface import Surface
 from tests.assets.edges.streets import Street, returns_of
+
+HDL32E = lidar_model("HDL-32E")
 
 Array = np.ndarray[Any, Any]
 
@@ -42,12 +45,12 @@ def town_street(length_m: float = 30.0, every: int = 1, seed: int = 3302) -> Sim
     corner = np.array([scene.map.easting_m, scene.map.northing_m, 0.0])
     for drive in drives_of(scene, Earth(scene.map.crs), ride):
         start = lidar.starts_gps_ns(drive)
-        count = int((drive.duration_s + 1.0) * 1e9) // lidar.PACKET_NS // lidar.BLOCK_PACKETS
+        count = int((drive.duration_s + 1.0) * 1e9) // HDL32E.block_ns // lidar.BLOCK_PACKETS
         for number in range(0, count, every):
             packets = number * lidar.BLOCK_PACKETS + np.arange(lidar.BLOCK_PACKETS)
             azimuths = lidar._azimuths(scene, 0.0, packets)
             block = lidar._measure_block(
-                scene, world, drive, start + packets * lidar.PACKET_NS, azimuths, number, number
+                scene, world, drive, start + packets * HDL32E.block_ns, azimuths, number, number
             )
             epoch = block.firing_gps_ns().reshape(len(packets), -1)
             position, _ = drive.poses(block.epoch_gps_ns).sensor(scene.lidar.mount, lidar.BODY_FROM_AXES)

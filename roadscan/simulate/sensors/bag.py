@@ -1,0 +1,227 @@
+"""Simulates the recording of a low-cost rig: one ROS bag with the lidar's clouds, IMU, GNSS positions and mountings.
+
+Vehicle and sensors have axes x ahead, y left, z up (REP 103). A cloud is a turn of the head; `t` counts nanoseconds
+from the header's stamp (as Ouster's driver writes it). Stamps are Unix UTC of each sensor's own clock; messages arrive
+late by random times, in the order of their arrival.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow.parquet as pq
+from scipy.spatial.transform import Rotation
+
+from roadscan.core.extras import need
+from roadscan.core.gpstime import NS_PER_S, TimeSystem
+from roadscan.simulate.caster import World
+from roadscan.simulate.drive import Drive
+from roadscan.simulate.noise import stream
+from roadscan.simulate.scene import ClockError, Mount, Scene
+from roadscan.simulate.sensors import gnss, imu, lidar
+from roadscan.simulate.sensors.clock import SensorClock
+
+Float64 = npt.NDArray[np.float64]
+
+CLOUDS: Final = "/lidar/points"
+IMU: Final = "/imu/data"
+POSITIONS: Final = "/gnss/fix"
+MOUNTINGS: Final = "/tf_static"
+_TYPES: Final = {
+    CLOUDS: "sensor_msgs/msg/PointCloud2", IMU: "sensor_msgs/msg/Imu", POSITIONS: "sensor_msgs/msg/NavSatFix",
+    MOUNTINGS: "tf2_msgs/msg/TFMessage",
+}  # fmt: skip
+_POINT: Final = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4"), ("ring", "<u2")]
+)
+_FIELD_TYPES: Final = {"<f4": 7, "<u4": 6, "<u2": 4}  # constants of sensor_msgs/PointField
+_FLU: Final = np.diag([1.0, -1.0, -1.0])
+"""Turns forward, right, down into forward, left, up, and back."""
+_STATUS: Final = {gnss.FIXED: 2, gnss.FLOAT: 0}
+"""sensor_msgs/NavSatStatus of a solution: GBAS_FIX of a fixed one, FIX of a float one."""
+
+
+class _Sent(NamedTuple):
+    """A message on its way to the recording computer."""
+
+    arrival_ns: int
+    number: int
+    topic: str
+    content: Any
+    returns: int
+
+
+def file_name(scene: Scene) -> str:
+    """Return the name of a pass's bag: a file of ROS 1, a folder of ROS 2."""
+    return "rig.bag" if scene.bag.container == "ros1" else "rig"
+
+
+def write_bag(scene: Scene, world: World | None, drive: Drive, bag: Path, hits_file: Path | None) -> Iterator[int]:
+    """Write the bag of one pass, a message a step; yields the returns of each."""
+    need("rosbags.typesys", "a simulated bag")
+    from rosbags.typesys import Stores, get_typestore
+
+    is_ros1 = scene.bag.container == "ros1"
+    kinds = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    messages = _Messages(scene, drive, kinds.types)
+    with ExitStack() as stack:
+        writer = stack.enter_context(_writer(scene, bag))
+        hits = stack.enter_context(pq.ParquetWriter(hits_file, lidar.HITS_SCHEMA)) if hits_file else None
+        topics = {name: writer.add_connection(name, kind, typestore=kinds) for name, kind in _TYPES.items()}
+        pack = kinds.serialize_ros1 if is_ros1 else kinds.serialize_cdr
+        streams = [messages.mountings(), messages.rates(), messages.positions(), messages.clouds(world, hits)]
+        for sent in heapq.merge(*streams, key=lambda one: one.arrival_ns):
+            writer.write(topics[sent.topic], sent.arrival_ns, pack(sent.content, _TYPES[sent.topic]))
+            yield sent.returns
+
+
+def _writer(scene: Scene, bag: Path) -> Any:
+    from rosbags import rosbag1, rosbag2
+
+    if scene.bag.container == "ros1":
+        bag.unlink(missing_ok=True)
+        return rosbag1.Writer(bag)
+    for file in (*bag.glob("*"), bag) if bag.is_dir() else ():
+        file.unlink() if file.is_file() else file.rmdir()
+    plugin = rosbag2.StoragePlugin.MCAP if scene.bag.container == "mcap" else rosbag2.StoragePlugin.SQLITE3
+    return rosbag2.Writer(bag, version=9, storage_plugin=plugin)
+
+
+class _Messages:
+    """The messages of one pass."""
+
+    def __init__(self, scene: Scene, drive: Drive, types: dict[str, Any]) -> None:
+        self.scene, self.drive, self.types = scene, drive, types
+
+    def _clock(self, error: ClockError) -> SensorClock:
+        plain = error.model_copy(update={"system": None})
+        return SensorClock.of(self.scene, plain, TimeSystem.UNIX_UTC)
+
+    def _sent(self, topic: str, numbered: Iterator[tuple[int, Any, int]]) -> Iterator[_Sent]:
+        """Yield contents with their stamps (ns) and returns, each with its arrival: later than all before it."""
+        rng, last = stream(self.scene.seed, self.drive.number, f"bag {topic}"), 0
+        delay_ns = self.scene.bag.delay_s * NS_PER_S
+        for number, (stamp, content, returns) in enumerate(numbered):
+            last = max(last + 1, stamp + round(delay_ns * (0.5 + rng.random())))
+            yield _Sent(last, number, topic, content, returns)
+
+    def _header(self, stamp_ns: int, frame: str, number: int) -> Any:
+        time = self.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NS_PER_S))
+        header = self.types["std_msgs/msg/Header"]
+        return header(seq=number, stamp=time, frame_id=frame) if "seq" in header.__dataclass_fields__ else header(
+            stamp=time, frame_id=frame)  # fmt: skip
+
+    def mountings(self) -> Iterator[_Sent]:
+        """Yield the transforms from the vehicle to the sensors, once."""
+        rig = {"lidar": self.scene.lidar.mount, "imu_link": imu.AT_BODY,
+               "gnss": Mount(lever_arm_body_m=self.scene.gnss.lever_arm_body_m)}  # fmt: skip
+        stamp = int(self._clock(ClockError()).stamps_ns(np.array([lidar.starts_gps_ns(self.drive)]))[0])
+        made = self.types["tf2_msgs/msg/TFMessage"]([self._mounting(stamp, n, m.nominal()) for n, m in rig.items()])
+        yield from self._sent(MOUNTINGS, iter([(stamp - NS_PER_S, made, 0)]))
+
+    def _mounting(self, stamp_ns: int, frame: str, mount: Mount) -> Any:
+        get = self.types
+        x, y, z = _FLU @ mount.lever_arm_body_m
+        boresight = Rotation.from_euler("ZYX", [mount.heading_deg, mount.pitch_deg, mount.roll_deg], degrees=True)
+        turn = Rotation.from_matrix(_FLU @ boresight.as_matrix() @ _FLU).as_quat()
+        return get["geometry_msgs/msg/TransformStamped"](
+            self._header(stamp_ns, "base_link", 0), frame,
+            get["geometry_msgs/msg/Transform"](
+                get["geometry_msgs/msg/Vector3"](x, y, z), get["geometry_msgs/msg/Quaternion"](*turn)
+            ),
+        )  # fmt: skip
+
+    def rates(self) -> Iterator[_Sent]:
+        """Yield the IMU's samples."""
+        if self.scene.imu.on:
+            yield from self._sent(IMU, self._rates())
+
+    def _rates(self) -> Iterator[tuple[int, Any, int]]:
+        get, clock, unknown = self.types, self._clock(self.scene.imu.clock), np.zeros(9)
+        vector, kind = get["geometry_msgs/msg/Vector3"], get["sensor_msgs/msg/Imu"]
+        none = get["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        no_attitude = np.array([-1.0, *[0.0] * 8])
+        number = 0
+        for epochs, rate, force in imu.samples(self.scene, self.drive, imu.imu_of(self.scene)):
+            for stamp, w, f in zip(clock.stamps_ns(epochs).tolist(), rate @ _FLU, force @ _FLU, strict=True):
+                header = self._header(stamp, "imu_link", number)
+                yield stamp, kind(header, none, no_attitude, vector(*w), unknown, vector(*f), unknown), 0
+                number += 1
+
+    def positions(self) -> Iterator[_Sent]:
+        """Yield the receiver's solutions; a pass without one has none."""
+        if self.scene.gnss.on:
+            yield from self._sent(POSITIONS, self._positions())
+
+    def _positions(self) -> Iterator[tuple[int, Any, int]]:
+        get, found = self.types, gnss.solve(self.scene, self.drive)
+        clock = self._clock(ClockError())
+        for i, stamp in enumerate(clock.stamps_ns(found.epoch_gps_ns).tolist()):
+            longitude, latitude, height = found.geographic[i]
+            north, east, down = found.sigma_ned_m[i] ** 2
+            status = get["sensor_msgs/msg/NavSatStatus"](_STATUS[int(found.quality[i])], 1)
+            fix = get["sensor_msgs/msg/NavSatFix"](
+                self._header(stamp, "gnss", i), status, latitude, longitude, height,
+                np.diag([east, north, down]).ravel(), 2,
+            )  # fmt: skip
+            yield stamp, fix, 0
+
+    def clouds(self, world: World | None, hits: pq.ParquetWriter | None) -> Iterator[_Sent]:
+        """Yield the lidar's turns."""
+        if world is not None and self.scene.lidar.on:
+            yield from self._sent(CLOUDS, self._clouds(world, hits))
+
+    def _clouds(self, world: World, hits: pq.ParquetWriter | None) -> Iterator[tuple[int, Any, int]]:
+        clock, first = self._clock(self.scene.lidar.clock), lidar.starts_gps_ns(self.drive)
+        turn_ns, begun, number = round(NS_PER_S / self.scene.lidar.turns_per_s), first, 0
+        held: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.void]]] = []
+
+        def cloud(upto: int) -> Iterator[tuple[int, Any, int]]:
+            epochs = np.concatenate([one[0] for one in held])
+            points = np.concatenate([one[1] for one in held])
+            now = epochs < upto
+            held[:] = [(epochs[~now], points[~now])]
+            stamp = int(clock.stamps_ns(np.array([begun]))[0])
+            own = points[now].copy()
+            own["t"] = clock.stamps_ns(epochs[now]) - stamp
+            yield stamp, self._cloud(stamp, own, number), own.size
+
+        for block in lidar.measure(self.scene, world, self.drive):
+            if hits is not None:
+                hits.write_batch(lidar.hits_of(block))
+            held.append(_points(block))
+            while block.epoch_gps_ns[-1] >= begun + turn_ns:
+                yield from cloud(begun + turn_ns)
+                begun, number = begun + turn_ns, number + 1
+        yield from cloud(np.iinfo(np.int64).max)
+
+    def _cloud(self, stamp_ns: int, points: npt.NDArray[np.void], number: int) -> Any:
+        kind, field = self.types["sensor_msgs/msg/PointCloud2"], self.types["sensor_msgs/msg/PointField"]
+        fields = [
+            field(name, int(_POINT.fields[name][1]), _FIELD_TYPES[_POINT.fields[name][0].str], 1)
+            for name in _POINT.names or () if _POINT.fields is not None
+        ]  # fmt: skip
+        size = points.size * _POINT.itemsize
+        header = self._header(stamp_ns, "lidar", number)
+        data = points.view(np.uint8).reshape(size)
+        return kind(header, 1, points.size, fields, False, _POINT.itemsize, size, data, True)
+
+
+def _points(block: lidar.Packets) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.void]]:
+    """Return epochs (m,) and points (m,) of a block's returns, in the sensor's axes; `t` is not filled in."""
+    seen = block.ranges > 0
+    range_m = block.ranges[seen] * block.model.figures.range_step_m
+    azimuth = np.radians(block.azimuth_deg[seen])
+    laser = np.broadcast_to(np.arange(block.model.lasers), seen.shape)[seen]
+    elevation = np.radians(block.model.elevation_deg)[laser]
+    out = np.zeros(range_m.size, _POINT)
+    out["x"], out["y"] = range_m * np.cos(elevation) * np.cos(azimuth), -range_m * np.cos(elevation) * np.sin(azimuth)
+    out["z"] = range_m * np.sin(elevation) + block.model.rise_m[laser]
+    out["intensity"], out["ring"] = block.intensity[seen], laser
+    return block.firing_gps_ns()[seen], out

@@ -62,7 +62,7 @@ class Message(NamedTuple):
     """Byte of the file at which it, or its chunk, starts; −1 where the file has no such place."""
     receive_ns: int
     """Time at which the recording computer received it (POSIX ns by its clock)."""
-    data: bytes
+    data: bytes | memoryview
     """Its content, serialised."""
     file: str = ""
     """File of a folder; '' for a bag of one file."""

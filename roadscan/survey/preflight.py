@@ -46,6 +46,7 @@ from roadscan.ingest.planned_logs import CONTROL_RUN, log_source
 from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
 from roadscan.ingest.sources import listed_name, remembered_formats
 from roadscan.navigation.tasks.clocks import check_clocks
+from roadscan.navigation.tasks.navigation_logs import unknown_imu
 from roadscan.run.selection import Selection
 from roadscan.run.stage import stages
 from roadscan.store.logs import read_log_records
@@ -337,6 +338,20 @@ def check_scale(asked: Asked) -> Iterator[RoadscanError]:
             )
 
 
+def check_imu(asked: Asked) -> Iterator[RoadscanError]:
+    """Runs without a trajectory, whose IMU and GNSS receiver make one: the rig file has to say how good the IMU is."""
+    stated = asked.survey.config.navigation.smoother.imu
+    for run in asked.survey.config.runs:
+        logs = [log for log in asked.logs if log.run == run.id and isinstance(log.config, LogConfig)]
+        tables = {table for log in logs for table in log.yields}
+        imus = {str(log.config.sensor) for log in logs if "imu" in log.yields and isinstance(log.config, LogConfig)}
+        name = next(iter(imus)) if stated is None and len(imus) == 1 else stated
+        sensor = asked.survey.rig.sensors.get(name or "")
+        is_made = "gnss" in tables and "trajectory" not in tables and name in imus
+        if is_made and sensor is not None and sensor.imu_errors() is None:
+            yield unknown_imu(str(name))
+
+
 def check_poses(asked: Asked) -> Iterator[RoadscanError]:
     """Check that each run with readings has poses, or data from which they are computed."""
     solve = asked.survey.config.navigation.solve
@@ -469,6 +484,7 @@ CHECKS: Final[tuple[tuple[str, Check], ...]] = (
     ("ingest", check_passes),
     ("ingest", check_times),
     ("navigate", check_motion_clocks),
+    ("navigate", check_imu),
     ("footprints", check_poses),
     ("footprints", check_segmentation),
     ("footprints", check_centre_lines),

@@ -289,6 +289,12 @@ def _remarks(found: FoundFolder, folder: Path) -> Iterator[str]:
 # --- the rig file ---------------------------------------------------------------------------------
 
 
+_GRADES: Final = (
+    'how good it is, since its readings make the trajectory: "mems", "industrial", "tactical", "navigation", or a '
+    "table of its data sheet"
+)
+
+
 def _rig(found: FoundFolder) -> Iterator[str]:
     yield "# A first rig file, written by `roadscan init`: the sensors that the logs name."
     yield f"# TO DO: complete each line that begins with {OPEN_QUESTION} and take its {OPEN_QUESTION} away."
@@ -297,6 +303,9 @@ def _rig(found: FoundFolder) -> Iterator[str]:
     yield 'name = ""'
     for name, log in sorted(found.sensors.items()):
         yield from _sensor(name, log)
+        if log.sensor_kind == "imu" and not any(one.is_trajectory for one in found.logs):
+            yield _question('imu = "????"')
+            yield from _remark(_GRADES)
 
 
 def _sensor(name: str, log: FoundLog) -> Iterator[str]:

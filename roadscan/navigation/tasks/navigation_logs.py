@@ -147,11 +147,7 @@ def vehicle_sensors(rig: Rig, logs: RunLogs) -> VehicleSensors:
     imu, gnss = _sensor(rig, logs.imu[0], "imu"), _sensor(rig, logs.gnss[0], "gnss")
     errors = imu.imu_errors()
     if errors is None:
-        raise ConfigError(
-            f"the rig file does not say how good the IMU '{logs.imu[0].sensor}' is",
-            expected="its errors",
-            change='add imu = "mems" (or "tactical", "industrial", "navigation", or a table of its data sheet)',
-        )
+        raise unknown_imu(logs.imu[0].sensor)
     rotation, lever = imu.mounting().arrays()
     sigma = gnss.lever_arm_sigma_m or (ANTENNA_SIGMA_M,) * 3
     wheel = rig.sensors.get(logs.encoder[0].sensor) if logs.encoder else None
@@ -162,6 +158,15 @@ def vehicle_sensors(rig: Rig, logs: RunLogs) -> VehicleSensors:
         antenna_lever_arm_body_m=np.array(gnss.lever_arm_body_m),
         antenna_sigma_body_m=np.array(sigma),
         wheel_lever_arm_body_m=None if wheel is None else np.array(wheel.lever_arm_body_m),
+    )
+
+
+def unknown_imu(name: str) -> ConfigError:
+    """Return the error of a rig file that does not say how good the IMU of a trajectory is."""
+    return ConfigError(
+        f"the rig file does not say how good the IMU '{name}' is",
+        expected="its errors",
+        change='add imu = "mems" (or "tactical", "industrial", "navigation", or a table of its data sheet)',
     )
 
 

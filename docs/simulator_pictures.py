@@ -66,6 +66,7 @@ class View:
 
 VIEWS: Final = {
     "demo": View(8.0, 1.75, (10.0, 45.0)),
+    "low_cost_rig": View(60.0, 1.6, (85.0, 125.0)),
     "reference_site": View(98.0, 1.9, (86.0, 126.0)),
     "calibration_yard": View(30.0, 0.0, (26.0, 54.0), 13.0, 12.28 / 13.0, 8.0, (5.0, 5.0)),
     "urban_street": View(70.0, 1.6, (85.0, 115.0)),
@@ -129,7 +130,7 @@ def main(names: list[str]) -> None:
 def draw(name: str, folder: Path) -> None:
     """Simulate a scene, as far as its pictures need it, and draw them."""
     scene, view = Scene.load(name), VIEWS[name]
-    off: dict[str, Any] = {sensor: {"on": False} for sensor in ("lidar", "sick", "imu", "gnss", "encoder", "camera")}
+    off: dict[str, Any] = {sensor: {"on": False} for sensor in ("lidar", "sick", "imu", "gnss", "encoder", "camera", "bag")}
     off["profilers"] = {"on": False, "head_imus": None}
     whole = write(scene.changed(**off), folder / "whole")
     save(plan_figure(whole, view), f"{name}-plan")
@@ -298,11 +299,13 @@ def draw_object(axes: Axes, one: dict[str, Any], turned: Any) -> None:
 
 
 def sensors_figure(survey: Survey, view: View) -> Figure:
-    """One profile of both heads over the truth, and one turn of the lidar."""
+    """One profile of both heads over the truth, where the rig has them, and one turn of the lidar."""
     figure = plt.figure(figsize=(9.6, 5.2), dpi=100, layout="constrained")
-    grid = figure.add_gridspec(2, 2, width_ratios=[1.0, 1.35])
-    draw_profile(figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0]), survey, view.profile_share)
-    draw_turn(figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1]), survey)
+    profiled = survey.scene.profilers.on
+    grid = figure.add_gridspec(2, 1 + profiled, width_ratios=[1.0, 1.35] if profiled else None)
+    if profiled:
+        draw_profile(figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0]), survey, view.profile_share)
+    draw_turn(figure.add_subplot(grid[0, -1]), figure.add_subplot(grid[1, -1]), survey)
     figure.legend(frameon=False, markerscale=6, fontsize=7, loc="outside lower right", ncols=9)
     return figure
 

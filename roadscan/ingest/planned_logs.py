@@ -121,7 +121,7 @@ def _open_log(survey: Survey, config: LogConfig | ControlConfig, sources: Source
     path = survey.resolve(config.path)
     try:
         format_ = sources.format(path, config.format)
-        options = format_.options.parse(config.options, file=path)
+        options = log_options(survey, config, format_, path)
         return _OpenedLog(path, format_, options, sources.begin(path, format_, format_.companions(path, options)))
     except RoadscanError as error:
         return error
@@ -199,6 +199,11 @@ def _earlier_checks(format_: LogFormat) -> list[list[list[object]]]:
     second: list[list[object]] = [["poses", 2]] if {POSES, FIXES} & set(format_.yields) else []
     before_stamps = [one for one in _checks_of(format_) if one[0] != "stamps"]
     return [before_stamps, second + places, first + places, []]
+
+
+def log_options(survey: Survey, config: LogConfig | ControlConfig, format_: LogFormat, path: Path) -> Strict:
+    """Return the settings of a log's format: its own before those that the survey file states for all."""
+    return format_.options.parse({**format_.shared_options(survey), **config.options}, file=path)
 
 
 def log_source(

@@ -42,7 +42,7 @@ from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, 
 from roadscan.ingest.one_stamp import one_stamp_logs
 from roadscan.ingest.overlap import Fault, NothingPlacedError, no_row
 from roadscan.ingest.place_checks import without_fix
-from roadscan.ingest.planned_logs import CONTROL_RUN, log_source
+from roadscan.ingest.planned_logs import CONTROL_RUN, log_options, log_source
 from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
 from roadscan.ingest.sources import listed_name, remembered_formats
 from roadscan.navigation.tasks.clocks import check_clocks
@@ -583,7 +583,7 @@ def _beginning(log: CheckedLog) -> _Beginning:
     """Read a log of positions up to its first rows: it has none only where it ends before them."""
     if log.format is None or log.source is None or log.header is None or not set(_POSITIONS) & set(log.yields):
         return _Beginning(log)
-    items = log.format.read(log.source, log.header)
+    items = log.format.beginning(log.source, log.header)
     reasons: Counter[str] = Counter()
     try:
         for item in items:
@@ -635,7 +635,7 @@ def _checked(survey: Survey, run: str, config: LogConfig | ControlConfig, moved:
         if cannot := cannot_be_opened(path):
             raise cannot
         format_ = format_named(config.format) if config.format else claimed_format(path)
-        options = format_.options.parse(config.options, file=path)
+        options = log_options(survey, config, format_, path)
         source = log_source(survey, config, path, format_, options)
         for file in format_.companions(path, options):
             if not is_there(file):

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,9 @@ from roadscan.core.rig import Sensor, SensorKind
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.reading.columns import Quantity
+
+if TYPE_CHECKING:
+    from roadscan.core.survey import Survey
 
 NO_LEVER_ARM: Final = [0.0, 0.0, 0.0]  # body axes, for mountings at the reference point (m)
 
@@ -353,6 +356,10 @@ class LogFormat(ABC):
         """
         return []
 
+    def shared_options(self, survey: Survey) -> dict[str, Any]:
+        """Return settings that the survey file states once for all logs of the format; a log's own go before them."""
+        return {}
+
     @abstractmethod
     def header(self, source: LogSource) -> LogHeader:
         """Read what is known before the records.
@@ -370,6 +377,10 @@ class LogFormat(ABC):
         A damaged record becomes a :class:`Reject`, what is doubtful a :class:`Finding`; only a fault of the whole
         log raises.
         """
+
+    def beginning(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream the first positions, for a check before the run; a format that computes them says about where."""
+        return self.read(source, header)
 
     def ending(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream the log's last records, where they can be found in a moment; nothing where they cannot."""

@@ -102,7 +102,7 @@ class PpkSettings(Strict):
 
     def shaping(self) -> dict[str, Any]:
         """Return the settings for keys, with files by their names: their content is in the log's fingerprint."""
-        return _names(self.model_dump())
+        return {name: _names(value) for name, value in self.model_dump().items()}
 
 
 def _names(value: Any) -> Any:

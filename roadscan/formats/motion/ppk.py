@@ -45,10 +45,6 @@ if TYPE_CHECKING:
 WHAT: Final = "post-processing of GNSS observations"
 _BINS: Final = 400
 """Differences of both directions that a log's record keeps for the picture: as many as it has pixels for them."""
-_EXAMPLE: Final = {
-    "files": ["base.obs"], "crs": "EPSG:7930", "epoch": 2010.0, "x_m": 3830000.0, "y_m": 630000.0, "z_m": 5040000.0,
-    "antenna_height_m": 0.0,
-}  # fmt: skip
 
 
 class PpkOptions(PpkSettings):
@@ -103,9 +99,9 @@ class Ppk(LogFormat):
                 "no navigation file is stated, which holds the satellites' orbits",
                 expected="navigation, one or more RINEX navigation files of the day",
                 file=source.path,
-                missing=Missing("options.navigation", ["brdc.nav"], is_example=True),
+                missing=Missing("options.navigation"),
             )
-        list(antenna_findings(settings, *map(rinex_header, files[:2]), source.path))
+        list(antenna_findings(settings, rinex_header(files[0]), rinex_header(files[1]), source.path))
         need_program(SOLVER, WHAT)
         if any(map(is_ubx, files)):
             need_program(CONVERTER, "a UBX recording")
@@ -159,7 +155,8 @@ def processed(source: LogSource, header: LogHeader, folder: Path) -> Iterator[It
             fixed += item.batch.column("quality").to_pylist().count("fixed")
         yield item
     yield from fixed_share(fixed, solved)
-    apart = Separation.of(*(_track(source, found[one]) for one in ("forward", "backward")), world_frame_of(base.crs))
+    forward, backward = _track(source, found["forward"]), _track(source, found["backward"])
+    apart = Separation.of(forward, backward, world_frame_of(base.crs))
     yield from apart.findings()
     if (lost := int(epochs.size) - solved) > 0:
         yield Reject("RTKLIB found no position at this epoch", records=lost)
@@ -183,7 +180,7 @@ def _base(source: LogSource) -> PpkBase:
             expected="[navigation.ppk] with base = { files, crs, epoch, x_m, y_m, z_m, antenna_height_m }; the "
             "approximate position in the header of its file is not used",
             file=source.path,
-            missing=Missing("options.base", _EXAMPLE, is_example=True),
+            missing=Missing("options.base"),
         )
     return base
 

@@ -130,7 +130,7 @@ def base_position_m(base: PpkBase, file: Path) -> Float64:
     if base.is_geocentric:
         return np.array(base.position)
     latitude, longitude, height = base.position
-    return world_from_geodetic(world_frame_of(base.crs), np.array([[longitude, latitude, height]]))[0]
+    return world_from_geodetic(world_frame_of(base.crs), np.array([[longitude, latitude, height]])).reshape(3)
 
 
 def _moves(crs: dict[str, Any]) -> bool:
@@ -199,7 +199,7 @@ def common_time(rover: Int64, base: Int64, max_age_s: float, file: Path) -> tupl
         f"The base has no observation within {max_age_s:g} s of {missing:,} of the rover's {rover.size:,} epochs: the "
         f"rover observed {_span(rover)}, the base {_span(base)}. These epochs have no position."
     )
-    return covered, [COMMON_TIME.finds("", text, missing)]
+    return covered, [COMMON_TIME.finds("", text)]
 
 
 def _span(epochs: Int64) -> str:

@@ -75,6 +75,11 @@ def is_ubx(path: Path) -> bool:
     return path.is_file() and UBX_SYNC in head_of(path, _SNIFF_BYTES)
 
 
+def is_precise(path: Path) -> bool:
+    """Whether a file holds precise orbits (SP3) or clocks (RINEX)."""
+    return rinex_kind(path) == "C" or re.match(rb"#[a-d][PV]\d{4}", head_of(path, 80)) is not None
+
+
 class Workplace:
     """A folder with the files of a rover and its base under plain names, in which RTKLIB runs."""
 

@@ -1,0 +1,208 @@
+"""Observations of GPS satellites on circular orbits, by IS-GPS-200 (20.3.3.4.3) and nothing of roadscan, as RINEX and UBX.
+
+Clocks of satellites and receivers are right and there is no ionosphere; the troposphere is 2.4 m over the sine of the
+elevation.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Float64 = npt.NDArray[np.float64]
+
+MU, OMEGA_EARTH, LIGHT = 3.986005e14, 7.2921151467e-5, 299_792_458.0
+WAVES_M = (LIGHT / 1575.42e6, LIGHT / 1227.60e6)
+AXIS_M, INCLINATION = 26_559_710.0, np.radians(55.0)
+WEEK, TOE_S = 2314, 302_400
+"""GPS week, and time of ephemeris in it: Wednesday 2024-05-15, 12:00:00 GPST."""
+BEGIN = dt.datetime(2024, 5, 15, 12, 0)
+ZENITH_DELAY_M = 2.4
+LEAST_ELEVATION = np.radians(12.0)
+CODE_SIGMA_M, CARRIER_SIGMA_M = 0.3, 0.002
+
+
+@dataclass(frozen=True)
+class Satellite:
+    prn: int
+    node: float
+    """Longitude of the ascending node at the week's beginning (rad)."""
+    anomaly: float
+    """Mean anomaly at the time of ephemeris (rad)."""
+
+    def position(self, since_toe_s: float) -> Float64:
+        """Earth-fixed position (3,) at a time, of a circular orbit."""
+        u = self.anomaly + np.sqrt(MU / AXIS_M**3) * since_toe_s
+        node = self.node - OMEGA_EARTH * (since_toe_s + TOE_S)
+        x, y = AXIS_M * np.cos(u), AXIS_M * np.sin(u)
+        return np.array(
+            [
+                x * np.cos(node) - y * np.cos(INCLINATION) * np.sin(node),
+                x * np.sin(node) + y * np.cos(INCLINATION) * np.cos(node),
+                y * np.sin(INCLINATION),
+            ]
+        )
+
+
+SATELLITES = tuple(
+    Satellite(1 + 5 * plane + slot, np.radians(60.0 * plane), np.radians(72.0 * slot + 25.0 * plane))
+    for plane in range(6)
+    for slot in range(5)
+)
+
+
+def distance(satellite: Satellite, t: float, receiver_m: Float64) -> tuple[float, float]:
+    """Distance (m) at reception, and elevation (rad)."""
+    delay = 0.07
+    for _ in range(4):
+        away = satellite.position(t - delay)
+        turn = OMEGA_EARTH * delay
+        at = np.array(
+            [np.cos(turn) * away[0] + np.sin(turn) * away[1], np.cos(turn) * away[1] - np.sin(turn) * away[0], away[2]]
+        )
+        range_m = float(np.linalg.norm(at - receiver_m))
+        delay = range_m / LIGHT
+    up = receiver_m / np.linalg.norm(receiver_m)
+    return range_m, float(np.arcsin((at - receiver_m) @ up / range_m))
+
+
+@dataclass(frozen=True)
+class Epoch:
+    t: float
+    """Seconds after the time of ephemeris."""
+    seen: dict[int, tuple[float, float, float, float]]
+    """By satellite: code (m) and carrier (cycles) on L1, the same on L2."""
+
+
+def observe(path_m: Callable[[float], Float64], times_s: Float64, seed: int = 1) -> list[Epoch]:
+    """Observations of a receiver on its way."""
+    rng = np.random.default_rng(seed)
+    whole = {s.prn: rng.integers(-(10**6), 10**6, 2) for s in SATELLITES}
+    epochs = []
+    for t in times_s:
+        seen = {}
+        for s in SATELLITES:
+            range_m, elevation = distance(s, float(t), path_m(float(t)))
+            if elevation < LEAST_ELEVATION:
+                continue
+            path = range_m + ZENITH_DELAY_M / np.sin(elevation)
+            code = path + rng.normal(0.0, CODE_SIGMA_M, 2)
+            carrier = [
+                (path + rng.normal(0.0, CARRIER_SIGMA_M)) / w + n for w, n in zip(WAVES_M, whole[s.prn], strict=True)
+            ]
+            seen[s.prn] = (float(code[0]), float(carrier[0]), float(code[1]), float(carrier[1]))
+        epochs.append(Epoch(float(t), seen))
+    return epochs
+
+
+def _line(text: str, label: str) -> str:
+    return f"{text:<60}{label}\n"
+
+
+def _when(t: float) -> tuple[dt.datetime, float]:
+    when = BEGIN + dt.timedelta(seconds=float(np.floor(t)))
+    return when, when.second + float(t - np.floor(t))
+
+
+def rinex2(epochs: list[Epoch], approximate_m: Float64, antenna_height_m: float = 0.0) -> str:
+    """RINEX 2.11 with C1, L1, P2, L2."""
+    out = _line(f"{2.11:9.2f}{'':11}OBSERVATION DATA    G (GPS)", "RINEX VERSION / TYPE")
+    out += _line("".join(f"{x:14.4f}" for x in approximate_m), "APPROX POSITION XYZ")
+    out += _line(f"{antenna_height_m:14.4f}{0:14.4f}{0:14.4f}", "ANTENNA: DELTA H/E/N")
+    out += _line("     1     1", "WAVELENGTH FACT L1/2")
+    out += _line("     4    C1    L1    P2    L2", "# / TYPES OF OBSERV")
+    out += _line("  2024     5    15    12     0    0.0000000     GPS", "TIME OF FIRST OBS")
+    out += _line("", "END OF HEADER")
+    for epoch in epochs:
+        when, second = _when(epoch.t)
+        names = "".join(f"G{prn:2d}" for prn in epoch.seen)
+        out += f" {when:%y} {when.month:2d} {when.day:2d} {when.hour:2d} {when.minute:2d}{second:11.7f}  0"
+        out += f"{len(epoch.seen):3d}{names}\n"
+        for values in epoch.seen.values():
+            out += "".join(f"{x:14.3f}  " for x in values) + "\n"
+    return out
+
+
+def rinex3(epochs: list[Epoch], approximate_m: Float64) -> str:
+    """RINEX 3.04 with C1C, L1C, C2W, L2W."""
+    out = _line(f"{3.04:9.2f}{'':11}OBSERVATION DATA    G: GPS", "RINEX VERSION / TYPE")
+    out += _line("".join(f"{x:14.4f}" for x in approximate_m), "APPROX POSITION XYZ")
+    out += _line("G    4 C1C L1C C2W L2W", "SYS / # / OBS TYPES")
+    out += _line("  2024     5    15    12     0    0.0000000     GPS", "TIME OF FIRST OBS")
+    out += _line("", "END OF HEADER")
+    for epoch in epochs:
+        when, second = _when(epoch.t)
+        out += f"> {when:%Y %m %d %H %M}{second:11.7f}  0{len(epoch.seen):3d}\n"
+        for prn, values in epoch.seen.items():
+            out += f"G{prn:02d}" + "".join(f"{x:14.3f}  " for x in values) + "\n"
+    return out
+
+
+def navigation() -> str:
+    """RINEX 2.10 navigation file of all satellites; the ionosphere's coefficients are too small to matter."""
+    out = _line(f"{2.10:9.2f}{'':11}N: GPS NAV DATA", "RINEX VERSION / TYPE")
+    out += _line("  " + "".join(_number(1e-12)[7:] for _ in range(4)), "ION ALPHA")
+    out += _line("  " + "".join(_number(1e3)[7:] for _ in range(4)), "ION BETA")
+    out += _line("", "END OF HEADER")
+    for s in SATELLITES:
+        out += f"{s.prn:2d} 24  5 15 12  0  0.0" + "".join(map(_number, (0, 0, 0))) + "\n"
+        for row in (
+            (1, 0, 0, s.anomaly), (0, 0, 0, np.sqrt(AXIS_M)), (TOE_S, 0, s.node, 0), (INCLINATION, 0, 0, 0),
+            (0, 1, WEEK, 0), (2, 0, 0, 1), (TOE_S - 1800, 4),
+        ):  # fmt: skip
+            out += "   " + "".join(map(_number, row)) + "\n"
+    return out
+
+
+def _number(x: float) -> str:
+    return f"{x:19.12E}".replace("E", "D")
+
+
+def ubx(epochs: list[Epoch]) -> bytes:
+    """RXM-RAWX of each epoch (u-blox F9 HPG 1.32, UBX-22008968, 3.17.5): L1 C/A, and L2 CL for the second carrier."""
+    out = b""
+    for epoch in epochs:
+        payload = struct.pack("<dHbBBBH", TOE_S + epoch.t, WEEK, 18, 2 * len(epoch.seen), 1, 1, 0)
+        for prn, (c1, l1, c2, l2) in epoch.seen.items():
+            for signal, code, carrier in ((0, c1, l1), (3, c2, l2)):
+                payload += struct.pack(
+                    "<ddfBBBBHBBBBBB", code, carrier, 0.0, 0, prn, signal, 0, 60_000, 45, 5, 1, 6, 0b0111, 0
+                )
+        body = struct.pack("<BBH", 0x02, 0x15, len(payload)) + payload
+        a = b = 0
+        for byte in body:
+            a = (a + byte) & 0xFF
+            b = (b + a) & 0xFF
+        out += b"\xb5\x62" + body + bytes([a, b])
+    return out
+
+
+def ecef(latitude_deg: float, longitude_deg: float, height_m: float) -> Float64:
+    """Geocentric position on the ellipsoid of WGS 84."""
+    a, e2 = 6_378_137.0, 0.00669437999014
+    la, lo = np.radians([latitude_deg, longitude_deg])
+    n = a / np.sqrt(1 - e2 * np.sin(la) ** 2)
+    return np.array(
+        [
+            (n + height_m) * np.cos(la) * np.cos(lo),
+            (n + height_m) * np.cos(la) * np.sin(lo),
+            (n * (1 - e2) + height_m) * np.sin(la),
+        ]
+    )
+
+
+def enu_axes(latitude_deg: float, longitude_deg: float) -> Float64:
+    """East, north, up as rows (3, 3)."""
+    la, lo = np.radians([latitude_deg, longitude_deg])
+    return np.array(
+        [
+            [-np.sin(lo), np.cos(lo), 0.0],
+            [-np.sin(la) * np.cos(lo), -np.sin(la) * np.sin(lo), np.cos(la)],
+            [np.cos(la) * np.cos(lo), np.cos(la) * np.sin(lo), np.sin(la)],
+        ]
+    )

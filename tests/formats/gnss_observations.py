@@ -1,4 +1,4 @@
-"""Observations of GPS satellites on circular orbits, by IS-GPS-200 (20.3.3.4.3) and nothing of roadscan, as RINEX and UBX.
+"""Observations of GPS satellites on circular orbits, by IS-GPS-200 (20.3.3.4.3) and none of roadscan's code.
 
 Clocks of satellites and receivers are right and there is no ionosphere; the troposphere is 2.4 m over the sine of the
 elevation.
@@ -19,12 +19,29 @@ Float64 = npt.NDArray[np.float64]
 MU, OMEGA_EARTH, LIGHT = 3.986005e14, 7.2921151467e-5, 299_792_458.0
 WAVES_M = (LIGHT / 1575.42e6, LIGHT / 1227.60e6)
 AXIS_M, INCLINATION = 26_559_710.0, np.radians(55.0)
-WEEK, TOE_S = 2314, 302_400
-"""GPS week, and time of ephemeris in it: Wednesday 2024-05-15, 12:00:00 GPST."""
-BEGIN = dt.datetime(2024, 5, 15, 12, 0)
 ZENITH_DELAY_M = 2.4
 LEAST_ELEVATION = np.radians(12.0)
 CODE_SIGMA_M, CARRIER_SIGMA_M = 0.3, 0.002
+
+
+@dataclass(frozen=True)
+class Sky:
+    """When the ephemerides are of; times count from there."""
+
+    week: int = 2314
+    toe_s: int = 302_400
+    """Second of the GPS week: with that week, Wednesday 2024-05-15, 12:00:00 GPST."""
+
+    @property
+    def begin(self) -> dt.datetime:
+        return dt.datetime(1980, 1, 6) + dt.timedelta(weeks=self.week, seconds=self.toe_s)
+
+    def when(self, t: float) -> tuple[dt.datetime, float]:
+        when = self.begin + dt.timedelta(seconds=float(np.floor(t)))
+        return when, when.second + float(t - np.floor(t))
+
+
+SKY = Sky()
 
 
 @dataclass(frozen=True)
@@ -35,10 +52,10 @@ class Satellite:
     anomaly: float
     """Mean anomaly at the time of ephemeris (rad)."""
 
-    def position(self, since_toe_s: float) -> Float64:
+    def position(self, since_toe_s: float, toe_s: float) -> Float64:
         """Earth-fixed position (3,) at a time, of a circular orbit."""
         u = self.anomaly + np.sqrt(MU / AXIS_M**3) * since_toe_s
-        node = self.node - OMEGA_EARTH * (since_toe_s + TOE_S)
+        node = self.node - OMEGA_EARTH * (since_toe_s + toe_s)
         x, y = AXIS_M * np.cos(u), AXIS_M * np.sin(u)
         return np.array(
             [
@@ -56,11 +73,11 @@ SATELLITES = tuple(
 )
 
 
-def distance(satellite: Satellite, t: float, receiver_m: Float64) -> tuple[float, float]:
+def distance(satellite: Satellite, t: float, receiver_m: Float64, toe_s: float) -> tuple[float, float]:
     """Distance (m) at reception, and elevation (rad)."""
     delay = 0.07
     for _ in range(4):
-        away = satellite.position(t - delay)
+        away = satellite.position(t - delay, toe_s)
         turn = OMEGA_EARTH * delay
         at = np.array(
             [np.cos(turn) * away[0] + np.sin(turn) * away[1], np.cos(turn) * away[1] - np.sin(turn) * away[0], away[2]]
@@ -79,7 +96,7 @@ class Epoch:
     """By satellite: code (m) and carrier (cycles) on L1, the same on L2."""
 
 
-def observe(path_m: Callable[[float], Float64], times_s: Float64, seed: int = 1) -> list[Epoch]:
+def observe(path_m: Callable[[float], Float64], times_s: Float64, seed: int = 1, sky: Sky = SKY) -> list[Epoch]:
     """Observations of a receiver on its way."""
     rng = np.random.default_rng(seed)
     whole = {s.prn: rng.integers(-(10**6), 10**6, 2) for s in SATELLITES}
@@ -87,7 +104,7 @@ def observe(path_m: Callable[[float], Float64], times_s: Float64, seed: int = 1)
     for t in times_s:
         seen = {}
         for s in SATELLITES:
-            range_m, elevation = distance(s, float(t), path_m(float(t)))
+            range_m, elevation = distance(s, float(t), path_m(float(t)), sky.toe_s)
             if elevation < LEAST_ELEVATION:
                 continue
             path = range_m + ZENITH_DELAY_M / np.sin(elevation)
@@ -104,22 +121,17 @@ def _line(text: str, label: str) -> str:
     return f"{text:<60}{label}\n"
 
 
-def _when(t: float) -> tuple[dt.datetime, float]:
-    when = BEGIN + dt.timedelta(seconds=float(np.floor(t)))
-    return when, when.second + float(t - np.floor(t))
-
-
-def rinex2(epochs: list[Epoch], approximate_m: Float64, antenna_height_m: float = 0.0) -> str:
+def rinex2(epochs: list[Epoch], approximate_m: Float64, antenna_height_m: float = 0.0, sky: Sky = SKY) -> str:
     """RINEX 2.11 with C1, L1, P2, L2."""
     out = _line(f"{2.11:9.2f}{'':11}OBSERVATION DATA    G (GPS)", "RINEX VERSION / TYPE")
     out += _line("".join(f"{x:14.4f}" for x in approximate_m), "APPROX POSITION XYZ")
     out += _line(f"{antenna_height_m:14.4f}{0:14.4f}{0:14.4f}", "ANTENNA: DELTA H/E/N")
     out += _line("     1     1", "WAVELENGTH FACT L1/2")
     out += _line("     4    C1    L1    P2    L2", "# / TYPES OF OBSERV")
-    out += _line("  2024     5    15    12     0    0.0000000     GPS", "TIME OF FIRST OBS")
+    out += _line(f"{sky.begin:  %Y    %m    %d    %H    %M}    0.0000000     GPS", "TIME OF FIRST OBS")
     out += _line("", "END OF HEADER")
     for epoch in epochs:
-        when, second = _when(epoch.t)
+        when, second = sky.when(epoch.t)
         names = "".join(f"G{prn:2d}" for prn in epoch.seen)
         out += f" {when:%y} {when.month:2d} {when.day:2d} {when.hour:2d} {when.minute:2d}{second:11.7f}  0"
         out += f"{len(epoch.seen):3d}{names}\n"
@@ -136,24 +148,24 @@ def rinex3(epochs: list[Epoch], approximate_m: Float64) -> str:
     out += _line("  2024     5    15    12     0    0.0000000     GPS", "TIME OF FIRST OBS")
     out += _line("", "END OF HEADER")
     for epoch in epochs:
-        when, second = _when(epoch.t)
+        when, second = SKY.when(epoch.t)
         out += f"> {when:%Y %m %d %H %M}{second:11.7f}  0{len(epoch.seen):3d}\n"
         for prn, values in epoch.seen.items():
             out += f"G{prn:02d}" + "".join(f"{x:14.3f}  " for x in values) + "\n"
     return out
 
 
-def navigation() -> str:
+def navigation(sky: Sky = SKY) -> str:
     """RINEX 2.10 navigation file of all satellites; the ionosphere's coefficients are too small to matter."""
     out = _line(f"{2.10:9.2f}{'':11}N: GPS NAV DATA", "RINEX VERSION / TYPE")
     out += _line("  " + "".join(_number(1e-12)[7:] for _ in range(4)), "ION ALPHA")
     out += _line("  " + "".join(_number(1e3)[7:] for _ in range(4)), "ION BETA")
     out += _line("", "END OF HEADER")
     for s in SATELLITES:
-        out += f"{s.prn:2d} 24  5 15 12  0  0.0" + "".join(map(_number, (0, 0, 0))) + "\n"
+        out += f"{s.prn:2d} {sky.begin:%y %m %d %H %M %S}.0" + "".join(map(_number, (0, 0, 0))) + "\n"
         for row in (
-            (1, 0, 0, s.anomaly), (0, 0, 0, np.sqrt(AXIS_M)), (TOE_S, 0, s.node, 0), (INCLINATION, 0, 0, 0),
-            (0, 1, WEEK, 0), (2, 0, 0, 1), (TOE_S - 1800, 4),
+            (1, 0, 0, s.anomaly), (0, 0, 0, np.sqrt(AXIS_M)), (sky.toe_s, 0, s.node, 0), (INCLINATION, 0, 0, 0),
+            (0, 1, sky.week, 0), (2, 0, 0, 1), (sky.toe_s - 1800, 4),
         ):  # fmt: skip
             out += "   " + "".join(map(_number, row)) + "\n"
     return out
@@ -167,7 +179,7 @@ def ubx(epochs: list[Epoch]) -> bytes:
     """RXM-RAWX of each epoch (u-blox F9 HPG 1.32, UBX-22008968, 3.17.5): L1 C/A, and L2 CL for the second carrier."""
     out = b""
     for epoch in epochs:
-        payload = struct.pack("<dHbBBBH", TOE_S + epoch.t, WEEK, 18, 2 * len(epoch.seen), 1, 1, 0)
+        payload = struct.pack("<dHbBBBH", SKY.toe_s + epoch.t, SKY.week, 18, 2 * len(epoch.seen), 1, 1, 0)
         for prn, (c1, l1, c2, l2) in epoch.seen.items():
             for signal, code, carrier in ((0, c1, l1), (3, c2, l2)):
                 payload += struct.pack(

@@ -14,6 +14,7 @@ import pyarrow as pa
 from roadscan.core.crs import geographic_of, world_frame_of
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing
 from roadscan.core.settings.ppk import PpkBase, PpkSettings
+from roadscan.formats.motion.nmea import Nmea
 from roadscan.formats.motion.ppk_checks import (
     Separation,
     Track,
@@ -36,13 +37,18 @@ from roadscan.formats.motion.rtklib_programs import (
     need_program,
     programs_digest,
 )
+from roadscan.formats.motion.ubx import Ubx
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import options_of
+from roadscan.ingest.reading.text_table import head_of
 
 if TYPE_CHECKING:
     from roadscan.core.survey import Survey
 
 WHAT: Final = "post-processing of GNSS observations"
+RAWX: Final = b"\xb5\x62\x02\x15"
+"""Sync characters, class and identifier of UBX-RXM-RAWX."""
+_SNIFF_BYTES: Final = 1 << 16  # bytes from which a recording is recognised
 _BINS: Final = 400
 """Differences of both directions that a log's record keeps for the picture: as many as it has pixels for them."""
 
@@ -57,7 +63,7 @@ class PpkOptions(PpkSettings):
 
 class Ppk(LogFormat):
     """Observations of code and carrier phase: RINEX 2 or 3, also packed with gzip, bzip2 or xz, or a UBX recording with
-    RXM-RAWX (state format = "ppk": without it, its NAV-PVT is read as [`ubx`](#ubx)).
+    RXM-RAWX (state format = "ppk" where it holds NAV-PVT or NMEA, too, which are read otherwise).
 
     RTKLIB computes positions from them, from those of a base station and from navigation files; they become rows like
     those of an RTKLIB solution ([`rtklib_pos`](#rtklib_pos)), in the datum of the base. `[navigation.ppk]` states base
@@ -73,8 +79,10 @@ class Ppk(LogFormat):
     options = PpkOptions
 
     def sniff(self, path: Path) -> bool:
-        """True for RINEX observations."""
-        return rinex_kind(path) == "O"
+        """True for RINEX observations, and for UBX with raw observations and no positions."""
+        if rinex_kind(path) == "O":
+            return True
+        return is_ubx(path) and RAWX in head_of(path, _SNIFF_BYTES) and not any(f.sniff(path) for f in (Ubx(), Nmea()))
 
     def shared_options(self, survey: Survey) -> dict[str, Any]:
         """Return `[navigation.ppk]`, its files absolute."""

@@ -34,7 +34,7 @@ _SLOWEST_BYTES_PER_S: Final = 20_000.0
 """A program that processes fewer bytes of observations a second has been caught by damaged ones: RTKLIB processes a
 hundred times as many."""
 PACKING_FAULTS: Final = (EOFError, OSError, zlib.error, lzma.LZMAError)
-_LEAST_S: Final = 60.0  # a program is given this long at least
+_LEAST_S: Final = 15.0  # a program is given this long at least, a hundred times what a short log takes
 _SYSTEM_BITS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}  # option pos1-navsys
 _SINGLE_INTERVAL_S: Final = 30  # interval of the base's own solutions: slower than their errors change
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import re
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ pytestmark = pytest.mark.skipif(
     shutil.which("rnx2rtkp") is None, reason="RTKLIB is not on PATH: apt-get install rtklib"
 )
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 ROVER, BASE, ORBITS = "07590920.05o", "30400920.05o", "30400920.05n"
 BASE_M = (-3978241.958, 3382840.234, 3649900.853)
 ROVER_DEG, ROVER_M = (35.160865959, 139.613843021), ecef(35.160865959, 139.613843021, 68.381)
@@ -313,3 +315,23 @@ def test_the_section_is_for_logs_of_the_format(tmp_path: Path) -> None:
     (tmp_path / "SURVEY.toml").write_text(SURVEY.replace("MODE", "static").replace('format = "ppk", ', ""))
     with pytest.raises(ConfigError, match='no log has format = "ppk"'):
         Survey.load(tmp_path / "SURVEY.toml")
+
+
+# --- the page --------------------------------------------------------------------------------------
+
+
+def test_the_pages_commands_print_what_it_shows(
+    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copyfile(REPOSITORY / "examples" / "real-data" / "quay.toml", tmp_path / "quay.toml")
+    (tmp_path / "recordings").symlink_to(recordings)
+    monkeypatch.chdir(tmp_path)
+    page = (REPOSITORY / "docs" / "ppk.md").read_text()
+    shown = re.findall(r"^\$ roadscan (.*)\n((?:[^$`].*\n)*)", page, flags=re.MULTILINE)
+    assert len(shown) == 3
+    for words, lines in shown:
+        done = roadscan(*shlex.split(words))
+        assert done.exit_code == 0, done.output
+        assert [one for one in lines.splitlines() if one != "…" and one.rstrip() not in done.output] == []
+    survey = re.findall(r"^```toml\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    assert survey[0].strip() in (tmp_path / "quay.toml").read_text()

@@ -102,9 +102,9 @@ def observe(path_m: Callable[[float], Float64], times_s: Float64, seed: int = 1,
     whole = {s.prn: rng.integers(-(10**6), 10**6, 2) for s in SATELLITES}
     epochs = []
     for t in times_s:
-        seen = {}
+        seen, at_m = {}, path_m(float(t))
         for s in SATELLITES:
-            range_m, elevation = distance(s, float(t), path_m(float(t)), sky.toe_s)
+            range_m, elevation = distance(s, float(t), at_m, sky.toe_s)
             if elevation < LEAST_ELEVATION:
                 continue
             path = range_m + ZENITH_DELAY_M / np.sin(elevation)

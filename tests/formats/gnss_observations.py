@@ -155,8 +155,8 @@ def rinex3(epochs: list[Epoch], approximate_m: Float64) -> str:
     return out
 
 
-def navigation(sky: Sky = SKY) -> str:
-    """RINEX 2.10 navigation file of all satellites; the ionosphere's coefficients are too small to matter."""
+def navigation(sky: Sky = SKY, ahead_rad: float = 0.0) -> str:
+    """RINEX 2.10 navigation file of all satellites, wrong by an angle along their orbits; next to no ionosphere."""
     out = _line(f"{2.10:9.2f}{'':11}N: GPS NAV DATA", "RINEX VERSION / TYPE")
     out += _line("  " + "".join(_number(1e-12)[7:] for _ in range(4)), "ION ALPHA")
     out += _line("  " + "".join(_number(1e3)[7:] for _ in range(4)), "ION BETA")
@@ -164,11 +164,34 @@ def navigation(sky: Sky = SKY) -> str:
     for s in SATELLITES:
         out += f"{s.prn:2d} {sky.begin:%y %m %d %H %M %S}.0" + "".join(map(_number, (0, 0, 0))) + "\n"
         for row in (
-            (1, 0, 0, s.anomaly), (0, 0, 0, np.sqrt(AXIS_M)), (sky.toe_s, 0, s.node, 0), (INCLINATION, 0, 0, 0),
-            (0, 1, sky.week, 0), (2, 0, 0, 1), (sky.toe_s - 1800, 4),
+            (1, 0, 0, s.anomaly + ahead_rad), (0, 0, 0, np.sqrt(AXIS_M)), (sky.toe_s, 0, s.node, 0),
+            (INCLINATION, 0, 0, 0), (0, 1, sky.week, 0), (2, 0, 0, 1), (sky.toe_s - 1800, 4),
         ):  # fmt: skip
             out += "   " + "".join(map(_number, row)) + "\n"
     return out
+
+
+def sp3(hours: float = 4.0) -> str:
+    """SP3-c of all satellites every 15 minutes from some hours before to as many after, with clocks that are right."""
+    count = int(8 * hours) + 1
+    begin = SKY.begin - dt.timedelta(hours=hours)
+    first = f"{begin:%Y} {begin.month:2d} {begin.day:2d} {begin.hour:2d} {begin.minute:2d}"
+    out = f"#cP{first}  0.00000000 {count:7d} ORBIT\n"
+    out += f"## {SKY.week:4d} {SKY.toe_s - 3600 * hours:15.8f}   900.00000000 60445 0.5000000000000\n"
+    names = [f"G{s.prn:02d}" for s in SATELLITES] + ["  0"] * (85 - len(SATELLITES))
+    for k in range(5):
+        head = f"+   {len(SATELLITES):2d}   " if k == 0 else "+        "
+        out += head + "".join(names[17 * k : 17 * (k + 1)]) + "\n"
+    out += ("++       " + "  0" * 17 + "\n") * 5
+    out += ("%c G  cc GPS ccc cccc cccc cccc cccc ccccc ccccc ccccc ccccc\n") + "%c cc cc ccc\n"
+    out += "%f  1.2500000  1.025000000  0.00000000000  0.000000000000000\n%f\n%i\n%i\n" + "/*\n" * 4
+    for k in range(count):
+        when = begin + dt.timedelta(minutes=15 * k)
+        out += f"*  {when:%Y} {when.month:2d} {when.day:2d} {when.hour:2d} {when.minute:2d}  0.00000000\n"
+        for s in SATELLITES:
+            x, y, z = s.position(900.0 * k - 3600 * hours, SKY.toe_s) / 1000
+            out += f"PG{s.prn:02d}{x:14.6f}{y:14.6f}{z:14.6f}{0.0:14.6f}\n"
+    return out + "EOF\n"
 
 
 def _number(x: float) -> str:

@@ -21,7 +21,7 @@ from roadscan.ingest.reading.format import format_of
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from tests.answers import roadscan
-from tests.formats.gnss_observations import SKY, ecef, enu_axes, navigation, observe, rinex2, rinex3, ubx
+from tests.formats.gnss_observations import SKY, ecef, enu_axes, navigation, observe, rinex2, rinex3, sp3, ubx
 from tests.formats.log_reading import Log, read_log
 from tests.pictures import drawn
 
@@ -75,6 +75,13 @@ def sample(folder: Path) -> Path:
     (folder / "base.obs").write_text(rinex2(BASE_SEEN[:12], MARK_M))
     (folder / "rover.obs").write_text(rinex2(ROVER_SEEN[:12], drive(0.0)))
     return folder / "rover.obs"
+
+
+def sample_ubx(folder: Path) -> Path:
+    """The same rover as UBX."""
+    sample(folder).unlink()
+    (folder / "rover.ubx").write_bytes(ubx(ROVER_SEEN[:12]))
+    return folder / "rover.ubx"
 
 
 def sample_options(**changes: Any) -> dict[str, Any]:
@@ -209,6 +216,17 @@ def test_antennas_with_other_phase_centres(driven: Path) -> None:
     assert np.abs(moved.mean(axis=0) - [0.0, 0.0, -0.04]).max() < 0.003
 
 
+def test_precise_orbits_go_before_the_broadcast_ones(driven: Path) -> None:
+    """The broadcast orbits are 2.7 km off along the way: code observations contradict one another."""
+    (driven / "late.nav").write_text(navigation(ahead_rad=1e-4))
+    (driven / "igs.sp3").write_text(sp3())
+    late = sample_options() | {"navigation": ["late.nav"]}
+    with pytest.raises(RoadscanError, match="found no position at any epoch"):
+        read_log("ppk", driven / "rover.obs", late)
+    log = read_log("ppk", driven / "rover.obs", late | {"precise": ["igs.sp3"]})
+    assert np.abs(off_enu_m(log)[:, :2]).max() < 0.02 and np.abs(off_enu_m(log)[:, 2]).max() < 0.06
+
+
 @pytest.mark.witness("ppk_common_time")
 def test_a_base_of_another_time(driven: Path, tmp_path: Path) -> None:
     for name in ("rover.obs", "brdc.nav"):
@@ -335,3 +353,44 @@ def test_the_pages_commands_print_what_it_shows(
         assert [one for one in lines.splitlines() if one != "…" and one.rstrip() not in done.output] == []
     survey = re.findall(r"^```toml\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
     assert survey[0].strip() in (tmp_path / "quay.toml").read_text()
+
+
+# --- looking at files ------------------------------------------------------------------------------
+
+
+def test_a_rover_of_which_nothing_is_stated_is_looked_at(driven: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")  # without RTKLIB
+    done = roadscan("inspect", driven / "rover.obs")
+    assert done.exit_code == 0
+    for words in (
+        "60 rows of gnss, 1 a second",
+        "options.base =",
+        "options.navigation =",
+        "rinex = 2.11",
+        "2024-05-15",
+    ):
+        assert words in done.output
+    assert "nan" not in done.output
+
+
+def test_files_of_orbits_name_their_way(driven: Path) -> None:
+    (driven / "packed.crx").write_text(f"{'1.0':<20}{'COMPACT RINEX FORMAT':<40}CRINEX VERS   / TYPE\n")
+    (driven / "igs.sp3").write_text("#cP2024  5 15  0  0  0.00000000      96 ORBIT IGS20 HLM  IGS\n")
+    for name, words in (("brdc.nav", "takes orbits"), ("packed.crx", "crx2rnx"), ("igs.sp3", "precise orbits")):
+        done = roadscan("inspect", driven / name)
+        assert words in done.output and "roadscan ppk" in done.output
+
+
+def test_a_first_survey_file_asks_for_the_base(driven: Path, tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    shutil.copyfile(driven / "rover.obs", tmp_path / "logs" / "rover.obs")
+    done = roadscan("init", tmp_path / "logs", "--out", tmp_path / "SURVEY.toml")
+    assert done.exit_code == 0, done.output
+    text = (tmp_path / "SURVEY.toml").read_text()
+    assert 'format = "ppk"' in text and '#? options.base = "????"' in text and "#? options.navigation" in text
+    answered = text.replace('#? options.base = "????"', "#").replace('#? options.navigation = ["????"]', "#")
+    (tmp_path / "SURVEY.toml").write_text(answered.replace('#? crs = "????"', 'crs = "EPSG:25832"'))
+    rig = (tmp_path / "RIG.toml").read_text()
+    (tmp_path / "RIG.toml").write_text(rig.replace("#? ", "").replace("????", "0.0"))
+    refused = roadscan("run", tmp_path / "SURVEY.toml")
+    assert "the base station of raw GNSS observations is not stated" in str(refused.exception)

@@ -528,9 +528,10 @@ def _poses() -> Iterator[Sample]:
     yield Sample(
         "rtklib_pos", "gz", file("a.pos.gz", lambda: gzip.compress(test_rtklib_pos.sample())), {}, sat, inside=GZIP
     )
-    ppk: dict[str, Any] = {"options": test_ppk.sample_options(), "text": True, "native": True}
-    yield Sample("ppk", "rover", _with_rtklib(test_ppk.sample), **ppk)
-    yield Sample("ppk", "base", _with_rtklib(test_ppk.sample), damaged=("base.obs", "brdc.nav"), **ppk)
+    ppk: dict[str, Any] = {"options": test_ppk.sample_options(), "native": True}
+    yield Sample("ppk", "rover", _with_rtklib(test_ppk.sample), text=True, **ppk)
+    yield Sample("ppk", "base", _with_rtklib(test_ppk.sample), text=True, damaged=("base.obs", "brdc.nav"), **ppk)
+    yield Sample("ppk", "ubx", _with_rtklib(test_ppk.sample_ubx), **ppk)
     yield Sample("ubx", "plain", file("a.ubx", test_ubx.sample), {}, sat, spans=every(100))
     for untimed in ("before", "after"):
         yield Sample("nmea", untimed, file("a.nmea", nmea), {"untimed": untimed}, sat, text=True, inside=nmea_inside)

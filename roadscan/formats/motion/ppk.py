@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -39,6 +40,7 @@ from roadscan.formats.motion.rtklib_programs import (
 )
 from roadscan.formats.motion.ubx import Ubx
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
+from roadscan.ingest.reading.gnss import NO_POSITION, QUALITIES
 from roadscan.ingest.reading.records import options_of
 from roadscan.ingest.reading.text_table import head_of
 
@@ -49,8 +51,16 @@ WHAT: Final = "post-processing of GNSS observations"
 RAWX: Final = b"\xb5\x62\x02\x15"
 """Sync characters, class and identifier of UBX-RXM-RAWX."""
 _SNIFF_BYTES: Final = 1 << 16  # bytes from which a recording is recognised
+_CHUNK_ROWS: Final = 100_000  # rows that are yielded at once, 2 MB
 _BINS: Final = 400
 """Differences of both directions that a log's record keeps for the picture: as many as it has pixels for them."""
+
+
+_UNKNOWN: Final = "????"
+_UNKNOWN_BASE: Final = {
+    "files": [_UNKNOWN], "crs": "EPSG:7930", "x_m": 6378137.0, "y_m": 0.0, "z_m": 0.0, "antenna_height_m": 0.0,
+}  # fmt: skip
+"""The base that `roadscan inspect` assumes to see a rover's epochs; no file has this name, so that no run takes it."""
 
 
 class PpkOptions(PpkSettings):
@@ -102,23 +112,23 @@ class Ppk(LogFormat):
         world = _world(source, base)
         base_position_m(base, source.path)
         files = [source.path, *(beside(source.path, one) for one in base.files)]
+        station = rinex_header(source.path)
         if not settings.navigation and not any(map(is_ubx, files)):
             raise ConfigError(
                 "no navigation file is stated, which holds the satellites' orbits",
                 expected="navigation, one or more RINEX navigation files of the day",
                 file=source.path,
-                missing=Missing("options.navigation"),
+                missing=Missing("options.navigation", [_UNKNOWN]),
             )
-        list(antenna_findings(settings, rinex_header(files[0]), rinex_header(files[1]), source.path))
-        need_program(SOLVER, WHAT)
+        list(antenna_findings(settings, station, rinex_header(files[1]), source.path))
         if any(map(is_ubx, files)):
             need_program(CONVERTER, "a UBX recording")
-        return LogHeader(
-            {
-                "world_frame": world, "read": "raw observations, post-processed by RTKLIB",
-                "base": base.model_dump(mode="json", exclude={"files"}, exclude_none=True),
-            }
-        )  # fmt: skip
+        said = {name: value for name, value in dataclasses.asdict(station).items() if value}
+        if _is_unknown(base):
+            return LogHeader(said)
+        need_program(SOLVER, WHAT)
+        stated = base.model_dump(mode="json", exclude={"files"}, exclude_none=True)
+        return LogHeader({"world_frame": world, **said, "base": stated})
 
     def beginning(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Yield the base's position, which is near the drive: nothing is computed before the run."""
@@ -127,9 +137,15 @@ class Ppk(LogFormat):
         yield Rows("gnss", pa.RecordBatch.from_pydict(dict(columns)))
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
-        """Compute the positions, compare them with their witnesses, and stream them."""
+        """Compute the positions, compare them with their witnesses, and stream them.
+
+        An unknown base, which only `roadscan inspect` assumes, gives the rover's epochs alone.
+        """
         with tempfile.TemporaryDirectory(prefix="roadscan-ppk-") as folder:
-            yield from processed(source, header, Path(folder))
+            if _is_unknown(_base(source)):
+                yield from _epochs_alone(source, Path(folder))
+            else:
+                yield from processed(source, header, Path(folder))
 
 
 def processed(source: LogSource, header: LogHeader, folder: Path) -> Iterator[Item]:
@@ -176,6 +192,20 @@ def processed(source: LogSource, header: LogHeader, folder: Path) -> Iterator[It
     }  # fmt: skip
 
 
+def _epochs_alone(source: LogSource, folder: Path) -> Iterator[Item]:
+    """Yield the rover's epochs, which have no position."""
+    rover = Workplace(folder, _settings(source), source.path).put("rover", [source.path])
+    epochs = _observed(rover, "rover", source.path)
+    for first in range(0, epochs.size, _CHUNK_ROWS):
+        part = epochs[first : first + _CHUNK_ROWS]
+        columns = {"epoch_gps_ns": part, "quality": np.full(part.size, QUALITIES[NO_POSITION])}
+        yield Rows("gnss", pa.RecordBatch.from_pydict(columns), first_record=first)
+
+
+def _is_unknown(base: PpkBase) -> bool:
+    return base.files == [Path(_UNKNOWN)]
+
+
 def _settings(source: LogSource) -> PpkSettings:
     return options_of(source, PpkOptions)
 
@@ -188,7 +218,7 @@ def _base(source: LogSource) -> PpkBase:
             expected="[navigation.ppk] with base = { files, crs, epoch, x_m, y_m, z_m, antenna_height_m }; the "
             "approximate position in the header of its file is not used",
             file=source.path,
-            missing=Missing("options.base"),
+            missing=Missing("options.base", _UNKNOWN_BASE),
         )
     return base
 

@@ -30,7 +30,8 @@ _TWO_DIGITS: Final = 80  # years 80 to 99 of RINEX 2 are of the 20th century
 class RinexHeader:
     """What the header of an observation file says of its station."""
 
-    version: str
+    rinex: str
+    """Version of the format."""
     approximate_m: tuple[float, ...] | None
     """Approximate geocentric position (m), often a code solution of the receiver; None where it is not said, or 0."""
     antenna_height_m: float | None

@@ -192,6 +192,16 @@ def test_other_files_give_the_same(driven: Path, rover: str, base: str) -> None:
     assert np.abs(log.positions - same.positions).max() < 0.002
 
 
+def test_damaged_messages_are_counted(driven: Path) -> None:
+    whole = bytearray((driven / "rover.ubx").read_bytes())
+    whole[len(whole) // 2 + 50] ^= 0xFF
+    (driven / "damaged.ubx").write_bytes(whole)
+    log = read_log("ppk", driven / "damaged.ubx", sample_options(files=["base.ubx"]))
+    assert len(log.epochs) == 59 and [(one.records, one.reason[:16]) for one in log.rejects] == [
+        (1, "the message RXM-")
+    ]
+
+
 def test_antenna_heights(driven: Path) -> None:
     """The base's mark is 2 m below its antenna, the wanted point 1.5 m below the rover's."""
     lower = {name: float(x) for name, x in zip(("x_m", "y_m", "z_m"), MARK_M - 2 * AXES[2], strict=True)}

@@ -42,7 +42,7 @@ from roadscan.formats.motion.ubx import Ubx
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.gnss import NO_POSITION, QUALITIES
 from roadscan.ingest.reading.records import options_of
-from roadscan.ingest.reading.text_table import head_of
+from roadscan.ingest.reading.text_table import head_of, open_text
 
 if TYPE_CHECKING:
     from roadscan.core.survey import Survey
@@ -51,6 +51,7 @@ WHAT: Final = "post-processing of GNSS observations"
 RAWX: Final = b"\xb5\x62\x02\x15"
 """Sync characters, class and identifier of UBX-RXM-RAWX."""
 _SNIFF_BYTES: Final = 1 << 16  # bytes from which a recording is recognised
+_BLOCK_BYTES: Final = 4 << 20  # bytes that are read at once
 _CHUNK_ROWS: Final = 100_000  # rows that are yielded at once, 2 MB
 _BINS: Final = 400
 """Differences of both directions that a log's record keeps for the picture: as many as it has pixels for them."""
@@ -182,6 +183,8 @@ def processed(source: LogSource, header: LogHeader, folder: Path) -> Iterator[It
     forward, backward = _track(source, found["forward"]), _track(source, found["backward"])
     apart = Separation.of(forward, backward, world_frame_of(base.crs))
     yield from apart.findings()
+    if (damaged := _recorded(source.path) - int(epochs.size)) > 0:
+        yield Reject("the message RXM-RAWX is damaged, or holds no observation", records=damaged)
     if (lost := int(epochs.size) - solved) > 0:
         yield Reject("RTKLIB found no position at this epoch", records=lost)
     header.attributes["ppk"] = {
@@ -200,6 +203,18 @@ def _epochs_alone(source: LogSource, folder: Path) -> Iterator[Item]:
         part = epochs[first : first + _CHUNK_ROWS]
         columns = {"epoch_gps_ns": part, "quality": np.full(part.size, QUALITIES[NO_POSITION])}
         yield Rows("gnss", pa.RecordBatch.from_pydict(columns), first_record=first)
+
+
+def _recorded(path: Path) -> int:
+    """Return how many epochs a UBX recording has; 0 for other files."""
+    if not is_ubx(path):
+        return 0
+    count, held = 0, b""
+    with open_text(path) as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            count += (held + block).count(RAWX)
+            held = block[-len(RAWX) + 1 :]
+    return count
 
 
 def _is_unknown(base: PpkBase) -> bool:

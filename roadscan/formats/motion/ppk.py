@@ -32,7 +32,6 @@ from roadscan.formats.motion.rtklib_programs import (
     ANTENNAS,
     CONVERTER,
     SOLVER,
-    Direction,
     Workplace,
     is_ubx,
     need_program,
@@ -169,10 +168,8 @@ def processed(source: LogSource, header: LogHeader, folder: Path) -> Iterator[It
         _track(source, place.single("base")), mark_m, base, rinex_header(observed[0]), source.path
     )
     yield from doubts
-    wanted: list[Direction] = ["forward", "backward", settings.direction]
-    found = {one: place.solve(one, mark_m.tolist()) for one in wanted}
-    found[settings.direction].rename(folder / "solution.pos")
-    found[settings.direction] = folder / "solution.pos"
+    found = place.solved(("forward", "backward", settings.direction), mark_m.tolist())
+    found[settings.direction] = found[settings.direction].rename(folder / "solution.pos")
     solved = fixed = 0
     for item in _rows(source, folder / "solution.pos"):
         if isinstance(item, Rows):

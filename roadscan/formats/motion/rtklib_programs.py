@@ -12,7 +12,8 @@ import re
 import shutil
 import subprocess
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, Literal
 
@@ -121,17 +122,20 @@ class Workplace:
         """Return observations of a UBX recording; its orbits go beside them."""
         raw, target = self.folder / f"{name}.ubx", self.folder / f"{name}.obs"
         _unpack(file, raw)
+        self.bytes += raw.stat().st_size
         program = need_program(CONVERTER, "a UBX recording")
         self._run([program, "-r", "ubx", "-os", "-od", "-o", target.name, "-n", f"nav-{name}.nav", raw.name], raw)
         raw.unlink()
         if not target.is_file() or rinex_kind(target) != "O":
             raise FormatError("the recording holds no raw observations", expected="UBX-RXM-RAWX", file=file)
-        self.bytes += target.stat().st_size
         return target
 
-    def solve(self, direction: Direction, base_m: Sequence[float]) -> Path:
-        """Return the file of the rover's positions, of one direction or both combined."""
-        return self._solved(direction, self._options(direction, base_m), ["rover*.obs", "base*.obs"])
+    def solved(self, directions: Iterable[Direction], base_m: Sequence[float]) -> dict[Direction, Path]:
+        """Return the files of the rover's positions by direction, which are computed beside one another."""
+        wanted, observed = list(dict.fromkeys(directions)), ["rover*.obs", "base*.obs"]
+        with ThreadPoolExecutor(len(wanted)) as threads:
+            files = threads.map(lambda one: self._solved(one, self._options(one, base_m), observed), wanted)
+            return dict(zip(wanted, files, strict=True))
 
     def single(self, role: str) -> Path:
         """Return the file of positions of a station by its own code observations, every 30 s."""
@@ -147,7 +151,7 @@ class Workplace:
         if not target.is_file() or not _has_positions(target):
             words = f": {said}" if said else ""
             raise FormatError(
-                f"RTKLIB found no position at any epoch{words}",
+                f"RTKLIB found no position of the {observed[0][:-5]} at any epoch{words}",
                 change="give navigation files of the day, and observations of one time",
                 file=self.log,
             )
@@ -186,7 +190,7 @@ class Workplace:
     def _run(self, command: list[Path | str], subject: Path) -> str:
         """Run a program in the folder; return the last thing that it says, where that is no report of progress."""
         most_s = _LEAST_S + self.bytes / _SLOWEST_BYTES_PER_S
-        heard = self.folder / "heard.txt"
+        heard = subject.with_suffix(".txt")
         with heard.open("wb") as out:
             try:
                 ended = subprocess.run(

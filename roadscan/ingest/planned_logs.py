@@ -23,7 +23,7 @@ from roadscan.ingest.reading.format import LogFormat, LogSource, SourceDefaults
 from roadscan.ingest.sources import Known, Sources, open_sources
 from roadscan.run.engine.fingerprint import grid_key, key_of
 from roadscan.run.session import Session, found_once
-from roadscan.store.logs import has_log
+from roadscan.store.logs import has_log, read_log_records
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 
@@ -177,7 +177,18 @@ def _plan_log(
             for checks in (_checks_of(format_), *_earlier_checks(format_))
         )
         key = next((one for one in earlier if has_log(store, one)), key)
+    if not has_log(store, key) and format_.lacks() is not None:
+        for programs in _programs_of(store, (run, name, content)):
+            computed = [{**one, "programs": programs} if one == options.shaping() else one for one in shaping]
+            kept = key_of(*computed, *_checks_of(format_))
+            key = kept if has_log(store, kept) else key
     return PlannedLog(run, name, config, format_, source, key, content, size, stamp)
+
+
+def _programs_of(store: Store, log: tuple[str, str, str]) -> list[str]:
+    """Return hashes of the programs that computed the stored rows of a log, by its run, sensor and content."""
+    own = (r for r in read_log_records(store, damaged=[]) if (r.run, r.sensor, r.content) == log)
+    return [str(r.attributes["programs"]) for r in own if "programs" in r.attributes]
 
 
 def _checks_of(format_: LogFormat) -> list[list[object]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import os
 import re
 import shlex
 import shutil
@@ -15,6 +16,7 @@ from PIL import Image
 
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.survey import Survey
+from roadscan.core.toml_text import toml
 from roadscan.formats.motion import rtklib_programs
 from roadscan.formats.motion.ppk_checks import Separation, Track
 from roadscan.ingest.reading.format import format_of
@@ -337,6 +339,27 @@ def test_another_program_computes_again(driven: Path, tmp_path: Path, monkeypatc
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
     assert rtklib_programs.programs_digest() != before
+
+
+def test_what_was_computed_is_kept_where_rtklib_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sample(tmp_path)
+    options = sample_options()
+    base = ", ".join(f"{name} = {toml(value)}" for name, value in options["base"].items())
+    file = tmp_path / "SURVEY.toml"
+    file.write_text(
+        'id = "one"\n[map]\ncrs = "EPSG:25832"\n[[runs]]\nid = "a"\nlogs = [{ path = "rover.obs", format = "ppk" }]\n'
+        f'[navigation.ppk]\nnavigation = ["brdc.nav"]\nbase = {{ {base} }}\n'
+    )
+    path = os.environ["PATH"]
+    monkeypatch.setenv("PATH", "")
+    assert "which is not on PATH" in str(roadscan("run", file, "--workers", "0").exception)
+    monkeypatch.setenv("PATH", path)
+    assert "read: a/gnss" in roadscan("run", file, "--workers", "0").output
+    monkeypatch.setenv("PATH", "")
+    again = roadscan("run", file, "--workers", "0")
+    assert again.exit_code == 0 and "known: a/gnss" in again.output
+    (tmp_path / "base.obs").write_text(rinex2(BASE_SEEN[:11], MARK_M))
+    assert "which is not on PATH" in str(roadscan("run", file, "--workers", "0").exception)
 
 
 def test_the_section_is_for_logs_of_the_format(tmp_path: Path) -> None:

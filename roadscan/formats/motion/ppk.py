@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from roadscan.core.crs import geographic_of, world_frame_of
-from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing
+from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError
 from roadscan.core.settings.ppk import PpkBase, PpkSettings
 from roadscan.formats.motion.nmea import Nmea
 from roadscan.formats.motion.ppk_checks import (
@@ -30,8 +30,8 @@ from roadscan.formats.motion.rinex import observed_epochs, rinex_header, rinex_k
 from roadscan.formats.motion.rtklib_pos import RtklibPos, RtklibPosOptions
 from roadscan.formats.motion.rtklib_programs import (
     ANTENNAS,
-    CONVERTER,
     SOLVER,
+    WHAT,
     Workplace,
     is_ubx,
     need_program,
@@ -46,7 +46,6 @@ from roadscan.ingest.reading.text_table import head_of, open_text
 if TYPE_CHECKING:
     from roadscan.core.survey import Survey
 
-WHAT: Final = "post-processing of GNSS observations"
 RAWX: Final = b"\xb5\x62\x02\x15"
 """Sync characters, class and identifier of UBX-RXM-RAWX."""
 _SNIFF_BYTES: Final = 1 << 16  # bytes from which a recording is recognised
@@ -106,7 +105,7 @@ class Ppk(LogFormat):
         return [beside(path, one) for one in named]
 
     def header(self, source: LogSource) -> LogHeader:
-        """Check what is stated of base, antennas and orbits, and that RTKLIB is there."""
+        """Check what is stated of base, antennas and orbits."""
         source.need_file()
         settings, base = _settings(source), _base(source)
         world = _world(source, base)
@@ -121,14 +120,19 @@ class Ppk(LogFormat):
                 missing=Missing("options.navigation", [_UNKNOWN]),
             )
         list(antenna_findings(settings, station, rinex_header(files[1]), source.path))
-        if any(map(is_ubx, files)):
-            need_program(CONVERTER, "a UBX recording")
         said = {name: value for name, value in dataclasses.asdict(station).items() if value}
         if _is_unknown(base):
             return LogHeader(said)
-        need_program(SOLVER, WHAT)
         stated = base.model_dump(mode="json", exclude={"files"}, exclude_none=True)
         return LogHeader({"world_frame": world, **said, "base": stated})
+
+    def lacks(self) -> RoadscanError | None:
+        """Return an error where RTKLIB is not on PATH."""
+        try:
+            need_program(SOLVER, WHAT)
+        except ConfigError as error:
+            return error
+        return None
 
     def beginning(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Yield the base's position, which is near the drive: nothing is computed before the run."""
@@ -184,11 +188,11 @@ def processed(source: LogSource, header: LogHeader, folder: Path) -> Iterator[It
         yield Reject("the message RXM-RAWX is damaged, or holds no observation", records=damaged)
     if (lost := int(epochs.size) - solved) > 0:
         yield Reject("RTKLIB found no position at this epoch", records=lost)
+    header.attributes["programs"] = programs_digest()
     header.attributes["ppk"] = {
         "epochs": int(epochs.size), "epochs_with_base": covered, "positions": solved, "fixed": fixed,
         "base_from_code_m": round(away_m, 2), "mode": settings.mode, "direction": settings.direction,
-        "ratio": settings.ratio, "programs": programs_digest(),
-        "apart": apart.figures(_BINS),
+        "ratio": settings.ratio, "apart": apart.figures(_BINS),
     }  # fmt: skip
 
 

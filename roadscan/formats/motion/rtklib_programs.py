@@ -26,6 +26,7 @@ Direction = Literal["combined", "forward", "backward"]
 
 SOLVER: Final = "rnx2rtkp"
 CONVERTER: Final = "convbin"
+WHAT: Final = "post-processing of GNSS observations"
 ANTENNAS: Final = "antennas"
 """Role of the file with phase centres of antennas; the others are rover, base, nav and precise."""
 UBX_SYNC: Final = b"\xb5\x62"
@@ -146,7 +147,7 @@ class Workplace:
         config, target = self.folder / f"{name}.conf", self.folder / f"{name}.pos"
         config.write_text("".join(f"{key}={value}\n" for key, value in options.items()))
         orbits = [one for one in ("nav*.nav", "precise*.sp3", "precise*.clk") if any(self.folder.glob(one))]
-        program = need_program(SOLVER, "post-processing of GNSS observations")
+        program = need_program(SOLVER, WHAT)
         said = self._run([program, *more, "-k", config.name, "-o", target.name, *observed, *orbits], target)
         if not target.is_file() or not _has_positions(target):
             words = f": {said}" if said else ""

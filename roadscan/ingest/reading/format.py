@@ -20,7 +20,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.core.crs import LOCAL_WORLD, Geoid, HeightKind, MapFrame
-from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, TimeSystemError, nearest
+from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError, TimeSystemError, nearest
 from roadscan.core.gpstime import Clock
 from roadscan.core.plugins import found_kinds
 from roadscan.core.rig import Sensor, SensorKind
@@ -377,6 +377,14 @@ class LogFormat(ABC):
         A damaged record becomes a :class:`Reject`, what is doubtful a :class:`Finding`; only a fault of the whole
         log raises.
         """
+
+    def lacks(self) -> RoadscanError | None:
+        """Return the error of a program that computes the rows and is not installed; rows computed before are kept.
+
+        Settings of such a format have a hash of the program in their `shaping`, and log records in their attributes, as
+        `programs`.
+        """
+        return None
 
     def beginning(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream the first positions, for a check before the run; a format that computes them says about where."""

@@ -159,41 +159,48 @@ def processed(source: LogSource, header: LogHeader, folder: Path) -> Iterator[It
     """
     settings, base = _settings(source), _base(source)
     mark_m, place = base_position_m(base, source.path), Workplace(folder, settings, source.path)
-    rover = place.put("rover", [source.path])
-    observed = place.put("base", [beside(source.path, one) for one in base.files])
-    place.put("nav", [beside(source.path, one) for one in settings.navigation])
-    place.put("precise", [beside(source.path, one) for one in settings.precise])
-    place.put(ANTENNAS, [beside(source.path, one) for one in (settings.antenna_calibration,) if one is not None])
-    yield from antenna_findings(settings, rinex_header(rover[0]), rinex_header(observed[0]), source.path)
+    rover, observed = _brought(source, place)
+    station = rinex_header(observed[0])
+    yield from antenna_findings(settings, rinex_header(rover[0]), station, source.path)
     epochs = _observed(rover, "rover", source.path)
     covered, doubts = common_time(epochs, _observed(observed, "base", source.path), settings.max_age_s, source.path)
     yield from doubts
-    away_m, doubts = base_place(
-        _track(source, place.single("base")), mark_m, base, rinex_header(observed[0]), source.path
-    )
+    away_m, doubts = base_place(_track(source, place.single("base")), mark_m, base, station, source.path)
     yield from doubts
     found = place.solved(("forward", "backward", settings.direction), mark_m.tolist())
     found[settings.direction] = found[settings.direction].rename(folder / "solution.pos")
-    solved = fixed = 0
+    solved = fixed = told = 0
     for item in _rows(source, folder / "solution.pos"):
         if isinstance(item, Rows):
             solved += item.batch.num_rows
             fixed += item.batch.column("quality").to_pylist().count("fixed")
+        elif isinstance(item, Reject):
+            told += item.records
         yield item
+    if (damaged := _recorded(source.path) - int(epochs.size)) > 0:
+        yield Reject("the message RXM-RAWX is damaged, or holds no observation", records=damaged)
+    if (lost := int(epochs.size) - solved - told) > 0:
+        yield Reject("RTKLIB found no position at this epoch", records=lost)
     yield from fixed_share(fixed, solved)
     forward, backward = _track(source, found["forward"]), _track(source, found["backward"])
     apart = Separation.of(forward, backward, world_frame_of(base.crs))
     yield from apart.findings()
-    if (damaged := _recorded(source.path) - int(epochs.size)) > 0:
-        yield Reject("the message RXM-RAWX is damaged, or holds no observation", records=damaged)
-    if (lost := int(epochs.size) - solved) > 0:
-        yield Reject("RTKLIB found no position at this epoch", records=lost)
+    baseline_m = float(np.linalg.norm(np.median(forward.world_m, axis=0) - mark_m))
     header.attributes["programs"] = programs_digest()
     header.attributes["ppk"] = {
         "epochs": int(epochs.size), "epochs_with_base": covered, "positions": solved, "fixed": fixed,
-        "base_from_code_m": round(away_m, 2), "mode": settings.mode, "direction": settings.direction,
-        "ratio": settings.ratio, "apart": apart.figures(_BINS),
+        "base_from_code_m": round(away_m, 2), "baseline_km": round(baseline_m / 1000, 2), "mode": settings.mode,
+        "direction": settings.direction, "ratio": settings.ratio, "apart": apart.figures(_BINS),
     }  # fmt: skip
+
+
+def _brought(source: LogSource, place: Workplace) -> tuple[list[Path], list[Path]]:
+    """Bring all files into the folder in which RTKLIB runs; return the observations of rover and base."""
+    settings, base = _settings(source), _base(source)
+    antennas = [] if settings.antenna_calibration is None else [settings.antenna_calibration]
+    for role, files in (("nav", settings.navigation), ("precise", settings.precise), (ANTENNAS, antennas)):
+        place.put(role, [beside(source.path, one) for one in files])
+    return place.put("rover", [source.path]), place.put("base", [beside(source.path, one) for one in base.files])
 
 
 def _epochs_alone(source: LogSource, folder: Path) -> Iterator[Item]:

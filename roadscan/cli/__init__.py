@@ -19,6 +19,7 @@ from roadscan.cli import (
     inventory,
     logs,
     pages,
+    ppk,
     profiles,
     queries,
     reports,
@@ -77,6 +78,7 @@ app.command("classes")(exports.classes)
 app.command("formats")(logs.list_formats)
 app.command("inspect")(logs.inspect_files)
 app.command("init")(logs.first_survey)
+app.command("ppk")(ppk.ppk)
 app.command("iri")(profiles.iri)
 app.command("mpd")(profiles.mpd)
 app.command("simulate")(simulations.simulate)

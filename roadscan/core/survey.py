@@ -17,6 +17,7 @@ from roadscan.core.ids import LanePass, PassId, RunId
 from roadscan.core.plugins import found_kinds
 from roadscan.core.rig import Rig, Sensor
 from roadscan.core.settings.calibration import CalibrationEvidence, CalibrationSettings
+from roadscan.core.settings.ppk import PpkSettings
 from roadscan.core.settings.segmentation import RoadSegmentation
 from roadscan.core.settings.smoothing import SmootherConfig, SplineConfig
 from roadscan.core.strict import MEANINGS, NAME_PATTERN, Strict, load_toml
@@ -278,6 +279,8 @@ class NavigationConfig(Strict):
     """Runs whose trajectory is computed from GNSS and IMU: those without a trajectory log, all that have both, none."""
     smoother: SmootherConfig = SmootherConfig()
     """How it is computed."""
+    ppk: PpkSettings | None = None
+    """Base station and settings of logs of raw GNSS observations (format = "ppk"); their options go before it."""
     spline: SplineConfig = SplineConfig()
     """Whether and how trajectory logs are smoothed where GNSS dropped out."""
     calibration: CalibrationSettings = CalibrationSettings()
@@ -426,6 +429,8 @@ class SurveyConfig(Strict):
         runs = [run.id for run in self.runs]
         if len(set(runs)) < len(runs):
             raise ValueError("two runs have the same id")
+        if self.navigation.ppk and all(log.format != "ppk" for run in self.runs for log in run.logs):
+            raise ValueError('[navigation.ppk] is for logs of raw observations, and no log has format = "ppk"')
         if len({p.id for p in self.passes}) < len(self.passes):
             raise ValueError("two passes have the same id")
         for one in self.passes:

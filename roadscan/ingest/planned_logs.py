@@ -23,7 +23,7 @@ from roadscan.ingest.reading.format import LogFormat, LogSource, SourceDefaults
 from roadscan.ingest.sources import Known, Sources, open_sources
 from roadscan.run.engine.fingerprint import grid_key, key_of
 from roadscan.run.session import Session, found_once
-from roadscan.store.logs import has_log
+from roadscan.store.logs import has_log, read_log_records
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 
@@ -121,7 +121,7 @@ def _open_log(survey: Survey, config: LogConfig | ControlConfig, sources: Source
     path = survey.resolve(config.path)
     try:
         format_ = sources.format(path, config.format)
-        options = format_.options.parse(config.options, file=path)
+        options = log_options(survey, config, format_, path)
         return _OpenedLog(path, format_, options, sources.begin(path, format_, format_.companions(path, options)))
     except RoadscanError as error:
         return error
@@ -177,7 +177,18 @@ def _plan_log(
             for checks in (_checks_of(format_), *_earlier_checks(format_))
         )
         key = next((one for one in earlier if has_log(store, one)), key)
+    if not has_log(store, key) and format_.lacks() is not None:
+        for programs in _programs_of(store, (run, name, content)):
+            computed = [{**one, "programs": programs} if one == options.shaping() else one for one in shaping]
+            kept = key_of(*computed, *_checks_of(format_))
+            key = kept if has_log(store, kept) else key
     return PlannedLog(run, name, config, format_, source, key, content, size, stamp)
+
+
+def _programs_of(store: Store, log: tuple[str, str, str]) -> list[str]:
+    """Return hashes of the programs that computed the stored rows of a log, by its run, sensor and content."""
+    own = (r for r in read_log_records(store, damaged=[]) if (r.run, r.sensor, r.content) == log)
+    return [str(r.attributes["programs"]) for r in own if "programs" in r.attributes]
 
 
 def _checks_of(format_: LogFormat) -> list[list[object]]:
@@ -199,6 +210,11 @@ def _earlier_checks(format_: LogFormat) -> list[list[list[object]]]:
     second: list[list[object]] = [["poses", 2]] if {POSES, FIXES} & set(format_.yields) else []
     before_stamps = [one for one in _checks_of(format_) if one[0] != "stamps"]
     return [before_stamps, second + places, first + places, []]
+
+
+def log_options(survey: Survey, config: LogConfig | ControlConfig, format_: LogFormat, path: Path) -> Strict:
+    """Return the settings of a log's format: its own before those that the survey file states for all."""
+    return format_.options.parse({**format_.shared_options(survey), **config.options}, file=path)
 
 
 def log_source(

@@ -30,11 +30,11 @@ _MOST_POINTS: Final = 6000
 """Most points of a line."""
 _INK, _GREY, _SHADE = "#222222", "#9a9a9a", "#f3d9c9"
 _AXIS_COLOURS: Final = ("#1f5fa8", "#d1495b", "#3d8b40")
-_QUALITY_COLOURS: Final = {
+QUALITY_COLOURS: Final = {
     "fixed": "#3d8b40", "float": "#e0a100", "ppp": "#2a9d8f", "dgps": "#d17b0f", "sbas": "#b0652f",
     "pps": "#7a5195", "single": "#d1495b",
 }  # fmt: skip
-_OTHER_COLOUR: Final = "#7b2d8b"
+OTHER_COLOUR: Final = "#7b2d8b"
 _DOWN, _REFUSED = "#e07a00", "#c1121f"
 
 
@@ -369,12 +369,12 @@ def _finish(axes: Axes, title: str, columns: int = 1) -> None:
 def _qualities(quality: npt.NDArray[np.str_]) -> list[str]:
     """Return the kinds of solution, the best first."""
     kinds = set(quality.tolist())
-    known = [name for name in _QUALITY_COLOURS if name in kinds]
+    known = [name for name in QUALITY_COLOURS if name in kinds]
     return known + sorted(kinds - set(known))
 
 
 def _colour(quality: str) -> str:
-    return _QUALITY_COLOURS.get(quality, _OTHER_COLOUR)
+    return QUALITY_COLOURS.get(quality, OTHER_COLOUR)
 
 
 def _thinned(count: int) -> Int64:

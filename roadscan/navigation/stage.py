@@ -8,11 +8,13 @@ from collections.abc import Sequence
 from roadscan.calibrate.tasks.calibrate import renew_reports
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
+from roadscan.ingest.ingest import survey_records
 from roadscan.ingest.planned_logs import logs_of
 from roadscan.navigation.tasks.clock_tables import set_damaged_clocks_aside
 from roadscan.navigation.tasks.clocks import estimate_clocks
 from roadscan.navigation.tasks.navigate import navigate, records_of
 from roadscan.navigation.tasks.navigation_status import navigation_status, trajectory_findings
+from roadscan.navigation.tasks.ppk_pictures import draw_post_processed
 from roadscan.run.session import Session, manifest_of
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord, read_log_records
@@ -40,6 +42,7 @@ class Navigate(Stage):
         try:
             if any(evidence.against != "trajectory" for evidence in survey.config.clocks):
                 estimate_clocks(survey, store, before_navigation=True, logs=logs_of(session))
+            draw_post_processed(survey, store, survey_records(survey, store, logs_of(session)), say)
             navigate(survey, store, say, logs_of(session))
             estimate_clocks(survey, store, say, logs=logs_of(session))
             renew_reports(store, say)

@@ -42,14 +42,14 @@ from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, 
 from roadscan.ingest.one_stamp import one_stamp_logs
 from roadscan.ingest.overlap import Fault, NothingPlacedError, no_row
 from roadscan.ingest.place_checks import without_fix
-from roadscan.ingest.planned_logs import CONTROL_RUN, log_source
+from roadscan.ingest.planned_logs import CONTROL_RUN, log_options, log_source, plan_logs
 from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
 from roadscan.ingest.sources import listed_name, remembered_formats
 from roadscan.navigation.tasks.clocks import check_clocks
 from roadscan.navigation.tasks.navigation_logs import unknown_imu
 from roadscan.run.selection import Selection
 from roadscan.run.stage import stages
-from roadscan.store.logs import read_log_records
+from roadscan.store.logs import has_log, read_log_records
 from roadscan.store.store import Store
 from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.surface_colours import check_cameras
@@ -214,6 +214,15 @@ def check_positions(asked: Asked) -> Iterator[RoadscanError]:
     for one in asked.beginnings:
         if one.error is not None:
             yield one.error
+
+
+def check_programs(asked: Asked) -> Iterator[RoadscanError]:
+    """Check that programs which compute the rows of logs are installed, where such rows are due."""
+    lacking = {log.format.name: error for log in asked.logs if log.format and (error := log.format.lacks())}
+    if lacking:
+        planned, _ = plan_logs(asked.survey, asked.store, only_looks=True)
+        due = [log.format.name for log in planned if not has_log(asked.store, log.key)]
+        yield from (error for name, error in lacking.items() if name in due)
 
 
 def check_kinds(asked: Asked) -> Iterator[RoadscanError]:
@@ -474,6 +483,7 @@ CHECKS: Final[tuple[tuple[str, Check], ...]] = (
     ("ingest", check_geoids),
     ("ingest", check_logs),
     ("ingest", check_positions),
+    ("ingest", check_programs),
     ("ingest", check_kinds),
     ("ingest", check_lever_arms),
     ("ingest", check_datums),
@@ -599,7 +609,7 @@ def _beginning(log: CheckedLog) -> _Beginning:
     """Read a log of positions up to its first rows: it has none only where it ends before them."""
     if log.format is None or log.source is None or log.header is None or not set(_POSITIONS) & set(log.yields):
         return _Beginning(log)
-    items = log.format.read(log.source, log.header)
+    items = log.format.beginning(log.source, log.header)
     reasons: Counter[str] = Counter()
     try:
         for item in items:
@@ -651,7 +661,7 @@ def _checked(survey: Survey, run: str, config: LogConfig | ControlConfig, moved:
         if cannot := cannot_be_opened(path):
             raise cannot
         format_ = format_named(config.format) if config.format else claimed_format(path)
-        options = format_.options.parse(config.options, file=path)
+        options = log_options(survey, config, format_, path)
         source = log_source(survey, config, path, format_, options)
         for file in format_.companions(path, options):
             if not is_there(file):

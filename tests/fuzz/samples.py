@@ -24,6 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.feather
 import pyarrow.parquet as pq
+import pytest
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.gpstime import Clock, TimeSystem
@@ -44,6 +45,7 @@ from tests.formats import (
     test_nmea,
     test_opencrg,
     test_ply,
+    test_ppk,
     test_psi,
     test_road_lines,
     test_rtklib_pos,
@@ -528,9 +530,24 @@ def _poses() -> Iterator[Sample]:
     yield Sample(
         "rtklib_pos", "gz", file("a.pos.gz", lambda: gzip.compress(test_rtklib_pos.sample())), {}, sat, inside=GZIP
     )
+    ppk: dict[str, Any] = {"options": test_ppk.sample_options(), "native": True}
+    yield Sample("ppk", "rover", _with_rtklib(test_ppk.sample), text=True, **ppk)
+    yield Sample("ppk", "base", _with_rtklib(test_ppk.sample), text=True, damaged=("base.obs", "brdc.nav"), **ppk)
+    yield Sample("ppk", "ubx", _with_rtklib(test_ppk.sample_ubx), **ppk)
     yield Sample("ubx", "plain", file("a.ubx", test_ubx.sample), {}, sat, spans=every(100))
     for untimed in ("before", "after"):
         yield Sample("nmea", untimed, file("a.nmea", nmea), {"untimed": untimed}, sat, text=True, inside=nmea_inside)
+
+
+def _with_rtklib(make: Callable[[Path], Path]) -> Callable[[Path], Path]:
+    """The maker of a log that RTKLIB reads; the test is skipped where it is absent."""
+
+    def made(folder: Path) -> Path:
+        if shutil.which("rnx2rtkp") is None:
+            pytest.skip("RTKLIB is not on PATH: apt-get install rtklib")
+        return make(folder)
+
+    return made
 
 
 def _tables() -> Iterator[Sample]:

@@ -99,7 +99,7 @@ class Ubx(LogFormat):
             raise FormatError(
                 "the recording holds no navigation solution (NAV-PVT)",
                 expected="UBX-NAV-PVT",
-                change="compute positions with RTKLIB (convbin, rnx2rtkp) as .pos, or let the receiver write NAV-PVT",
+                change='state format = "ppk" to post-process its raw observations (RXM-RAWX), or record NAV-PVT',
                 file=source.path,
             )
 

@@ -330,7 +330,7 @@ class TableFigures:
         if leaps.size and not self.leaps.count:
             self.leaps.record, self.leaps.file = first + skipped + int(leaps[0]), place[0]
         self.leaps.count += leaps.size
-        self.path_m += float(steps_m.sum() - steps_m[leaps].sum())
+        self.path_m += float(np.nansum(steps_m) - steps_m[leaps].sum())
         self._last = (int(epochs[-1]), own[-1])
 
     def _take_readings(self, batch: pa.RecordBatch) -> None:

@@ -13,20 +13,23 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.core.crs import LOCAL_WORLD, Geoid, HeightKind, MapFrame
-from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, TimeSystemError, nearest
+from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError, TimeSystemError, nearest
 from roadscan.core.gpstime import Clock
 from roadscan.core.plugins import found_kinds
 from roadscan.core.rig import Sensor, SensorKind
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.reading.columns import Quantity
+
+if TYPE_CHECKING:
+    from roadscan.core.survey import Survey
 
 NO_LEVER_ARM: Final = [0.0, 0.0, 0.0]  # body axes, for mountings at the reference point (m)
 
@@ -388,6 +391,10 @@ class LogFormat(ABC):
         """Return all streams of a container, those of other formats too; None for a log of its own."""
         return None
 
+    def shared_options(self, survey: Survey) -> dict[str, Any]:
+        """Return settings that the survey file states once for all logs of the format; a log's own go before them."""
+        return {}
+
     @abstractmethod
     def header(self, source: LogSource) -> LogHeader:
         """Read what is known before the records.
@@ -405,6 +412,18 @@ class LogFormat(ABC):
         A damaged record becomes a :class:`Reject`, what is doubtful a :class:`Finding`; only a fault of the whole
         log raises.
         """
+
+    def lacks(self) -> RoadscanError | None:
+        """Return the error of a program that computes the rows and is not installed; rows computed before are kept.
+
+        Settings of such a format have a hash of the program in their `shaping`, and log records in their attributes, as
+        `programs`.
+        """
+        return None
+
+    def beginning(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream the first positions, for a check before the run; a format that computes them says about where."""
+        return self.read(source, header)
 
     def ending(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream the log's last records, where they can be found in a moment; nothing where they cannot."""

@@ -76,7 +76,9 @@ class TopicFormat(LogFormat):
         return sorted([*bag_files(path), *([metadata] if metadata.is_file() else [])])
 
     def contents(self, path: Path) -> Contents | None:
-        """Return all topics of the bag."""
+        """Return all topics of the bag; None for what is none."""
+        if not is_bag(path):
+            return None
         return contents(path, tuple(one for one in log_formats().values() if isinstance(one, TopicFormat)))
 
     def header(self, source: LogSource) -> LogHeader:

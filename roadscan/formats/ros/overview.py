@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -32,8 +32,9 @@ _MOST_FRAMES: Final = 100  # longest way from a frame to the vehicle's
 _FLU: Final = np.diag([1.0, -1.0, -1.0])  # forward, right, down from x ahead, y left, z up (REP 103)
 
 
+@runtime_checkable
 class Reader(Protocol):
-    """A format of messages."""
+    """A format that reads topics of bags: any :class:`LogFormat` with this method, whatever else it reads."""
 
     name: ClassVar[str]
 

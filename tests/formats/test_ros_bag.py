@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import sqlite3
 import struct
 import zlib
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +129,15 @@ def test_a_part_that_metadata_names_and_that_is_missing_is_named(tmp_path: Path)
     (path / "metadata.yaml").write_text(text.replace("- bag.db3", "- bag.db3\n  - bag_1.db3"))
     with Bag.open(path) as bag:
         assert any("bag_1.db3" in item.reason for item in bag.messages("/imu") if isinstance(item, Reject))
+
+
+def test_messages_that_metadata_count_and_that_are_missing_are_named(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", "sqlite", _topics(100))
+    with closing(sqlite3.connect(path / "bag.db3")) as base, base:
+        base.execute("UPDATE messages SET topic_id = 77 WHERE id = 5")
+    with Bag.open(path) as bag:
+        (lost,) = (item for item in bag.messages("/imu") if isinstance(item, Reject))
+    assert (lost.reason, lost.records) == ("metadata.yaml counts more messages than the files hold", 1)
 
 
 def test_a_hostile_type_name_is_no_code(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import struct
 from collections.abc import Iterator, Set
 from contextlib import closing
 from pathlib import Path
@@ -21,12 +22,15 @@ class SqliteFile(Container):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
+        stated, size, self._cut_page = _end(path)
         try:
             with closing(self._connect()) as base:
                 self._find_topics(base)
                 self._find_spans(base)
         except sqlite3.Error as error:
             raise self.damaged(f"the database cannot be read: {error}") from error
+        if stated > size:
+            self.faults.append(Reject(f"the file is cut off: {size:,} of {stated:,} bytes are there"))
         log = path.with_name(path.name + "-wal")
         if log.is_file() and log.stat().st_size:
             self.faults.append(
@@ -44,7 +48,9 @@ class SqliteFile(Container):
                 try:
                     for number, topic, stamp, data in base.execute(query, (*sorted(wanted), last)):
                         last, skip = number, 0
-                        if isinstance(stamp, int) and isinstance(data, bytes):
+                        if self._cut_page and isinstance(data, bytes) and self._reaches_beyond(data):
+                            yield Reject("the file ends inside this message")
+                        elif isinstance(stamp, int) and isinstance(data, bytes):
                             yield Raw(topic, -1, stamp, data)
                         else:
                             yield Reject("the row is no message")
@@ -54,6 +60,12 @@ class SqliteFile(Container):
                         yield Reject(f"the database is damaged after message {last}: {error}")
                     last, skip = last + (1 << skip), skip + 1
 
+    def _reaches_beyond(self, data: bytes) -> bool:
+        """Return whether zeros behind the file's end may be part of a message: it holds what is there of the last page,
+        or begins at its end.
+        """
+        return self._cut_page in data or self._cut_page.endswith(data.rstrip(b"\0"))
+
     def _connect(self) -> sqlite3.Connection:
         base = sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
         base.execute("PRAGMA writable_schema = ON")  # without it, SQLite refuses a file that is cut off
@@ -61,10 +73,9 @@ class SqliteFile(Container):
         return base
 
     def _find_topics(self, base: sqlite3.Connection) -> None:
-        for number, name, type_name, encoding in base.execute(
-            "SELECT id, name, type, serialization_format FROM topics"
-        ):
-            self.connections[int(number)] = Connection(int(number), str(name), str(type_name), str(encoding))
+        for number, name, kind, encoding in base.execute("SELECT id, name, type, serialization_format FROM topics"):
+            if isinstance(number, int):
+                self.connections[number] = Connection(number, str(name), str(kind), str(encoding))
         try:
             texts = base.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
             known = {name: (str(text), "idl" if "idl" in str(language) else "msg") for name, language, text in texts}
@@ -84,3 +95,18 @@ class SqliteFile(Container):
                 if isinstance(item, Raw) and item.connection in self.connections:
                     connection = self.connections[item.connection]
                     connection.held = Held(1, item.receive_ns, item.receive_ns).joined(connection.held)
+
+
+def _end(path: Path) -> tuple[int, int, bytes]:
+    """Return the size that a database's header states (0 where it states none), its real size, and what is there of a
+    page that is cut off: SQLite fills such a page with zeros (SQLite's file format, 1.3 and 1.6).
+    """
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        head = stream.read(100)
+        if len(head) < 100 or head[24:28] != head[92:96]:  # written by a version that does not keep the size
+            return 0, size, b""
+        page, pages = struct.unpack_from(">H", head, 16)[0], struct.unpack_from(">I", head, 28)[0]
+        page = max(65_536 if page == 1 else page, 512)
+        stream.seek(size - size % page)
+        return page * pages, size, stream.read(page)[4:].rstrip(b"\0")  # behind the number of the next page

@@ -37,6 +37,7 @@ import yaml
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
+from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, mean_rate, steps, waits_ns
 
 Bool = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]
@@ -62,9 +63,8 @@ LATEST_STAMP_US: Final = 3_660_000_000
 
 _EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)  # scales 255 to 65,535
 _FASTEST_HZ: Final = 25.0  # fastest turn that is accepted
+_LARGEST_STEP_CENTIDEG: Final = 300  # larger steps from block to block are no turn of a head (0.01°)
 _SLACK_CENTIDEGREES: Final = 10  # tolerance of azimuth steps (0.01°)
-_TURN: Final = 36_000
-"""A full turn in 0.01°."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ MODELS: Final = (
 """Supported sensors."""
 
 
-def faults(raw: npt.NDArray[np.void], model: Model, unstated: bool) -> list[tuple[Bool, str]]:
+def faults(raw: npt.NDArray[np.void], model: Model, unstated: bool, gap: Gap | None = None) -> list[tuple[Bool, str]]:
     """Return masks (n,) of damaged packets, each with its reason.
 
     Parameters
@@ -232,6 +232,7 @@ def faults(raw: npt.NDArray[np.void], model: Model, unstated: bool) -> list[tupl
     raw : (n,) packets of dtype :data:`PACKET`.
     model : the sensor.
     unstated : whether mode and product may be 0, as old firmware writes them.
+    gap : of the sensor's view.
     """
     dual = (raw["mode"] == DUAL) & (model.banks > 1)
     azimuth = np.where(dual[:, None], raw["blocks"]["azimuth"][:, :1], raw["blocks"]["azimuth"])
@@ -241,31 +242,27 @@ def faults(raw: npt.NDArray[np.void], model: Model, unstated: bool) -> list[tupl
         (flags[:, : model.blocks(True)] != model.flags(True)).any(axis=1),
         (flags != model.flags(False)).any(axis=1),
     )
-    steps = _steps(azimuth)
-    block_s = max(1, SLOTS // model.lasers) * model.cycle_ns / NS_PER_S
-    farthest = _TURN * _FASTEST_HZ * block_s + _SLACK_CENTIDEGREES
     silent = (raw["mode"] == 0) & (raw["product"] == 0) & unstated
     known = np.isin(raw["mode"], list(MODES))
     return [
         (unflagged, "a block does not begin with 0x" + (" 0x".join(f"{f:X}" for f in FLAGS[: model.banks]))),
         ((raw["product"] != model.product) & ~silent, "the product byte is not the sensor's"),
         (~known & ~silent, "the return mode is unknown"),
-        ((azimuth >= _TURN).any(axis=1), "an azimuth is 360° or more"),
-        (
-            ((steps < -_SLACK_CENTIDEGREES) | (steps > farthest)).any(axis=1),
-            "the azimuth jumps inside the packet (damage, or a limited field of view)",
-        ),
+        ((azimuth >= TURN).any(axis=1), "an azimuth is 360° or more"),
+        (jumps(azimuth, odd_steps(azimuth, model), gap), "the azimuth jumps inside the packet"),
         (raw["stamp_us"] > LATEST_STAMP_US, "the stamp is more than 3,660 s past the hour"),
     ]
 
 
-def _steps(azimuth: npt.NDArray[np.uint16]) -> Int32:
-    """Return (n, blocks − 1) turn from block to block, 0.01°, within half a turn either way."""
-    return np.asarray(np.mod(np.diff(azimuth.astype(np.int32), axis=1) + _TURN // 2, _TURN) - _TURN // 2)
+def odd_steps(azimuth: npt.NDArray[np.uint16], model: Model) -> Bool:
+    """Return which steps (n, blocks − 1) from block to block the head cannot have turned."""
+    block_s = max(1, SLOTS // model.lasers) * model.cycle_ns / NS_PER_S
+    turn = steps(azimuth)
+    return np.asarray((turn < -_SLACK_CENTIDEGREES) | (turn > TURN * _FASTEST_HZ * block_s + _SLACK_CENTIDEGREES))
 
 
 def decode(
-    raw: npt.NDArray[np.void], epochs: Int64, sweeps: Int32, model: Model, dual: bool, turning: bool = True
+    raw: npt.NDArray[np.void], epochs: Int64, sweeps: Int32, model: Model, dual: bool, as_driver: bool = False
 ) -> pa.RecordBatch:
     """Return the returns of sound packets.
 
@@ -275,7 +272,7 @@ def decode(
     epochs : (n,) GPS ns of each packet's stamp.
     sweeps : (n, 12) sweep of each block.
     dual : whether blocks come in pairs of last and strongest return.
-    turning : whether the head's turn between a block's azimuth and each firing counts.
+    as_driver : whether azimuths are those of ROS drivers (:func:`_driver_directions`).
 
     Returns
     -------
@@ -291,15 +288,20 @@ def decode(
         wanted[:, strongest] &= ~twice
     times_ns, lasers = model.slot_times_ns(dual), model.slot_lasers(dual)
     rows = np.flatnonzero(wanted)
-    if turning:
-        rates = _rates(blocks["azimuth"], epochs, model.azimuth_times_ns(dual))
-        sines, cosines = _directions(blocks["azimuth"], times_ns - model.azimuth_times_ns(dual)[:, None], rates)
+    if as_driver and (model.at_once > 1):
+        sines, cosines = _driver_directions(blocks["azimuth"], model, dual)
     else:
-        start = np.radians(blocks["azimuth"] * 0.01)[:, :, None]
-        sines, cosines = np.sin(start).astype(np.float32), np.cos(start).astype(np.float32)
+        after_ns = times_ns - model.azimuth_times_ns(dual)[:, None]
+        rates = _rates(blocks["azimuth"], epochs, model.azimuth_times_ns(dual))
+        sines, cosines = _directions(blocks["azimuth"], after_ns, rates)
     x, y, z = _positions(distance, sines, cosines, model, lasers)
     shape = distance.shape
-    epoch = np.add(epochs[:, None, None], times_ns).reshape(-1)[rows]
+    odd = odd_steps(blocks["azimuth"], model)
+    epoch = np.add(epochs[:, None, None], times_ns)
+    if odd.any():
+        rate = mean_rate(blocks["azimuth"], epochs)
+        epoch += waits_ns(blocks["azimuth"], odd, rate, max(1, SLOTS // model.lasers) * model.cycle_ns)[:, :, None]
+    epoch = epoch.reshape(-1)[rows]
     columns: dict[str, npt.NDArray[Any]] = {
         "epoch_gps_ns": epoch,
         "pose_epoch_gps_ns": epoch,
@@ -350,11 +352,14 @@ def _rates(azimuth: npt.NDArray[np.uint16], epochs: Int64, times_ns: Int64) -> n
     """
     span_ns = float(times_ns[-1] - times_ns[0])
     if span_ns:
-        return np.asarray(np.radians(_steps(azimuth).sum(axis=1) * 0.01) / span_ns)
+        turn = steps(azimuth)
+        whole = np.abs(turn).max(axis=1) <= _LARGEST_STEP_CENTIDEG  # no gap of the view lies in the packet
+        rates = np.radians(turn.sum(axis=1) * 0.01) / span_ns
+        return np.where(whole, rates, np.median(rates[whole]) if whole.any() else 0.0)
     if len(epochs) < 2:
         return np.zeros(len(epochs))
     passed_ns = np.maximum(np.diff(epochs), 1)
-    rates = np.radians(_steps(azimuth[:, :1].T)[0] * 0.01) / passed_ns
+    rates = np.radians(steps(azimuth[:, :1].T)[0] * 0.01) / passed_ns
     near = passed_ns < 10 * np.median(passed_ns)
     rates = np.where(near, rates, np.median(rates[near]))
     return np.append(rates, rates[-1])
@@ -384,3 +389,25 @@ def _directions(
     small_cosine = (1.0 - square / 2.0).astype(np.float32)
     sine, cosine = np.sin(start).astype(np.float32), np.cos(start).astype(np.float32)
     return sine * small_cosine + cosine * small_sine, cosine * small_cosine - sine * small_sine
+
+
+def _driver_directions(azimuth: npt.NDArray[np.uint16], model: Model, dual: bool) -> tuple[Float32, Float32]:
+    """Return sine and cosine (n, blocks, 32) of the head's azimuth as ROS drivers have it, to 0.01°.
+
+    Each laser gets its share of the turn to the next block, none in the last. A VLP-32C's lasers count as fired one after another, which
+    takes 71 µs of a cycle of 55; of a VLS-128, only the last of a sequence's blocks turns: all four share an azimuth.
+    """
+    turn = steps(azimuth)
+    turn = np.where(np.abs(turn) > _LARGEST_STEP_CENTIDEG, np.median(turn), turn)
+    if model.banks > 1:
+        per = 1 + dual
+        ahead = turn.reshape(len(turn), -1)
+        step = np.zeros(azimuth.shape)
+        step[:, : ahead.shape[1] + 1 - per] = sum(ahead[:, k : ahead.shape[1] + 1 - per + k] for k in range(per))
+        firing = model.slot_lasers(dual).astype(np.int64) // model.at_once
+        share = (firing + firing // model.rest_after) * model.firing_ns / model.cycle_ns
+    else:
+        step = np.pad(turn, ((0, 0), (0, 1)))
+        share = np.arange(SLOTS) * model.firing_ns / model.cycle_ns
+    angle = np.radians(np.rint(azimuth[:, :, None] + step[:, :, None] * share) * 0.01)
+    return np.sin(angle).astype(np.float32), np.cos(angle).astype(np.float32)

@@ -20,6 +20,7 @@ once. See `docs/clocks.md`, "Clocks that step".
 from __future__ import annotations
 
 import functools
+import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -48,6 +49,7 @@ from roadscan.formats.lidars.velodyne_packets import (
     Model,
     decode,
     faults,
+    odd_steps,
 )
 from roadscan.formats.lidars.velodyne_segments import (
     STEPPED,
@@ -59,6 +61,7 @@ from roadscan.formats.lidars.velodyne_segments import (
     reference,
 )
 from roadscan.formats.lidars.velodyne_sentences import SENTENCES, Sentences
+from roadscan.formats.lidars.view_gaps import Gap, gap_of
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import Sieve, options_of
 
@@ -78,6 +81,8 @@ Source: TypeAlias = Callable[[Wanted], Iterator[Datagram | Reject]]
 """Gives the wanted packets of a log in file order."""
 
 
+_VIEWED_PACKETS: Final = 5_000  # packets in which a gap of the view is looked for: more than ten turns
+_AZIMUTHS: Final = "<" + "xxH96x" * BLOCKS  # azimuths of a packet's blocks
 _FIRST_FLAG: Final = FLAGS[0].to_bytes(2, "little")  # bytes with which a data packet begins
 _MANY_LASERS: Final = MODELS[-1]  # the one whose blocks have four flags
 
@@ -120,9 +125,10 @@ class VelodyneOptions(Strict):
     calibration: Path | None = None
     """Calibration file of the unit (YAML with angles and offsets by laser, as velodyne_pointcloud and VeloView's
     converter write it), relative to the log's folder; the maker's design angles where left out."""
-    azimuth: Literal["firing", "block"] = "firing"
-    """firing: the head's turn between a block's azimuth and each laser's firing is added, as the manuals say (up to
-    0.12° at 10 Hz with a VLP-32C); block: it is not, as ROS drivers of the VLP-32C do."""
+    azimuth: Literal["firing", "driver"] = "firing"
+    """firing: the head's turn between a block's azimuth and each laser's firing is added, as the manuals say; driver: a
+    VLP-32C's or VLS-128's azimuths are as ROS drivers compute them, which the manuals contradict (by up to 0.14° and
+    0.16° at 10 Hz), to compare with their clouds."""
     stamp: Literal["first_firing", "packet_end"] = "first_firing"
     """first_firing: a packet's stamp is the time of its first firing (application note 63-9277);
     packet_end: of its end, 542.592 µs later, as early HDL-32E manuals say (63-9113, appendix E)."""
@@ -193,6 +199,8 @@ class VelodynePcap(LogFormat):
         if first_hour is not None:
             first_s = first_hour + start.stamp_us / 1e6
             attributes["capture_minus_sensor_s"] = round(start.capture_ns / NS_PER_S - first_s, 6)
+        if (gap := known.gap(model)) is not None:
+            attributes["view_gap_centideg"] = list(gap)
         if len(known.parts.found) > 1:
             attributes["clock_steps"] = len(known.parts.found) - 1
         return LogHeader(attributes)
@@ -206,7 +214,8 @@ class VelodynePcap(LogFormat):
         packets_of = self.packets(source)
         sender = str(header.attributes["sender"])
         hours = Hours(source, header.attributes["first_hour_unix_s"])
-        decoder = _Decoder(model, options, hours, source, sender, packets_of)
+        gap = header.attributes.get("view_gap_centideg")
+        decoder = _Decoder(model, options, hours, source, sender, packets_of, gap and (gap[0], gap[1]))
         if "clock_steps" in header.attributes:
             decoder.judge()
         packets: list[Datagram] = []
@@ -241,6 +250,8 @@ class _Decoder:
     sender: str
     """Address of the sensor."""
     packets_of: Source
+    gap: Gap | None
+    """Gap of the sensor's view."""
     _sweep: int = 0
     _azimuth: int = -1
     _watch: StepWatch = field(default_factory=StepWatch)
@@ -323,14 +334,14 @@ class _Decoder:
             if part.size:
                 rows = slice(None) if part.size == len(raw) else part
                 batch = decode(
-                    raw[rows], epochs[rows], sweeps[rows], self.model, dual, self.options.azimuth == "firing"
+                    raw[rows], epochs[rows], sweeps[rows], self.model, dual, self.options.azimuth == "driver"
                 )
                 yield Rows("returns", batch, first_record=int(numbers[part[0]]))
 
     def _sifted(self, packets: list[Datagram], raw: npt.NDArray[np.void], numbers: npt.NDArray[np.int64]) -> Sieve:
         """Return which packets are sound, no copies, and in a part of the capture on GPS time."""
         sieve = Sieve(len(packets))
-        for bad, reason in faults(raw, self.model, unstated=self.options.model is not None):
+        for bad, reason in faults(raw, self.model, self.options.model is not None, self.gap):
             sieve.drop(bad, reason)
         stamps_us = raw["stamp_us"].astype(np.int64)
         leaping = np.zeros(len(packets), dtype=bool)
@@ -423,6 +434,8 @@ class _Known:
     turned: int = 0
     astray: int = 0
     """Packets whose azimuth was compared with that of the packet before, and those that deviate."""
+    azimuths: list[tuple[int, ...]] = field(default_factory=list)
+    """Azimuths (0.01°) of each block of the first packets."""
     _before: tuple[int, int, float] | None = None
     """Stamp (µs), first azimuth (0.01°) and rate (0.01° per µs) of the last packet."""
 
@@ -432,6 +445,8 @@ class _Known:
         self.products[packet.payload[1205]] += 1
         self.modes[packet.payload[1204]] += 1
         stamp_us = int.from_bytes(packet.payload[1200:1204], "little")
+        if len(self.azimuths) < _VIEWED_PACKETS:
+            self.azimuths.append(struct.unpack(_AZIMUTHS, packet.payload[:1200]))
         self.parts.data(packet.number, stamp_us, packet.capture_ns // 1000)
         self._turn(packet.payload, stamp_us)
 
@@ -452,6 +467,11 @@ class _Known:
         inside = int.from_bytes(payload[last + 2 : last + 4], "little") - azimuth
         rate = ((inside + 18_000) % 36_000 - 18_000) / (float(times_ns[-1] - times_ns[0]) / 1e3)
         self._before = stamp_us, azimuth, rate
+
+    def gap(self, model: Model) -> Gap | None:
+        """Return the gap of the sensor's view."""
+        azimuth = np.array(self.azimuths, dtype=np.uint16)[:, : model.blocks(False)]
+        return gap_of(azimuth, odd_steps(azimuth, model)) if model.banks == 1 else None
 
     def start(self, sentences: bool) -> Start:
         """Return the time of the first packet on GPS time, and of a matching sentence."""

@@ -60,6 +60,7 @@ Source: TypeAlias = Callable[[int | None, str | None], Iterator[Datagram | Rejec
 
 _CHUNK_SLOTS: Final = 240_000  # slots that are decoded at once
 _FIRST_LOOK: Final = 5_000  # packets of the first look: some turns
+_NO_PORT: Final = -1  # a port that no packet is sent to
 _SNIFFED: Final = 1 << 20  # bytes of a file's start that are searched
 _AGREE_S: Final = 5.0
 """Largest difference of the clocks of sensor and computer; other time scales differ by more: GPS by 18 s, TAI by 37."""
@@ -327,8 +328,8 @@ class _Known:
 def _captured(path: Path, options: HesaiOptions, length: int | None, sender: str | None) -> Iterator[Datagram | Reject]:
     """Yield the data packets of a capture; packets of any length where none is given."""
     if length is None:
-        return datagrams(path, Wanted(0, 0, options.port, sender or options.sender))
-    return datagrams(path, Wanted(options.port, length, 0, sender, sole=options.sender is None))
+        return datagrams(path, Wanted(_NO_PORT, 0, options.port, sender or options.sender))
+    return datagrams(path, Wanted(options.port, length, _NO_PORT, sender, sole=options.sender is None))
 
 
 def _has_data_packet(start: bytes) -> bool:

@@ -17,7 +17,8 @@ and the head turns on meanwhile at its mean rate. A return's position, in axes `
     x = d cos ω cos α,  y = −d cos ω sin α,  z = d sin ω + v
 
 with the azimuth α and the laser's own part of it, its elevation ω and its vertical offset v (HDL-32E: drawing
-86-0106; VLP-16: manual, table 9-1; VLP-32C and VLS-128: the maker's calibration files, as VeloView has them).
+86-0106; VLP-16: manual, table 9-1; VLP-32C and VLS-128: the maker's calibration files, as VeloView has them, and
+beams whose lenses are 42.4 mm and 58.63 mm from the axis, which they cross at v).
 
 Decoding is done here and checked in the tests against ``velodyne-decoder``. That library emits whole
 turns, rounds every azimuth to 0.01° (4 mm at 50 m) and gives float32 seconds relative to the turn; here
@@ -174,6 +175,29 @@ class Model:
         )
 
 
+_VLP_32C_DEG: Final = (
+    -25.0, -1.0, -1.667, -15.639, -11.31, 0.0, -0.667, -8.843, -7.254, 0.333, -0.333, -6.148, -5.333, 1.333,
+    0.667, -4.0, -4.667, 1.667, 1.0, -3.667, -3.333, 3.333, 2.333, -2.667, -3.0, 7.0, 4.667, -2.333, -2.0, 15.0,
+    10.333, -1.333,
+)  # fmt: skip
+_VLS_128_DEG: Final = (
+    -11.742, -1.99, 3.4, -5.29, -0.78, 4.61, -4.08, 1.31, -6.5, -1.11, 4.28, -4.41, 0.1, 6.48, -3.2, 2.19,
+    -3.86, 1.53, -9.244, -1.77, 2.74, -5.95, -0.56, 4.83, -2.98, 2.41, -6.28, -0.89, 3.62, -5.07, 0.32, 7.58,
+    -0.34, 5.18, -3.64, 1.75, -25.0, -2.43, 2.96, -5.73, 0.54, 9.7, -2.76, 2.63, -7.65, -1.55, 3.84, -4.85,
+    3.18, -5.51, -0.12, 5.73, -4.3, 1.09, -16.042, -2.21, 4.06, -4.63, 0.76, 15.0, -3.42, 1.97, -6.85, -1.33,
+    -5.62, -0.23, 5.43, -3.53, 0.98, -19.582, -2.32, 3.07, -4.74, 0.65, 11.75, -2.65, 1.86, -7.15, -1.44, 3.95,
+    -2.1, 3.29, -5.4, -0.01, 4.5, -4.19, 1.2, -13.565, -1.22, 4.17, -4.52, 0.87, 6.08, -3.31, 2.08, -6.65, 1.42,
+    -10.346, -1.88, 3.51, -6.06, -0.67, 4.72, -3.97, 2.3, -6.39, -1.0, 4.39, -5.18, 0.21, 6.98, -3.09, 4.98,
+    -3.75, 1.64, -8.352, -2.54, 2.85, -5.84, -0.45, 8.43, -2.87, 2.52, -6.17, -1.66, 3.73, -4.96, 0.43,
+)  # fmt: skip
+"""Elevations by design (°)."""
+
+
+def _rises(lens_mm: float, elevations_deg: tuple[float, ...]) -> tuple[float, ...]:
+    """Return where beams through lenses at `lens_mm` from the axis of rotation cross it (mm above the origin)."""
+    return tuple((-lens_mm * np.tan(np.radians(elevations_deg))).tolist())
+
+
 MODELS: Final = (
     Model(
         "HDL-32E", 0x21, 32, 46_080, 1_152,
@@ -194,31 +218,18 @@ MODELS: Final = (
     ),
     Model(
         "VLP-32C", 0x28, 32, 55_296, 2_304,
-        (
-            -25.0, -1.0, -1.667, -15.639, -11.31, 0.0, -0.667, -8.843, -7.254, 0.333, -0.333, -6.148, -5.333, 1.333,
-            0.667, -4.0, -4.667, 1.667, 1.0, -3.667, -3.333, 3.333, 2.333, -2.667, -3.0, 7.0, 4.667, -2.333, -2.0,
-            15.0, 10.333, -1.333,
-        ),
+        _VLP_32C_DEG,
         azimuths_deg=(
             1.4, -4.2, 1.4, -1.4, 1.4, -1.4, 4.2, -1.4, 1.4, -4.2, 1.4, -1.4, 4.2, -1.4, 4.2, -1.4, 1.4, -4.2, 1.4,
             -4.2, 4.2, -1.4, 1.4, -1.4, 1.4, -1.4, 1.4, -4.2, 4.2, -1.4, 1.4, -1.4,
         ),
-        distance_mm=4.0, at_once=2,
+        rises_mm=_rises(42.4, _VLP_32C_DEG), distance_mm=4.0, at_once=2,
     ),
     Model(
         "VLS-128", 0xA1, 128, 53_300, 2_665,
-        (
-            -11.742, -1.99, 3.4, -5.29, -0.78, 4.61, -4.08, 1.31, -6.5, -1.11, 4.28, -4.41, 0.1, 6.48, -3.2, 2.19,
-            -3.86, 1.53, -9.244, -1.77, 2.74, -5.95, -0.56, 4.83, -2.98, 2.41, -6.28, -0.89, 3.62, -5.07, 0.32, 7.58,
-            -0.34, 5.18, -3.64, 1.75, -25.0, -2.43, 2.96, -5.73, 0.54, 9.7, -2.76, 2.63, -7.65, -1.55, 3.84, -4.85,
-            3.18, -5.51, -0.12, 5.73, -4.3, 1.09, -16.042, -2.21, 4.06, -4.63, 0.76, 15.0, -3.42, 1.97, -6.85, -1.33,
-            -5.62, -0.23, 5.43, -3.53, 0.98, -19.582, -2.32, 3.07, -4.74, 0.65, 11.75, -2.65, 1.86, -7.15, -1.44, 3.95,
-            -2.1, 3.29, -5.4, -0.01, 4.5, -4.19, 1.2, -13.565, -1.22, 4.17, -4.52, 0.87, 6.08, -3.31, 2.08, -6.65,
-            1.42, -10.346, -1.88, 3.51, -6.06, -0.67, 4.72, -3.97, 2.3, -6.39, -1.0, 4.39, -5.18, 0.21, 6.98, -3.09,
-            4.98, -3.75, 1.64, -8.352, -2.54, 2.85, -5.84, -0.45, 8.43, -2.87, 2.52, -6.17, -1.66, 3.73, -4.96, 0.43,
-        ),
+        _VLS_128_DEG,
         azimuths_deg=(6.354, 4.548, 2.732, 0.911, -0.911, -2.732, -4.548, -6.354) * 16,
-        distance_mm=4.0, at_once=8, rest_after=8, first_ns=-8_700,
+        rises_mm=_rises(58.63, _VLS_128_DEG), distance_mm=4.0, at_once=8, rest_after=8, first_ns=-8_700,
     ),
 )  # fmt: skip
 """Supported sensors."""
@@ -394,8 +405,9 @@ def _directions(
 def _driver_directions(azimuth: npt.NDArray[np.uint16], model: Model, dual: bool) -> tuple[Float32, Float32]:
     """Return sine and cosine (n, blocks, 32) of the head's azimuth as ROS drivers have it, to 0.01°.
 
-    Each laser gets its share of the turn to the next block, none in the last. A VLP-32C's lasers count as fired one after another, which
-    takes 71 µs of a cycle of 55; of a VLS-128, only the last of a sequence's blocks turns: all four share an azimuth.
+    Each laser gets its share of the turn to the next block, none in the last. A VLP-32C's lasers count as fired one
+    after another, which takes 71 µs of a cycle of 55; of a VLS-128, only the last of a sequence's blocks turns, as all
+    four share an azimuth.
     """
     turn = steps(azimuth)
     turn = np.where(np.abs(turn) > _LARGEST_STEP_CENTIDEG, np.median(turn), turn)

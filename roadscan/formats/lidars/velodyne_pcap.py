@@ -124,7 +124,7 @@ class VelodyneOptions(Strict):
     """Sensor, where its firmware is too old to write it into the packets."""
     calibration: Path | None = None
     """Calibration file of the unit (YAML with angles and offsets by laser, as velodyne_pointcloud and VeloView's
-    converter write it), relative to the log's folder; the maker's design angles where left out."""
+    converter write it), relative to the log's folder; the maker's design angles and offsets where left out."""
     azimuth: Literal["firing", "driver"] = "firing"
     """firing: the head's turn between a block's azimuth and each laser's firing is added, as the manuals say; driver: a
     VLP-32C's or VLS-128's azimuths are as ROS drivers compute them, which the manuals contradict (by up to 0.14° and

@@ -45,7 +45,7 @@ _CONTAINERS: Final[tuple[tuple[bytes, type[Container]], ...]] = (
     (MCAP, McapFile),
     (SQLITE, SqliteFile),
 )
-_SUFFIXES: Final = (".bag", ".active", ".db3", ".mcap")
+_SUFFIXES: Final = (".db3", ".mcap")  # endings of the files that make a bag of ROS 2
 _PACKED: Final = (".zstd", ".zst")  # endings of files that ROS 2's recorder compressed as a whole
 _LISTED: Final = re.compile(r"^  relative_file_paths:\n((?: +- .*\n?)*)", re.MULTILINE)
 _DIGITS: Final = re.compile(r"\d+")
@@ -132,7 +132,7 @@ class Bag:
             bag.close()
             raise
         if not bag.files:
-            raise FormatError("the folder holds no file of a bag", expected=".db3, .mcap or .bag", file=path)
+            raise FormatError("the folder holds no file of a bag", expected=".db3 or .mcap", file=path)
         return bag
 
     def __enter__(self) -> Self:
@@ -183,9 +183,12 @@ class Bag:
                 yield Message(number, item.offset, item.receive_ns, data, name)
                 number += 1
 
-    def decoded(self, topic: str) -> Iterator[tuple[Message, Any] | Reject]:
-        """Yield each message of a topic with its content (fields as attributes, arrays of numbers as NumPy arrays)."""
-        decode = self.topic(topic).decoder()
+    def decoded(self, topic: str, decode: Decode | None = None) -> Iterator[tuple[Message, Any] | Reject]:
+        """Yield each message of a topic with its content (fields as attributes, arrays of numbers as NumPy arrays).
+
+        decode : reads a message in place of the topic's own definition.
+        """
+        decode = decode or self.topic(topic).decoder()
         for message in self.messages(topic):
             if isinstance(message, Reject):
                 yield message
@@ -252,10 +255,16 @@ def bag_files(path: Path) -> list[Path]:
     """Files of a bag in the order in which they were written."""
     if not path.is_dir():
         return [path]
-    found = [
-        p for p in path.iterdir() if p.suffix in _SUFFIXES or (p.suffix in _PACKED and Path(p.stem).suffix in _SUFFIXES)
-    ]
-    return sorted((p for p in found if p.is_file()), key=lambda p: [int(n) for n in _DIGITS.findall(p.name)] + [0])
+    whole = (path / METADATA).is_file()
+    found = [p for p in path.iterdir() if p.is_file() and _plain(p).suffix in _SUFFIXES]
+    if not whole and len({_DIGITS.sub("#", _plain(p).name) for p in found}) > 1:
+        return []  # bags of their own, in one folder
+    return sorted(found, key=lambda p: [int(number) for number in _DIGITS.findall(_plain(p).stem)])
+
+
+def _plain(file: Path) -> Path:
+    """Return the name of a file without the ending of a compression."""
+    return file.with_suffix("") if file.suffix in _PACKED else file
 
 
 def packets(bag: Bag, topic: str) -> Iterator[Datagram | Reject]:
@@ -293,8 +302,8 @@ def _payloads(content: Any, receive_ns: int) -> Iterator[tuple[bytes, int]]:
 
 def _is_part(file: Path) -> bool:
     """Whether a file is one of a bag; a compressed one by its name alone."""
-    if file.suffix in _PACKED and Path(file.stem).suffix in _SUFFIXES:
-        return True
+    if file.suffix in _PACKED:
+        return _plain(file).suffix in _SUFFIXES
     try:
         with file.open("rb") as stream:
             start = stream.read(_SNIFFED)

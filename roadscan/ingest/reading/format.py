@@ -297,6 +297,37 @@ class Provisional:
     """Settings of the format that have no default."""
 
 
+@dataclass(frozen=True)
+class Part:
+    """One of the streams of a container, such as a topic of a ROS bag: a log each, by the settings that select it."""
+
+    name: str
+    """What the container calls it."""
+    words: str
+    """Its type, number of messages, rate and span, in words."""
+    format: str = ""
+    """Format that reads it; "" where none does."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Settings by which the format reads this part."""
+    frame: str = ""
+    """Name of the frame of its readings, "" where it has none."""
+    parent: str = ""
+    """Frame from which the container counts that frame's mounting; "" where it says nothing of it."""
+    mounting: Mapping[str, Any] = field(default_factory=dict)
+    """Mounting of the frame by keys of :class:`roadscan.core.rig.Sensor`, if the parent is x ahead, y left, z up."""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a container holds."""
+
+    what: str
+    """What it is, in words."""
+    parts: tuple[Part, ...]
+    faults: tuple[str, ...] = ()
+    """What is damaged of the container as a whole."""
+
+
 def beside(log: Path, named: Path) -> Path:
     """Return the absolute path of a file that a log's settings name, relative to the log's folder."""
     return (log if log.is_dir() else log.parent) / named
@@ -352,6 +383,10 @@ class LogFormat(ABC):
         A relative path counts from the log's folder (:func:`beside`).
         """
         return []
+
+    def contents(self, path: Path) -> Contents | None:
+        """Return all streams of a container, those of other formats too; None for a log of its own."""
+        return None
 
     @abstractmethod
     def header(self, source: LogSource) -> LogHeader:

@@ -16,8 +16,7 @@ from scipy.spatial import cKDTree
 
 from roadscan.core.errors import ConfigError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.formats.ros.lidar_packets import topic_packets
-from roadscan.formats.ros.velodyne_scans import TYPES
+from roadscan.formats.ros.bag import Bag, packets
 from roadscan.ingest.reading.format import Reject, format_of
 from tests.formats.readings import Readings, read
 from tests.formats.test_hesai import polar, sweep_of
@@ -217,7 +216,9 @@ def test_the_bag_against_the_sweep_of_another_program(recordings: Path) -> None:
     assert log.rejected == 0
     assert log.attributes["view_gap_centideg"] == pytest.approx([9_100, 27_000], abs=60)
     sweep = sweep_of(folder)
-    messages = [p.payload for p in topic_packets(folder / "bag", None, TYPES) if not isinstance(p, Reject)][:76]
+    with Bag.open(folder / "bag") as bag:
+        sent = [p.payload for p in packets(bag, next(iter(bag.topics))) if not isinstance(p, Reject)]
+    messages = sent[:76]
     blocks = np.frombuffer(b"".join(p[:1200] for p in messages), np.uint8).reshape(76, 12, 100)
     azimuth, units = blocks[:, :, 2] + 256 * blocks[:, :, 3].astype(int), blocks[:, :, 4:]
     measured = (units.reshape(76, 12, 32, 3)[..., :2] != 0).any(axis=3)

@@ -460,11 +460,15 @@ def test_orthometric_altitudes_need_a_geoid(tmp_path: Path) -> None:
         read("ros_gnss", bag, {"altitude": "orthometric"}, clock=UTC, crs="EPSG:4979", height="orthometric")
 
 
+def nmea_lines() -> list[str]:
+    """Sentences of five epochs, with their date in the last one."""
+    lines = [f"$GPGGA,1200{s:02d}.00,4800.0000,N,01100.0000,E,4,12,0.8,500.0,M,46.5,M,1.0,0001*" for s in range(5)]
+    lines.append("$GPRMC,120004.00,A,4800.0000,N,01100.0000,E,0.0,0.0,140526,,,R*")
+    return [line + f"{np.bitwise_xor.reduce(np.frombuffer(line[1:-1].encode(), np.uint8)):02X}" for line in lines]
+
+
 def test_sentences_are_those_of_an_nmea_log(tmp_path: Path) -> None:
-    lines = [f"$GPGGA,1200{s:02d}.00,4800.0000,N,01100.0000,E,4,12,0.8,500.0,M,46.5,M,1.0,0001*" for s in range(5)] + [
-        "$GPRMC,120004.00,A,4800.0000,N,01100.0000,E,0.0,0.0,140526,,,R*"
-    ]
-    sums = [line + f"{np.bitwise_xor.reduce(np.frombuffer(line[1:-1].encode(), np.uint8)):02X}" for line in lines]
+    sums = nmea_lines()
     (tmp_path / "a.nmea").write_text("\n".join(sums) + "\n")
     direct = read("nmea", tmp_path / "a.nmea", crs="EPSG:4979")
     for name, field in (("nmea_msgs/msg/Sentence", "sentence"), ("std_msgs/msg/String", "data")):

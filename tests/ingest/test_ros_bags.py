@@ -174,8 +174,8 @@ import sys, time
 from pathlib import Path
 from roadscan.formats.ros.bag import Bag
 begun = time.perf_counter()
-from roadscan.formats.ros.overview import contents
-found = contents(Path(sys.argv[1]))
+from roadscan.ingest.reading.format import format_named
+found = format_named("ros_points").contents(Path(sys.argv[1]))
 peak_kb = Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]
 print(found.parts[0].words, "|", time.perf_counter() - begun, int(peak_kb) / 1024)
 """

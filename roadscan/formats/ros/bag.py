@@ -62,7 +62,7 @@ class Message(NamedTuple):
     """Byte of the file at which it, or its chunk, starts; −1 where the file has no such place."""
     receive_ns: int
     """Time at which the recording computer received it (POSIX ns by its clock)."""
-    data: bytes
+    data: bytes | memoryview
     """Its content, serialised."""
     file: str = ""
     """File of a folder; '' for a bag of one file."""
@@ -162,7 +162,7 @@ class Bag:
 
     def messages(self, topic: str) -> Iterator[Message | Reject]:
         """Yield the messages of a topic in the order of the bag, not deserialised, and a reject for what is damaged."""
-        wanted, number = self.topic(topic), 0
+        wanted, number, lost = self.topic(topic), 0, 0
         yield from self.faults
         for name, container in self.files:
             ids = {
@@ -170,6 +170,7 @@ class Bag:
             }
             for item in container.messages(ids) if ids else ():
                 if isinstance(item, Reject):
+                    lost += item.records
                     yield replace(item, record=number, file=name)
                     continue
                 data = item.data
@@ -182,6 +183,9 @@ class Bag:
                         continue
                 yield Message(number, item.offset, item.receive_ns, data, name)
                 number += 1
+        if number + lost < wanted.count:
+            missing = wanted.count - number - lost
+            yield Reject("the bag's index counts more messages than there are", number, -1, missing)
 
     def decoded(self, topic: str, decode: Decode | None = None) -> Iterator[tuple[Message, Any] | Reject]:
         """Yield each message of a topic with its content (fields as attributes, arrays of numbers as NumPy arrays).

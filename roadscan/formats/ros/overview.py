@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +17,7 @@ from roadscan.formats.ros.bag import Bag, Topic, bag_files
 from roadscan.formats.ros.mcap_file import McapFile
 from roadscan.formats.ros.ros1_file import Ros1File
 from roadscan.formats.ros.sqlite_file import SqliteFile
-from roadscan.formats.ros.topics import TopicFormat
-from roadscan.ingest.reading.format import Contents, Part, Reject, log_formats
+from roadscan.ingest.reading.format import Contents, Part, Reject
 
 Float64 = npt.NDArray[np.float64]
 
@@ -32,14 +31,22 @@ _MOST_FRAMES: Final = 100  # longest way from a frame to the vehicle's
 _FLU: Final = np.diag([1.0, -1.0, -1.0])  # forward, right, down from x ahead, y left, z up (REP 103)
 
 
-def contents(path: Path) -> Contents | None:
-    """Return the topics of a bag by name."""
-    return _contents_of(path, tuple((str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in bag_files(path)))
+class Reader(Protocol):
+    """A format of messages."""
+
+    name: ClassVar[str]
+
+    def reads(self, bag: Bag, topic: Topic) -> bool:
+        """Return whether it reads a topic."""
+
+
+def contents(path: Path, readers: tuple[Reader, ...]) -> Contents:
+    """Return the topics of a bag by name, each with the reader that reads it."""
+    return _contents_of(path, readers, tuple((str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in bag_files(path)))
 
 
 @functools.lru_cache(maxsize=16)
-def _contents_of(path: Path, stamp: object) -> Contents:
-    readers = [one for one in log_formats().values() if isinstance(one, TopicFormat)]
+def _contents_of(path: Path, readers: tuple[Reader, ...], stamp: object) -> Contents:
     with Bag.open(path) as bag:
         mountings = _mountings(bag)
         parts = tuple(_part(bag, bag.topics[name], readers, mountings) for name in sorted(bag.topics))
@@ -49,7 +56,7 @@ def _contents_of(path: Path, stamp: object) -> Contents:
         return Contents(what, parts, tuple(fault.reason for fault in faults))
 
 
-def _part(bag: Bag, topic: Topic, readers: list[TopicFormat], mountings: dict[str, tuple[str, Float64]]) -> Part:
+def _part(bag: Bag, topic: Topic, readers: tuple[Reader, ...], mountings: dict[str, tuple[str, Float64]]) -> Part:
     frame = _frame(bag, topic)
     parent, pose = mountings.get(frame, ("", np.eye(4)))
     return Part(

@@ -18,7 +18,8 @@ from roadscan.formats.lidars.pcap import Datagram
 from roadscan.formats.ros.arrivals import Arrivals
 from roadscan.formats.ros.bag import METADATA, Bag, Message, Topic, bag_files, is_bag, packets, stamp_ns
 from roadscan.formats.ros.definitions import Decode
-from roadscan.ingest.reading.format import Contents, Item, LogFormat, LogHeader, LogSource, Reject
+from roadscan.formats.ros.overview import contents
+from roadscan.ingest.reading.format import Contents, Item, LogFormat, LogHeader, LogSource, Reject, log_formats
 from roadscan.ingest.reading.records import options_of
 
 TIME: Final = (
@@ -77,9 +78,7 @@ class TopicFormat(LogFormat):
 
     def contents(self, path: Path) -> Contents | None:
         """Return all topics of the bag."""
-        from roadscan.formats.ros.overview import contents  # it knows all formats of topics, as this one
-
-        return contents(path)
+        return contents(path, tuple(one for one in log_formats().values() if isinstance(one, TopicFormat)))
 
     def header(self, source: LogSource) -> LogHeader:
         """Find the topic and check the clock; the first message says the frame."""

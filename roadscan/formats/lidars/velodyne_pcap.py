@@ -5,7 +5,8 @@ damaged one is rejected whole. Position packets of 512 bytes hold the lidar's st
 Coordinates have axes ``flu``; `laser` is the maker's own number (its place in the firing sequence);
 reflectivity is scaled to 16 bits (255 becomes 65,535); a sweep ends where the azimuth passes 360°. In dual
 return mode both returns are kept, and one that is written twice is kept once. Angles are the maker's design values,
-or those of the unit's calibration file.
+or those of the unit's calibration file. Where the sensor leaves out azimuths, one packet a turn lies across the gap:
+its later blocks wait for the head to turn on.
 
 **Which hour** it is the data packets do not say. It comes from a valid GPRMC in the capture, or from
 `options.hour` with the clock's date; from the capture's own clock only when `options.hour = "capture"`.

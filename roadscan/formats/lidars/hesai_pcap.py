@@ -170,7 +170,6 @@ class HesaiPcap(LogFormat):
                 "lasers": model.channels,
                 "returns": RETURNS.get(known.mode, 1),
                 "sender": known.sender,
-                "packet": known.first.hex(),
                 "checksum": known.checksum,
                 "clock": str(clock.system),
                 "view_gap_centideg": known.gap and list(known.gap),
@@ -182,9 +181,8 @@ class HesaiPcap(LogFormat):
         """Stream packets, decoded some hundreds at a time."""
         options = options_of(source, HesaiOptions)
         at = header.attributes
-        layout = Layout.of(bytes.fromhex(at["packet"]))
-        if layout is None:
-            raise FormatError("the log's header holds no packet", file=source.path)
+        known = _survey(source.path, options, self.packets(source))
+        layout = known.layout
         model = next(m for m in MODELS if m.name == at["model"])
         geometry = Geometry(
             model, _angles(source, options, model), layout.unit_mm, options.azimuth == "firing", options.optical_centre
@@ -192,8 +190,8 @@ class HesaiPcap(LogFormat):
         clock = dataclasses.replace(
             source.any_clock or Clock(TimeSystem.UNIX_UTC), system=TimeSystem(at["clock"]), unit="us"
         )
-        epochs, first, gap = EpochReader(clock, source.path), bytes.fromhex(at["packet"]), at["view_gap_centideg"]
-        decoder = _Decoder(layout, geometry, epochs, first, at["checksum"], gap and (gap[0], gap[1]))
+        epochs = EpochReader(clock, source.path)
+        decoder = _Decoder(layout, geometry, epochs, known.first, known.checksum, known.gap)
         chunk = max(1, _CHUNK_SLOTS // (layout.blocks * model.channels))
         packets: list[Datagram] = []
         for item in self.packets(source)(layout.packet.itemsize, at["sender"]):

@@ -212,6 +212,11 @@ class Layout:
     """Where the bytes under the CRC begin and end, in packets that have one."""
 
     @property
+    def shared(self) -> list[int]:
+        """Return where in a packet the bytes of `head` stand."""
+        return [0, 1, 2, 3, 6, 7, 8, 9, 10, 11][: len(self.head)]
+
+    @property
     def blocks(self) -> int:
         """Return the number of blocks."""
         return int(self.packet["block"].shape[0])
@@ -328,7 +333,7 @@ def _with_version(payload: bytes) -> Layout | None:
 
 def head_of(payload: bytes, layout: Layout) -> bytes:
     """Return the bytes of a packet's head that all packets of a log share."""
-    return payload[:4] + payload[6:12] if len(layout.head) > 4 else payload[: len(layout.head)]
+    return bytes(payload[k] for k in layout.shared)
 
 
 @dataclass(frozen=True)

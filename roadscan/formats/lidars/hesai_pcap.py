@@ -272,10 +272,9 @@ class _Decoder:
     def _sifted(self, packets: list[Datagram], raw: npt.NDArray[np.void]) -> Sieve:
         """Return which packets are sound by themselves."""
         sieve = Sieve(raw.size)
-        head = head_of(self.first, self.layout)
-        sieve.drop(
-            np.array([head_of(p.payload, self.layout) != head for p in packets]), "the head is not that of the log"
-        )
+        octets = raw.view(np.uint8).reshape(raw.size, -1)
+        shared = np.frombuffer(self.first, np.uint8)[self.layout.shared]
+        sieve.drop((octets[:, self.layout.shared] != shared).any(axis=1), "the head is not that of the log")
         if self.layout.body is not None and self.checksum:
             wrong = crc_faults([p.payload for p in packets], self.layout.body, self.checksum)
             sieve.drop(wrong, "the checksum is wrong")

@@ -14,11 +14,10 @@ from roadscan.core.errors import ConfigError, FormatError, Missing, RoadscanErro
 from roadscan.core.extras import need
 from roadscan.core.gpstime import Clock
 from roadscan.core.strict import Strict
-from roadscan.formats.lidars.pcap import Datagram
 from roadscan.formats.ros.arrivals import Arrivals
-from roadscan.formats.ros.bag import METADATA, Bag, Message, Topic, bag_files, is_bag, packets, stamp_ns
+from roadscan.formats.ros.bag import METADATA, Bag, Message, Topic, bag_files, is_bag, stamp_ns
 from roadscan.formats.ros.definitions import Decode
-from roadscan.formats.ros.overview import contents
+from roadscan.formats.ros.overview import Reader, contents
 from roadscan.ingest.reading.format import Contents, Item, LogFormat, LogHeader, LogSource, Reject, log_formats
 from roadscan.ingest.reading.records import options_of
 
@@ -77,8 +76,10 @@ class TopicFormat(LogFormat):
         return sorted([*bag_files(path), *([metadata] if metadata.is_file() else [])])
 
     def contents(self, path: Path) -> Contents | None:
-        """Return all topics of the bag."""
-        return contents(path, tuple(one for one in log_formats().values() if isinstance(one, TopicFormat)))
+        """Return all topics of the bag; None for what is none."""
+        if not is_bag(path):
+            return None
+        return contents(path, tuple(one for one in log_formats().values() if isinstance(one, Reader)))
 
     def header(self, source: LogSource) -> LogHeader:
         """Find the topic and check the clock; the first message says the frame."""
@@ -148,20 +149,6 @@ class TopicFormat(LogFormat):
                 continue
             yield Timed(message, content, own_ns if by_header else message.receive_ns)
         yield from arrivals.findings(by_header=by_header)
-
-
-class PacketTopic(TopicFormat):
-    """A format of messages that hold a lidar's packets, read by the format of its captures."""
-
-    def attributes(self, source: LogSource, bag: Bag, topic: Topic) -> dict[str, Any]:
-        """Return nothing: the format of captures states what is needed."""
-        return {}
-
-    def datagrams(self, source: LogSource) -> Iterator[Datagram | Reject]:
-        """Yield the topic's packets in their order."""
-        need("rosbags.typesys", "a ROS bag")
-        with Bag.open(source.path) as bag:
-            yield from packets(bag, self.topic(bag, source).name)
 
 
 def message_clock(source: LogSource) -> Clock:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -163,3 +165,51 @@ def test_packets_of_real_bags(recordings: Path, name: str, topic: str, count: in
     assert isinstance(found[0], Datagram)
     assert found[0].capture_ns == first_ns
     assert hashlib.sha256(found[0].payload).digest() != hashlib.sha256(bytes(length)).digest()
+
+
+def test_an_mcap_without_chunks(tmp_path: Path) -> None:
+    """As ROS 2 writes it with the preset `fastwrite`: the records of the chunks, at the top level, and no summary."""
+    path = write_bag(tmp_path / "bag", "mcap", _topics(20_000))
+    expected = _raw(path)["/imu"]
+    content, at, records = (path / "bag.mcap").read_bytes(), 8, b""
+    while at < len(content) - 8:
+        kind, size = struct.unpack_from("<BQ", content, at)
+        body = content[at + 9 : at + 9 + size]
+        if kind == 1:
+            records += content[at : at + 9 + size]
+        elif kind == 6:  # two times, size, CRC, no compression's name, and size again stand before the records
+            records += body[28 + 4 + 8 :]
+        at += 9 + size
+    footer = struct.pack("<BQ", 15, 4) + bytes(4) + struct.pack("<BQ", 2, 20) + bytes(20)
+    whole = tmp_path / "flat.mcap"
+    whole.write_bytes(content[:8] + records + footer + content[:8])
+    with Bag.open(whole) as bag:
+        assert not bag.faults
+        assert [(m.receive_ns, m.data) for m in _messages(bag, "/imu")] == expected
+        assert bag.topics["/imu"].count == len(expected)
+    whole.write_bytes((content[:8] + records)[:-40])
+    with Bag.open(whole) as bag:
+        assert [(m.receive_ns, m.data) for m in _messages(bag, "/imu")] == expected[: bag.topics["/imu"].count]
+        assert bag.topics["/imu"].count >= len(expected) - 1
+
+
+def test_a_wrong_checksum_of_a_chunk_costs_it(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", "mcap", _topics(20_000))
+    expected = _raw(path)["/imu"]
+    file = path / "bag.mcap"
+    content = bytearray(file.read_bytes())
+    at, chunks = 8, []
+    while at < len(content) - 8:
+        kind, size = struct.unpack_from("<BQ", content, at)
+        chunks += [at] if kind == 6 else []
+        at += 9 + size
+    for number, start in enumerate(chunks):  # rosbags writes none (0)
+        size = struct.unpack_from("<Q", content, start + 1)[0]
+        crc = zlib.crc32(content[start + 9 + 40 : start + 9 + size]) + (number == 2)
+        content[start + 9 + 24 : start + 9 + 28] = struct.pack("<I", crc)
+    file.write_bytes(content)
+    with Bag.open(path) as bag:
+        items = list(bag.messages("/imu"))
+    lost = [item for item in items if isinstance(item, Reject)]
+    assert "checksum" in lost[0].reason
+    assert sum(one.records for one in lost) + len(items) - len(lost) == len(expected)

@@ -17,6 +17,7 @@ from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
 from roadscan.formats.lidars.hesai_packets import crc_faults
 from roadscan.ingest.reading.format import format_of
+from tests.formats import ros_files
 from tests.formats.hesai_files import DUAL, MOMENT, SHAPES, TRIPLE, angle_file, packet, turning
 from tests.formats.readings import Readings, read
 from tests.formats.test_velodyne_pcap import capture, frame, gps_ns, posix_ns
@@ -381,3 +382,35 @@ def test_a_year_is_counted_from_the_right_one(tmp_path: Path) -> None:
     for model in ("Pandar40P", "PandarXT-32"):
         log = read_log(tmp_path, model, turning(model, 2))
         assert abs(log.epochs[0] - gps_ns(MOMENT + dt.timedelta(seconds=1))) < 10**6
+
+
+# --- bags -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+@pytest.mark.parametrize("message", ["pandar_msgs/msg/PandarScan", "nebula_msgs/msg/NebulaPackets"])
+def test_a_bag_gives_what_a_capture_gives(tmp_path: Path, kind: str, message: str) -> None:
+    payloads = turning("QT128", 9)
+    begin_ns = posix_ns(MOMENT) + 10**9
+
+    def sent(k: int) -> dict[str, Any]:
+        data = np.frombuffer(payloads[k], np.uint8)
+        own = {"stamp": ros_files.stamp(begin_ns + k * 400_000), "data": data}
+        return (
+            own
+            if message.startswith("nebula")
+            else own | {"data": np.pad(data, (0, 1500 - data.size)), "size": data.size}
+        )
+
+    rows = [
+        (begin_ns + k, {"header": {"frame_id": "top"}, "packets": [sent(k), sent(k + 1), sent(k + 2)]})
+        for k in (0, 3, 6)
+    ]
+    path = ros_files.write_bag(tmp_path / "bag", kind, {"/lidar": (message, rows)})
+    angles = angle_file(tmp_path / "angles.csv", *angles_of("QT128"))
+    assert format_of(path).name == "hesai_scans"
+    log = read("hesai_scans", path, {"angles": angles})
+    direct = read_log(tmp_path, "QT128", payloads)
+    assert log.table.equals(direct.table)
+    with pytest.raises(FormatError, match="no topic '/lidr'"):
+        read("hesai_scans", path, {"angles": angles, "topic": "/lidr"})

@@ -214,7 +214,7 @@ class Layout:
     @property
     def shared(self) -> list[int]:
         """Return where in a packet the bytes of `head` stand."""
-        return [0, 1, 2, 3, 6, 7, 8, 9, 10, 11][: len(self.head)]
+        return [0, 1, 2, 3, 6, 7, 9, 11][: len(self.head)]
 
     @property
     def blocks(self) -> int:
@@ -328,7 +328,8 @@ def _with_version(payload: bytes) -> Layout | None:
         return None
     packet = _dtype(len(payload), 12, blocks, lasers, unit, tail, _fields(sequenced, **at))
     body = (12, end) if guarded else None
-    return Layout(models, payload[:4] + payload[6:12], packet, unit_mm, 1900, body)
+    head = bytes(payload[k] for k in (0, 1, 2, 3, 6, 7, 9, 11))
+    return Layout(models, head, packet, unit_mm, 1900, body)
 
 
 def head_of(payload: bytes, layout: Layout) -> bytes:

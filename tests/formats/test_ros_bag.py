@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import sqlite3
 import struct
 import zlib
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +78,7 @@ def test_a_bag_of_each_kind_gives_what_was_written(kind: str, tmp_path: Path) ->
 @pytest.mark.parametrize("kind", ["ros1", "ros1-lz4", "mcap", "mcap-storage", "sqlite"])
 @pytest.mark.parametrize("share", [0.5, 0.97])
 def test_a_bag_cut_off_keeps_whole_chunks(kind: str, share: float, tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "bag", kind, _topics(40_000))
+    path = write_bag(tmp_path / "bag", kind, _topics(20_000))
     expected = _raw(path)["/imu"]
     file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix in {".db3", ".mcap"})
     whole = file.read_bytes()
@@ -92,7 +94,7 @@ def test_a_bag_cut_off_keeps_whole_chunks(kind: str, share: float, tmp_path: Pat
 
 
 def test_a_damaged_chunk_costs_its_own_messages(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "bag", "ros1-bz2", _topics(40_000))
+    path = write_bag(tmp_path / "bag", "ros1-bz2", _topics(20_000))
     expected = _raw(path)["/imu"]
     content = bytearray(path.read_bytes())
     with Reader1(path) as reader:
@@ -127,6 +129,15 @@ def test_a_part_that_metadata_names_and_that_is_missing_is_named(tmp_path: Path)
     (path / "metadata.yaml").write_text(text.replace("- bag.db3", "- bag.db3\n  - bag_1.db3"))
     with Bag.open(path) as bag:
         assert any("bag_1.db3" in item.reason for item in bag.messages("/imu") if isinstance(item, Reject))
+
+
+def test_messages_that_metadata_count_and_that_are_missing_are_named(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", "sqlite", _topics(100))
+    with closing(sqlite3.connect(path / "bag.db3")) as base, base:
+        base.execute("UPDATE messages SET topic_id = 77 WHERE id = 5")
+    with Bag.open(path) as bag:
+        (lost,) = (item for item in bag.messages("/imu") if isinstance(item, Reject))
+    assert (lost.reason, lost.records) == ("metadata.yaml counts more messages than the files hold", 1)
 
 
 def test_a_hostile_type_name_is_no_code(tmp_path: Path) -> None:

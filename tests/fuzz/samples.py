@@ -33,11 +33,14 @@ from roadscan.formats.clouds.e57_file import page_checksums
 from roadscan.formats.scanners.sick_telegrams import encode_scans
 from roadscan.ingest.reading.text_table import LINE_BYTES_MAX
 from tests.formats import (
+    hesai_files,
+    ros_files,
     test_argoverse,
     test_carmen,
     test_control_lines,
     test_control_vector,
     test_encoder_csv,
+    test_hesai,
     test_images,
     test_imu_csv,
     test_kitti,
@@ -53,6 +56,7 @@ from tests.formats import (
     test_sick_lms,
     test_smrmsg,
     test_ubx,
+    test_velodyne_models,
     test_velodyne_pcap,
 )
 from tests.formats.e57_files import PAGE, PAYLOAD, small_e57
@@ -483,7 +487,7 @@ _VIDEO = {"end": test_images.T0}
 
 def all_samples() -> list[Sample]:
     """Every form of every format."""
-    return [s for part in (_poses(), _tables(), _lidar(), _clouds(), _others(), _bags()) for s in part]
+    return [s for part in (_poses(), _tables(), _lidar(), _packets(), _clouds(), _others(), _bags()) for s in part]
 
 
 def samples_of(name: str) -> list[Sample]:
@@ -579,6 +583,59 @@ def _tables() -> Iterator[Sample]:
     yield Sample("road_lines", "gpkg", vector(roads, "a.gpkg"), {}, lane)
     yield Sample("road_lines", "shp", vector(roads, "a.shp"), {}, lane, ("a.shp", "a.shx", "a.dbf", "a.prj"))
     yield Sample("road_lines", "zip", roads_zip, {}, lane, inside=zip_inside)
+
+
+def pcap_of(product: int, *, dual: bool = False) -> Callable[[Path], Path]:
+    mode = test_velodyne_pcap.DUAL if dual else test_velodyne_pcap.STRONGEST
+    packets = test_velodyne_models.drive(product, RECORDS, mode=mode)
+    return lambda folder: test_velodyne_pcap.capture(folder / "a.pcap", packets)
+
+
+def hesai(model: str) -> Callable[[Path], Path]:
+    return lambda folder: test_hesai.log_of(folder, model, hesai_files.turning(model, RECORDS))
+
+
+def bag_scans(kind: str, message: str, payloads: list[bytes]) -> Callable[[Path], Path]:
+    """A bag with three packets a message, stamped by the driver."""
+    pandar = message.startswith("pandar")
+    begin_ns = test_velodyne_pcap.posix_ns(hesai_files.MOMENT) + 10**9
+
+    def packet(k: int) -> dict[str, Any]:
+        data = np.frombuffer(payloads[k].ljust(1500 if pandar else 1206, b"\0"), np.uint8)
+        more = {"size": len(payloads[k])} if pandar else {}
+        return {"stamp": ros_files.stamp(begin_ns + k * 400_000), "data": data, **more}
+
+    rows = [
+        (begin_ns + k * 400_000, {"packets": [packet(k + j) for j in range(3)]}) for k in range(0, len(payloads), 3)
+    ]
+
+    def make(folder: Path) -> Path:
+        hesai_files.angle_file(folder / "angles.csv", *test_hesai.angles_of("PandarXT-16"))
+        return ros_files.write_bag(folder / "bag", kind, {"/packets": (message, rows)})
+
+    return make
+
+
+def _packets() -> Iterator[Sample]:
+    """Lidars whose packets are in a capture or in a bag."""
+    hour = {"options": {"hour": 9}, "stated": {"clock": test_velodyne_pcap.CLOCK}, "fields": _PCAP_FIELDS}
+    yield Sample("velodyne_pcap", "vlp_32c", pcap_of(test_velodyne_models.VLP_32C), **hour)
+    yield Sample("velodyne_pcap", "vls_128", pcap_of(test_velodyne_models.VLS_128), **hour)
+    yield Sample("velodyne_pcap", "vls_128_dual", pcap_of(test_velodyne_models.VLS_128, dual=True), **hour)
+    for model in hesai_files.SHAPES:
+        stated = {"model": model} if model in ("Pandar128", "OT128") else {}
+        options = {"angles": "angles.csv", **stated}
+        size = 16 + 42 + len(hesai_files.turning(model, 1)[0])
+        spans = every(size, 24) if model in ("QT128", "PandarXT-16") else None
+        yield Sample("hesai_pcap", model.lower(), hesai(model), options, {}, fields=_PCAP_FIELDS, spans=spans)
+    velodyne = [content[42:] for _, content in test_velodyne_models.drive(test_velodyne_models.VLP_32C, RECORDS)]
+    xt = hesai_files.turning("PandarXT-16", RECORDS)
+    for kind, log in (("ros1", "bag.bag"), ("mcap", "bag/*.mcap"), ("sqlite", "bag/*.db3")):
+        pandar = bag_scans(kind, "pandar_msgs/msg/PandarScan", xt)
+        angles = {"angles": "angles.csv" if kind == "ros1" else "../angles.csv"}
+        yield Sample("hesai_scans", kind, pandar, angles, {}, (log,))
+        driver = bag_scans(kind, "velodyne_msgs/msg/VelodyneScan", velodyne)
+        yield Sample("velodyne_scans", kind, driver, {"hour": "capture"}, {}, (log,))
 
 
 def _lidar() -> Iterator[Sample]:

@@ -1,10 +1,12 @@
-"""Velodyne HDL-32E and VLP-16: network captures (PCAP) of the sensor's UDP packets.
+"""Velodyne HDL-32E, VLP-16, VLP-32C and VLS-128: network captures (PCAP) of the sensor's UDP packets.
 
 One data packet is one record: :mod:`roadscan.formats.lidars.velodyne_packets` says how it is decoded, and a
 damaged one is rejected whole. Position packets of 512 bytes hold the lidar's stamp and a GPRMC sentence.
 Coordinates have axes ``flu``; `laser` is the maker's own number (its place in the firing sequence);
 reflectivity is scaled to 16 bits (255 becomes 65,535); a sweep ends where the azimuth passes 360°. In dual
-return mode both returns are kept, and one that is written twice is kept once.
+return mode both returns are kept, and one that is written twice is kept once. Angles are the maker's design values,
+or those of the unit's calibration file. Where the sensor leaves out azimuths, one packet a turn lies across the gap:
+its later blocks wait for the head to turn on.
 
 **Which hour** it is the data packets do not say. It comes from a valid GPRMC in the capture, or from
 `options.hour` with the clock's date; from the capture's own clock only when `options.hour = "capture"`.
@@ -18,11 +20,13 @@ once. See `docs/clocks.md`, "Clocks that step".
 
 from __future__ import annotations
 
+import functools
+import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal
+from typing import Any, ClassVar, Final, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -38,7 +42,7 @@ from roadscan.formats.lidars.velodyne_packets import (
     BLOCKS,
     DATA_BYTES,
     DUAL,
-    FLAG,
+    FLAGS,
     LATEST_STAMP_US,
     MODELS,
     MODES,
@@ -46,6 +50,7 @@ from roadscan.formats.lidars.velodyne_packets import (
     Model,
     decode,
     faults,
+    odd_steps,
 )
 from roadscan.formats.lidars.velodyne_segments import (
     STEPPED,
@@ -57,7 +62,8 @@ from roadscan.formats.lidars.velodyne_segments import (
     reference,
 )
 from roadscan.formats.lidars.velodyne_sentences import SENTENCES, Sentences
-from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
+from roadscan.formats.lidars.view_gaps import Gap, gap_of
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import Sieve, options_of
 
 _CHUNK_PACKETS: Final = 640  # 245,760 slots
@@ -70,8 +76,16 @@ _FASTEST_DRIFT: Final = 6e-4
 """Largest rate between clocks: NTP moves a computer's clock by up to 500 ppm, and a quartz drifts by up to 100."""
 _LEAST_DRIFT_S: Final = 0.05  # smaller gains of the capture's clock are ignored
 _NAMES_IN_RIG_FILES: Final = ("HDL32", "VLP16", "HDL64", "VLP32", "VLS128", "PUCKHIRES")
-_OTHER_PRODUCTS: Final = {0x23: "VLP-32A/B", 0x24: "Puck Hi-Res", 0x28: "VLP-32C", 0x31: "Velarray", 0xA1: "VLS-128"}
+_OTHER_PRODUCTS: Final = {0x23: "VLP-32A/B", 0x24: "Puck Hi-Res", 0x31: "Velarray"}
 
+Source: TypeAlias = Callable[[Wanted], Iterator[Datagram | Reject]]
+"""Gives the wanted packets of a log in file order."""
+
+
+_VIEWED_PACKETS: Final = 5_000  # packets in which a gap of the view is looked for: more than ten turns
+_AZIMUTHS: Final = "<" + "xxH96x" * BLOCKS  # azimuths of a packet's blocks
+_FIRST_FLAG: Final = FLAGS[0].to_bytes(2, "little")  # bytes with which a data packet begins
+_MANY_LASERS: Final = MODELS[-1]  # the one whose blocks have four flags
 
 TWICE: Final = Witness(
     "lidar_packets_twice",
@@ -107,8 +121,15 @@ class VelodyneOptions(Strict):
     hour: Literal["capture"] | int | None = None
     """UTC hour (0–23) of the first data packet, on the clock's date, where the capture holds no valid GPRMC;
     "capture" takes it from the recording computer's clock, and the date too where the clock states none."""
-    model: Literal["HDL-32E", "VLP-16"] | None = None
+    model: Literal["HDL-32E", "VLP-16", "VLP-32C", "VLS-128"] | None = None
     """Sensor, where its firmware is too old to write it into the packets."""
+    calibration: Path | None = None
+    """Calibration file of the unit (YAML with angles and offsets by laser, as velodyne_pointcloud and VeloView's
+    converter write it), relative to the log's folder; the maker's design angles and offsets where left out."""
+    azimuth: Literal["firing", "driver"] = "firing"
+    """firing: the head's turn between a block's azimuth and each laser's firing is added, as the manuals say; driver: a
+    VLP-32C's or VLS-128's azimuths are as ROS drivers compute them, which the manuals contradict (by up to 0.14° and
+    0.16° at 10 Hz), to compare with their clouds."""
     stamp: Literal["first_firing", "packet_end"] = "first_firing"
     """first_firing: a packet's stamp is the time of its first firing (application note 63-9277);
     packet_end: of its end, 542.592 µs later, as early HDL-32E manuals say (63-9113, appendix E)."""
@@ -124,9 +145,9 @@ class VelodynePcap(LogFormat):
     """Captures of Velodyne packets."""
 
     name: ClassVar[str] = "velodyne_pcap"
-    title: ClassVar[str] = "Velodyne HDL-32E or VLP-16 packets in a PCAP capture, a stamp per return"
+    title: ClassVar[str] = "Velodyne HDL-32E, VLP-16, VLP-32C or VLS-128 packets in a PCAP capture, a stamp per return"
     yields: ClassVar[tuple[str, ...]] = ("returns",)
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     suffixes: ClassVar[tuple[str, ...]] = (
         ".pcap",
         ".pcapng",
@@ -150,11 +171,22 @@ class VelodynePcap(LogFormat):
             return False
         return start[:4] in {*MAGICS, PCAPNG} and _has_data_packet(start)
 
+    def companions(self, path: Path, options: Strict) -> list[Path]:
+        """Return the calibration file, where one is stated."""
+        named = options.calibration if isinstance(options, VelodyneOptions) else None
+        return [] if named is None else [beside(path, named)]
+
+    def packets(self, source: LogSource) -> Source:
+        """Return what gives the log's packets; logs that are no capture give their own."""
+        return functools.partial(datagrams, source.path)
+
     def header(self, source: LogSource) -> LogHeader:
         """Return model, return mode, sender and first hour."""
         options = options_of(source, VelodyneOptions)
-        known = _survey_capture(source.path, options)
+        known = _survey(source.path, options, self.packets(source))
         model = _model(source, options, known)
+        if options.calibration is not None:
+            model.calibrated(beside(source.path, options.calibration))
         start = known.start(_has_hours(source))
         first_hour = first_hour_unix_s(source, options.hour, start)
         attributes: dict[str, Any] = {
@@ -168,6 +200,8 @@ class VelodynePcap(LogFormat):
         if first_hour is not None:
             first_s = first_hour + start.stamp_us / 1e6
             attributes["capture_minus_sensor_s"] = round(start.capture_ns / NS_PER_S - first_s, 6)
+        if (gap := known.gap(model)) is not None:
+            attributes["view_gap_centideg"] = list(gap)
         if len(known.parts.found) > 1:
             attributes["clock_steps"] = len(known.parts.found) - 1
         return LogHeader(attributes)
@@ -176,14 +210,18 @@ class VelodynePcap(LogFormat):
         """Stream packets, decoded some hundreds at a time."""
         options = options_of(source, VelodyneOptions)
         model = next(m for m in MODELS if m.name == header.attributes["model"])
+        if options.calibration is not None:
+            model = model.calibrated(beside(source.path, options.calibration))
+        packets_of = self.packets(source)
         sender = str(header.attributes["sender"])
         hours = Hours(source, header.attributes["first_hour_unix_s"])
-        decoder = _Decoder(model, options, hours, source, sender)
+        gap = header.attributes.get("view_gap_centideg")
+        decoder = _Decoder(model, options, hours, source, sender, packets_of, gap and (gap[0], gap[1]))
         if "clock_steps" in header.attributes:
             decoder.judge()
         packets: list[Datagram] = []
         positions: list[Datagram] = []
-        for item in datagrams(source.path, _wanted(options, sender)):
+        for item in packets_of(_wanted(options, sender)):
             if isinstance(item, Reject):
                 yield item
             elif item.port == options.position_port:
@@ -212,6 +250,9 @@ class _Decoder:
     source: LogSource
     sender: str
     """Address of the sensor."""
+    packets_of: Source
+    gap: Gap | None
+    """Gap of the sensor's view."""
     _sweep: int = 0
     _azimuth: int = -1
     _watch: StepWatch = field(default_factory=StepWatch)
@@ -241,7 +282,7 @@ class _Decoder:
 
     def judge(self) -> None:
         """Search the whole capture for steps of the sensor's clock, and judge its parts."""
-        known = _survey_capture(self.source.path, self.options, whole_of=self.sender)
+        known = _survey(self.source.path, self.options, self.packets_of, whole_of=self.sender)
         self._verdicts = judged(known.parts.found, _has_hours(self.source))
 
     def findings(self) -> Iterator[Finding]:
@@ -286,19 +327,22 @@ class _Decoder:
             raw, numbers, epochs = raw[order], numbers[order], epochs[order]
         if self.options.stamp == "packet_end":
             epochs = epochs - self.model.slot_times_ns(dual=False)[-1, -1]
-        sweeps = self._sweeps(raw["blocks"]["azimuth"])
         is_dual = raw["mode"] == DUAL
+        azimuth = raw["blocks"]["azimuth"]
+        sweeps = self._sweeps(np.where(is_dual[:, None] & (self.model.banks > 1), azimuth[:, :1], azimuth))
         for dual in (False, True):
             part = np.flatnonzero(is_dual == dual)
             if part.size:
                 rows = slice(None) if part.size == len(raw) else part
-                batch = decode(raw[rows], epochs[rows], sweeps[rows], self.model, dual)
+                batch = decode(
+                    raw[rows], epochs[rows], sweeps[rows], self.model, dual, self.options.azimuth == "driver"
+                )
                 yield Rows("returns", batch, first_record=int(numbers[part[0]]))
 
     def _sifted(self, packets: list[Datagram], raw: npt.NDArray[np.void], numbers: npt.NDArray[np.int64]) -> Sieve:
         """Return which packets are sound, no copies, and in a part of the capture on GPS time."""
         sieve = Sieve(len(packets))
-        for bad, reason in faults(raw, self.model, unstated=self.options.model is not None):
+        for bad, reason in faults(raw, self.model, self.options.model is not None, self.gap):
             sieve.drop(bad, reason)
         stamps_us = raw["stamp_us"].astype(np.int64)
         leaping = np.zeros(len(packets), dtype=bool)
@@ -391,6 +435,8 @@ class _Known:
     turned: int = 0
     astray: int = 0
     """Packets whose azimuth was compared with that of the packet before, and those that deviate."""
+    azimuths: list[tuple[int, ...]] = field(default_factory=list)
+    """Azimuths (0.01°) of each block of the first packets."""
     _before: tuple[int, int, float] | None = None
     """Stamp (µs), first azimuth (0.01°) and rate (0.01° per µs) of the last packet."""
 
@@ -400,6 +446,8 @@ class _Known:
         self.products[packet.payload[1205]] += 1
         self.modes[packet.payload[1204]] += 1
         stamp_us = int.from_bytes(packet.payload[1200:1204], "little")
+        if len(self.azimuths) < _VIEWED_PACKETS:
+            self.azimuths.append(struct.unpack(_AZIMUTHS, packet.payload[:1200]))
         self.parts.data(packet.number, stamp_us, packet.capture_ns // 1000)
         self._turn(packet.payload, stamp_us)
 
@@ -413,9 +461,18 @@ class _Known:
                 self.turned += 1
                 self.astray += abs((off + 18_000) % 36_000 - 18_000) > _ASTRAY_CENTIDEG
         model = next((m for m in MODELS if m.product == payload[1205]), MODELS[0])
-        span_us = float(model.slot_times_ns(payload[1204] == DUAL)[-1, 0]) / 1e3
-        inside = int.from_bytes(payload[100 * (BLOCKS - 1) + 2 : 100 * (BLOCKS - 1) + 4], "little") - azimuth
-        self._before = stamp_us, azimuth, ((inside + 18_000) % 36_000 - 18_000) / span_us
+        times_ns = model.azimuth_times_ns(payload[1204] == DUAL)
+        if times_ns[-1] == times_ns[0]:
+            return  # one azimuth a packet: nothing predicts the next one's
+        last = 100 * (times_ns.size - 1)
+        inside = int.from_bytes(payload[last + 2 : last + 4], "little") - azimuth
+        rate = ((inside + 18_000) % 36_000 - 18_000) / (float(times_ns[-1] - times_ns[0]) / 1e3)
+        self._before = stamp_us, azimuth, rate
+
+    def gap(self, model: Model) -> Gap | None:
+        """Return the gap of the sensor's view."""
+        azimuth = np.array(self.azimuths, dtype=np.uint16)[:, : model.blocks(False)]
+        return gap_of(azimuth, odd_steps(azimuth, model)) if model.banks == 1 else None
 
     def start(self, sentences: bool) -> Start:
         """Return the time of the first packet on GPS time, and of a matching sentence."""
@@ -429,15 +486,23 @@ def _wanted(options: VelodyneOptions, sender: str | None) -> Wanted:
 
 
 def _has_data_packet(start: bytes) -> bool:
-    at = start.find(FLAG)
+    at = start.find(_FIRST_FLAG)
     while 0 <= at < len(start) - DATA_BYTES:
-        if all(start[at + 100 * k : at + 100 * k + 2] == FLAG for k in range(1, BLOCKS)):
+        if _is_flagged(start[at : at + DATA_BYTES]):
             return True
-        at = start.find(FLAG, at + 1)
+        at = start.find(_FIRST_FLAG, at + 1)
     return False
 
 
-def _survey_capture(path: Path, options: VelodyneOptions, whole_of: str | None = None) -> _Known:
+def _is_flagged(payload: bytes) -> bool:
+    """Return True where all blocks begin with the flags of a Velodyne's data packet."""
+    flags = [int.from_bytes(payload[100 * k : 100 * k + 2], "little") for k in range(BLOCKS)]
+    if payload[1205] != _MANY_LASERS.product:
+        return flags == [FLAGS[0]] * BLOCKS
+    return any(flags[: _MANY_LASERS.blocks(dual)] == _MANY_LASERS.flags(dual).tolist() for dual in (False, True))
+
+
+def _survey(path: Path, options: VelodyneOptions, packets_of: Source, whole_of: str | None = None) -> _Known:
     """Read the first packets, up to a GPRMC that agrees unless the hour is stated; everything if the clock steps.
 
     Parameters
@@ -445,7 +510,7 @@ def _survey_capture(path: Path, options: VelodyneOptions, whole_of: str | None =
     whole_of : look at all packets of this sender in any case.
     """
     known = _Known()
-    for item in datagrams(path, _wanted(options, whole_of or options.sender)):
+    for item in packets_of(_wanted(options, whole_of or options.sender)):
         if isinstance(item, Reject):
             continue
         if item.port == options.position_port:
@@ -489,9 +554,8 @@ def _survey_capture(path: Path, options: VelodyneOptions, whole_of: str | None =
 
 
 def _begins_well(payload: bytes) -> bool:
-    """Return True for a data packet with sound first and last flags and a possible stamp."""
-    stamp_us = int.from_bytes(payload[1200:1204], "little")
-    return payload[:2] == FLAG and payload[1100:1102] == FLAG and stamp_us <= LATEST_STAMP_US
+    """Return True for a data packet with sound flags and a possible stamp."""
+    return _is_flagged(payload) and int.from_bytes(payload[1200:1204], "little") <= LATEST_STAMP_US
 
 
 def _model(source: LogSource, options: VelodyneOptions, known: _Known) -> Model:
@@ -503,7 +567,7 @@ def _model(source: LogSource, options: VelodyneOptions, known: _Known) -> Model:
         name = _OTHER_PRODUCTS.get(product, f"of product byte 0x{product:02x}")
         raise FormatError(
             f"the packets are {name}",
-            expected="HDL-32E (0x21) or VLP-16 (0x22)",
+            expected=" or ".join(f"{m.name} (0x{m.product:02x})" for m in MODELS),
             change="state options.model if the firmware writes no product byte (0x00)",
             file=source.path,
             missing=Missing("options.model"),

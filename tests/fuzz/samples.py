@@ -27,6 +27,7 @@ import pyarrow.parquet as pq
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.rig import Sensor
 from roadscan.formats.clouds.e57_file import page_checksums
 from roadscan.formats.scanners.sick_telegrams import encode_scans
 from roadscan.ingest.reading.text_table import LINE_BYTES_MAX
@@ -54,6 +55,7 @@ from tests.formats import (
 )
 from tests.formats.e57_files import PAGE, PAYLOAD, small_e57
 from tests.formats.nmea_files import Fix, sentences
+from tests.formats.ouster_files import ouster
 from tests.formats.sick_files import encode_telegram, write_telegrams
 from tests.fuzz.mutations import Change, Inside
 from tests.fuzz.pose_samples import (
@@ -577,6 +579,16 @@ def _lidar() -> Iterator[Sample]:
         stated,
         fields=_PCAP_FIELDS,
     )
+    metadata, count = {"metadata": "a.json"}, {"clock": Clock(TimeSystem.FREE)}
+    yield Sample("ouster_pcap", "legacy", ouster("LEGACY"), metadata, count, fields=_PCAP_FIELDS)
+    dual = ouster("RNG19_RFL8_SIG16_NIR16_DUAL", checksum=True)
+    whole = 16 + 42 + 64 + 4 * (12 + 4 * 16)
+    yield Sample("ouster_pcap", "dual", dual, metadata, count, fields=_PCAP_FIELDS, spans=every(whole, 24))
+    low = ouster("RNG15_RFL8_NIR8")
+    yield Sample("ouster_pcap", "metadata", low, metadata, count, ("a.json",), text=True)
+    imu = count | {"sensor": Sensor(kind="imu")}
+    yield Sample("ouster_imu", "packets", ouster("LEGACY", imu=True), metadata, imu, fields=_PCAP_FIELDS)
+    yield Sample("ouster_imu", "metadata", ouster("LEGACY", imu=True), metadata, imu, ("a.json",), text=True)
     by_rate = test_sick_lms.BY_RATE
     one = len(encode_scans(test_sick_lms.scans(1), "mm").tobytes())
     scan_clock = {"clock": GPS}

@@ -57,7 +57,7 @@ from roadscan.formats.lidars.velodyne_segments import (
     reference,
 )
 from roadscan.formats.lidars.velodyne_sentences import SENTENCES, Sentences
-from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, log_formats
 from roadscan.ingest.reading.records import Sieve, options_of
 
 _CHUNK_PACKETS: Final = 640  # 245,760 slots
@@ -461,6 +461,15 @@ def _survey_capture(path: Path, options: VelodyneOptions, whole_of: str | None =
                 break
     known.parts.flush(last=True)
     if not known.parts.seen:
+        other = next(
+            (name for name, kind in log_formats().items() if name != VelodynePcap.name and kind.sniff(path)), ""
+        )
+        if other:
+            raise FormatError(
+                f"the capture's packets are no Velodyne's but those of {other}",
+                file=path,
+                missing=Missing("format", other),
+            )
         raise FormatError(
             f"no Velodyne data packet was sent to port {options.port}",
             expected=f"UDP packets of {DATA_BYTES} bytes",

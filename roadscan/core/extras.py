@@ -24,9 +24,12 @@ EXTRAS: Final = {
     "onnxruntime": ("onnxruntime", "onnx"),
     "psycopg": ("psycopg", "postgis"),
     "rapidocr": ("rapidocr", "ocr"),
+    "lz4.frame": ("lz4", "ros"),
+    "rosbags.typesys": ("rosbags", "ros"),
     "s3fs": ("s3fs", "s3"),
     "small_gicp": ("small_gicp", "icp"),
     "xarray": ("xarray", "frames"),
+    "zstandard": ("zstandard", "ros"),
 }
 """Distribution and extra of each package that roadscan can do without, by the name that is imported."""
 

@@ -1,0 +1,312 @@
+"""Opens a bag of ROS 1 or ROS 2, lists its topics, and yields the messages of one.
+
+A bag is a file of ROS 1 (`.bag`), a file of ROS 2 (`.db3`, `.mcap`), or a folder of such files with or without its
+`metadata.yaml`. A bag that was cut off, or was never closed, gives what its whole chunks hold.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, NamedTuple, Self
+
+from roadscan.core.errors import FormatError, nearest
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.formats.lidars.pcap import Datagram
+from roadscan.formats.ros.compression import ZSTD, unpack_file, unpacked
+from roadscan.formats.ros.definitions import Decode, decoder, type_name
+from roadscan.formats.ros.mcap_file import MAGIC as MCAP
+from roadscan.formats.ros.mcap_file import McapFile
+from roadscan.formats.ros.ros1_file import OLDER as ROS1
+from roadscan.formats.ros.ros1_file import Ros1File
+from roadscan.formats.ros.sqlite_file import MAGIC as SQLITE
+from roadscan.formats.ros.sqlite_file import SqliteFile
+from roadscan.formats.ros.storage import Connection, Container, Held
+from roadscan.ingest.reading.format import Reject
+
+METADATA: Final = "metadata.yaml"
+PACKETS: Final = (
+    "velodyne_msgs/msg/VelodyneScan",
+    "pandar_msgs/msg/PandarScan",
+    "hesai_lidar/msg/PandarScan",
+    "nebula_msgs/msg/NebulaPackets",
+    "ouster_ros/msg/PacketMsg",
+    "ouster_msgs/msg/PacketMsg",
+    "ouster_sensor_msgs/msg/PacketMsg",
+)
+"""Types whose messages are a lidar's packets as it sent them."""
+
+_CONTAINERS: Final[tuple[tuple[bytes, type[Container]], ...]] = (
+    (ROS1, Ros1File),
+    (MCAP, McapFile),
+    (SQLITE, SqliteFile),
+)
+_SUFFIXES: Final = (".bag", ".active", ".db3", ".mcap")
+_PACKED: Final = (".zstd", ".zst")  # endings of files that ROS 2's recorder compressed as a whole
+_LISTED: Final = re.compile(r"^  relative_file_paths:\n((?: +- .*\n?)*)", re.MULTILINE)
+_DIGITS: Final = re.compile(r"\d+")
+_TABLES: Final = (b"topics", b"messages")  # tables by which a database of a bag is known
+_SNIFFED: Final = 16_384  # bytes of a file's start that are searched for them
+
+
+class Message(NamedTuple):
+    """A message as the bag holds it."""
+
+    number: int
+    """Number in its topic, from 0."""
+    offset: int
+    """Byte of the file at which it, or its chunk, starts; −1 where the file has no such place."""
+    receive_ns: int
+    """Time at which the recording computer received it (POSIX ns by its clock)."""
+    data: bytes
+    """Its content, serialised."""
+    file: str = ""
+    """File of a folder; '' for a bag of one file."""
+
+
+@dataclass
+class Topic:
+    """A topic of a bag."""
+
+    name: str
+    type: str
+    """`package/msg/Name`, of ROS 1 as of ROS 2."""
+    encoding: str
+    """How its messages are serialised: `ros1` or `cdr`."""
+    definition: str = ""
+    definition_language: str = "msg"
+    held: Held | None = None
+    """Number of its messages, and their first and last receive stamp (POSIX ns); None where it has none."""
+
+    @property
+    def count(self) -> int:
+        """Number of messages."""
+        return 0 if self.held is None else self.held.count
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Messages a second by the receive stamps; None for fewer than two."""
+        if self.held is None or self.held.count < 2 or self.held.last_ns <= self.held.first_ns:
+            return None
+        return (self.held.count - 1) * NS_PER_S / (self.held.last_ns - self.held.first_ns)
+
+    def decoder(self) -> Decode:
+        """What reads its messages; raises FormatError where nothing can."""
+        return decoder(self.type, self.encoding, self.definition, self.definition_language)
+
+
+@dataclass
+class Bag:
+    """An open bag; to be closed, as it may have unpacked files into a temporary folder."""
+
+    path: Path
+    files: list[tuple[str, Container]] = field(default_factory=list)
+    """The files in their order, each with its name in the folder ('' for a bag of one file)."""
+    topics: dict[str, Topic] = field(default_factory=dict)
+    faults: list[Reject] = field(default_factory=list)
+    """What is damaged of the bag as a whole, such as an end that is missing."""
+    _scratch: tempfile.TemporaryDirectory[str] | None = None
+
+    @classmethod
+    def open(cls, path: Path) -> Bag:
+        """Open a bag; a list of its topics costs reading its index, or its records' heads where it has none.
+
+        Raises
+        ------
+        FormatError
+            if it is no bag, or nothing of it can be read.
+        """
+        bag = cls(path)
+        try:
+            for file in bag_files(path):
+                bag._take(file, file.name if path.is_dir() else "")
+            bag._find_missing()
+        except OSError as error:
+            bag.close()
+            raise FormatError(f"the bag cannot be read: {error.strerror or error}", file=path) from error
+        except FormatError:
+            bag.close()
+            raise
+        if not bag.files:
+            raise FormatError("the folder holds no file of a bag", expected=".db3, .mcap or .bag", file=path)
+        return bag
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Remove what was unpacked."""
+        if self._scratch is not None:
+            self._scratch.cleanup()
+            self._scratch = None
+
+    def topic(self, name: str) -> Topic:
+        """A topic by name; an error that lists the bag's topics where it has none of that name."""
+        if name not in self.topics:
+            listed = ", ".join(sorted(self.topics)) or "none"
+            raise FormatError(
+                f"the bag has no topic '{name}'{nearest(name, self.topics)}",
+                expected=f"one of: {listed}",
+                file=self.path,
+            )
+        return self.topics[name]
+
+    def messages(self, topic: str) -> Iterator[Message | Reject]:
+        """Yield the messages of a topic in the order of the bag, not deserialised, and a reject for what is damaged."""
+        wanted, number = self.topic(topic), 0
+        yield from self.faults
+        for name, container in self.files:
+            ids = {
+                c.id for c in container.connections.values() if c.topic == topic and type_name(c.type) == wanted.type
+            }
+            for item in container.messages(ids) if ids else ():
+                if isinstance(item, Reject):
+                    yield replace(item, record=number, file=name)
+                    continue
+                data = item.data
+                if wanted.encoding == "cdr" and data[:4] == ZSTD:  # messages that were compressed one by one
+                    try:
+                        data = unpacked(data, "zstd")
+                    except ValueError as error:
+                        yield Reject(f"the compressed message is damaged: {error}", number, item.offset, 1, name)
+                        number += 1
+                        continue
+                yield Message(number, item.offset, item.receive_ns, data, name)
+                number += 1
+
+    def decoded(self, topic: str) -> Iterator[tuple[Message, Any] | Reject]:
+        """Yield each message of a topic with its content (fields as attributes, arrays of numbers as NumPy arrays)."""
+        decode = self.topic(topic).decoder()
+        for message in self.messages(topic):
+            if isinstance(message, Reject):
+                yield message
+                continue
+            try:
+                content = decode(message.data)
+            except Exception:  # noqa: BLE001 — generated code that meets damaged bytes raises whatever comes
+                yield Reject("the message does not fit its definition", message.number, message.offset, 1, message.file)
+                continue
+            yield message, content
+
+    def _take(self, file: Path, name: str) -> None:
+        """Open one file of the bag."""
+        if file.suffix in _PACKED:
+            if self._scratch is None:
+                self._scratch = tempfile.TemporaryDirectory(prefix="roadscan-bag-")
+            plain = Path(self._scratch.name) / file.stem
+            fault = unpack_file(file, plain)
+            if fault:
+                self.faults.append(Reject(fault, file=name))
+            file = plain
+        container = _container(file)
+        self.files.append((name, container))
+        for connection in container.connections.values():
+            self._join(connection)
+
+    def _join(self, connection: Connection) -> None:
+        kind = type_name(connection.type)
+        topic = self.topics.setdefault(
+            connection.topic,
+            Topic(
+                connection.topic,
+                kind,
+                connection.encoding,
+                connection.definition,
+                connection.definition_language,
+            ),
+        )
+        if topic.type != kind:
+            self.faults.append(Reject(f"the topic {topic.name} is of two types: {topic.type} is read, {kind} is not"))
+        elif connection.held is not None:
+            topic.held = connection.held.joined(topic.held)
+
+    def _find_missing(self) -> None:
+        """Note files that the folder's metadata name and that are not there."""
+        metadata = self.path / METADATA
+        if not metadata.is_file():
+            return
+        listed = _LISTED.search(metadata.read_text(encoding="utf-8", errors="replace"))
+        for line in listed[1].splitlines() if listed else ():
+            name = Path(line.strip().removeprefix("- ").strip("\"'")).name
+            if not any((self.path / name).with_name(name + end).is_file() for end in ("", *_PACKED)):
+                self.faults.append(Reject(f"{METADATA} names {name}, which is not there", file=METADATA))
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a file or folder is a bag, by its content."""
+    if path.is_dir():
+        return any(_is_part(file) for file in bag_files(path)[:1])
+    return _is_part(path)
+
+
+def bag_files(path: Path) -> list[Path]:
+    """Files of a bag in the order in which they were written."""
+    if not path.is_dir():
+        return [path]
+    found = [
+        p for p in path.iterdir() if p.suffix in _SUFFIXES or (p.suffix in _PACKED and Path(p.stem).suffix in _SUFFIXES)
+    ]
+    return sorted((p for p in found if p.is_file()), key=lambda p: [int(n) for n in _DIGITS.findall(p.name)] + [0])
+
+
+def packets(bag: Bag, topic: str) -> Iterator[Datagram | Reject]:
+    """Yield the packets of a lidar that a topic of raw packets holds, in their order.
+
+    A packet's time is the stamp that the driver gave it, and where it gave none, that of its message: by the recording
+    computer's clock in either case, or the sensor's where the driver was so configured. Sender and port are not known.
+    """
+    number = 0
+    for item in bag.decoded(topic):
+        if isinstance(item, Reject):
+            yield item
+            continue
+        message, content = item
+        for payload, stamp_ns in _payloads(content, message.receive_ns):
+            yield Datagram(number, message.offset, stamp_ns, "", 0, payload)
+            number += 1
+
+
+def stamp_ns(stamp: Any) -> int:
+    """A stamp of ROS (`sec`, `nanosec`) in nanoseconds."""
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+def _payloads(content: Any, receive_ns: int) -> Iterator[tuple[bytes, int]]:
+    """Yield the packets of a message, each with its time (POSIX ns)."""
+    if hasattr(content, "buf"):
+        yield content.buf.tobytes(), receive_ns
+        return
+    for packet in content.packets:
+        own_ns = stamp_ns(packet.stamp) if hasattr(packet, "stamp") else 0
+        size = int(packet.size) if hasattr(packet, "size") else None
+        yield packet.data[:size].tobytes(), own_ns or receive_ns
+
+
+def _is_part(file: Path) -> bool:
+    """Whether a file is one of a bag; a compressed one by its name alone."""
+    if file.suffix in _PACKED and Path(file.stem).suffix in _SUFFIXES:
+        return True
+    try:
+        with file.open("rb") as stream:
+            start = stream.read(_SNIFFED)
+    except OSError:
+        return False
+    return start.startswith((ROS1, MCAP)) or (start.startswith(SQLITE) and all(table in start for table in _TABLES))
+
+
+def _container(file: Path) -> Container:
+    with file.open("rb") as stream:
+        start = stream.read(len(SQLITE))
+    for magic, kind in _CONTAINERS:
+        if start.startswith(magic):
+            return kind(file)
+    raise FormatError("the file is no part of a bag", expected="ROS 1 (.bag), ROS 2 (.db3) or MCAP (.mcap)", file=file)

@@ -1,0 +1,86 @@
+"""The container of ROS 2's recorder with SQLite: a table of topics and a table of messages."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Set
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+from roadscan.formats.ros.storage import Connection, Container, Held, Raw, RawItem
+from roadscan.ingest.reading.format import Reject
+
+MAGIC: Final = b"SQLite format 3\0"
+
+_MOST_SKIPS: Final = 40  # after damage, reading goes on 1, 2, 4 … 2^40 messages farther
+
+
+class SqliteFile(Container):
+    """A `.db3` file."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        try:
+            with closing(self._connect()) as base:
+                self._find_topics(base)
+                self._find_spans(base)
+        except sqlite3.Error as error:
+            raise self.damaged(f"the database cannot be read: {error}") from error
+        log = path.with_name(path.name + "-wal")
+        if log.is_file() and log.stat().st_size:
+            self.faults.append(
+                Reject(f"its last messages stand in {log.name}: sqlite3 {path.name} 'PRAGMA wal_checkpoint'")
+            )
+
+    def messages(self, wanted: Set[int]) -> Iterator[RawItem]:
+        """Yield the messages of some topics in the order in which they were written."""
+        yield from self.faults
+        last, skip = -1, 0
+        marks = ",".join("?" * len(wanted))
+        query = f"SELECT id, topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) AND id > ? ORDER BY id"
+        with closing(self._connect()) as base:
+            while skip <= _MOST_SKIPS:
+                try:
+                    for number, topic, stamp, data in base.execute(query, (*sorted(wanted), last)):
+                        last, skip = number, 0
+                        if isinstance(stamp, int) and isinstance(data, bytes):
+                            yield Raw(topic, -1, stamp, data)
+                        else:
+                            yield Reject("the row is no message")
+                    return
+                except sqlite3.Error as error:
+                    if not skip:
+                        yield Reject(f"the database is damaged after message {last}: {error}")
+                    last, skip = last + (1 << skip), skip + 1
+
+    def _connect(self) -> sqlite3.Connection:
+        base = sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+        base.execute("PRAGMA writable_schema = ON")  # without it, SQLite refuses a file that is cut off
+        base.text_factory = lambda text: text.decode(errors="replace")
+        return base
+
+    def _find_topics(self, base: sqlite3.Connection) -> None:
+        for number, name, type_name, encoding in base.execute(
+            "SELECT id, name, type, serialization_format FROM topics"
+        ):
+            self.connections[int(number)] = Connection(int(number), str(name), str(type_name), str(encoding))
+        try:
+            texts = base.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
+            known = {name: (text, "idl" if "idl" in language else "msg") for name, language, text in texts}
+        except sqlite3.Error:
+            return  # recorders before ROS 2 Iron write no such table
+        for connection in self.connections.values():
+            connection.definition, connection.definition_language = known.get(connection.type, ("", "msg"))
+
+    def _find_spans(self, base: sqlite3.Connection) -> None:
+        query = "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
+        try:
+            for number, count, first, last in base.execute(query):
+                if number in self.connections and isinstance(first, int) and isinstance(last, int):
+                    self.connections[number].held = Held(count, first, last)
+        except sqlite3.Error:
+            for item in self.messages(self.connections.keys()):
+                if isinstance(item, Raw) and item.connection in self.connections:
+                    connection = self.connections[item.connection]
+                    connection.held = Held(1, item.receive_ns, item.receive_ns).joined(connection.held)

@@ -1,0 +1,172 @@
+"""What the containers of a bag have in common: connections, messages, and files that consist of chunks.
+
+A connection is a stream of messages of one topic, one type and one definition. A chunk is a run of records that is
+compressed as a whole; the records after it say how many messages of each connection it holds.
+"""
+
+from __future__ import annotations
+
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Set
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, Final, NamedTuple, TypeAlias
+
+from roadscan.core.errors import FormatError
+from roadscan.ingest.reading.format import Reject
+
+MOST_CHUNK_BYTES: Final = 1 << 30  # larger chunks count as damage (bytes); recorders write 768 KiB to some MB
+BROKEN: Final = (struct.error, ValueError, IndexError, KeyError, EOFError, OverflowError, MemoryError)
+"""What reading damaged bytes raises."""
+
+
+@dataclass
+class Connection:
+    """A stream of messages of one topic and one type."""
+
+    id: int
+    topic: str
+    type: str
+    """Name of the type as recorded, such as `sensor_msgs/Imu` or `sensor_msgs/msg/Imu`."""
+    encoding: str
+    """How messages are serialised: `ros1`, `cdr` (ROS 2), or another word of the container."""
+    definition: str = ""
+    """Text of the type's definition; '' where the bag holds none."""
+    definition_language: str = "msg"
+    """Language of the definition: msg or idl."""
+    held: Held | None = None
+    """What the file holds of it; None where it holds no message."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """Number of messages, and their first and last receive stamp (POSIX ns)."""
+
+    count: int
+    first_ns: int
+    last_ns: int
+
+    def joined(self, other: Held | None) -> Held:
+        """Figures of two parts of one connection together."""
+        if other is None:
+            return self
+        return Held(self.count + other.count, min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns))
+
+
+class Raw(NamedTuple):
+    """A serialised message."""
+
+    connection: int
+    offset: int
+    """Byte of the file at which the message, or its chunk, starts; −1 where the file has no such place."""
+    receive_ns: int
+    """Time at which the recording computer received it (POSIX ns by its clock)."""
+    data: bytes
+
+
+RawItem: TypeAlias = Raw | Reject
+
+
+class Container(ABC):
+    """One file of a bag."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.connections: dict[int, Connection] = {}
+        self.faults: list[Reject] = []
+        """What is damaged of the container itself."""
+
+    @abstractmethod
+    def messages(self, wanted: Set[int]) -> Iterator[RawItem]:
+        """Yield the messages of some connections in the order of the file, and a reject for what is damaged."""
+
+    def damaged(self, what: str) -> FormatError:
+        """The error of a file of which nothing can be read."""
+        return FormatError(
+            what, change="record it again, or look into it with the recorder's own tools", file=self.path
+        )
+
+
+@dataclass
+class Chunk:
+    """Records that stand together in a file."""
+
+    offset: int
+    """Byte at which the chunk's record starts."""
+    length: int
+    """Bytes up to the end of the chunk's record."""
+    held: dict[int, Held] = field(default_factory=dict)
+    """What it holds of each connection; empty where that is not known."""
+
+
+class ChunkedContainer(Container):
+    """A file of chunks, known from its index or, where it has none, found by going from record to record."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.chunks: list[Chunk] = []
+        self.size = path.stat().st_size
+        with path.open("rb") as stream:
+            self.open(stream)
+        for chunk in self.chunks:
+            for number, held in chunk.held.items():
+                connection = self.connections.get(number)
+                if connection is not None:
+                    connection.held = held.joined(connection.held)
+
+    @abstractmethod
+    def open(self, stream: BinaryIO) -> None:
+        """Find connections and chunks."""
+
+    @abstractmethod
+    def within(self, stream: BinaryIO, chunk: Chunk) -> Iterator[Raw | Connection]:
+        """Yield messages and connections of a chunk in their order; raises one of `BROKEN` where it is damaged."""
+
+    def messages(self, wanted: Set[int]) -> Iterator[RawItem]:
+        """Yield the messages of some connections, chunk by chunk; a damaged chunk costs its own messages."""
+        with self.path.open("rb") as stream:
+            for chunk in self.chunks:
+                if chunk.held and not wanted & chunk.held.keys():
+                    continue
+                found = 0
+                try:
+                    for item in self.within(stream, chunk):
+                        if isinstance(item, Raw) and item.connection in wanted:
+                            found += 1
+                            yield item
+                except BROKEN as error:
+                    stated = sum(held.count for number, held in chunk.held.items() if number in wanted)
+                    lost = max(1, stated - found)
+                    yield Reject(f"the chunk is damaged: {error}", -1, chunk.offset, lost)
+        yield from self.faults
+
+    def count(self, stream: BinaryIO, chunk: Chunk) -> bool:
+        """Find what a chunk holds by reading it; False where it is damaged before its first message."""
+        try:
+            for item in self.within(stream, chunk):
+                if isinstance(item, Connection):
+                    self.connections.setdefault(item.id, item)
+                else:
+                    held = Held(1, item.receive_ns, item.receive_ns)
+                    chunk.held[item.connection] = held.joined(chunk.held.get(item.connection))
+        except BROKEN:
+            return bool(chunk.held)
+        return True
+
+    def complete(self, stream: BinaryIO) -> None:
+        """Read the chunks whose content is not stated, or that hold connections not yet known."""
+        for chunk in self.chunks:
+            if not chunk.held or not chunk.held.keys() <= self.connections.keys():
+                stated = dict(chunk.held)
+                chunk.held.clear()
+                self.count(stream, chunk)
+                chunk.held = stated or chunk.held
+
+
+def exactly(stream: BinaryIO, count: int) -> bytes:
+    """Read so many bytes; EOFError where there are fewer."""
+    data = stream.read(count)
+    if len(data) != count:
+        raise EOFError("the file ends here")
+    return data

@@ -43,6 +43,7 @@ from tests.formats import (
     test_las,
     test_nmea,
     test_opencrg,
+    test_ouster_bag,
     test_ply,
     test_psi,
     test_road_lines,
@@ -589,6 +590,11 @@ def _lidar() -> Iterator[Sample]:
     imu = count | {"sensor": Sensor(kind="imu")}
     yield Sample("ouster_imu", "packets", ouster("LEGACY", imu=True), metadata, imu, fields=_PCAP_FIELDS)
     yield Sample("ouster_imu", "metadata", ouster("LEGACY", imu=True), metadata, imu, ("a.json",), text=True)
+    for kind in ("ros1", "mcap", "sqlite"):
+        bag = functools.partial(test_ouster_bag.small_bag, kind)
+        parts = () if kind == "ros1" else ("bag/bag*",)
+        yield Sample("ouster_bag", kind, bag, {}, count, parts)
+        yield Sample("ouster_bag_imu", kind, bag, {}, imu, parts)
     by_rate = test_sick_lms.BY_RATE
     one = len(encode_scans(test_sick_lms.scans(1), "mm").tobytes())
     scan_clock = {"clock": GPS}

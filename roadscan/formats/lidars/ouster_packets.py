@@ -395,20 +395,20 @@ def faults(
     raw: Bytes, columns: Columns, metadata: OusterMetadata, *, has_checksum: bool
 ) -> list[tuple[npt.NDArray[np.bool_], str]]:
     """Return masks (n,) of damaged packets (n, b), each with its reason."""
-    found = []
+    found: dict[str, Any] = {}
     if has_checksum:
-        found.append((~checksums_fit(raw), "the packet's checksum (CRC-64) is wrong"))
+        found["the packet's checksum (CRC-64) is wrong"] = ~checksums_fit(raw)
     if metadata.profile_name != LEGACY:
-        found.append((raw[:, 0] != _LIDAR_PACKET, "the packet's type is not that of lidar data"))
+        found["the packet's type is not that of lidar data"] = raw[:, 0] != _LIDAR_PACKET
         own = serials(raw, metadata)
         foreign = (own != 0) & (own != metadata.serial) & (metadata.serial != 0)
-        found.append((foreign, "the packet is of another sensor than the metadata, by its serial number"))
+        found["the packet is of another sensor than the metadata, by its serial number"] = foreign
     beyond = columns.measured & (columns.numbers >= metadata.columns)
-    found.append((beyond.any(axis=1), f"a column's number is not below {metadata.columns:,}, as the metadata say"))
+    found[f"a column's number is not below {metadata.columns:,}, as the metadata say"] = beyond.any(axis=1)
     after_ns = columns.stamps_ns - columns.first_ns[:, None]
     astray = columns.measured & ((after_ns < 0) | (after_ns > _LONGEST_PACKET_NS) | (columns.stamps_ns < 0))
-    found.append((astray.any(axis=1), "the stamps of the packet's columns do not follow one another"))
-    return found
+    found["the stamps of the packet's columns do not follow one another"] = astray.any(axis=1)
+    return [(np.asarray(bad), reason) for reason, bad in found.items()]
 
 
 def examined(packets: Sequence[Datagram], metadata: OusterMetadata, path: Path) -> bool:
@@ -494,8 +494,9 @@ def _returns_of(metadata: OusterMetadata, options: OusterOptions, path: Path) ->
 
 
 def _room(size: int) -> Returns:
-    kinds = (np.int64, np.float32, np.float32, np.float32, np.uint16, np.uint8, np.int32)
-    return Returns(*(np.empty(size, kind) for kind in kinds))
+    x, y, z = np.empty((3, size), np.float32)
+    numbers = np.empty(size, np.int64), x, y, z, np.empty(size, np.uint16), np.empty(size, np.uint8)
+    return Returns(*numbers, np.empty(size, np.int32))
 
 
 def _batch(room: Returns, count: int) -> pa.RecordBatch:

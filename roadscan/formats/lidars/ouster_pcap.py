@@ -11,13 +11,16 @@ from typing import Any, ClassVar, Final
 from pydantic import Field
 
 from roadscan.core.errors import FormatError, Missing
+from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem
 from roadscan.core.strict import Strict
 from roadscan.formats.lidars.ouster_metadata import OusterMetadata, read_metadata
 from roadscan.formats.lidars.ouster_packets import (
+    Columns,
     OusterDecoder,
     OusterOptions,
     examined,
     is_lidar_packet,
+    joined,
     packet_bytes,
     sensor_clock,
     serial_of,
@@ -26,7 +29,8 @@ from roadscan.formats.lidars.pcap import Datagram, datagrams_of_sizes
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, beside
 from roadscan.ingest.reading.records import options_of
 
-_LOOKED_AT: Final = 300  # packets of the first look: a whole turn, whatever the mode
+LOOKED_AT: Final = 300
+"""Packets of the first look: a whole turn, whatever the mode."""
 _SNIFFED: Final = 500  # UDP packets among which one is lidar data, where a capture holds any
 _MOST_BESIDE: Final = 200  # JSON files beside a capture that are looked into
 
@@ -83,13 +87,14 @@ class OusterPcap(LogFormat):
         """Return sensor, profile and mode; metadata and packets have to fit each other."""
         options = options_of(source, OusterPcapOptions)
         metadata = stated_metadata(source, options.metadata)
-        sensor_clock(source, metadata)
-        looked = list(itertools.islice(_packets(source, options, metadata), _LOOKED_AT))
+        clock = sensor_clock(source, metadata)
+        looked = list(itertools.islice(_packets(source, options, metadata), LOOKED_AT))
         if not looked:
             raise _none_of_length(source.path, metadata)
         port, sender = chosen(looked, options.port, metadata.lidar_port, source.path)
-        has_checksum = examined([p for p in looked if (p.port, p.sender) == (port, sender)], metadata, source.path)
-        return LogHeader(described(metadata, options) | {"port": port, "sender": sender, "checksum": has_checksum})
+        own = [p for p in looked if (p.port, p.sender) == (port, sender)]
+        said = {"port": port, "sender": sender, "checksum": examined(own, metadata, source.path)}
+        return LogHeader(described(metadata, options) | said | least_delay_s(own, metadata, clock))
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream packets, decoded some at a time."""
@@ -113,6 +118,18 @@ def decoded(found: Iterator[Datagram | Reject], decoder: OusterDecoder) -> Itera
             packets = []
     yield from decoder.items(packets)
     yield from decoder.findings()
+
+
+def least_delay_s(packets: list[Datagram], metadata: OusterMetadata, clock: Clock) -> dict[str, float]:
+    """Return how far the recording computer's clock (POSIX) is ahead of a free-running one, by the fastest packet.
+
+    With the scale of that clock it is a first `offset_s`, late by the way of the packet (docs/clocks.md).
+    """
+    if clock.system is not TimeSystem.FREE:
+        return {}
+    stamps_ns = Columns.of(joined(packets), metadata).stamps_ns[:, -1].tolist()
+    delays_ns = [packet.capture_ns - stamp for packet, stamp in zip(packets, stamps_ns, strict=True) if stamp > 0]
+    return {"capture_minus_sensor_s": round(min(delays_ns) / NS_PER_S, 6)} if delays_ns else {}
 
 
 def described(metadata: OusterMetadata, options: OusterOptions) -> dict[str, Any]:

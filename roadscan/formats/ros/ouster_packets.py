@@ -1,0 +1,199 @@
+"""Ouster packets in a bag of ROS 1 or ROS 2, as the maker's driver writes them, with the metadata in a topic."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from roadscan.core.errors import FormatError, Missing
+from roadscan.core.extras import need
+from roadscan.core.strict import Strict
+from roadscan.formats.lidars.ouster_metadata import OusterMetadata, metadata_of, read_metadata
+from roadscan.formats.lidars.ouster_packets import (
+    OusterDecoder,
+    OusterOptions,
+    examined,
+    is_lidar_packet,
+    packet_bytes,
+    sensor_clock,
+)
+from roadscan.formats.lidars.ouster_pcap import LOOKED_AT, decoded, described, least_delay_s
+from roadscan.formats.lidars.pcap import Datagram
+from roadscan.formats.ros.bag import Bag, is_bag, packets
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, beside
+from roadscan.ingest.reading.records import options_of
+
+TYPES: Final = ("ouster_ros/msg/PacketMsg", "ouster_msgs/msg/PacketMsg", "ouster_sensor_msgs/msg/PacketMsg")
+"""Messages of packets, of the lidar and of its IMU."""
+TEXT: Final = "std_msgs/msg/String"
+"""Messages of the metadata."""
+
+
+class BagPacketsOptions(Strict):
+    """Settings of packets of an Ouster in a bag."""
+
+    topic: str | None = None
+    """Topic of the packets, where the bag has several."""
+    metadata: Path | None = None
+    """The sensor's metadata (JSON), relative to the bag's folder, where no topic of the bag holds them."""
+    metadata_topic: str | None = None
+    """Topic of the metadata, where the bag has several sensors' under other names than the packets'."""
+
+
+class OusterBagOptions(OusterOptions, BagPacketsOptions):
+    """Settings of lidar packets of an Ouster in a bag."""
+
+
+class OusterBag(LogFormat):
+    """Lidar packets of type `ouster_ros/PacketMsg` (or `ouster_msgs`, `ouster_sensor_msgs`) in a bag of ROS.
+
+    They are read as those of a capture: see `ouster_pcap`. The metadata are those of a topic of strings in the bag
+    (`…/metadata`); where no topic holds any, as older drivers served them on demand, `options.metadata` names the
+    JSON. In a bag with topics of other kinds, state `format = "ouster_bag"`; its IMU packets are `ouster_bag_imu`.
+    """
+
+    name: ClassVar[str] = "ouster_bag"
+    title: ClassVar[str] = "Ouster lidar packets in a ROS bag (PacketMsg), a stamp per column"
+    yields: ClassVar[tuple[str, ...]] = ("returns",)
+    axes_on_sensor: ClassVar[str] = "x points away from the external connector, y left of it, z out of the top"
+    usual_axes: ClassVar[Mapping[str, str]] = {"flu": "it stands upright and its connector points back"}
+    time: ClassVar[str] = "the sensor's own, as in a capture (ouster_pcap); the bag's stamps are not used"
+    options: ClassVar[type[Strict]] = OusterBagOptions
+
+    def sniff(self, path: Path) -> bool:
+        """True for a bag that holds nothing but packets of an Ouster, among them the lidar's, and strings."""
+        return holds_only_packets(path) is True
+
+    def files(self, path: Path) -> list[Path]:
+        """Return the bag's files, with its metadata."""
+        return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+
+    def companions(self, path: Path, options: Strict) -> list[Path]:
+        """Return the metadata, where they are a file."""
+        named = options.metadata if isinstance(options, OusterBagOptions) else None
+        return [] if named is None else [beside(path, named)]
+
+    def header(self, source: LogSource) -> LogHeader:
+        """Return sensor, profile and mode; metadata and packets have to fit each other."""
+        need("rosbags.typesys", "a ROS bag")
+        options = options_of(source, OusterBagOptions)
+        with Bag.open(source.path) as bag:
+            metadata = bag_metadata(bag, options)
+            clock = sensor_clock(source, metadata)
+            topic = topic_of_length(bag, options, packet_bytes(metadata))
+            found = packets_of_length(bag, topic, packet_bytes(metadata))
+            looked = list(itertools.islice((p for p in found if isinstance(p, Datagram)), LOOKED_AT))
+        has_checksum = examined(looked, metadata, source.path)
+        said = {"topic": topic, "checksum": has_checksum} | least_delay_s(looked, metadata, clock)
+        return LogHeader(described(metadata, options) | said)
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream packets, decoded some at a time."""
+        options, said = options_of(source, OusterBagOptions), header.attributes
+        with Bag.open(source.path) as bag:
+            metadata = bag_metadata(bag, options)
+            clock = sensor_clock(source, metadata)
+            decoder = OusterDecoder(metadata, options, clock, source.path, bool(said["checksum"]))
+            yield from decoded(packets_of_length(bag, str(said["topic"]), packet_bytes(metadata)), decoder)
+
+
+def holds_only_packets(path: Path) -> bool | None:
+    """Return whether a bag's packets of an Ouster are the lidar's too; None for other bags. Never raises."""
+    try:
+        if not is_bag(path):
+            return None
+        with Bag.open(path) as bag:
+            kinds = {topic.type for topic in bag.topics.values() if topic.count}
+            if not kinds & set(TYPES) or not kinds <= {*TYPES, TEXT}:
+                return None
+            return any(is_lidar_packet(payload) for payload in _first_payloads(bag).values())
+    except Exception:  # noqa: BLE001 — a content test must not fail, whatever the bag or its definitions hold
+        return None
+
+
+def _first_payloads(bag: Bag) -> dict[str, bytes]:
+    """Return the first packet of each topic of packets that has one."""
+    topics = sorted(name for name, topic in bag.topics.items() if topic.type in TYPES)
+    firsts = {name: next((p for p in packets(bag, name) if isinstance(p, Datagram)), None) for name in topics}
+    return {name: first.payload for name, first in firsts.items() if first is not None}
+
+
+def topic_of_length(bag: Bag, options: BagPacketsOptions, length: int) -> str:
+    """Return the stated topic of packets, or the only one whose packets have this length.
+
+    Raises
+    ------
+    FormatError
+        where there is none, or several and none is stated.
+    """
+    if options.topic is not None and bag.topic(options.topic).type not in TYPES:
+        kind = bag.topic(options.topic).type
+        raise FormatError(f"topic {options.topic} is of type {kind}", expected=" or ".join(TYPES), file=bag.path)
+    firsts = _first_payloads(bag)
+    lengths = {length, length + 1}
+    fitting = [name for name, own in firsts.items() if len(own) in lengths and options.topic in {None, name}]
+    if len(fitting) != 1:
+        held = ", ".join(f"{name}: {len(payload):,} bytes" for name, payload in firsts.items()) or "none"
+        raise FormatError(
+            f"{len(fitting)} topics hold packets of {length:,} bytes, as the metadata say ({held})",
+            expected="one topic a log",
+            file=bag.path,
+            missing=Missing("options.topic", choices=tuple(firsts)),
+        )
+    return fitting[0]
+
+
+def bag_metadata(bag: Bag, options: BagPacketsOptions) -> OusterMetadata:
+    """Return the metadata that the log's settings name, or those of the bag.
+
+    Raises
+    ------
+    FormatError
+        where the bag holds none, or those of several sensors and none is named like the packets' topic.
+    """
+    if options.metadata is not None:
+        return read_metadata(beside(bag.path, options.metadata))
+    found = dict(_texts(bag, options.metadata_topic))
+    near = {n: m for n, m in found.items() if options.topic and _parent(n) == _parent(options.topic)}
+    if len(found) > 1 and len(near) == 1:
+        found = near
+    if len(found) != 1:
+        key = "options.metadata_topic" if found else "options.metadata"
+        raise FormatError(
+            f"{len(found)} topics hold metadata of an Ouster" + (": " + ", ".join(sorted(found)) if found else ""),
+            expected="those of the packets' sensor",
+            change="state options.metadata_topic, or name their JSON as options.metadata",
+            file=bag.path,
+            missing=Missing(key, choices=tuple(sorted(found))),
+        )
+    return next(iter(found.values()))
+
+
+def _texts(bag: Bag, stated: str | None) -> Iterator[tuple[str, OusterMetadata]]:
+    """Yield the topics of strings whose first message holds metadata."""
+    for name in (stated,) if stated is not None else sorted(bag.topics):
+        if bag.topic(name).type != TEXT:
+            continue
+        content: Any = next((one[1] for one in bag.decoded(name) if not isinstance(one, Reject)), None)
+        try:
+            yield name, metadata_of(str(getattr(content, "data", "")), bag.path)
+        except FormatError:
+            if stated is not None:
+                raise
+
+
+def _parent(topic: str) -> str:
+    return topic.rpartition("/")[0]
+
+
+def packets_of_length(bag: Bag, topic: str, length: int) -> Iterator[Datagram | Reject]:
+    """Yield the packets of a topic; those of another length are rejected. A byte behind it is the driver's."""
+    for item in packets(bag, topic):
+        if isinstance(item, Reject) or len(item.payload) == length:
+            yield item
+        elif len(item.payload) == length + 1:
+            yield item._replace(payload=item.payload[:length])
+        else:
+            yield Reject(f"the packet is not {length:,} bytes long", item.number, item.offset)

@@ -183,9 +183,12 @@ class Bag:
                 yield Message(number, item.offset, item.receive_ns, data, name)
                 number += 1
 
-    def decoded(self, topic: str) -> Iterator[tuple[Message, Any] | Reject]:
-        """Yield each message of a topic with its content (fields as attributes, arrays of numbers as NumPy arrays)."""
-        decode = self.topic(topic).decoder()
+    def decoded(self, topic: str, decode: Decode | None = None) -> Iterator[tuple[Message, Any] | Reject]:
+        """Yield each message of a topic with its content (fields as attributes, arrays of numbers as NumPy arrays).
+
+        decode : reads a message in place of the topic's own definition.
+        """
+        decode = decode or self.topic(topic).decoder()
         for message in self.messages(topic):
             if isinstance(message, Reject):
                 yield message

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeAlias
@@ -297,6 +297,26 @@ class Provisional:
     """Settings of the format that have no default."""
 
 
+@dataclass(frozen=True)
+class Part:
+    """One of the streams of a container, such as a topic of a ROS bag: a log each, by the settings that select it."""
+
+    name: str
+    """What the container calls it."""
+    words: str
+    """Its type, number of messages, rate and span, in words."""
+    format: str = ""
+    """Format that reads it; "" where none does."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Settings by which the format reads this part."""
+    frame: str = ""
+    """Name of the frame of its readings, "" where it has none."""
+    parent: str = ""
+    """Frame from which the container counts that frame's mounting; "" where it says nothing of it."""
+    mounting: Mapping[str, Any] = field(default_factory=dict)
+    """Mounting of the frame by keys of :class:`roadscan.core.rig.Sensor`, if the parent is x ahead, y left, z up."""
+
+
 def beside(log: Path, named: Path) -> Path:
     """Return the absolute path of a file that a log's settings name, relative to the log's folder."""
     return (log if log.is_dir() else log.parent) / named
@@ -352,6 +372,10 @@ class LogFormat(ABC):
         A relative path counts from the log's folder (:func:`beside`).
         """
         return []
+
+    def parts(self, path: Path) -> Sequence[Part]:
+        """Return all streams of a container, those of other formats too; none for a log of its own."""
+        return ()
 
     @abstractmethod
     def header(self, source: LogSource) -> LogHeader:

@@ -1,0 +1,114 @@
+"""Finds how a cloud states the time of each point, from the size of the numbers and their span against the rate.
+
+Drivers write it under many names, in seconds to nanoseconds, from the header's stamp or from 1970. Neighbouring units
+differ a thousandfold: one of them alone makes a sweep last about as long as from one message to the next, or falls into
+our time. Where the numbers leave several, or none, nothing is assumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.errors import Missing, TimeSystemError
+from roadscan.core.gpstime import NS_PER_S, UNIT_NS
+
+Float64 = npt.NDArray[np.float64]
+
+FIELDS: Final = ("t", "time", "timestamp", "time_stamp", "offset_time", "timestamps", "point_time", "time_offset")
+"""Names by which a field with times of points is known."""
+Origin = Literal["header", "epoch"]
+
+_NEAR_NS: Final = 2 * NS_PER_S  # times from 1970 lie so near to the header's stamp (ns), if one clock wrote both
+_SWEEP_NS: Final = (5_000_000, 2 * NS_PER_S)
+"""Range of a sweep's duration (ns) where the rate of the messages is not known: 200 Hz to 0.5 Hz."""
+_SHARE: Final = (0.2, 1.6)  # span of a sweep's times to the interval of messages; part of a turn may be empty
+_OUR_TIME_S: Final = (4.75e8, 2.524e9)  # seconds from 1970 or 1980 of dates from 1985 to 2060
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Times of the points of one message."""
+
+    header_ns: int
+    least: float
+    """Least time as the field states it."""
+    most: float
+
+
+@dataclass(frozen=True)
+class PointTimes:
+    """How the times of points are written."""
+
+    field: str
+    unit: str
+    """s, ms, us or ns."""
+    origin: Origin
+    """What they count from: the message's stamp, or the origin of the clock."""
+
+    def offsets_ns(self, values: npt.NDArray[np.generic], stamp_ns: int) -> npt.NDArray[np.int64]:
+        """Return times (n,) relative to a stamp (ns), rounded to ns; values that are not finite give 0."""
+        scale = UNIT_NS[self.unit]
+        if values.dtype.kind in "iu":
+            whole = values.astype(np.int64)
+            return np.asarray(whole * scale - (stamp_ns if self.origin == "epoch" else 0))
+        numbers = values.astype(np.float64)
+        if self.origin == "epoch":
+            # Whole units first: a double holds the difference of two near times better than either of them in ns.
+            units, rest_ns = divmod(stamp_ns, scale)
+            return np.rint(np.nan_to_num((numbers - units) * scale)).astype(np.int64) - rest_ns
+        return np.rint(np.nan_to_num(numbers * scale)).astype(np.int64)
+
+
+def found(field: str, samples: Sequence[Sample], unit: str | None, origin: Origin | None, file: Path) -> PointTimes:
+    """Return how the times of a field are written: as stated, else as the numbers alone can mean it.
+
+    Parameters
+    ----------
+    samples : of the first messages, in their order.
+
+    Raises
+    ------
+    TimeSystemError
+        where the numbers fit none, or several.
+    """
+    fitting = [
+        (u, o)
+        for o in ("header", "epoch")
+        for u in UNIT_NS
+        if unit in {None, u} and origin in {None, o} and (_fits(samples, UNIT_NS[u], o) or (unit and origin))
+    ]
+    if len(fitting) == 1:
+        return PointTimes(field, fitting[0][0], "epoch" if fitting[0][1] == "epoch" else "header")
+    least, most = min(s.least for s in samples), max(s.most for s in samples)
+    means = " and ".join(f"{u} from the {'header' if o == 'header' else 'origin of the clock'}" for u, o in fitting)
+    questions = {"options.time_unit": tuple(UNIT_NS), "options.time_from": ("header", "epoch")}
+    asked = [Missing(key, choices=choices) for key, choices in questions.items()]
+    raise TimeSystemError(
+        f"the times of the points (field '{field}', {least:.10g} to {most:.10g}) can be {means or 'of no usual unit'}",
+        expected="options.time_unit (s, ms, us, ns) and options.time_from (header, epoch), by the driver's manual",
+        file=file,
+        missing=[asked],
+    )
+
+
+def _fits(samples: Sequence[Sample], scale: int, origin: str) -> bool:
+    """Whether times of that unit and origin make sense of the first messages."""
+    spans = np.array([(s.most - s.least) * scale for s in samples])
+    headers = np.array([s.header_ns for s in samples])
+    steps = np.diff(headers)
+    period_ns = float(np.median(steps)) if steps.size and (steps > 0).all() else 0.0
+    low, high = (period_ns * share for share in _SHARE) if period_ns else _SWEEP_NS
+    if not low <= float(np.median(spans)) <= high:
+        return False
+    ends = np.array([(s.least * scale, s.most * scale) for s in samples])
+    if origin == "header":
+        return bool((np.abs(ends) <= 2 * max(high, _SWEEP_NS[0])).all())
+    near = np.abs(ends - headers[:, None]) <= _NEAR_NS
+    seconds = ends / NS_PER_S
+    return bool(near.all() or ((seconds > _OUR_TIME_S[0]) & (seconds < _OUR_TIME_S[1])).all())

@@ -1,0 +1,267 @@
+"""Point clouds of a bag (sensor_msgs/PointCloud2), of any layout of their fields."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.errors import ConfigError, FormatError, Missing, nearest
+from roadscan.core.strict import Strict
+from roadscan.formats.ros.bag import Bag, Topic, stamp_ns
+from roadscan.formats.ros.point_times import FIELDS, Origin, PointTimes, Sample, found
+from roadscan.formats.ros.return_rows import INTENSITY_MAX, ReturnRows
+from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions
+from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
+from roadscan.ingest.reading.records import options_of
+
+_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Number types of sensor_msgs/PointField by its constants."""
+_AXES: Final = ("x", "y", "z")
+_LASERS: Final = ("ring", "channel", "line", "laser_id", "laser")  # names of a field with the laser's number
+_INTENSITIES: Final = ("intensity", "intensities", "reflectivity", "signal")  # names of a field with the intensity
+_LOOKED_AT: Final = 8  # messages from which units are found
+_MAP_FRAMES: Final = ("map", "odom", "world", "earth", "utm")
+"""Frames that are not of a sensor: a cloud in one of them was placed by another program already (REP 105)."""
+
+
+class RosPointsOptions(TopicOptions):
+    """Settings of `ros_points`."""
+
+    time_field: str | None = None
+    """Field with the time of each point. Found by itself under the usual names: t, time, timestamp, time_stamp,
+    offset_time."""
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    """Unit of that field; needed where the numbers leave it open."""
+    time_from: Origin | None = None
+    """What that field counts from: the message's own stamp (`header`), or the origin of the clock (`epoch`); needed
+    where the numbers leave it open."""
+    untimed: Literal["stamp"] | None = None
+    """For clouds without a time of each point: "stamp" gives every point that of its message. It is right where the
+    cloud was compensated for motion to that instant, and smears it otherwise. Has to be stated."""
+    compensated: bool = False
+    """True where the driver has moved all points to where the sensor saw them at the message's stamp."""
+    intensity_field: str | None = None
+    """Field with the intensity. Found by itself as intensity, reflectivity or signal, in this order."""
+    intensity_full: float | None = None
+    """Value of that field that becomes 65,535. Where left out, whole numbers stay as recorded, and fractions between 0
+    and 1 are scaled by 65,535; needed for other fractions."""
+    laser_field: str | None = None
+    """Field with the laser's number. Found by itself as ring, channel, line or laser_id; 0 without one."""
+
+
+class RosPoints(TopicFormat):
+    """A message a sweep (or a part of one): points with any fields, of which x, y, z (m) are needed.
+
+    Points whose position is not a number, or 0, 0, 0, are no returns and are left out. Big-endian clouds, rows of
+    organised clouds with gaps between them, and unknown fields are read. Unit and origin of the points' times are
+    stated, or follow from the numbers where these leave one alone: times within 2 s of the header's stamp count from
+    the origin of its clock, and a sweep lasts about as long as from one message to the next.
+    """
+
+    name = "ros_points"
+    title = "Point clouds in a ROS bag (sensor_msgs/PointCloud2)"
+    yields = ("returns",)
+    types = ("sensor_msgs/msg/PointCloud2",)
+    options: ClassVar[type[Strict]] = RosPointsOptions
+    axes_on_sensor: ClassVar[str] = "they are those of the frame that the messages name, by the driver's manual"
+    usual_axes: ClassVar[Mapping[str, str]] = {"flu": "the frame is x ahead, y left, z up, as ROS advises (REP 103)"}
+
+    def attributes(self, source: LogSource, bag: Bag, topic: Topic) -> dict[str, Any]:
+        """Find fields, units and the time of points in the first messages."""
+        source.need_sensor("lidar")
+        plan = _plan(source, bag, topic)
+        times = plan.times
+        said = {} if times is None else {"time_field": times.field, "time_unit": times.unit, "time_from": times.origin}
+        return {"frame": "sensor", "fields": list(plan.fields), "intensity_full": plan.intensity_full} | said
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream message by message; one that is no cloud, or of other fields than the first, is rejected."""
+        options = options_of(source, RosPointsOptions)
+        with Bag.open(source.path) as bag:
+            plan = _plan(source, bag, self.topic(bag, source))
+            rows = ReturnRows(source, compensated=options.compensated)
+            for item in self.timed(source, bag):
+                if not isinstance(item, Timed):
+                    yield item
+                    continue
+                message = item.message
+                try:
+                    cloud = _cloud(item.content)
+                    plan.check(cloud)
+                except ValueError as error:
+                    yield Reject(str(error), message.number, message.offset, 1, message.file)
+                    continue
+                offsets_ns = None
+                if plan.times is not None:
+                    own_ns = item.stamp_ns if options.stamps == "header" else stamp_ns(item.content.header.stamp)
+                    offsets_ns = plan.times.offsets_ns(cloud[plan.times.field], own_ns)
+                yield from rows.items(
+                    message, item.stamp_ns, [cloud[axis] for axis in _AXES], offsets_ns,
+                    plan.intensity(cloud), None if plan.laser is None else cloud[plan.laser],
+                )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """How the clouds of a topic are read."""
+
+    fields: tuple[str, ...]
+    times: PointTimes | None
+    laser: str | None
+    brightness: str | None
+    intensity_full: float | None
+
+    def check(self, cloud: npt.NDArray[np.void]) -> None:
+        """Raise ValueError where a field that is read is missing."""
+        names = cloud.dtype.names or ()
+        wanted = (*_AXES, self.laser, self.brightness, None if self.times is None else self.times.field)
+        missing = [name for name in wanted if name is not None and name not in names]
+        if missing:
+            raise ValueError(f"the cloud has no field '{missing[0]}', as the first one has")
+
+    def intensity(self, cloud: npt.NDArray[np.void]) -> npt.NDArray[np.generic] | None:
+        """Return the intensity (n,), 65,535 for the brightest."""
+        if self.brightness is None:
+            return None
+        values = cloud[self.brightness]
+        if self.intensity_full is None or self.intensity_full == INTENSITY_MAX:
+            return np.asarray(values)
+        return np.asarray(values * values.dtype.type(INTENSITY_MAX / self.intensity_full))
+
+
+def _plan(source: LogSource, bag: Bag, topic: Topic) -> _Plan:
+    """Find fields and units in the first messages with points."""
+    options = options_of(source, RosPointsOptions)
+    first = list(itertools.islice(_first_clouds(bag, topic), _LOOKED_AT))
+    if not first:
+        raise FormatError(f"the topic {topic.name} holds no cloud with points", file=source.path)
+    content, cloud = first[0]
+    frame = str(content.header.frame_id).strip("/").split("/")[-1]
+    if frame in _MAP_FRAMES:
+        raise FormatError(
+            f"the clouds of {topic.name} are in the frame '{frame}': another program has placed them already",
+            expected="clouds in the frame of the sensor",
+            change="name the topic that the lidar's driver writes",
+            file=source.path,
+        )
+    names = cloud.dtype.names or ()
+    if missing := [axis for axis in _AXES if axis not in names]:
+        raise FormatError(f"the clouds have no field '{missing[0]}'", expected="x, y, z in metres", file=source.path)
+    brightness = _field(options.intensity_field, "intensity_field", _INTENSITIES, names, source)
+    full = options.intensity_full
+    if brightness is not None and full is None:
+        full = _full(np.concatenate([one[brightness].astype(np.float64) for _, one in first]), brightness, source)
+    return _Plan(
+        fields=names,
+        times=_times(options, first, names, source),
+        laser=_field(options.laser_field, "laser_field", _LASERS, names, source),
+        brightness=brightness,
+        intensity_full=full,
+    )
+
+
+def _first_clouds(bag: Bag, topic: Topic) -> Iterator[tuple[Any, npt.NDArray[np.void]]]:
+    for item in bag.decoded(topic.name):
+        if isinstance(item, Reject):
+            continue
+        try:
+            cloud = _cloud(item[1])
+        except ValueError:
+            continue
+        if cloud.size:
+            yield item[1], cloud
+
+
+def _field(
+    stated: str | None, option: str, usual: tuple[str, ...], names: tuple[str, ...], source: LogSource
+) -> str | None:
+    """Return a field's name, as stated or one of the usual ones; None where there is none."""
+    if stated is None:
+        return next((name for name in usual if name in names), None)
+    if stated not in names:
+        raise ConfigError(
+            f"options.{option} = '{stated}'{nearest(stated, names)}: the clouds have no such field",
+            expected="one of: " + ", ".join(names),
+            file=source.path,
+        )
+    return stated
+
+
+def _times(
+    options: RosPointsOptions, first: list[tuple[Any, npt.NDArray[np.void]]], names: tuple[str, ...], source: LogSource
+) -> PointTimes | None:
+    """Return how the points' times are written; None where options say that there are none."""
+    name = _field(options.time_field, "time_field", FIELDS, names, source)
+    if name is None or (options.untimed is not None and options.time_field is None):
+        if options.untimed is None:
+            raise ConfigError(
+                "the clouds state no time of each point, among their fields " + ", ".join(names),
+                expected="options.time_field, or options.untimed",
+                change='"stamp" gives each point the time of its message, which smears a sweep not compensated '
+                "for motion: 0.1 s at 50 km/h are 1.4 m",
+                file=source.path,
+                missing=[Missing("options.untimed", "stamp"), Missing("options.time_field", choices=names)],
+            )
+        return None
+    samples = []
+    for content, cloud in first:
+        place = np.abs([cloud[axis] for axis in _AXES]).max(axis=0)
+        values = cloud[name].astype(np.float64)[place > 0.0]  # what is no return may have any time
+        values = values[np.isfinite(values)]
+        if values.size:
+            samples.append(Sample(stamp_ns(content.header.stamp), float(values.min()), float(values.max())))
+    if not samples:
+        raise FormatError(f"the field '{name}' holds no number", file=source.path)
+    return found(name, samples, options.time_unit, options.time_from, source.path)
+
+
+def _full(values: npt.NDArray[np.float64], name: str, source: LogSource) -> float | None:
+    """Return the value that becomes 65,535; None where values are whole numbers, which stay as recorded."""
+    values = values[np.isfinite(values)]
+    if not values.size or (values == np.rint(values)).all():
+        return None
+    if values.min() >= 0.0 and values.max() <= 1.0:
+        return 1.0
+    raise ConfigError(
+        f"the field '{name}' holds fractions from {values.min():.4g} to {values.max():.4g}, and what its brightest "
+        "value is does not follow from them",
+        expected="options.intensity_full, by the driver's manual",
+        file=source.path,
+        missing=Missing("options.intensity_full", choices=(255.0, 100.0, float(INTENSITY_MAX))),
+    )
+
+
+def _cloud(content: Any) -> npt.NDArray[np.void]:
+    """Return the points of a message (n,) by the names of their fields, without copying them.
+
+    Raises
+    ------
+    ValueError
+        where the message contradicts itself.
+    """
+    width, height, step = int(content.width), int(content.height), int(content.point_step)
+    known = [f for f in content.fields if f.datatype in _TYPES and f.count <= 1]
+    order = ">" if content.is_bigendian else "<"
+    names = [str(f.name) for f in known]
+    places = [int(f.offset) for f in known]
+    kinds = [np.dtype(order + _TYPES[f.datatype]) for f in known]
+    if len(set(names)) < len(names):
+        raise ValueError("two fields of the cloud have one name")
+    if any(place + kind.itemsize > step for place, kind in zip(places, kinds, strict=True)):
+        raise ValueError("a field reaches beyond its point")
+    if not width * height:
+        return np.empty(0, np.dtype([("x", "f4")]))
+    points = np.dtype({"names": names, "formats": kinds, "offsets": places, "itemsize": step})
+    row = int(content.row_step) if height > 1 else width * step
+    data = content.data
+    if row < width * step or data.size < (height - 1) * row + width * step:
+        raise ValueError("the cloud holds fewer bytes than its points need")
+    if row == width * step:
+        return np.frombuffer(data, points, count=width * height)
+    rows = np.lib.stride_tricks.as_strided(data, (height, width * step), (row, 1), writeable=False)
+    return np.ascontiguousarray(rows).view(points).ravel()

@@ -103,3 +103,10 @@ def test_two_sensors_of_a_bag_are_told_apart_by_their_topics(tmp_path: Path) -> 
     )
     with pytest.raises(FormatError, match=r"/left/imu_packets: 48 bytes"):
         read("ouster_bag", path, {"topic": "/left/imu_packets"}, clock=FREE)
+
+
+def test_topics_of_packets_are_listed_with_the_formats_that_read_them(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", "sqlite", topics(files.metadata(PROFILE)))
+    listed = {part.name: part.format for part in format_of(path).parts(path)}
+    assert listed["/ouster/lidar_packets"] == "ouster_bag"
+    assert listed["/ouster/imu_packets"] == "ouster_bag_imu"

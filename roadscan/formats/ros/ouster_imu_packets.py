@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -10,15 +10,16 @@ from roadscan.core.extras import need
 from roadscan.core.strict import Strict
 from roadscan.formats.lidars.ouster_packets import sensor_clock
 from roadscan.formats.motion.ouster_imu import imu_described, imu_items, imu_packet_bytes
-from roadscan.formats.ros.bag import Bag
+from roadscan.formats.ros.bag import Bag, Topic
 from roadscan.formats.ros.ouster_packets import (
     BagPacketsOptions,
     bag_metadata,
+    holds_lidar,
     holds_only_packets,
     packets_of_length,
     topic_of_length,
 )
-from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, beside
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Part, beside
 from roadscan.ingest.reading.records import EpochReader, options_of
 
 
@@ -43,6 +44,16 @@ class OusterBagImu(LogFormat):
     def files(self, path: Path) -> list[Path]:
         """Return the bag's files, with its metadata."""
         return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+
+    def parts(self, path: Path) -> Sequence[Part]:
+        """Return all topics of the bag."""
+        from roadscan.formats.ros.overview import parts
+
+        return parts(path)
+
+    def claims(self, bag: Bag, topic: Topic) -> bool:
+        """Return True for a topic of IMU packets."""
+        return holds_lidar(bag, topic) is False
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
         """Return the metadata, where they are a file."""

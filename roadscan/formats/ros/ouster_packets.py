@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -21,8 +21,8 @@ from roadscan.formats.lidars.ouster_packets import (
 )
 from roadscan.formats.lidars.ouster_pcap import LOOKED_AT, decoded, described, least_delay_s
 from roadscan.formats.lidars.pcap import Datagram
-from roadscan.formats.ros.bag import Bag, is_bag, packets
-from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, beside
+from roadscan.formats.ros.bag import Bag, Topic, is_bag, packets
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Part, Reject, beside
 from roadscan.ingest.reading.records import options_of
 
 TYPES: Final = ("ouster_ros/msg/PacketMsg", "ouster_msgs/msg/PacketMsg", "ouster_sensor_msgs/msg/PacketMsg")
@@ -70,6 +70,16 @@ class OusterBag(LogFormat):
         """Return the bag's files, with its metadata."""
         return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
 
+    def parts(self, path: Path) -> Sequence[Part]:
+        """Return all topics of the bag."""
+        from roadscan.formats.ros.overview import parts
+
+        return parts(path)
+
+    def claims(self, bag: Bag, topic: Topic) -> bool:
+        """Return True for a topic of lidar packets."""
+        return holds_lidar(bag, topic) is True
+
     def companions(self, path: Path, options: Strict) -> list[Path]:
         """Return the metadata, where they are a file."""
         named = options.metadata if isinstance(options, OusterBagOptions) else None
@@ -111,6 +121,17 @@ def holds_only_packets(path: Path) -> bool | None:
             return any(is_lidar_packet(payload) for payload in _first_payloads(bag).values())
     except Exception:  # noqa: BLE001 — a content test must not fail, whatever the bag or its definitions hold
         return None
+
+
+def holds_lidar(bag: Bag, topic: Topic) -> bool | None:
+    """Return whether a topic of packets of an Ouster holds the lidar's; None for other topics. Never raises."""
+    if topic.type not in TYPES:
+        return None
+    try:
+        first = next((p for p in packets(bag, topic.name) if isinstance(p, Datagram)), None)
+    except FormatError:
+        return None
+    return None if first is None else is_lidar_packet(first.payload)
 
 
 def _first_payloads(bag: Bag) -> dict[str, bytes]:

@@ -46,12 +46,18 @@ def _part(bag: Bag, topic: Topic, readers: dict[str, str], mountings: dict[str, 
     return Part(
         name=topic.name,
         words=_words(topic),
-        format=readers.get(topic.type, "") if topic.count else "",
+        format=(readers.get(topic.type) or _claimed(bag, topic)) if topic.count else "",
         options={"topic": topic.name},
         frame=frame,
         parent=parent,
         mounting=_mounting(pose) if parent else {},
     )
+
+
+def _claimed(bag: Bag, topic: Topic) -> str:
+    """Return the format that knows the topic by its messages, since their type alone does not tell; "" for none."""
+    readers = ((f.name, getattr(f, "claims", None)) for f in log_formats().values())
+    return next((name for name, claims in readers if claims is not None and claims(bag, topic)), "")
 
 
 def _words(topic: Topic) -> str:

@@ -44,6 +44,7 @@ from tests.formats import (
     test_nmea,
     test_opencrg,
     test_ouster_bag,
+    test_pcd,
     test_ply,
     test_psi,
     test_road_lines,
@@ -627,6 +628,12 @@ def _lidar() -> Iterator[Sample]:
 
 
 def _clouds() -> Iterator[Sample]:
+    for coding in test_pcd.CODINGS:
+        make = functools.partial(test_pcd.sample, coding)
+        text = coding is test_pcd.CODINGS[0]
+        yield Sample("pcd", coding.value, make, {}, {"clock": test_pcd.FREE}, text=text)
+        scan = test_pcd.CLOUD | {"intensity": False}
+        yield Sample("pcd_cloud", coding.value, make, scan, {"crs": "local", "height": "ellipsoidal"}, text=text)
     cloud = {"clock": test_las.ADJUSTED, "height": "ellipsoidal"}
     for point_format in (3, 7):
         yield Sample("las", f"las{point_format}", las("a.las", point_format), {}, cloud, fields=_LAS_FIELDS)

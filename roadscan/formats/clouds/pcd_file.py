@@ -29,6 +29,7 @@ INTENSITIES: Final = ("intensity", "intensities", "reflectivity", "signal")
 
 _HEADER_BYTES_MAX: Final = 1 << 16  # bytes in which the header has to end
 _RECORD_BYTES_MAX: Final = 1 << 16  # bytes of a point; more is damage
+_BLOCK_BYTES: Final = 4 << 20  # bytes of a block
 _EXPANDED_BYTES_MAX: Final = 1 << 30
 """Bytes of a compressed cloud: it has to be expanded whole. 30 million points of 32 bytes fit."""
 _MOST_EXPANSION: Final = 100  # LZF makes 264 bytes of three at most
@@ -176,10 +177,11 @@ def points(path: Path, header: PcdHeader, names: Sequence[str]) -> Iterator[Poin
 
 def _binary(path: Path, header: PcdHeader, names: list[str]) -> Iterator[Points | Reject]:
     record = header.record
+    size = max(1, min(CHUNK_POINTS, _BLOCK_BYTES // record.itemsize))
     with path.open("rb") as stream:
         stream.seek(header.body)
-        for first in range(0, header.points, CHUNK_POINTS):
-            block = stream.read(min(CHUNK_POINTS, header.points - first) * record.itemsize)
+        for first in range(0, header.points, size):
+            block = stream.read(min(size, header.points - first) * record.itemsize)
             rows = np.frombuffer(block, record, len(block) // record.itemsize)
             if not rows.size:
                 return
@@ -190,11 +192,12 @@ def _binary(path: Path, header: PcdHeader, names: list[str]) -> Iterator[Points 
 def _compressed(path: Path, header: PcdHeader, names: list[str]) -> Iterator[Points | Reject]:
     with path.open("rb") as stream:
         stream.seek(header.body)
-        lengths = np.frombuffer(stream.read(_LENGTHS_BYTES), "<u4")
-        packed = np.frombuffer(stream.read(int(lengths[0]) if lengths.size == 2 else 0), np.uint8)
+        head = stream.read(_LENGTHS_BYTES)
+        lengths = np.frombuffer(head if len(head) == _LENGTHS_BYTES else bytes(_LENGTHS_BYTES), "<u4")
+        packed = np.frombuffer(stream.read(min(int(lengths[0]), _EXPANDED_BYTES_MAX)), np.uint8)
     widths = [np.dtype(f.kind).itemsize * f.count for f in header.fields]
     whole = header.points * sum(widths)
-    if lengths.size < 2 or int(lengths[1]) != whole or whole > min(_EXPANDED_BYTES_MAX, _MOST_EXPANSION * packed.size):
+    if int(lengths[1]) != whole or whole > min(_EXPANDED_BYTES_MAX, _MOST_EXPANSION * packed.size):
         return
     out = np.empty(whole, np.uint8)
     if expand(packed, out) < whole:

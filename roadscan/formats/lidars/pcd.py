@@ -38,6 +38,7 @@ _MOST_LASERS: Final = 255  # greatest number of a laser
 _LATEST_NS: Final = 10_000_000_000  # points measured longer before or after a sweep's stamp count as damage
 _MOST_COMMON: Final = 0.5  # share of a sweep's time that the next one may have in common
 _LOOKED_AT: Final = 2  # files whose times are compared
+_MOST_LOOKED: Final = 20  # files among which they are looked for
 
 Unit = Literal["s", "ms", "us", "ns"]
 
@@ -98,7 +99,7 @@ class Pcd(LogFormat):
         files = self.files(source.path)
         if not files:
             raise FormatError("the folder holds no PCD file", expected="files *.pcd", file=source.path)
-        plan = _Plan.of(source, read_header(files[0]))
+        plan = _Plan.of(source, next((head for _, head in _readable(files)), None) or read_header(files[0]))
         _check_order(files, plan, source)
         said = {"frame": "sensor", "fields": list(plan.fields), "time_field": plan.time}
         return LogHeader(said | {"time_from": plan.options.time_from, "files": len(files)})
@@ -272,23 +273,38 @@ def _named(items: Iterable[Item], name: str) -> Iterator[Item]:
     return (dataclasses.replace(item, file=name) if isinstance(item, Rows | Reject) else item for item in items)
 
 
+def _readable(files: Sequence[Path]) -> list[tuple[Path, PcdHeader]]:
+    """Return the first files whose headers can be read, with these."""
+    found = []
+    for file in files[:_MOST_LOOKED]:
+        try:
+            found.append((file, read_header(file)))
+        except FormatError:
+            continue
+        if len(found) == _LOOKED_AT:
+            break
+    return found
+
+
 def _check_order(files: Sequence[Path], plan: _Plan, source: LogSource) -> None:
     """Refuse times that start anew in each file where they are stated to count from the clock's origin."""
     if plan.options.time_from == "file_name" or len(files) < _LOOKED_AT:
         return
     spans = []
-    for file in files[:_LOOKED_AT]:
-        first = next(points(file, read_header(file), [plan.time]), None)
-        if not isinstance(first, Points):
-            return
-        values = first.columns[plan.time].astype(np.float64)
+    known = [(file, head) for file, head in _readable(files) if plan.time in head.kinds]
+    for file, head in known[:_LOOKED_AT]:
+        first = next(points(file, head, [plan.time]), None)
+        values = first.columns[plan.time].astype(np.float64) if isinstance(first, Points) else np.empty(0)
         values = values[np.isfinite(values)]
-        spans.append((float(values.min()), float(values.max())) if values.size else (0.0, 0.0))
+        if values.size:
+            spans.append((float(values.min()), float(values.max())))
+    if len(spans) < _LOOKED_AT:
+        return
     (low, high), (later_low, later_high) = spans
     common = min(high, later_high) - max(low, later_low)
     if high > low and common > _MOST_COMMON * (high - low):
         raise TimeSystemError(
-            f"the times of {files[0].name} run from {low:.10g} to {high:.10g}, those of {files[1].name} from "
+            f"the times of {known[0][0].name} run from {low:.10g} to {high:.10g}, those of {known[1][0].name} from "
             f"{later_low:.10g} to {later_high:.10g}: they start anew in each file",
             expected="times that go on, or files named by their stamps",
             file=source.path,

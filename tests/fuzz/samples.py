@@ -41,6 +41,7 @@ from tests.formats import (
     test_imu_csv,
     test_kitti,
     test_las,
+    test_livox_lvx,
     test_nmea,
     test_opencrg,
     test_ouster_bag,
@@ -596,6 +597,8 @@ def _lidar() -> Iterator[Sample]:
         parts = () if kind == "ros1" else ("bag/bag*",)
         yield Sample("ouster_bag", kind, bag, {}, count, parts)
         yield Sample("ouster_bag_imu", kind, bag, {}, imu, parts)
+    yield Sample("livox_lvx", "lvx2", test_livox_lvx.sample, {}, count)
+    yield Sample("livox_lvx", "lvx", test_livox_lvx.old_sample, {}, count)
     by_rate = test_sick_lms.BY_RATE
     one = len(encode_scans(test_sick_lms.scans(1), "mm").tobytes())
     scan_clock = {"clock": GPS}

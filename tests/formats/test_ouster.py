@@ -333,6 +333,17 @@ def test_two_sensors_under_one_port_are_told_apart_by_their_address(tmp_path: Pa
     assert len(read_ouster(path, sender="10.0.0.2")) == SDK["RNG15_RFL8_NIR8"][0]
 
 
+def test_the_serial_number_tells_two_addresses_apart(tmp_path: Path) -> None:
+    profile = "RNG15_RFL8_NIR8"
+    own, other = files.turns(profile), files.turns(profile, serial=files.SERIAL + 1)
+    sent = [(k, frame(p, 7502, "10.0.0.1")) for k, p in enumerate(own)]
+    sent += [(k, frame(p, 7502, "10.0.0.2")) for k, p in enumerate(other)]
+    capture(tmp_path / "a.pcap", sorted(sent))
+    (tmp_path / "a.json").write_text(json.dumps(files.metadata(profile)))
+    found = read_ouster(tmp_path / "a.pcap")
+    assert (len(found), found.rejects, found.attributes["sender"]) == (SDK[profile][0], [], "10.0.0.1")
+
+
 @pytest.mark.parametrize("broken", ["{", "[1]", '{"beam_altitude_angles": 3}', '{"sensor_info": {}}'])
 def test_what_is_no_metadata_is_refused(broken: str, tmp_path: Path) -> None:
     path = files.write(tmp_path, files.turns("LEGACY"), files.metadata("LEGACY"))
@@ -427,6 +438,22 @@ def test_packets_in_fragments_are_put_together(tmp_path: Path) -> None:
     assert len(found) < len(whole)
 
 
+def test_fragments_of_ipv6_are_put_together(tmp_path: Path) -> None:
+    """Frames by RFC 8200: a fragment header (next header, offset and M flag, identification) behind that of IPv6."""
+    profile = "RNG19_RFL8_SIG16_NIR16_DUAL"
+    packets = files.turns(profile)
+    whole = read_ouster(files.write(tmp_path, packets, files.metadata(profile)))
+    frames = []
+    for number, packet in enumerate(packets):
+        body = struct.pack(">HHHH", 443, 7502, 8 + len(packet), 0) + packet
+        for at in range(0, len(body), 1448):
+            part, more = body[at : at + 1448], at + 1448 < len(body)
+            head = struct.pack(">IHBB", 6 << 28, 8 + len(part), 44, 64) + bytes(15) + b"\x01" + bytes(15) + b"\x02"
+            frames.append(bytes(12) + b"\x86\xdd" + head + struct.pack(">BBHI", 17, 0, at | more, number) + part)
+    capture(tmp_path / "a.pcap", list(enumerate(frames)))
+    assert read_ouster(tmp_path / "a.pcap").table.equals(whole.table)
+
+
 # --- IMU --------------------------------------------------------------------------------------------
 
 
@@ -460,6 +487,9 @@ def test_imu_packets_with_several_samples(tmp_path: Path) -> None:
 def test_a_capture_of_imu_packets_alone_is_known(tmp_path: Path) -> None:
     imu = [files.imu_packet(files.FIRST_NS + k * 10_000_000) for k in range(5)]
     assert format_of(files.write(tmp_path, [], files.metadata(), imu=imu)).name == "ouster_imu"
+    samples = [struct.pack("<QHH6f", files.FIRST_NS + j * 1_000_000, j, 1, 0, 0, 9.8, 0, 0, 0) for j in range(8)]
+    newer = bytes(132) + b"".join(samples) + bytes(32)
+    assert format_of(files.write(tmp_path, [], files.metadata(), imu=[newer])).name == "ouster_imu"
 
 
 def test_imu_packets_of_a_recording_read_gravity(recordings: Path) -> None:

@@ -140,7 +140,7 @@ class Device(NamedTuple):
     """Roll, pitch, yaw (°), x, y, z (m) that the user typed in."""
 
 
-@dataclass
+@dataclass(slots=True)
 class _Package:
     """Points of one device that it measured one after another."""
 
@@ -226,14 +226,14 @@ class LivoxLvx(LogFormat):
         with source.path.open("rb") as stream:
             file = _File.open(stream, source.path)
             packages: list[_Package] = []
-            size = 0
+            size, most = 0, _CHUNK_POINTS * file.least_bytes
             for item in file.packages():
                 if isinstance(item, Reject):
                     yield item
                 elif item.key == int(said["device_key"]) and file.is_measured(item):
                     packages.append(item)
                     size += len(item.points)
-                if size > _CHUNK_POINTS * file.least_bytes:
+                if size > most:
                     yield from _items(packages, file, kind, float(said["pulse_ns"]), epochs)
                     packages, size = [], 0
             yield from _items(packages, file, kind, float(said["pulse_ns"]), epochs)
@@ -459,11 +459,12 @@ def _rows(packages: list[_Package], epoch: npt.NDArray[np.int64], points: _Point
     pulse = np.arange(raw.size) - np.repeat(np.cumsum(counts) - counts, counts)
     xyz, bright = _places(raw, points)
     with np.errstate(invalid="ignore"):
-        farthest = np.abs(xyz).max(axis=-1)
+        farthest = np.maximum(np.maximum(np.abs(xyz[0]), np.abs(xyz[1])), np.abs(xyz[2]))
         astray = np.unique(package[~(farthest <= _FARTHEST_M).all(axis=1)])  # NaN, or too far
     for k in astray.tolist():
         yield Reject("a position of the package is beyond 10 km", packages[k].number, packages[k].offset)
-    kept = np.nonzero((farthest > 0.0) & ~np.isin(package, astray)[:, None])
+    returned = farthest > 0.0
+    kept = np.nonzero(returned & ~np.isin(package, astray)[:, None] if astray.size else returned)
     if not kept[0].size:
         return
     when = epoch[package] + np.rint(pulse * pulse_ns).astype(np.int64)
@@ -471,7 +472,7 @@ def _rows(packages: list[_Package], epoch: npt.NDArray[np.int64], points: _Point
     columns: dict[str, npt.NDArray[Any]] = {
         "epoch_gps_ns": when[kept[0]],
         "pose_epoch_gps_ns": when[kept[0]],
-        **{f"{axis}_sensor_m": np.ascontiguousarray(xyz[..., k][kept]) for k, axis in enumerate("xyz")},
+        **{f"{axis}_sensor_m": values[kept] for axis, values in zip("xyz", xyz, strict=True)},
         "intensity": bright[kept].astype(np.uint16) * np.uint16(_FULL_BYTE),
         "laser": np.zeros(own.size, np.uint8),
         "sweep": np.array([p.sweep for p in packages], dtype=np.int32)[own],
@@ -481,13 +482,14 @@ def _rows(packages: list[_Package], epoch: npt.NDArray[np.int64], points: _Point
     yield Rows("returns", batch, first_record=int(numbers[0]), records=numbers)
 
 
-def _places(raw: npt.NDArray[np.void], points: _Points) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
-    """Return positions (n, returns, 3) in metres and reflectivities (n, returns)."""
+def _places(raw: npt.NDArray[np.void], points: _Points) -> tuple[list[npt.NDArray[np.float32]], npt.NDArray[np.uint8]]:
+    """Return x, y, z (n, returns) in metres, and reflectivities (n, returns)."""
     returns = raw["returns"] if "returns" in (raw.dtype.names or ()) else raw[:, None]
     if points.unit_m:
-        with np.errstate(invalid="ignore", over="ignore"):  # what is no number, or too far, is no return
-            return (returns["xyz"] * np.float64(points.unit_m)).astype(np.float32), returns["bright"]
+        with np.errstate(invalid="ignore", over="ignore"):  # what is no number, or too far, is refused
+            xyz = [(returns["xyz"][..., k] * np.float64(points.unit_m)).astype(np.float32) for k in range(3)]
+        return xyz, returns["bright"]
     zenith, azimuth = np.radians(raw["zenith"] * 0.01)[:, None], np.radians(raw["azimuth"] * 0.01)[:, None]
-    level = np.sin(zenith)
-    directions = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)], axis=-1)
-    return (returns["depth"][..., None] * _MM * directions).astype(np.float32), returns["bright"]
+    level, depth_m = np.sin(zenith), returns["depth"] * _MM
+    directions = level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)
+    return [(depth_m * one).astype(np.float32) for one in directions], returns["bright"]

@@ -91,7 +91,10 @@ class OusterPcap(LogFormat):
         looked = list(itertools.islice(_packets(source, options, metadata), LOOKED_AT))
         if not looked:
             raise _none_of_length(source.path, metadata)
-        port, sender = chosen(looked, options.port, metadata.lidar_port, source.path)
+        written = {p.sender for p in looked if serial_of(p.payload, metadata) == metadata.serial != 0}
+        port, sender = chosen(
+            [p for p in looked if not written or p.sender in written], options.port, metadata.lidar_port, source.path
+        )
         own = [p for p in looked if (p.port, p.sender) == (port, sender)]
         said = {"port": port, "sender": sender, "checksum": examined(own, metadata, source.path)}
         return LogHeader(described(metadata, options) | said | least_delay_s(own, metadata, clock))

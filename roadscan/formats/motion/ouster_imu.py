@@ -25,8 +25,9 @@ from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, opt
 Float64 = npt.NDArray[np.float64]
 
 _G_M_PER_S2: Final = 9.80665  # unit of the old packets' acceleration
-_AROUND_SAMPLES: Final = 32 + 100 + 32
-"""Bytes of the newer packets around their samples: header, a stamp with an NMEA sentence, footer."""
+_BEFORE_SAMPLES: Final = 32 + 100
+"""Bytes of the newer packets before their samples: header, and a stamp with an NMEA sentence."""
+_AROUND_SAMPLES: Final = _BEFORE_SAMPLES + 32  # with the footer
 _LOOKED_AT: Final = 300  # packets of the first look
 _CHUNK_PACKETS: Final = 8_192  # packets of a chunk
 _SNIFFED: Final = 20  # packets that have to be alike
@@ -77,7 +78,8 @@ class OusterImu(LogFormat):
             first = [p for p in itertools.islice(datagrams_of_sizes(path, None), _SNIFFED) if isinstance(p, Datagram)]
         except (FormatError, OSError):
             return False
-        return bool(first) and all(_is_old(packet.payload) for packet in first)
+        is_old = bool(first) and all(_is_old(packet.payload) for packet in first)
+        return is_old or any(_is_new(packet.payload) for packet in first)
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
         """Return the metadata."""
@@ -199,7 +201,7 @@ def _old_samples(raw: npt.NDArray[np.uint8]) -> Samples:
 
 
 def _samples(raw: npt.NDArray[np.uint8]) -> Samples:
-    samples = np.ascontiguousarray(raw[:, 132:-32]).view(_SAMPLE)
+    samples = np.ascontiguousarray(raw[:, _BEFORE_SAMPLES:-32]).view(_SAMPLE)
     with np.errstate(invalid="ignore", over="ignore"):
         force, rate = samples["force"].astype(np.float64), samples["rate"].astype(np.float64)
     return np.ascontiguousarray(samples["stamp"]), force, rate, (samples["status"] & 1).astype(bool)
@@ -212,3 +214,17 @@ def _is_old(payload: bytes) -> bool:
     stamps = packet["stamps"].astype(np.float64)
     near = np.ptp(stamps) < 1e9 and stamps.min() > 0  # the three are read within a second
     return bool(near and np.isfinite(packet["rate"]).all() and 0 < np.abs(packet["force"]).max() < _MOST_FORCE_G)
+
+
+def _is_new(payload: bytes) -> bool:
+    """Return True for a packet whose samples follow one another in number and time, and read about gravity."""
+    count, rest = divmod(len(payload) - _AROUND_SAMPLES, _SAMPLE.itemsize)
+    if rest or count < 2:
+        return False
+    samples = np.frombuffer(payload, _SAMPLE, count, _BEFORE_SAMPLES)
+    with np.errstate(invalid="ignore", over="ignore"):
+        force = np.linalg.norm(samples["force"].astype(np.float64), axis=1)
+    follow = (np.diff(samples["number"].astype(int)) == 1).all() and (
+        np.diff(samples["stamp"].view(np.int64)) > 0
+    ).all()
+    return bool(follow and (force < _MOST_FORCE_G * _G_M_PER_S2).all() and force.max() > 0)

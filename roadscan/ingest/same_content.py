@@ -7,7 +7,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 from roadscan.core.survey import LogConfig, Survey
 from roadscan.core.witness import Finding, Witness
@@ -24,6 +24,8 @@ SAME_CONTENT: Final = Witness(
     told=("findings",),
 )
 
+_Listed: TypeAlias = dict[tuple[str, str, str | None], LogConfig]
+"""Logs of the survey file by run, path and sensor."""
 _READINGS: Final = ("scans", "returns", "cloud", "images")
 """Tables of which no two runs share a log. One trajectory may cover several runs."""
 _FRAME: Final = ("crs", "height", "geoid", "vertical_crs")
@@ -37,21 +39,19 @@ _COMPARED_BYTES: Final = 1 << 20
 
 def same_content_findings(survey: Survey, records: Sequence[LogRecord]) -> list[Finding]:
     """Return findings on copies among the survey file's logs, and on readings that count twice."""
-    listed = {(run.id, str(log.path)): log for run in survey.config.runs for log in run.logs}
+    listed = {(run.id, str(log.path), log.sensor): log for run in survey.config.runs for log in run.logs}
     return [*_copies(survey, listed, records), *_twice(listed, records), *_same_points(records)]
 
 
-def _copies(
-    survey: Survey, listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord]
-) -> Iterator[Finding]:
+def _copies(survey: Survey, listed: _Listed, records: Sequence[LogRecord]) -> Iterator[Finding]:
     """Yield findings on logs without a record whose bytes and settings are those of another."""
     known = {(r.run, r.path) for r in records}
-    for (run, path), config in listed.items():
+    for (run, path, _), config in listed.items():
         file = survey.resolve(config.path)
         if (run, path) in known or not file.is_file():
             continue
         for record in records:
-            other = listed.get((record.run, record.path))
+            other = _entry(listed, record)
             same = other is not None and record.run == run and _settings(other) == _settings(config)
             if same and _is_copy(file, survey.resolve(Path(record.path))):
                 yield SAME_CONTENT.finds(
@@ -60,7 +60,7 @@ def _copies(
                 break
 
 
-def _twice(listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord]) -> Iterator[Finding]:
+def _twice(listed: _Listed, records: Sequence[LogRecord]) -> Iterator[Finding]:
     """Yield findings on readings of the same bytes in two runs, or of two sensors with the same settings."""
     groups: dict[str, list[LogRecord]] = defaultdict(list)
     for record in records:
@@ -68,7 +68,7 @@ def _twice(listed: dict[tuple[str, str], LogConfig], records: Sequence[LogRecord
             groups[record.content].append(record)
     for group in groups.values():
         for first, later in itertools.pairwise(sorted(group, key=lambda r: (r.run, r.path, r.sensor))):
-            one, other = listed.get((first.run, first.path)), listed.get((later.run, later.path))
+            one, other = _entry(listed, first), _entry(listed, later)
             if one is None or other is None or one.options != other.options:
                 continue
             yield SAME_CONTENT.finds(
@@ -107,6 +107,12 @@ def _same_points(records: Sequence[LogRecord]) -> Iterator[Finding]:
                 f"{text} ({first.run}/{first.sensor}): they count a second time as {later.run}/{later.sensor}; they "
                 "are used",
             )
+
+
+def _entry(listed: _Listed, record: LogRecord) -> LogConfig | None:
+    """Return the entry of a log; of several with one path, such as topics of a bag, that of its sensor."""
+    own = listed.get((record.run, record.path, record.sensor))
+    return own or listed.get((record.run, record.path, None))
 
 
 def _settings(config: LogConfig) -> dict[str, object]:

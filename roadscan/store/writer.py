@@ -242,12 +242,22 @@ def _write_by_arrow(to: Path | pa.NativeFile, rows: pa.Table, schema: TableSchem
 def sorted_rows(schema: TableSchema, rows: pa.Table) -> pa.Table:
     """Return rows in the schema's order; equal keys keep their input order."""
     keys = [rows.column(name).to_numpy() for name in schema.sort]
-    if len(keys) == 1 and (keys[0][1:] >= keys[0][:-1]).all():
-        return rows
-    if keys[0].dtype.kind != "O" and (keys[0][1:] > keys[0][:-1]).all():
+    if _in_order(keys):
         return rows
     order = np.lexsort(keys[::-1])
     return rows if np.array_equal(order, np.arange(order.size)) else rows.take(pa.array(order))
+
+
+def _in_order(keys: list[npt.NDArray[Any]]) -> bool:
+    """Return True if rows are in order of these keys, the first foremost; names are compared only where they lead."""
+    tied = np.ones(max(keys[0].size - 1, 0), dtype=bool)
+    for key in keys:
+        if key.dtype.kind == "O" and len(keys) > 1:
+            return not tied.any()
+        if (tied & ~(key[1:] >= key[:-1])).any():  # also where one is no number
+            return False
+        tied &= key[1:] == key[:-1]
+    return True
 
 
 def _by_bin(schema: TableSchema, rows: pa.RecordBatch) -> list[tuple[int, pa.RecordBatch]]:

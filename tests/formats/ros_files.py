@@ -17,6 +17,7 @@ from roadscan.formats.ros.definitions import _SHIPPED
 
 KINDS: Final = ("ros1", "ros1-bz2", "ros1-lz4", "sqlite", "sqlite-message", "sqlite-file", "mcap", "mcap-storage")
 
+_TREE: Final = "geometry_msgs/TransformStamped[] transforms\n"
 NS: Final = 1_000_000_000
 
 Topics = Mapping[str, tuple[str, Sequence[tuple[int, Mapping[str, Any]]]]]
@@ -36,7 +37,8 @@ def header(ns: int, frame: str = "") -> dict[str, Any]:
 def store_of(kind: str) -> Any:
     """Types of ROS 1 or ROS 2, and those of lidar drivers."""
     store = get_typestore(Stores.ROS1_NOETIC if kind.startswith("ros1") else Stores.LATEST)
-    for name, text in _SHIPPED.items():
+    tree = {} if "tf2_msgs/msg/TFMessage" in store.fielddefs else {"tf2_msgs/msg/TFMessage": _TREE}
+    for name, text in (_SHIPPED | tree).items():
         store.register(get_types_from_msg(text, name))
     return store
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import gzip
+import itertools
 import lzma
 import tarfile
 from pathlib import Path
@@ -71,6 +72,11 @@ def same(rows: Readings, direct: Readings, columns: tuple[str, ...]) -> None:
         np.testing.assert_array_equal(left.to_numpy(), right.to_numpy(), name)
 
 
+def _head(packed: Path, lines: int) -> bytes:
+    with gzip.open(packed) as stream:
+        return b"".join(itertools.islice(stream, lines))
+
+
 # --- the same rows as the direct formats ------------------------------------------------------------
 
 
@@ -78,8 +84,8 @@ def same(rows: Readings, direct: Readings, columns: tuple[str, ...]) -> None:
 def test_the_drive_of_a_bag_is_that_of_its_files(kind: str, recordings: Path, tmp_path: Path) -> None:
     """IMU and RTK positions of a real drive, written by rosbags."""
     imu_file, pos_file = tmp_path / "imu.csv", tmp_path / "gnss.pos"
-    imu_file.write_bytes(b"".join(gzip.open(recordings / "drive/imu.csv.gz").readlines()[:6_000]))
-    pos_file.write_bytes(b"".join(gzip.open(recordings / "drive/gnss_rtk.pos.gz").readlines()[:600]))
+    imu_file.write_bytes(_head(recordings / "drive/imu.csv.gz", 6_000))
+    pos_file.write_bytes(_head(recordings / "drive/gnss_rtk.pos.gz", 600))
     imu = read("imu_csv", imu_file, clock=GPST, sensor=IMU)
     gnss = read("rtklib_pos", pos_file, crs="EPSG:4979", height="ellipsoidal")
     shift_ns = 315_964_800 * NS  # GPS time counted from 1970, as GPST
@@ -454,11 +460,15 @@ def test_orthometric_altitudes_need_a_geoid(tmp_path: Path) -> None:
         read("ros_gnss", bag, {"altitude": "orthometric"}, clock=UTC, crs="EPSG:4979", height="orthometric")
 
 
+def nmea_lines() -> list[str]:
+    """Sentences of five epochs, with their date in the last one."""
+    lines = [f"$GPGGA,1200{s:02d}.00,4800.0000,N,01100.0000,E,4,12,0.8,500.0,M,46.5,M,1.0,0001*" for s in range(5)]
+    lines.append("$GPRMC,120004.00,A,4800.0000,N,01100.0000,E,0.0,0.0,140526,,,R*")
+    return [line + f"{np.bitwise_xor.reduce(np.frombuffer(line[1:-1].encode(), np.uint8)):02X}" for line in lines]
+
+
 def test_sentences_are_those_of_an_nmea_log(tmp_path: Path) -> None:
-    lines = [f"$GPGGA,1200{s:02d}.00,4800.0000,N,01100.0000,E,4,12,0.8,500.0,M,46.5,M,1.0,0001*" for s in range(5)] + [
-        "$GPRMC,120004.00,A,4800.0000,N,01100.0000,E,0.0,0.0,140526,,,R*"
-    ]
-    sums = [line + f"{np.bitwise_xor.reduce(np.frombuffer(line[1:-1].encode(), np.uint8)):02X}" for line in lines]
+    sums = nmea_lines()
     (tmp_path / "a.nmea").write_text("\n".join(sums) + "\n")
     direct = read("nmea", tmp_path / "a.nmea", crs="EPSG:4979")
     for name, field in (("nmea_msgs/msg/Sentence", "sentence"), ("std_msgs/msg/String", "data")):

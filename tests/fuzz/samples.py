@@ -60,6 +60,7 @@ from tests.formats.e57_files import PAGE, PAYLOAD, small_e57
 from tests.formats.nmea_files import Fix, sentences
 from tests.formats.ouster_files import ouster
 from tests.formats.sick_files import encode_telegram, write_telegrams
+from tests.fuzz import bag_samples
 from tests.fuzz.mutations import Change, Inside
 from tests.fuzz.pose_samples import (
     control_csv,
@@ -484,7 +485,7 @@ _VIDEO = {"end": test_images.T0}
 
 def all_samples() -> list[Sample]:
     """Every form of every format."""
-    return [s for part in (_poses(), _tables(), _lidar(), _clouds(), _others()) for s in part]
+    return [s for part in (_poses(), _tables(), _lidar(), _clouds(), _others(), _bags()) for s in part]
 
 
 def samples_of(name: str) -> list[Sample]:
@@ -628,6 +629,23 @@ def _lidar() -> Iterator[Sample]:
     yield Sample("scans", "plain", scans(plain_parquet))
     yield Sample("scans", "arrow", scans(test_scans.write_arrow))
     yield Sample("scans", "zstd", scans(test_scans.write_compressed))
+
+
+def _bags() -> Iterator[Sample]:
+    """One topic a format; the containers are shared out, and those of point clouds are all."""
+    stated: dict[str, dict[str, Any]] = {
+        "ros_points": bag_samples.LIDAR,
+        "ros_livox": bag_samples.LIDAR,
+        "ros_imu": {"clock": bag_samples.UTC, "sensor": Sensor(kind="imu")},
+        "ros_gnss": {"clock": bag_samples.UTC, "crs": "EPSG:4979"},
+        "ros_poses": {"clock": bag_samples.UTC, "crs": "local"},
+        "ros_nmea": {"crs": "EPSG:4979"},
+    }
+    options = {"ros_poses": {"axes": "flu"}}
+    for name in bag_samples.TOPICS:
+        kinds = bag_samples.CONTAINERS if name == "ros_points" else ("ros1", "sqlite", "mcap")
+        for kind in kinds:
+            yield Sample(name, kind, bag_samples.bag(name, kind), options.get(name, {}), stated[name])
 
 
 def _clouds() -> Iterator[Sample]:

@@ -67,8 +67,8 @@ class Arrivals:
             yield STAMPS_OF_A_BAG.finds(
                 "",
                 f"the difference of receive stamp and header stamp steps {np.count_nonzero(np.abs(steps) > _STEP_NS)} "
-                f"times, by {steps[worst] / NS_PER_S:+.3f} s at the most ({(windows[worst + 1] - windows[0]) * 10} s after "
-                f"the first message): one of the two clocks was set, or messages waited; {used}",
+                f"times, by {steps[worst] / NS_PER_S:+.3f} s at the most ({(windows[worst + 1] - windows[0]) * 10} s "
+                f"after the first message): one of the two clocks was set, or messages waited; {used}",
             )
         elif abs(grown := int(late[-1] - late[0])) > _DRIFT_NS:
             seconds = float(windows[-1] - windows[0]) * 10

@@ -45,7 +45,7 @@ _CONTAINERS: Final[tuple[tuple[bytes, type[Container]], ...]] = (
     (MCAP, McapFile),
     (SQLITE, SqliteFile),
 )
-_SUFFIXES: Final = (".bag", ".active", ".db3", ".mcap")
+_SUFFIXES: Final = (".db3", ".mcap")  # endings of the files that make a bag of ROS 2
 _PACKED: Final = (".zstd", ".zst")  # endings of files that ROS 2's recorder compressed as a whole
 _LISTED: Final = re.compile(r"^  relative_file_paths:\n((?: +- .*\n?)*)", re.MULTILINE)
 _DIGITS: Final = re.compile(r"\d+")
@@ -62,7 +62,7 @@ class Message(NamedTuple):
     """Byte of the file at which it, or its chunk, starts; −1 where the file has no such place."""
     receive_ns: int
     """Time at which the recording computer received it (POSIX ns by its clock)."""
-    data: bytes
+    data: bytes | memoryview
     """Its content, serialised."""
     file: str = ""
     """File of a folder; '' for a bag of one file."""
@@ -132,7 +132,7 @@ class Bag:
             bag.close()
             raise
         if not bag.files:
-            raise FormatError("the folder holds no file of a bag", expected=".db3, .mcap or .bag", file=path)
+            raise FormatError("the folder holds no file of a bag", expected=".db3 or .mcap", file=path)
         return bag
 
     def __enter__(self) -> Self:
@@ -162,7 +162,7 @@ class Bag:
 
     def messages(self, topic: str) -> Iterator[Message | Reject]:
         """Yield the messages of a topic in the order of the bag, not deserialised, and a reject for what is damaged."""
-        wanted, number = self.topic(topic), 0
+        wanted, number, lost = self.topic(topic), 0, 0
         yield from self.faults
         for name, container in self.files:
             ids = {
@@ -170,6 +170,7 @@ class Bag:
             }
             for item in container.messages(ids) if ids else ():
                 if isinstance(item, Reject):
+                    lost += item.records
                     yield replace(item, record=number, file=name)
                     continue
                 data = item.data
@@ -182,6 +183,9 @@ class Bag:
                         continue
                 yield Message(number, item.offset, item.receive_ns, data, name)
                 number += 1
+        if number + lost < wanted.count:
+            missing = wanted.count - number - lost
+            yield Reject("the bag's index counts more messages than there are", number, -1, missing)
 
     def decoded(self, topic: str, decode: Decode | None = None) -> Iterator[tuple[Message, Any] | Reject]:
         """Yield each message of a topic with its content (fields as attributes, arrays of numbers as NumPy arrays).
@@ -255,10 +259,16 @@ def bag_files(path: Path) -> list[Path]:
     """Files of a bag in the order in which they were written."""
     if not path.is_dir():
         return [path]
-    found = [
-        p for p in path.iterdir() if p.suffix in _SUFFIXES or (p.suffix in _PACKED and Path(p.stem).suffix in _SUFFIXES)
-    ]
-    return sorted((p for p in found if p.is_file()), key=lambda p: [int(n) for n in _DIGITS.findall(p.name)] + [0])
+    whole = (path / METADATA).is_file()
+    found = [p for p in path.iterdir() if p.is_file() and _plain(p).suffix in _SUFFIXES]
+    if not whole and len({_DIGITS.sub("#", _plain(p).name) for p in found}) > 1:
+        return []  # bags of their own, in one folder
+    return sorted(found, key=lambda p: [int(number) for number in _DIGITS.findall(_plain(p).stem)])
+
+
+def _plain(file: Path) -> Path:
+    """Return the name of a file without the ending of a compression."""
+    return file.with_suffix("") if file.suffix in _PACKED else file
 
 
 def packets(bag: Bag, topic: str) -> Iterator[Datagram | Reject]:
@@ -296,8 +306,8 @@ def _payloads(content: Any, receive_ns: int) -> Iterator[tuple[bytes, int]]:
 
 def _is_part(file: Path) -> bool:
     """Whether a file is one of a bag; a compressed one by its name alone."""
-    if file.suffix in _PACKED and Path(file.stem).suffix in _SUFFIXES:
-        return True
+    if file.suffix in _PACKED:
+        return _plain(file).suffix in _SUFFIXES
     try:
         with file.open("rb") as stream:
             start = stream.read(_SNIFFED)

@@ -14,7 +14,7 @@ WHAT: Final = "a compressed bag"  # as the error of a missing package names it
 ZSTD: Final = b"\x28\xb5\x2f\xfd"  # first bytes of a Zstandard frame (RFC 8878, 3.1.1)
 
 
-def unpacked(data: bytes, method: str, size: int | None = None) -> bytes:
+def unpacked(data: bytes | memoryview, method: str, size: int | None = None) -> bytes | memoryview:
     """Unpacked bytes; `size` where the bag states their number.
 
     Raises
@@ -26,7 +26,7 @@ def unpacked(data: bytes, method: str, size: int | None = None) -> bytes:
     if most > MOST_CHUNK_BYTES:
         raise ValueError(f"it states {most:,} bytes unpacked")
     if method in {"", "none"}:
-        content = data
+        content: bytes | memoryview = data
     elif method == "bz2":
         content = _bz2(data, most)
     elif method == "lz4":
@@ -52,14 +52,14 @@ def unpack_file(packed: Path, to: Path) -> str:
     return ""
 
 
-def _bz2(data: bytes, most: int) -> bytes:
+def _bz2(data: bytes | memoryview, most: int) -> bytes:
     try:
         return bz2.BZ2Decompressor().decompress(data, most + 1)
     except OSError as error:
         raise ValueError(str(error)) from error
 
 
-def _lz4(data: bytes, most: int) -> bytes:
+def _lz4(data: bytes | memoryview, most: int) -> bytes:
     frame = needed("lz4.frame", WHAT)
     try:
         return bytes(frame.LZ4FrameDecompressor().decompress(data, most + 1))
@@ -67,7 +67,7 @@ def _lz4(data: bytes, most: int) -> bytes:
         raise ValueError(str(error)) from error
 
 
-def _zstd(data: bytes, most: int) -> bytes:
+def _zstd(data: bytes | memoryview, most: int) -> bytes:
     zstandard = needed("zstandard", WHAT)
     try:
         if zstandard.frame_content_size(data) > most:

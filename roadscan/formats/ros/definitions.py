@@ -54,7 +54,7 @@ _SHIPPED: Final = {
 _TYPE: Final = re.compile(r"([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)", re.ASCII)
 _RULE: Final = "=" * 80 + "\n"  # divides the definitions of a text
 
-Decode = Callable[[bytes], Any]
+Decode = Callable[[bytes | memoryview], Any]
 """Reads a serialised message; raises anything where the bytes are no such message."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Final, Literal
 
@@ -103,7 +104,7 @@ def _unit(source: LogSource, bag: Bag, topic: Topic) -> str:
     for item in bag.decoded(topic.name):
         if not isinstance(item, Reject):
             vector = item[1].linear_acceleration
-            forces.append(np.linalg.norm([vector.x, vector.y, vector.z]))
+            forces.append(math.hypot(vector.x, vector.y, vector.z))
         if len(forces) >= _LOOKED_AT:
             break
     middle = float(np.median(forces)) if forces else STANDARD_GRAVITY_M_PER_S2

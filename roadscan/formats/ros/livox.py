@@ -68,22 +68,24 @@ class RosLivox(TopicFormat):
                 )  # fmt: skip
 
 
-def _ros1(data: bytes) -> Any:
+def _ros1(data: bytes | memoryview) -> Any:
     """A message as ROS 1 serialises it: all fields one after another."""
     _, seconds, ns, length = struct.unpack_from("<IIII", data)
-    return _message(data, "<", seconds, ns, data[16 : 16 + length], 16 + length + _BEHIND_HEADER, _ROS1_BYTES)
+    return _message(data, "<", seconds, ns, bytes(data[16 : 16 + length]), 16 + length + _BEHIND_HEADER, _ROS1_BYTES)
 
 
-def _cdr(data: bytes) -> Any:
+def _cdr(data: bytes | memoryview) -> Any:
     """A message as ROS 2 serialises it: every number at a multiple of its size, counted from the fifth byte."""
     order = "<" if data[1] else ">"
     seconds, ns, length = struct.unpack_from(order + "iII", data, _CDR_HEAD)
     behind = 12 + length
     at = _CDR_HEAD + behind + -behind % 8 + _BEHIND_HEADER
-    return _message(data, order, seconds, ns, data[_CDR_HEAD + 12 : _CDR_HEAD + behind].rstrip(b"\0"), at, _CDR_BYTES)
+    return _message(
+        data, order, seconds, ns, bytes(data[_CDR_HEAD + 12 : _CDR_HEAD + behind]).rstrip(b"\0"), at, _CDR_BYTES
+    )
 
 
-def _message(data: bytes, order: str, seconds: int, ns: int, frame: bytes, at: int, step: int) -> Any:
+def _message(data: bytes | memoryview, order: str, seconds: int, ns: int, frame: bytes, at: int, step: int) -> Any:
     """Return header and points; raises where the bytes are no such message.
 
     at : place of the number of points.
@@ -93,7 +95,7 @@ def _message(data: bytes, order: str, seconds: int, ns: int, frame: bytes, at: i
     places = [0, 4, 8, 12, 16, 17, 18]
     points = np.dtype({"names": names, "formats": [order + k for k in kinds], "offsets": places, "itemsize": step})
     needed = (count - 1) * step + _ROS1_BYTES if count else 0  # the last one is not filled up
-    content = data[at + 4 :]
+    content = bytes(data[at + 4 :])
     if not needed <= len(content) < needed + step:
         raise ValueError("the message is no CustomMsg")
     content = content.ljust(count * step, b"\0")

@@ -53,9 +53,9 @@ class McapFile(ChunkedContainer):
     def within(self, stream: BinaryIO, chunk: Chunk) -> Iterator[Raw | Connection]:
         """Yield messages and channels of a chunk, or of a run of records outside chunks."""
         stream.seek(chunk.offset)
-        content = exactly(stream, chunk.length)
+        content = memoryview(exactly(stream, chunk.length))  # parts of it are not copied
         if content[0] == _CHUNK:
-            content = _unpacked(content[_RECORD.size :])
+            content = memoryview(_unpacked(content[_RECORD.size :]))
         at = 0
         while at < len(content):
             kind, length = _RECORD.unpack_from(content, at)
@@ -66,9 +66,9 @@ class McapFile(ChunkedContainer):
                 channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(content, start)
                 yield Raw(channel, chunk.offset, log_ns, content[start + _MESSAGE_HEAD.size : at])
             elif kind == _CHANNEL:
-                yield self._channel(content[start:at])
+                yield self._channel(bytes(content[start:at]))
             elif kind == _SCHEMA:
-                self._schema(content[start:at])
+                self._schema(bytes(content[start:at]))
 
     def _summarised(self, stream: BinaryIO) -> bool:
         """Take what the summary says; False where there is none, or it does not list all messages."""
@@ -164,11 +164,11 @@ class McapFile(ChunkedContainer):
         return Connection(number, topic, name, encoding, text, "idl" if "idl" in language else "msg")
 
 
-def _unpacked(content: bytes) -> bytes:
+def _unpacked(content: memoryview) -> bytes | memoryview:
     _, _, size, crc = _CHUNK_HEAD.unpack_from(content)
     at = _CHUNK_HEAD.size
     length = struct.unpack_from("<I", content, at)[0]
-    method = content[at + 4 : at + 4 + length].decode()
+    method = bytes(content[at + 4 : at + 4 + length]).decode()
     at += 4 + length
     packed = struct.unpack_from("<Q", content, at)[0]
     records = unpacked(content[at + 8 : at + 8 + packed], method, size)

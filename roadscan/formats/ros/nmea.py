@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from roadscan.core.errors import RoadscanError
 from roadscan.core.strict import Strict
 from roadscan.formats.motion.nmea import Nmea, NmeaOptions
 from roadscan.formats.ros.bag import Bag, Topic
-from roadscan.formats.ros.topics import TopicFormat, topics_of
+from roadscan.formats.ros.topics import TopicFormat
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.records import options_of
 
@@ -42,11 +43,12 @@ class RosNmea(TopicFormat):
     time = "UTC by its nature, with the date of RMC or ZDA"
     options: ClassVar[type[Strict]] = RosNmeaOptions
 
-    def sniff(self, path: Path) -> bool:
-        """True for a bag with a topic of sentences, or of strings among which are some."""
-        return any(
-            t.type == _SENTENCES or (t.type == _STRINGS and _holds_sentences(path, t)) for t in topics_of(path).values()
-        )
+    def reads(self, bag: Bag, topic: Topic) -> bool:
+        """Return whether a topic is of sentences; strings are where one of the first is a sentence."""
+        if not super().reads(bag, topic) or topic.type == _SENTENCES:
+            return super().reads(bag, topic)
+        first = itertools.islice(bag.decoded(topic.name), _LOOKED_AT)
+        return any(isinstance(one, tuple) and _text(one[1]).lstrip().startswith("$G") for one in first)
 
     def header(self, source: LogSource) -> LogHeader:
         """Check clock, CRS and heights, as for a log of sentences."""
@@ -61,13 +63,6 @@ class RosNmea(TopicFormat):
         """Stream solutions."""
         with self._sentences(source) as (log, _):
             yield from Nmea().read(log, header)
-
-    def topic(self, bag: Bag, source: LogSource) -> Topic:
-        """Return the topic to read; strings count where one of the first is a sentence."""
-        for topic in bag.topics.values():
-            if topic.type == _STRINGS and not _is_of_sentences(bag, topic):
-                bag.topics = {name: one for name, one in bag.topics.items() if one is not topic}
-        return super().topic(bag, source)
 
     @contextmanager
     def _sentences(self, source: LogSource) -> Iterator[tuple[LogSource, str]]:
@@ -87,20 +82,3 @@ class RosNmea(TopicFormat):
 
 def _text(content: Any) -> str:
     return str(content.sentence if hasattr(content, "sentence") else content.data)
-
-
-def _holds_sentences(path: Path, topic: Topic) -> bool:
-    try:
-        with Bag.open(path) as bag:
-            return _is_of_sentences(bag, topic)
-    except RoadscanError:
-        return False
-
-
-def _is_of_sentences(bag: Bag, topic: Topic) -> bool:
-    for number, item in enumerate(bag.decoded(topic.name)):
-        if number >= _LOOKED_AT:
-            break
-        if not isinstance(item, Reject) and _text(item[1]).lstrip().startswith("$G"):
-            return True
-    return False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -21,8 +21,9 @@ from roadscan.formats.lidars.ouster_packets import (
 )
 from roadscan.formats.lidars.ouster_pcap import LOOKED_AT, decoded, described, least_delay_s
 from roadscan.formats.lidars.pcap import Datagram
-from roadscan.formats.ros.bag import Bag, Topic, is_bag, packets
-from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Part, Reject, beside
+from roadscan.formats.ros.bag import Bag, Topic, packets
+from roadscan.formats.ros.topics import TopicFormat
+from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject, beside
 from roadscan.ingest.reading.records import options_of
 
 TYPES: Final = ("ouster_ros/msg/PacketMsg", "ouster_msgs/msg/PacketMsg", "ouster_sensor_msgs/msg/PacketMsg")
@@ -46,12 +47,12 @@ class OusterBagOptions(OusterOptions, BagPacketsOptions):
     """Settings of lidar packets of an Ouster in a bag."""
 
 
-class OusterBag(LogFormat):
+class OusterBag(TopicFormat):
     """Lidar packets of type `ouster_ros/PacketMsg` (or `ouster_msgs`, `ouster_sensor_msgs`) in a bag of ROS.
 
     They are read as those of a capture: see `ouster_pcap`. The metadata are those of a topic of strings in the bag
     (`…/metadata`); where no topic holds any, as older drivers served them on demand, `options.metadata` names the
-    JSON. In a bag with topics of other kinds, state `format = "ouster_bag"`; its IMU packets are `ouster_bag_imu`.
+    JSON. IMU packets of the bag are a log of their own (`ouster_bag_imu`).
     """
 
     name: ClassVar[str] = "ouster_bag"
@@ -61,23 +62,10 @@ class OusterBag(LogFormat):
     usual_axes: ClassVar[Mapping[str, str]] = {"flu": "it stands upright and its connector points back"}
     time: ClassVar[str] = "the sensor's own, as in a capture (ouster_pcap); the bag's stamps are not used"
     options: ClassVar[type[Strict]] = OusterBagOptions
+    types: ClassVar[tuple[str, ...]] = TYPES
 
-    def sniff(self, path: Path) -> bool:
-        """True for a bag that holds nothing but packets of an Ouster, among them the lidar's, and strings."""
-        return holds_only_packets(path) is True
-
-    def files(self, path: Path) -> list[Path]:
-        """Return the bag's files, with its metadata."""
-        return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-
-    def parts(self, path: Path) -> Sequence[Part]:
-        """Return all topics of the bag."""
-        from roadscan.formats.ros.overview import parts
-
-        return parts(path)
-
-    def claims(self, bag: Bag, topic: Topic) -> bool:
-        """Return True for a topic of lidar packets."""
+    def reads(self, bag: Bag, topic: Topic) -> bool:
+        """Return whether a topic is of lidar packets."""
         return holds_lidar(bag, topic) is True
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
@@ -90,14 +78,18 @@ class OusterBag(LogFormat):
         need("rosbags.typesys", "a ROS bag")
         options = options_of(source, OusterBagOptions)
         with Bag.open(source.path) as bag:
-            metadata = bag_metadata(bag, options)
-            clock = sensor_clock(source, metadata)
-            topic = topic_of_length(bag, options, packet_bytes(metadata))
-            found = packets_of_length(bag, topic, packet_bytes(metadata))
-            looked = list(itertools.islice((p for p in found if isinstance(p, Datagram)), LOOKED_AT))
-        has_checksum = examined(looked, metadata, source.path)
-        said = {"topic": topic, "checksum": has_checksum} | least_delay_s(looked, metadata, clock)
-        return LogHeader(described(metadata, options) | said)
+            length = packet_bytes(bag_metadata(bag, options))
+            return LogHeader(self.attributes(source, bag, topic_of_length(bag, options, length)))
+
+    def attributes(self, source: LogSource, bag: Bag, topic: Topic) -> dict[str, Any]:
+        """Return what the header states, by metadata and first packets."""
+        options = options_of(source, OusterBagOptions)
+        metadata = bag_metadata(bag, options)
+        clock = sensor_clock(source, metadata)
+        found = packets_of_length(bag, topic.name, packet_bytes(metadata))
+        looked = list(itertools.islice((p for p in found if isinstance(p, Datagram)), LOOKED_AT))
+        said = {"topic": topic.name, "checksum": examined(looked, metadata, source.path)}
+        return described(metadata, options) | said | least_delay_s(looked, metadata, clock)
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream packets, decoded some at a time."""
@@ -107,20 +99,6 @@ class OusterBag(LogFormat):
             clock = sensor_clock(source, metadata)
             decoder = OusterDecoder(metadata, options, clock, source.path, bool(said["checksum"]))
             yield from decoded(packets_of_length(bag, str(said["topic"]), packet_bytes(metadata)), decoder)
-
-
-def holds_only_packets(path: Path) -> bool | None:
-    """Return whether a bag's packets of an Ouster are the lidar's too; None for other bags. Never raises."""
-    try:
-        if not is_bag(path):
-            return None
-        with Bag.open(path) as bag:
-            kinds = {topic.type for topic in bag.topics.values() if topic.count}
-            if not kinds & set(TYPES) or not kinds <= {*TYPES, TEXT}:
-                return None
-            return any(is_lidar_packet(payload) for payload in _first_payloads(bag).values())
-    except Exception:  # noqa: BLE001 — a content test must not fail, whatever the bag or its definitions hold
-        return None
 
 
 def holds_lidar(bag: Bag, topic: Topic) -> bool | None:
@@ -141,7 +119,7 @@ def _first_payloads(bag: Bag) -> dict[str, bytes]:
     return {name: first.payload for name, first in firsts.items() if first is not None}
 
 
-def topic_of_length(bag: Bag, options: BagPacketsOptions, length: int) -> str:
+def topic_of_length(bag: Bag, options: BagPacketsOptions, length: int) -> Topic:
     """Return the stated topic of packets, or the only one whose packets have this length.
 
     Raises
@@ -163,7 +141,7 @@ def topic_of_length(bag: Bag, options: BagPacketsOptions, length: int) -> str:
             file=bag.path,
             missing=Missing("options.topic", choices=tuple(firsts)),
         )
-    return fitting[0]
+    return bag.topics[fitting[0]]
 
 
 def bag_metadata(bag: Bag, options: BagPacketsOptions) -> OusterMetadata:

@@ -5,19 +5,23 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.counted import counted
 from roadscan.core.frames import BODY_FROM_AXES, rotation_from_quaternion, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.formats.ros.bag import Bag, Topic, bag_files
-from roadscan.formats.ros.topics import TopicFormat
-from roadscan.ingest.reading.format import Part, Reject, log_formats
+from roadscan.formats.ros.mcap_file import McapFile
+from roadscan.formats.ros.ros1_file import Ros1File
+from roadscan.formats.ros.sqlite_file import SqliteFile
+from roadscan.ingest.reading.format import Contents, Part, Reject
 
 Float64 = npt.NDArray[np.float64]
 
+_KINDS: Final[dict[type, str]] = {Ros1File: "ROS 1", SqliteFile: "ROS 2 (SQLite)", McapFile: "ROS 2 (MCAP)"}
 _STATIC: Final = "tf2_msgs/msg/TFMessage"
 _ROS1_STATIC: Final = "tf/msg/tfMessage"  # as ROS 1 called it before tf2
 _STATIC_NAME: Final = "tf_static"
@@ -27,37 +31,43 @@ _MOST_FRAMES: Final = 100  # longest way from a frame to the vehicle's
 _FLU: Final = np.diag([1.0, -1.0, -1.0])  # forward, right, down from x ahead, y left, z up (REP 103)
 
 
-def parts(path: Path) -> tuple[Part, ...]:
-    """Return the topics of a bag by name."""
-    return _parts(path, tuple((str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in bag_files(path)))
+class Reader(Protocol):
+    """A format of messages."""
+
+    name: ClassVar[str]
+
+    def reads(self, bag: Bag, topic: Topic) -> bool:
+        """Return whether it reads a topic."""
+
+
+def contents(path: Path, readers: tuple[Reader, ...]) -> Contents:
+    """Return the topics of a bag by name, each with the reader that reads it."""
+    return _contents_of(path, readers, tuple((str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in bag_files(path)))
 
 
 @functools.lru_cache(maxsize=16)
-def _parts(path: Path, stamp: object) -> tuple[Part, ...]:
-    readers = {t: f.name for f in log_formats().values() if isinstance(f, TopicFormat) for t in f.types}
+def _contents_of(path: Path, readers: tuple[Reader, ...], stamp: object) -> Contents:
     with Bag.open(path) as bag:
         mountings = _mountings(bag)
-        return tuple(_part(bag, bag.topics[name], readers, mountings) for name in sorted(bag.topics))
+        parts = tuple(_part(bag, bag.topics[name], readers, mountings) for name in sorted(bag.topics))
+        faults = [*bag.faults, *(fault for _, container in bag.files for fault in container.faults)]
+        kinds = " and ".join(sorted({_KINDS[type(container)] for _, container in bag.files}))
+        what = f"a bag of {kinds} with {counted(len(parts), 'topic')}"
+        return Contents(what, parts, tuple(fault.reason for fault in faults))
 
 
-def _part(bag: Bag, topic: Topic, readers: dict[str, str], mountings: dict[str, tuple[str, Float64]]) -> Part:
+def _part(bag: Bag, topic: Topic, readers: tuple[Reader, ...], mountings: dict[str, tuple[str, Float64]]) -> Part:
     frame = _frame(bag, topic)
     parent, pose = mountings.get(frame, ("", np.eye(4)))
     return Part(
         name=topic.name,
         words=_words(topic),
-        format=(readers.get(topic.type) or _claimed(bag, topic)) if topic.count else "",
+        format=next((one.name for one in readers if one.reads(bag, topic)), ""),
         options={"topic": topic.name},
         frame=frame,
         parent=parent,
         mounting=_mounting(pose) if parent else {},
     )
-
-
-def _claimed(bag: Bag, topic: Topic) -> str:
-    """Return the format that knows the topic by its messages, since their type alone does not tell; "" for none."""
-    readers = ((f.name, getattr(f, "claims", None)) for f in log_formats().values())
-    return next((name for name, claims in readers if claims is not None and claims(bag, topic)), "")
 
 
 def _words(topic: Topic) -> str:

@@ -61,7 +61,7 @@ class Ros1File(ChunkedContainer):
         stream.seek(chunk.offset)
         fields = _header(stream)
         data = exactly(stream, _LENGTH.unpack(exactly(stream, 4))[0])
-        content = unpacked(data, fields[b"compression"].decode(), _LENGTH.unpack(fields[b"size"])[0])
+        content = memoryview(unpacked(data, fields[b"compression"].decode(), _LENGTH.unpack(fields[b"size"])[0]))
         at = 0
         while at < len(content):
             fields, at = _fields_at(content, at)
@@ -73,7 +73,7 @@ class Ros1File(ChunkedContainer):
                 number, seconds, ns = struct.unpack("<III", fields[b"conn"] + fields[b"time"])
                 yield Raw(number, chunk.offset, seconds * NS_PER_S + ns, content[at + 4 : end])
             elif kind == _CONNECTION:
-                yield _connection(fields, content[at + 4 : end])
+                yield _connection(fields, bytes(content[at + 4 : end]))
             at = end
 
     def _indexed(self, stream: BinaryIO, index: int, connections: int, chunks: int) -> bool:
@@ -157,12 +157,12 @@ def _skip_data(stream: BinaryIO) -> None:
     stream.seek(_LENGTH.unpack(exactly(stream, 4))[0], 1)
 
 
-def _fields_at(content: bytes, at: int) -> tuple[_Fields, int]:
+def _fields_at(content: memoryview, at: int) -> tuple[_Fields, int]:
     """The header at a place of a chunk, and where it ends."""
     end = at + 4 + _LENGTH.unpack_from(content, at)[0]
     if end > len(content):
         raise ValueError("a record reaches beyond it")
-    return _fields(content[at + 4 : end]), end
+    return _fields(bytes(content[at + 4 : end])), end
 
 
 def _fields(header: bytes) -> _Fields:

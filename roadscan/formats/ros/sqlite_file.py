@@ -67,7 +67,7 @@ class SqliteFile(Container):
             self.connections[int(number)] = Connection(int(number), str(name), str(type_name), str(encoding))
         try:
             texts = base.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
-            known = {n: (str(text), "idl" if "idl" in str(language) else "msg") for n, language, text in texts}
+            known = {name: (str(text), "idl" if "idl" in str(language) else "msg") for name, language, text in texts}
         except sqlite3.Error:
             return  # recorders before ROS 2 Iron write no such table
         for connection in self.connections.values():

@@ -62,7 +62,7 @@ class Raw(NamedTuple):
     """Byte of the file at which the message, or its chunk, starts; −1 where the file has no such place."""
     receive_ns: int
     """Time at which the recording computer received it (POSIX ns by its clock)."""
-    data: bytes
+    data: bytes | memoryview
 
 
 RawItem: TypeAlias = Raw | Reject

@@ -5,18 +5,20 @@ from __future__ import annotations
 import functools
 from abc import abstractmethod
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Final, Literal
 
-from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
+from roadscan.core.errors import ConfigError, FormatError, Missing, RoadscanError, TimeSystemError
 from roadscan.core.extras import need
 from roadscan.core.gpstime import Clock
 from roadscan.core.strict import Strict
 from roadscan.formats.ros.arrivals import Arrivals
-from roadscan.formats.ros.bag import Bag, Message, Topic, bag_files, is_bag, stamp_ns
+from roadscan.formats.ros.bag import METADATA, Bag, Message, Topic, bag_files, is_bag, stamp_ns
 from roadscan.formats.ros.definitions import Decode
-from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Part, Reject
+from roadscan.formats.ros.overview import contents
+from roadscan.ingest.reading.format import Contents, Item, LogFormat, LogHeader, LogSource, Reject, log_formats
 from roadscan.ingest.reading.records import options_of
 
 TIME: Final = (
@@ -56,18 +58,26 @@ class TopicFormat(LogFormat):
     suffixes: ClassVar[tuple[str, ...]] = ()
 
     def sniff(self, path: Path) -> bool:
-        """True for a bag with a topic of one of the types."""
-        return any(topic.type in self.types for topic in topics_of(path).values())
+        """True for a bag with a topic that it reads."""
+        topics = [topic for topic in topics_of(path).values() if topic.type in self.types and topic.count]
+        try:
+            with Bag.open(path) if topics else nullcontext() as bag:
+                return bag is not None and any(self.reads(bag, topic) for topic in topics)
+        except RoadscanError:
+            return False
+
+    def reads(self, bag: Bag, topic: Topic) -> bool:
+        """Return whether it reads a topic."""
+        return topic.type in self.types and topic.count > 0
 
     def files(self, path: Path) -> list[Path]:
         """Return the bag's files, with its metadata."""
-        return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+        metadata = path / METADATA
+        return sorted([*bag_files(path), *([metadata] if metadata.is_file() else [])])
 
-    def parts(self, path: Path) -> tuple[Part, ...]:
+    def contents(self, path: Path) -> Contents | None:
         """Return all topics of the bag."""
-        from roadscan.formats.ros.overview import parts
-
-        return parts(path)
+        return contents(path, tuple(one for one in log_formats().values() if isinstance(one, TopicFormat)))
 
     def header(self, source: LogSource) -> LogHeader:
         """Find the topic and check the clock; the first message says the frame."""
@@ -109,7 +119,7 @@ class TopicFormat(LogFormat):
                     f"the topic {name} is of type {topic.type}", expected=" or ".join(self.types), file=source.path
                 )
             return topic
-        fitting = sorted(t.name for t in bag.topics.values() if t.type in self.types and t.count)
+        fitting = sorted(t.name for t in bag.topics.values() if self.reads(bag, t))
         if not fitting:
             raise FormatError("the bag has no topic to read", expected=" or ".join(self.types), file=source.path)
         if fitting[1:]:

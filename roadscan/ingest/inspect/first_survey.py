@@ -24,8 +24,8 @@ from roadscan.core.rig import SensorKind
 from roadscan.ingest.inspect.diagnosis import formats_of, specific_fault
 from roadscan.ingest.inspect.file_kinds import FileKind, kind_of
 from roadscan.ingest.inspect.inspect import Inspection, LogReport, Progress, inspect
-from roadscan.ingest.inspect.provisional import Need, raw_stamps_ns, sensor_kind
-from roadscan.ingest.reading.format import LogFormat
+from roadscan.ingest.inspect.provisional import Need, Stated, raw_stamps_ns, sensor_kind
+from roadscan.ingest.reading.format import Contents, LogFormat, Part
 
 Int64 = npt.NDArray[np.int64]
 
@@ -49,6 +49,8 @@ class FoundLog:
     inspection: Inspection
     sensor: str = ""
     """Name of the sensor of the rig that wrote it; "" for none."""
+    part: Part | None = None
+    """Part of the file that it is, where the file is a container of several logs."""
     companions: dict[str, FoundLog] = field(default_factory=dict)
     """Logs that belong to this one, by the setting of its format that names them."""
 
@@ -106,7 +108,9 @@ class FoundLog:
 
     @property
     def stem(self) -> str:
-        """Name without suffixes."""
+        """Name without suffixes; of a part, its own."""
+        if self.part is not None:
+            return self.part.name.strip("/")
         return self.path.name if self.path.is_dir() else self.path.name.split(".")[0]
 
 
@@ -256,6 +260,8 @@ def _taken_by_folder_log(folder: Path) -> frozenset[Path]:
     """
     for log_format in formats_of(folder):
         own = log_format.files(folder)
+        if log_format.contents(folder) is not None:
+            return frozenset(own)
         singly = {path: {f.name for f in formats_of(path)} for path in own[:_SAMPLED]}
         others = {path for path, names in singly.items() if names and log_format.name not in names}
         parts = [path for path, names in singly.items() if log_format.name in names]
@@ -278,6 +284,9 @@ def _pattern(path: Path) -> tuple[Path, str]:
 def _sort_in(path: Path, found: FoundFolder, logs: list[FoundLog], progress: Progress) -> None:
     size = path.stat().st_size if path.is_file() else 0
     inspection = inspect(path, quick=size > WHOLE_BYTES, progress=progress) if formats_of(path) else None
+    if inspection is not None and inspection.contents is not None:
+        _sort_in_parts(inspection, inspection.contents, found, logs, progress)
+        return
     if inspection is not None and inspection.readable:
         log = FoundLog(path, inspection)
         if log.is_control:
@@ -300,6 +309,21 @@ def _sort_in(path: Path, found: FoundFolder, logs: list[FoundLog], progress: Pro
         fault = None if kind.role == "archive" else specific_fault(path)
         words = kind.words if fault is None else f"{fault.arrived}; {fault.change}".removesuffix("; ")
         found.unknown.append((path, words + (" (unpack it first)" if kind.role == "archive" else "")))
+
+
+def _sort_in_parts(
+    container: Inspection, contents: Contents, found: FoundFolder, logs: list[FoundLog], progress: Progress
+) -> None:
+    """Sort in each part of a container as a log of its own."""
+    for part in contents.parts:
+        if not part.format:
+            continue
+        stated, quick = Stated(options=dict(part.options)), container.bytes > WHOLE_BYTES
+        one = inspect(container.path, stated, part.format, quick=quick, progress=progress)
+        if one.readable:
+            logs.append(FoundLog(container.path, one, part=part))
+        else:
+            found.unknown.append((container.path, f"{part.name} ({part.words}), which cannot be read: {one.error}"))
 
 
 # --- which logs belong together -------------------------------------------------------------------

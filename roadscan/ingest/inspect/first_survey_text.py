@@ -30,7 +30,7 @@ from roadscan.ingest.inspect.first_survey import FoundFolder, FoundLog, FoundRun
 from roadscan.ingest.inspect.inspect import LogReport
 from roadscan.ingest.inspect.log_figures import Extent
 from roadscan.ingest.inspect.provisional import Need
-from roadscan.ingest.reading.format import LogFormat
+from roadscan.ingest.reading.format import LogFormat, Part
 
 Float64 = npt.NDArray[np.float64]
 
@@ -186,11 +186,13 @@ def _run(run: FoundRun, folder: Path) -> Iterator[str]:
 
 def _log(log: FoundLog, folder: Path) -> Iterator[str]:
     yield f"path = {_path(log.path, folder)}"
-    others = [name for name in log.inspection.formats if name != log.format.name]
+    others = [name for name in log.inspection.formats if name != log.format.name and log.part is None]
     also = f"  # the content fits {', '.join(others)} too" if others else ""
     yield f"format = {toml(log.format.name)}{also}"
     if log.sensor:
         yield f"sensor = {toml(log.sensor)}"
+    for setting, value in {} if log.part is None else log.part.options.items():
+        yield f"options.{setting} = {toml(value)}"
     for setting, companion in log.companions.items():
         yield f"options.{setting} = {_path(companion.path, log.path.parent)}"
         yield from _remark(f"{companion.format.title}; it lies beside this log in time: {_summary(companion.report)}")
@@ -315,6 +317,9 @@ def _sensor(name: str, log: FoundLog) -> Iterator[str]:
 
 
 def _mounting(kind: str, log: FoundLog) -> Iterator[str]:
+    if log.part is not None and log.part.mounting:
+        yield from _stated_by_container(log.part, kind)
+        return
     known = {} if log.is_assumed else log.report.header.get("mounting", {})
     for key, value in known.items():
         yield f"{key} = {toml(value)}  # as the log says"
@@ -329,6 +334,17 @@ def _mounting(kind: str, log: FoundLog) -> Iterator[str]:
     if kind in _READS and "axes" not in known:
         yield _question("boresight = { roll_deg = 0.0, pitch_deg = 0.0, heading_deg = 0.0 }")
         yield "# how far it is turned from those axes, by its mount (a tilted scanner) or a calibration; 0 by neither"
+
+
+def _stated_by_container(part: Part, kind: str) -> Iterator[str]:
+    """Yield the mounting that a container states, as questions: what its frames are on the vehicle it does not say."""
+    for key, value in part.mounting.items():
+        if key == "lever_arm_body_m" or kind in _TURNED:
+            yield _question(f"{key} = {toml(value)}")
+    yield from _remark(
+        f"the frame {part.frame} as the recording's static transforms place it on the frame {part.parent}: right if "
+        f"{part.parent} is x ahead, y left, z up, and its origin is the vehicle's reference point"
+    )
 
 
 def _axes(log_format: LogFormat) -> Iterator[str]:

@@ -26,7 +26,7 @@ from roadscan.ingest.inspect.diagnosis import cannot_be_opened, diagnose, format
 from roadscan.ingest.inspect.file_kinds import FileKind, is_cut_off, kind_of, wrapper_of
 from roadscan.ingest.inspect.log_figures import Fault, LogFigures, TableFigures
 from roadscan.ingest.inspect.provisional import OpenedLog, Stated, raw_stamps_ns
-from roadscan.ingest.reading.format import Item, LogFormat, Rows, format_named
+from roadscan.ingest.reading.format import Contents, Item, LogFormat, Rows, format_named
 from roadscan.ingest.reading.future_times import FutureTimes
 
 QUICK_VALUES: Final = 1_000_000
@@ -150,6 +150,8 @@ class Inspection:
     kind: FileKind | None = None
     """Kind of the file by its bytes, where no raw format claims it."""
     log: LogReport | None = None
+    contents: Contents | None = None
+    """Logs that it contains, where it is a container of several."""
     error: str = ""
     """Why it cannot be read."""
     refusals: dict[str, str] = field(default_factory=dict)
@@ -158,12 +160,14 @@ class Inspection:
     @property
     def readable(self) -> bool:
         """True if roadscan can read it: a log (once everything is stated), a product, or a settings file."""
-        return not self.error and (self.log is not None or (self.kind is not None and self.kind.readable))
+        of_parts = self.contents is not None and any(part.format for part in self.contents.parts)
+        return not self.error and (of_parts or self.log is not None or bool(self.kind and self.kind.readable))
 
     @property
     def faults(self) -> list[Fault]:
         """Return all faults."""
         found = [] if self.kind is None else [Fault(text, 1) for text in self.kind.faults]
+        found += [] if self.contents is None else [Fault(text, 1) for text in self.contents.faults]
         return found + (self.log.figures.faults if self.log is not None else [])
 
     def as_json(self) -> dict[str, Any]:
@@ -180,6 +184,7 @@ class Inspection:
             "error": self.error or None,
             "details": self.kind.details if self.kind is not None else {},
             "log": None if self.log is None else _log_json(self.log),
+            "parts": [] if self.contents is None else [dataclasses.asdict(part) for part in self.contents.parts],
             "faults": [dataclasses.asdict(fault) for fault in self.faults],
         }
 
@@ -283,6 +288,14 @@ def _look(
         found.wrappers = (wrapper,)
     if not candidates:
         return _look_at_unknown(found, stated)
+    contents = next((one for one in (f.contents(path) for f in candidates) if one is not None), None)
+    if contents is not None and wanted is None:
+        chosen = [part for part in contents.parts if part.format and part.options.items() <= stated.options.items()]
+        if not chosen:
+            found.what, found.contents = contents.what, contents
+            return found
+        candidates = [format_named(chosen[0].format)]
+        found.formats = (chosen[0].format,)
     for candidate in candidates:
         found.what = found.what or candidate.title
         opened, refusal = try_open(candidate, path, stated)

@@ -15,6 +15,7 @@ from roadscan.ingest.inspect.inspect import Inspection, LogReport, TimeSpan
 from roadscan.ingest.inspect.log_figures import ColumnFigures, Extent, Fault, TableFigures
 from roadscan.ingest.inspect.provisional import OpenedLog
 from roadscan.ingest.reading.columns import UNITS
+from roadscan.ingest.reading.format import Contents, Part
 
 _LABEL: Final = 9  # characters of the column of labels
 _PLAIN_WIDTH: Final = 110  # least width (characters) where the output is no terminal
@@ -47,6 +48,8 @@ def _lines(found: Inspection) -> Iterator[Line]:
             ("holds", value if name == "holds" else f"{name}: {value}", "")
             for name, value in found.kind.details.items()
         )
+    if found.contents is not None:
+        yield from _parts(found.contents)
     if found.log is not None:
         yield from _log(found.log)
     yield from _wrong(found)
@@ -58,12 +61,32 @@ def _what(found: Inspection) -> Iterator[Line]:
     name = f" ({found.log.opened.format.name})" if found.log is not None else ""
     yield "what", found.what + name, "bold"
     yield "size", f"{_bytes(found.bytes)}{files}{wrapped}", ""
-    if len(found.formats) > 1:
+    if len(found.formats) > 1 and found.contents is None:
         yield "fits", "the content fits " + " and ".join(found.formats) + ': state format = "…"', "yellow"
     for name, refusal in found.refusals.items() if found.log is not None else ():
         yield "fits", f"{name} says: {refusal}", "yellow"
     if found.nearest:
         yield "nearest", ", ".join(found.nearest), ""
+
+
+def _parts(contents: Contents) -> Iterator[Line]:
+    for part in contents.parts:
+        frame = f", frame {part.frame}" if part.frame else ""
+        yield "holds", f"{part.name}: {part.words}{frame} → {part.format or 'not read'}", "" if part.format else "dim"
+        if part.mounting:
+            yield "holds", f"  {part.frame} as it stands on {part.parent}: {mounting_words(part)}", ""
+    first = next((part for part in contents.parts if part.format), None)
+    if first is not None:
+        settings = " ".join(f"--option {name}={value}" for name, value in first.options.items())
+        yield "next", f"`roadscan inspect {settings} …` reads one of them; `roadscan init` lists each as a log", ""
+
+
+def mounting_words(part: Part) -> str:
+    """Return a part's mounting in words; it holds where the frame that it is counted from is x ahead, y left, z up."""
+    lever = ", ".join(f"{value:.3f}" for value in part.mounting["lever_arm_body_m"])
+    turns = ", ".join(f"{value:.3f}°" for value in part.mounting["boresight"].values())
+    axes = part.mounting["axes"]
+    return f"lever arm {lever} m forward, right, down; axes {axes}, turned by roll, pitch, heading {turns}"
 
 
 def _log(log: LogReport) -> Iterator[Line]:

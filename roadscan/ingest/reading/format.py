@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeAlias
@@ -317,6 +317,17 @@ class Part:
     """Mounting of the frame by keys of :class:`roadscan.core.rig.Sensor`, if the parent is x ahead, y left, z up."""
 
 
+@dataclass(frozen=True)
+class Contents:
+    """What a container holds."""
+
+    what: str
+    """What it is, in words."""
+    parts: tuple[Part, ...]
+    faults: tuple[str, ...] = ()
+    """What is damaged of the container as a whole."""
+
+
 def beside(log: Path, named: Path) -> Path:
     """Return the absolute path of a file that a log's settings name, relative to the log's folder."""
     return (log if log.is_dir() else log.parent) / named
@@ -373,9 +384,9 @@ class LogFormat(ABC):
         """
         return []
 
-    def parts(self, path: Path) -> Sequence[Part]:
-        """Return all streams of a container, those of other formats too; none for a log of its own."""
-        return ()
+    def contents(self, path: Path) -> Contents | None:
+        """Return all streams of a container, those of other formats too; None for a log of its own."""
+        return None
 
     @abstractmethod
     def header(self, source: LogSource) -> LogHeader:

@@ -15,7 +15,6 @@ import pytest
 from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
-from roadscan.formats.lidars.kernels import ouster as kernels
 from roadscan.formats.lidars.ouster_metadata import metadata_of, read_metadata
 from roadscan.formats.lidars.ouster_packets import is_lidar_packet, optics_of
 from roadscan.ingest.inspect.inspect import inspect
@@ -499,17 +498,3 @@ def test_imu_packets_of_a_recording_read_gravity(recordings: Path) -> None:
     assert len(found) == 30
     force = np.stack([found[f"specific_force_{a}_m_per_s2"] for a in "xyz"], axis=-1)
     np.testing.assert_allclose(np.linalg.norm(force, axis=1).mean(), 10.5, atol=0.7)
-
-
-# --- kernels ----------------------------------------------------------------------------------------
-
-
-def test_checksum_is_that_of_the_catalogue() -> None:
-    """CRC-64/XZ of "123456789" is 0x995DC9BBDF1939FA (catalogue of parametrised CRC algorithms)."""
-    for text in (b"123456789", b"12345678"):
-        packet = np.frombuffer(text + bytes(8 + (-len(text)) % 8), np.uint8)[None]
-        whole = packet[:, : len(text) + 8]
-        out = np.zeros(1, np.uint64)
-        kernels.checksums(whole, packet.view("<u8"), kernels.checksum_tables(), out)
-        assert int(out[0]) == files.crc64(text)
-    assert files.crc64(b"123456789") == 0x995DC9BBDF1939FA

@@ -6,14 +6,12 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import lzf
 import numpy as np
 import pytest
 from pypcd4 import Encoding, PointCloud
 
 from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.formats.clouds.kernels.lzf import expand
 from roadscan.ingest.reading.format import format_of
 from tests.formats.readings import Readings, read
 
@@ -175,15 +173,3 @@ def test_padding_and_fields_of_several_values_are_passed_over(tmp_path: Path) ->
     found = read_pcd(tmp_path / "a.pcd")
     assert found.epochs.tolist() == [10 * 10**9, 11 * 10**9]
     assert found["x_sensor_m"].tolist() == [1.0, 2.0]
-
-
-def test_lzf_expands_what_liblzf_compressed() -> None:
-    random = np.random.default_rng(1)
-    for content in (b"a" * 5_000, bytes(random.integers(0, 4, 9_000, dtype="u1")), b"abcabcabcabd" * 40):
-        packed = np.frombuffer(lzf.compress(content), np.uint8)
-        out = np.zeros(len(content), np.uint8)
-        assert expand(packed, out) == len(content)
-        assert out.tobytes() == content
-        assert expand(packed[: packed.size // 2], out) < len(content)
-        assert expand(packed, out[:100]) <= 100
-    assert expand(np.array([0x20, 0x00, 5], np.uint8), out) == 0  # a copy from before the start

@@ -19,7 +19,6 @@ THROUGH_ITS_CALLER = {
     "tiles.kernels.bucket_readings.bucket_returns": "tests/tiles/test_cell_path.py",
     "tiles.kernels.profile_counting.accumulate_profiles": "tests/tiles/test_cell_path.py",
     "surface.kernels.faint_cracks.confirm_strips": "tests/surface/test_faint_cracks.py",
-    "formats.lidars.kernels.ouster.decode": "tests/formats/test_ouster.py",
     "georeference.kernels.flat_profiles.georeference_flat_profiles": "tests/georeference/test_place.py",
     "poses.kernels.poses.interpolate": "tests/poses/test_trajectory.py",
     "poses.kernels.poses.interval_coefficients": "tests/poses/test_trajectory.py",

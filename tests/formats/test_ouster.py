@@ -383,6 +383,14 @@ def test_a_capture_stated_as_velodynes_is_told_whose_it_is(tmp_path: Path) -> No
         read("velodyne_pcap", path, {}, clock=FREE)
 
 
+def test_a_capture_of_nobody_known_is_told_what_was_looked_for(tmp_path: Path) -> None:
+    path = capture(tmp_path / "a.pcap", [(k, frame(bytes(700), 5555)) for k in range(20)])
+    found = inspect(path)
+    assert "by its name it may be" in found.error
+    assert "no lidar packet of an Ouster is among the capture's first packets" in found.error
+    assert "no Velodyne data packet was sent to port 2368" in found.error
+
+
 # --- clocks -----------------------------------------------------------------------------------------
 
 

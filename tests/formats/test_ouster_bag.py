@@ -80,6 +80,18 @@ def test_a_bag_of_each_kind_gives_the_rows_of_a_capture(kind: str, tmp_path: Pat
     assert found.table.equals(expected.table)
 
 
+def test_drivers_that_add_a_byte_to_each_packet(tmp_path: Path) -> None:
+    """`ouster_ros` up to 0.4 made its buffers one byte longer than a packet."""
+    sections = files.metadata(PROFILE)
+    longer = topics(sections)
+    for kind, rows in longer.values():
+        if kind.endswith("PacketMsg"):
+            rows[:] = [(ns, {"buf": np.append(fields["buf"], np.uint8(0))}) for ns, fields in rows]
+    path = write_bag(tmp_path / "bag", "ros1", longer)
+    assert len(read("ouster_bag", path, clock=FREE)) == 5478
+    assert len(read("ouster_bag_imu", path, clock=FREE, sensor=Sensor(kind="imu"))) == 5
+
+
 def test_metadata_may_be_a_file(tmp_path: Path) -> None:
     sections = files.metadata(PROFILE)
     (tmp_path / "a.json").write_text(json.dumps(sections))

@@ -15,6 +15,7 @@ the sensor's (`lidar_to_sensor_transform`; same documentation, "Lidar range to X
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -195,7 +196,7 @@ class OusterDecoder:
     _optics: Optics = field(init=False)
     _returns: Int64 = field(init=False)
     _epochs: EpochReader = field(init=False)
-    _seen: set[int] = field(default_factory=set)
+    _recent: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
     """Stamps of recent packets."""
     _frame: int | None = None
     """Number of the last packet's frame, as it stands there, and the sweep it was."""
@@ -291,12 +292,12 @@ class OusterDecoder:
     def _copies(self, stamps_ns: Int64) -> npt.NDArray[np.bool_]:
         """Return which packets (n,) have the stamp of a recent one."""
         copies = np.zeros(stamps_ns.size, dtype=bool)
-        if not (stamps_ns[1:] > stamps_ns[:-1]).all() or int(stamps_ns[0]) in self._seen:
-            seen = set(self._seen)
+        if (stamps_ns[1:] <= stamps_ns[:-1]).any() or int(stamps_ns[0]) <= max(self._recent, default=-1):
+            seen = set(self._recent)
             for k, stamp in enumerate(stamps_ns.tolist()):
                 copies[k] = stamp in seen
                 seen.add(stamp)
-        self._seen = {*list(self._seen)[-_RECENT:], *stamps_ns[-_RECENT:].tolist()}
+        self._recent.extend(stamps_ns[-_RECENT:].tolist())
         return copies
 
     def _counted(self, raw: Bytes, columns: Columns, sound: Int64) -> Int64:

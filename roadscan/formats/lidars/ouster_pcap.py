@@ -86,6 +86,12 @@ class OusterPcap(LogFormat):
     def header(self, source: LogSource) -> LogHeader:
         """Return sensor, profile and mode; metadata and packets have to fit each other."""
         options = options_of(source, OusterPcapOptions)
+        if options.metadata is None and not has_lidar_packet(source.path):
+            raise FormatError(
+                "no lidar packet of an Ouster is among the capture's first packets",
+                expected="packets whose columns follow one another, in one of Ouster's profiles",
+                file=source.path,
+            )
         metadata = stated_metadata(source, options.metadata)
         clock = sensor_clock(source, metadata)
         looked = list(itertools.islice(_packets(source, options, metadata), LOOKED_AT))

@@ -109,7 +109,9 @@ def holds_lidar(bag: Bag, topic: Topic) -> bool | None:
         first = next((p for p in packets(bag, topic.name) if isinstance(p, Datagram)), None)
     except FormatError:
         return None
-    return None if first is None else is_lidar_packet(first.payload)
+    if first is None:
+        return None
+    return is_lidar_packet(first.payload) or is_lidar_packet(first.payload[:-1])  # a byte behind it is the driver's
 
 
 def _first_payloads(bag: Bag) -> dict[str, bytes]:

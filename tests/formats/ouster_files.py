@@ -196,17 +196,17 @@ def write(
 
 
 def ouster(profile: str, *, checksum: bool = False, imu: bool = False) -> Callable[[Path], Path]:
-    """A maker of small captures: four beams, four columns a packet, sixteen a turn."""
-    beams = {"beam_altitude_angles": [10, 5, 0, -5], "beam_azimuth_angles": [3, 1, -1, -3]}
-    turn = {"columns_per_frame": 16, "column_window": [0, 15], "columns_per_packet": 4, "pixels_per_column": 4}
+    """A maker of small captures: four columns a packet, sixteen a turn; or of IMU packets alone."""
+    turn = {"columns_per_frame": 16, "column_window": [0, 15], "columns_per_packet": 4}
 
     def make(folder: Path) -> Path:
         packets = []
-        for k in range(10):
-            fields, column = pixels(profile, k, 4, 4), 4 * k % 16
+        for k in range(0 if imu else 10):
+            fields, column = pixels(profile, k, 4), 4 * k % 16
+            fields |= {name: values | 256 for name, values in fields.items() if "RANGE" in name}  # a return everywhere
             stamps = stamps_of(column, k // 4, 4)
             packets.append(lidar_packet(profile, fields, column, k // 4, stamps, checksum=checksum))
         readings = [imu_packet(FIRST_NS + k * 10_000_000) for k in range(10)] if imu else None
-        return write(folder, packets, metadata(profile, **beams, **turn), imu=readings)
+        return write(folder, packets, metadata(profile, **turn), imu=readings)
 
     return make

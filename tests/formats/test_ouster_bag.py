@@ -12,7 +12,7 @@ import pytest
 from roadscan.core.errors import FormatError
 from roadscan.core.rig import Sensor
 from roadscan.formats.lidars.ouster_metadata import metadata_of
-from roadscan.formats.lidars.ouster_packets import optics_of, packet_bytes
+from roadscan.formats.lidars.ouster_packets import optics_of
 from roadscan.formats.lidars.pcap import Datagram, datagrams_of_sizes
 from roadscan.ingest.reading.format import format_named, log_formats
 from tests.formats import ouster_files as files
@@ -38,21 +38,16 @@ def topics(sections: dict[str, Any], space: str = "/ouster", *, metadata: bool =
     return out | ({f"{space}/metadata": ("std_msgs/msg/String", text)} if metadata else {})
 
 
-def small_bag(kind: str, folder: Path) -> Path:
-    """A bag of ten packets of four beams, and ten of the IMU."""
-    capture = files.ouster("LEGACY", imu=True)(folder)
-    sent: dict[int, list[Any]] = {packet_bytes(metadata_of((folder / "a.json").read_text(), folder)): [], 48: []}
-    for item in datagrams_of_sizes(capture, set(sent)):
-        assert isinstance(item, Datagram)
-        sent[len(item.payload)].append((item.capture_ns, {"buf": np.frombuffer(item.payload, np.uint8)}))
-    lidar, imu = sent.values()
+def small_bag(kind: str, folder: Path, *, imu: bool = False) -> Path:
+    """A bag of ten packets of the lidar, or of its IMU, and the metadata."""
+    capture = files.ouster("LEGACY", imu=imu)(folder)
+    packets = [one for one in datagrams_of_sizes(capture, None) if isinstance(one, Datagram)]
+    rows = [(one.capture_ns, {"buf": np.frombuffer(one.payload, np.uint8)}) for one in packets]
     text = [(files.POSIX_NS, {"data": (folder / "a.json").read_text()})]
     for file in folder.iterdir():
         file.unlink()
-    topics = {"/a/metadata": ("std_msgs/msg/String", text)} | {
-        f"/a/{name}": ("ouster_ros/msg/PacketMsg", rows) for name, rows in (("lidar", lidar), ("imu", imu))
-    }
-    return write_bag(folder / "bag", kind, topics)
+    own = {"/a/metadata": ("std_msgs/msg/String", text), "/a/packets": ("ouster_ros/msg/PacketMsg", rows)}
+    return write_bag(folder / "bag", kind, own)
 
 
 def test_a_recorded_bag_gives_the_returns_of_ouster_sdk(recordings: Path) -> None:

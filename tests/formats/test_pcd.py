@@ -51,6 +51,15 @@ def sample(coding: Encoding, folder: Path) -> Path:
     return folder / "a.pcd"
 
 
+def scan(coding: Encoding, folder: Path) -> Path:
+    """A small cloud without times."""
+    points = np.random.default_rng(3).normal(0, 20, (40, 3)).astype("f4")
+    bright = np.arange(40, dtype="u1")
+    fields, types = ("x", "y", "z", "intensity"), (np.float32, np.float32, np.float32, np.uint8)
+    PointCloud.from_points([*points.T, bright], fields, types).save(folder / "a.pcd", encoding=coding)
+    return folder / "a.pcd"
+
+
 def read_pcd(path: Path, clock: Clock = FREE, **options: Any) -> Readings:
     return read("pcd", path, options, clock=clock)
 

@@ -586,7 +586,7 @@ def _lidar() -> Iterator[Sample]:
     metadata, count = {"metadata": "a.json"}, {"clock": Clock(TimeSystem.FREE)}
     yield Sample("ouster_pcap", "legacy", ouster("LEGACY"), metadata, count, fields=_PCAP_FIELDS)
     dual = ouster("RNG19_RFL8_SIG16_NIR16_DUAL", checksum=True)
-    whole = 16 + 42 + 64 + 4 * (12 + 4 * 16)
+    whole = 16 + 42 + 64 + 4 * (12 + 16 * 16)
     yield Sample("ouster_pcap", "dual", dual, metadata, count, fields=_PCAP_FIELDS, spans=every(whole, 24))
     low = ouster("RNG15_RFL8_NIR8")
     yield Sample("ouster_pcap", "metadata", low, metadata, count, ("a.json",), text=True)
@@ -597,7 +597,7 @@ def _lidar() -> Iterator[Sample]:
         bag = functools.partial(test_ouster_bag.small_bag, kind)
         parts = () if kind == "ros1" else ("bag/bag*",)
         yield Sample("ouster_bag", kind, bag, {}, count, parts)
-        yield Sample("ouster_bag_imu", kind, bag, {}, imu, parts)
+        yield Sample("ouster_bag_imu", kind, functools.partial(bag, imu=True), {}, imu, parts)
     yield Sample("livox_lvx", "lvx2", test_livox_lvx.sample, {}, count)
     yield Sample("livox_lvx", "lvx", test_livox_lvx.old_sample, {}, count)
     by_rate = test_sick_lms.BY_RATE
@@ -653,8 +653,9 @@ def _clouds() -> Iterator[Sample]:
         make = functools.partial(test_pcd.sample, coding)
         text = coding is test_pcd.CODINGS[0]
         yield Sample("pcd", coding.value, make, {}, {"clock": test_pcd.FREE}, text=text)
-        scan = test_pcd.CLOUD | {"intensity": False}
-        yield Sample("pcd_cloud", coding.value, make, scan, {"crs": "local", "height": "ellipsoidal"}, text=text)
+        scan = functools.partial(test_pcd.scan, coding)
+        local = {"crs": "local", "height": "ellipsoidal"}
+        yield Sample("pcd_cloud", coding.value, scan, test_pcd.CLOUD, local, text=text)
     cloud = {"clock": test_las.ADJUSTED, "height": "ellipsoidal"}
     for point_format in (3, 7):
         yield Sample("las", f"las{point_format}", las("a.las", point_format), {}, cloud, fields=_LAS_FIELDS)

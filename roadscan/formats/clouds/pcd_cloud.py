@@ -62,8 +62,9 @@ class PcdCloud(LogFormat):
     """A PCD file (text, binary, or compressed) of points in a CRS, without a time of each.
 
     x, y and z are needed; intensity (8 bits are multiplied by 257, 16 bits stay, others need
-    `options.intensity_range`) and the packed colours `rgb` or `rgba` are read, other fields are passed over. PCD states
-    neither CRS, unit nor time: the survey file does. A file with times is a lidar's sweep (`pcd`).
+    `options.intensity_range`) and the packed colours `rgb` or `rgba` are read, other fields are passed over. Points
+    whose coordinates are NaN, as those of organised clouds where nothing was measured, are left out. PCD states neither
+    CRS, unit nor time: the survey file does. A file with times is a lidar's sweep (`pcd`).
     """
 
     name: ClassVar[str] = "pcd_cloud"
@@ -108,10 +109,11 @@ class PcdCloud(LogFormat):
         options, epoch, scale = _checked(head, source)
         intensity = _intensity(head) if options.intensity else None
         packed = next((name for name in _PACKED if head.kinds.get(name, "")[2:] == "4"), None)
-        for part in points(source.path, head, [*_AXES, *(name for name in (intensity, packed) if name)]):
-            if isinstance(part, Reject):
-                yield part
+        for item in points(source.path, head, [*_AXES, *(name for name in (intensity, packed) if name)]):
+            if isinstance(item, Reject):
+                yield item
                 continue
+            part = _present(item)
             sieve = Sieve(part.records.size)
             columns = _columns(part, options, epoch)
             if intensity is not None:
@@ -154,6 +156,13 @@ def _checked(head: PcdHeader, source: LogSource) -> tuple[PcdCloudOptions, int, 
         raise no_epoch("the file says no time", file)
     name = _intensity(head) if options.intensity else None
     return options, epoch, None if name is None else scale_of(name, head.kinds[name], options.intensity_range, file)
+
+
+def _present(part: Points) -> Points:
+    """Return the points without those of an organised cloud where nothing was measured: their coordinates are NaN."""
+    kept = np.flatnonzero(~np.any([np.isnan(part.columns[axis]) for axis in _AXES], axis=0))
+    columns = {name: values[kept] for name, values in part.columns.items()}
+    return Points(columns, part.records[kept], part.offsets[kept])
 
 
 def _intensity(head: PcdHeader) -> str | None:

@@ -228,7 +228,8 @@ class _Plan:
         """Return the points' times (n,) in the clock's count; those far from their file's stamp are dropped."""
         if self.options.time_from == "clock":
             return values if values.dtype.kind == "f" else values.astype(np.int64)
-        offsets_ns = values.astype(np.float64) * UNIT_NS[self.options.time_unit or "ns"]
+        with np.errstate(invalid="ignore", over="ignore"):  # numbers of damaged points
+            offsets_ns = values.astype(np.float64) * UNIT_NS[self.options.time_unit or "ns"]
         near = np.abs(offsets_ns) <= _LATEST_NS  # False with a NaN
         sieve.drop(~near, "its time is more than 10 s from its file's, or not a number")
         return stamp_ns + np.rint(np.where(near, offsets_ns, 0.0)).astype(np.int64)
@@ -246,7 +247,8 @@ def _items(part: Points, plan: _Plan, stamp_ns: int, sweep: int, epochs: EpochRe
     records, offsets = part.records[returned], part.offsets[returned]
     sieve = Sieve(returned.size)
     sieve.drop(~(farthest[returned] <= _FARTHEST_M), "the position is beyond 10 km")
-    laser = np.zeros(returned.size) if plan.laser is None else own[plan.laser].astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        laser = np.zeros(returned.size) if plan.laser is None else own[plan.laser].astype(np.float64)
     sieve.drop(~((laser >= 0) & (laser <= _MOST_LASERS)), "the laser's number is outside 0 to 255")
     stamps = plan.counted(own[plan.time], stamp_ns, sieve)
     epoch = epochs.epochs(stamps, sieve, records) if sieve.good.any() else np.zeros(returned.size, np.int64)
@@ -294,8 +296,8 @@ def _check_order(files: Sequence[Path], plan: _Plan, source: LogSource) -> None:
     known = [(file, head) for file, head in _readable(files) if plan.time in head.kinds]
     for file, head in known[:_LOOKED_AT]:
         first = next(points(file, head, [plan.time]), None)
-        values = first.columns[plan.time].astype(np.float64) if isinstance(first, Points) else np.empty(0)
-        values = values[np.isfinite(values)]
+        values = first.columns[plan.time] if isinstance(first, Points) else np.empty(0)
+        values = values[np.isfinite(values)].astype(np.float64)
         if values.size:
             spans.append((float(values.min()), float(values.max())))
     if len(spans) < _LOOKED_AT:

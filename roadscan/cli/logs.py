@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import typer
 
 from roadscan.cli.arguments import formats_for
 from roadscan.cli.terminal import looking, print_table
+
+_MOST_REJECTS: Final = 20  # messages that are listed singly
 
 
 def list_formats(
@@ -115,3 +117,22 @@ def first_survey(
         typer.echo(f"not understood: {os.path.relpath(path, found.folder)}: {words}")
     written = " and ".join(str(file) for file in (made.survey_file, made.rig_file) if file is not None)
     typer.echo(f"written: {written}, with {made.questions} lines to complete (they begin with #?)")
+
+
+def unpack_topic(
+    bag: Annotated[Path, typer.Argument(help="ROS bag: a file or a folder.", show_default=False)],
+    topic: Annotated[str, typer.Argument(help="Topic, such as /camera/image_raw.", show_default=False)],
+    folder: Annotated[Path, typer.Argument(help="Folder to write to; it is made.", show_default=False)],
+) -> None:
+    """Write pictures of a bag's topic with their stamps, or pairs of stamps of any other topic, as files.
+
+    The format images reads such pictures; clock.pairs.table reads such pairs.
+    """
+    from roadscan.formats.ros.unpack import unpack
+
+    made = unpack(bag, topic, folder)
+    typer.echo(f"written: {made.table}, {made.rows:,} rows")
+    for reject in made.rejects[:_MOST_REJECTS]:
+        typer.echo(f"left out: message {reject.record}: {reject.reason}")
+    if len(made.rejects) > _MOST_REJECTS:
+        typer.echo(f"left out: {len(made.rejects) - _MOST_REJECTS:,} more")

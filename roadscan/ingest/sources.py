@@ -43,6 +43,7 @@ class Sources:
         self._kept, self._forgotten = known or {}, known is None
         self._before = _renamed(self._kept, folder)
         self._now: dict[str, Any] = {}
+        self._begun: dict[Path, Future[Known]] = {}
 
     def format(self, path: Path, stated: str | None) -> LogFormat:
         """Return the format of a log: as stated, as remembered, or found from its bytes."""
@@ -68,10 +69,16 @@ class Sources:
             missing = next((file for file in named.values() if not file.exists()), None)
             if missing is not None:
                 raise FormatError("a file that the log's options name does not exist", file=missing)
-            return {n: self._threads.submit(self._fingerprint, file, before.get(n)) for n, file in named.items()}
+            return {name: self._once(file, before.get(name)) for name, file in named.items()}
         if before:
             return {name: _done(known) for name, known in before.items()}
         raise FormatError("the log does not exist", change="check its path in the survey file", file=path)
+
+    def _once(self, file: Path, before: Known | None) -> Future[Known]:
+        """Start to fingerprint a file, unless another log has: topics of a bag are logs of the same files."""
+        if file not in self._begun:
+            self._begun[file] = self._threads.submit(self._fingerprint, file, before)
+        return self._begun[file]
 
     def end(self, path: Path, format_: LogFormat, begun: dict[str, Future[Known]]) -> tuple[str, int, str]:
         """Return the fingerprint over names and contents of a log's files and companions, their total bytes, and their

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import sqlite3
+import struct
+import zlib
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +78,7 @@ def test_a_bag_of_each_kind_gives_what_was_written(kind: str, tmp_path: Path) ->
 @pytest.mark.parametrize("kind", ["ros1", "ros1-lz4", "mcap", "mcap-storage", "sqlite"])
 @pytest.mark.parametrize("share", [0.5, 0.97])
 def test_a_bag_cut_off_keeps_whole_chunks(kind: str, share: float, tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "bag", kind, _topics(40_000))
+    path = write_bag(tmp_path / "bag", kind, _topics(20_000))
     expected = _raw(path)["/imu"]
     file = path if path.is_file() else next(p for p in path.iterdir() if p.suffix in {".db3", ".mcap"})
     whole = file.read_bytes()
@@ -90,7 +94,7 @@ def test_a_bag_cut_off_keeps_whole_chunks(kind: str, share: float, tmp_path: Pat
 
 
 def test_a_damaged_chunk_costs_its_own_messages(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "bag", "ros1-bz2", _topics(40_000))
+    path = write_bag(tmp_path / "bag", "ros1-bz2", _topics(20_000))
     expected = _raw(path)["/imu"]
     content = bytearray(path.read_bytes())
     with Reader1(path) as reader:
@@ -125,6 +129,15 @@ def test_a_part_that_metadata_names_and_that_is_missing_is_named(tmp_path: Path)
     (path / "metadata.yaml").write_text(text.replace("- bag.db3", "- bag.db3\n  - bag_1.db3"))
     with Bag.open(path) as bag:
         assert any("bag_1.db3" in item.reason for item in bag.messages("/imu") if isinstance(item, Reject))
+
+
+def test_messages_that_metadata_count_and_that_are_missing_are_named(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", "sqlite", _topics(100))
+    with closing(sqlite3.connect(path / "bag.db3")) as base, base:
+        base.execute("UPDATE messages SET topic_id = 77 WHERE id = 5")
+    with Bag.open(path) as bag:
+        (lost,) = (item for item in bag.messages("/imu") if isinstance(item, Reject))
+    assert (lost.reason, lost.records) == ("metadata.yaml counts more messages than the files hold", 1)
 
 
 def test_a_hostile_type_name_is_no_code(tmp_path: Path) -> None:
@@ -163,3 +176,51 @@ def test_packets_of_real_bags(recordings: Path, name: str, topic: str, count: in
     assert isinstance(found[0], Datagram)
     assert found[0].capture_ns == first_ns
     assert hashlib.sha256(found[0].payload).digest() != hashlib.sha256(bytes(length)).digest()
+
+
+def test_an_mcap_without_chunks(tmp_path: Path) -> None:
+    """As ROS 2 writes it with the preset `fastwrite`: the records of the chunks, at the top level, and no summary."""
+    path = write_bag(tmp_path / "bag", "mcap", _topics(20_000))
+    expected = _raw(path)["/imu"]
+    content, at, records = (path / "bag.mcap").read_bytes(), 8, b""
+    while at < len(content) - 8:
+        kind, size = struct.unpack_from("<BQ", content, at)
+        body = content[at + 9 : at + 9 + size]
+        if kind == 1:
+            records += content[at : at + 9 + size]
+        elif kind == 6:  # two times, size, CRC, no compression's name, and size again stand before the records
+            records += body[28 + 4 + 8 :]
+        at += 9 + size
+    footer = struct.pack("<BQ", 15, 4) + bytes(4) + struct.pack("<BQ", 2, 20) + bytes(20)
+    whole = tmp_path / "flat.mcap"
+    whole.write_bytes(content[:8] + records + footer + content[:8])
+    with Bag.open(whole) as bag:
+        assert not bag.faults
+        assert [(m.receive_ns, m.data) for m in _messages(bag, "/imu")] == expected
+        assert bag.topics["/imu"].count == len(expected)
+    whole.write_bytes((content[:8] + records)[:-40])
+    with Bag.open(whole) as bag:
+        assert [(m.receive_ns, m.data) for m in _messages(bag, "/imu")] == expected[: bag.topics["/imu"].count]
+        assert bag.topics["/imu"].count >= len(expected) - 1
+
+
+def test_a_wrong_checksum_of_a_chunk_costs_it(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag", "mcap", _topics(20_000))
+    expected = _raw(path)["/imu"]
+    file = path / "bag.mcap"
+    content = bytearray(file.read_bytes())
+    at, chunks = 8, []
+    while at < len(content) - 8:
+        kind, size = struct.unpack_from("<BQ", content, at)
+        chunks += [at] if kind == 6 else []
+        at += 9 + size
+    for number, start in enumerate(chunks):  # rosbags writes none (0)
+        size = struct.unpack_from("<Q", content, start + 1)[0]
+        crc = zlib.crc32(content[start + 9 + 40 : start + 9 + size]) + (number == 2)
+        content[start + 9 + 24 : start + 9 + 28] = struct.pack("<I", crc)
+    file.write_bytes(content)
+    with Bag.open(path) as bag:
+        items = list(bag.messages("/imu"))
+    lost = [item for item in items if isinstance(item, Reject)]
+    assert "checksum" in lost[0].reason
+    assert sum(one.records for one in lost) + len(items) - len(lost) == len(expected)

@@ -460,10 +460,11 @@ def test_orthometric_altitudes_need_a_geoid(tmp_path: Path) -> None:
         read("ros_gnss", bag, {"altitude": "orthometric"}, clock=UTC, crs="EPSG:4979", height="orthometric")
 
 
-def nmea_lines() -> list[str]:
-    """Sentences of five epochs, with their date in the last one."""
-    lines = [f"$GPGGA,1200{s:02d}.00,4800.0000,N,01100.0000,E,4,12,0.8,500.0,M,46.5,M,1.0,0001*" for s in range(5)]
-    lines.append("$GPRMC,120004.00,A,4800.0000,N,01100.0000,E,0.0,0.0,140526,,,R*")
+def nmea_lines(count: int = 6) -> list[str]:
+    """Sentences, the last one with the date of the epoch before it."""
+    epochs = [f"1200{second:02d}.00" for second in range(count - 1)]
+    lines = [f"$GPGGA,{e},4800.0000,N,01100.0000,E,4,12,0.8,500.0,M,46.5,M,1.0,0001*" for e in epochs]
+    lines.append(f"$GPRMC,{epochs[-1]},A,4800.0000,N,01100.0000,E,0.0,0.0,140526,,,R*")
     return [line + f"{np.bitwise_xor.reduce(np.frombuffer(line[1:-1].encode(), np.uint8)):02X}" for line in lines]
 
 

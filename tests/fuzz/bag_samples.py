@@ -44,7 +44,7 @@ def _pose(k: int) -> dict[str, Any]:
 
 
 def _sentence(k: int) -> dict[str, Any]:
-    return {"sentence": nmea_lines()[k % len(nmea_lines())]}
+    return {"sentence": nmea_lines(_MESSAGES)[k]}
 
 
 TOPICS: Final[dict[str, tuple[str, Callable[[int], dict[str, Any]]]]] = {

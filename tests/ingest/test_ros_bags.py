@@ -90,6 +90,17 @@ def test_inspect_lists_the_topics_of_a_bag(kind: str, tmp_path: Path) -> None:
     assert "20,000 rows of returns" in one.stdout
 
 
+def test_a_bag_of_which_nothing_is_read_is_listed_all_the_same(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", "sqlite", {"/chatter": ("std_msgs/msg/String", [(T0, {"data": "hello"})])})
+    done = roadscan("inspect", bag)
+    assert done.exit_code == 2
+    assert "/chatter: std_msgs/String, 1 message" in done.stdout
+    assert "of which no raw format reads one" in done.stdout
+    file = tmp_path / "cut.mcap"
+    file.write_bytes(b"\x89MCAP0\r\n" + bytes(3))
+    assert roadscan("inspect", file).exit_code == 2
+
+
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_a_survey_of_one_bag_is_asked_for_topic_by_topic(kind: str, tmp_path: Path) -> None:
     (tmp_path / "logs").mkdir()

@@ -60,6 +60,9 @@ _EPOCH_DAY: Final = dt.date(1970, 1, 1)  # origin of day counts
 _UNKNOWN: Final = np.iinfo(np.int64).min
 
 
+_BAGS: Final = (b"#ROS", b"\x89MCA", b"SQLi")  # first bytes of ROS bags
+
+
 class NmeaOptions(Strict):
     """Settings of `nmea`."""
 
@@ -103,7 +106,7 @@ class Nmea(LogFormat):
     def sniff(self, path: Path) -> bool:
         """True if the first sentences are known, with right checksums for the most part; several in binary data."""
         head = head_of(path, SNIFF_BYTES) if path.is_file() else b""
-        if b"$" not in head or head[:4] in {*MAGICS, PCAPNG}:  # captures hold the sentences of a lidar's receiver
+        if b"$" not in head or head[:4] in {*MAGICS, PCAPNG, *_BAGS}:  # they may hold the sentences of a receiver
             return False
         whole = head[: head.rfind(b"\n") + 1] or head
         found = find_sentences(whole)

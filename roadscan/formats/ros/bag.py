@@ -48,6 +48,7 @@ _CONTAINERS: Final[tuple[tuple[bytes, type[Container]], ...]] = (
 _SUFFIXES: Final = (".db3", ".mcap")  # endings of the files that make a bag of ROS 2
 _PACKED: Final = (".zstd", ".zst")  # endings of files that ROS 2's recorder compressed as a whole
 _LISTED: Final = re.compile(r"^  relative_file_paths:\n((?: +- .*\n?)*)", re.MULTILINE)
+_COUNTED: Final = re.compile(r"^  message_count: (\d{1,15})$", re.MULTILINE)
 _DIGITS: Final = re.compile(r"\d+")
 _TABLES: Final = (b"topics", b"messages")  # tables by which a database of a bag is known
 _SNIFFED: Final = 16_384  # bytes of a file's start that are searched for them
@@ -237,11 +238,15 @@ class Bag:
             topic.held = connection.held.joined(topic.held)
 
     def _find_missing(self) -> None:
-        """Note files that the folder's metadata name and that are not there."""
+        """Note files that the folder's metadata name, and messages that they count, and that are not there."""
         metadata = self.path / METADATA
         if not metadata.is_file():
             return
-        listed = _LISTED.search(metadata.read_text(encoding="utf-8", errors="replace"))
+        text = metadata.read_text(encoding="utf-8", errors="replace")
+        listed, stated = _LISTED.search(text), _COUNTED.search(text)
+        lost = (int(stated[1]) if stated else 0) - sum(topic.count for topic in self.topics.values())
+        if lost > 0:
+            self.faults.append(Reject(f"{METADATA} counts more messages than the files hold", -1, -1, lost, METADATA))
         for line in listed[1].splitlines() if listed else ():
             name = Path(line.strip().removeprefix("- ").strip("\"'")).name
             if not any((self.path / name).with_name(name + end).is_file() for end in ("", *_PACKED)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -25,14 +25,16 @@ _KINDS: Final[dict[type, str]] = {Ros1File: "ROS 1", SqliteFile: "ROS 2 (SQLite)
 _STATIC: Final = "tf2_msgs/msg/TFMessage"
 _ROS1_STATIC: Final = "tf/msg/tfMessage"  # as ROS 1 called it before tf2
 _STATIC_NAME: Final = "tf_static"
+_UNPACKED: Final = tuple(f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "TimeReference"))
 _VEHICLE: Final = "base_link"  # frame of the vehicle by REP 105
 _MOST_TREES: Final = 100  # messages of transforms that are read
 _MOST_FRAMES: Final = 100  # longest way from a frame to the vehicle's
 _FLU: Final = np.diag([1.0, -1.0, -1.0])  # forward, right, down from x ahead, y left, z up (REP 103)
 
 
+@runtime_checkable
 class Reader(Protocol):
-    """A format of messages."""
+    """A format that reads topics of bags: any :class:`LogFormat` with this method, whatever else it reads."""
 
     name: ClassVar[str]
 
@@ -71,9 +73,11 @@ def _part(bag: Bag, topic: Topic, readers: tuple[Reader, ...], mountings: dict[s
 
 
 def _words(topic: Topic) -> str:
-    words = f"{topic.type.replace('/msg/', '/')}, {topic.count:,} messages"
+    words = f"{topic.type.replace('/msg/', '/')}, {counted(topic.count, 'message')}"
     if topic.held is not None and topic.rate_hz is not None:
         words += f", {topic.rate_hz:.4g} Hz, {(topic.held.last_ns - topic.held.first_ns) / NS_PER_S:,.1f} s"
+    if topic.type in _UNPACKED:
+        words += ", `roadscan unpack` makes files of them"
     return words
 
 

@@ -61,10 +61,9 @@ class SqliteFile(Container):
         return base
 
     def _find_topics(self, base: sqlite3.Connection) -> None:
-        for number, name, type_name, encoding in base.execute(
-            "SELECT id, name, type, serialization_format FROM topics"
-        ):
-            self.connections[int(number)] = Connection(int(number), str(name), str(type_name), str(encoding))
+        for number, name, kind, encoding in base.execute("SELECT id, name, type, serialization_format FROM topics"):
+            if isinstance(number, int):
+                self.connections[number] = Connection(number, str(name), str(kind), str(encoding))
         try:
             texts = base.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
             known = {name: (str(text), "idl" if "idl" in str(language) else "msg") for name, language, text in texts}

@@ -17,7 +17,7 @@ from roadscan.core.strict import Strict
 from roadscan.formats.ros.arrivals import Arrivals
 from roadscan.formats.ros.bag import METADATA, Bag, Message, Topic, bag_files, is_bag, stamp_ns
 from roadscan.formats.ros.definitions import Decode
-from roadscan.formats.ros.overview import contents
+from roadscan.formats.ros.overview import Reader, contents
 from roadscan.ingest.reading.format import Contents, Item, LogFormat, LogHeader, LogSource, Reject, log_formats
 from roadscan.ingest.reading.records import options_of
 
@@ -76,8 +76,10 @@ class TopicFormat(LogFormat):
         return sorted([*bag_files(path), *([metadata] if metadata.is_file() else [])])
 
     def contents(self, path: Path) -> Contents | None:
-        """Return all topics of the bag."""
-        return contents(path, tuple(one for one in log_formats().values() if isinstance(one, TopicFormat)))
+        """Return all topics of the bag; None for what is none."""
+        if not is_bag(path):
+            return None
+        return contents(path, tuple(one for one in log_formats().values() if isinstance(one, Reader)))
 
     def header(self, source: LogSource) -> LogHeader:
         """Find the topic and check the clock; the first message says the frame."""

@@ -19,14 +19,14 @@ from typing import Any, Final
 import numpy as np
 
 from roadscan.core.counted import counted
-from roadscan.core.errors import RoadscanError
+from roadscan.core.errors import FormatError, RoadscanError
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem, iso_from_gps_ns
 from roadscan.core.witness import Finding
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, diagnose, formats_of, is_there, try_open, unpack
 from roadscan.ingest.inspect.file_kinds import FileKind, is_cut_off, kind_of, wrapper_of
 from roadscan.ingest.inspect.log_figures import Fault, LogFigures, TableFigures
 from roadscan.ingest.inspect.provisional import OpenedLog, Stated, raw_stamps_ns
-from roadscan.ingest.reading.format import Contents, Item, LogFormat, Rows, format_named
+from roadscan.ingest.reading.format import Contents, Item, LogFormat, Rows, format_named, log_formats
 from roadscan.ingest.reading.future_times import FutureTimes
 
 QUICK_VALUES: Final = 1_000_000
@@ -267,6 +267,9 @@ def _inspect(
     except OSError as error:
         found.error = f"{path}: {error.strerror or error}"
         return found
+    except FormatError as error:  # a container that cannot be opened
+        found.what, found.error = found.what or kind_of(path).words, str(error)
+        return found
 
 
 def _look(
@@ -286,13 +289,15 @@ def _look(
     found.bytes, found.files = _size(candidates[0] if candidates else None, path)
     if wrapper:
         found.wrappers = (wrapper,)
-    if not candidates:
+    contents = contents_of(path) if wanted is None else None
+    if not candidates and contents is None:
         return _look_at_unknown(found, stated)
-    contents = next((one for one in (f.contents(path) for f in candidates) if one is not None), None)
-    if contents is not None and wanted is None:
+    if contents is not None:
         chosen = [part for part in contents.parts if part.format and part.options.items() <= stated.options.items()]
         if not chosen:
             found.what, found.contents = contents.what, contents
+            if not candidates:
+                found.error = f"{path}: {contents.what}, of which no raw format reads one"
             return found
         candidates = [format_named(chosen[0].format)]
         found.formats = (chosen[0].format,)
@@ -307,6 +312,11 @@ def _look(
         return found
     found.error = next(iter(found.refusals.values()))
     return found
+
+
+def contents_of(path: Path) -> Contents | None:
+    """Return what a container of several logs holds; None for anything else."""
+    return next((one for one in (log_format.contents(path) for log_format in log_formats().values()) if one), None)
 
 
 def _look_inside(

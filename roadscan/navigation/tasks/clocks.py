@@ -149,7 +149,8 @@ def _pair_tasks(survey: Survey, records: Sequence[LogRecord]) -> Iterator[_Task]
             found = log_pairs(survey, log)
             if found is None or log.clock is None:
                 continue
-            sensor = log.sensor or next((r.sensor for r in records if r.path == str(log.path)), "trajectory")
+            own = (r for r in records if r.path == str(log.path) and log.format in {None, r.format})
+            sensor = log.sensor or next((r.sensor for r in own), "trajectory")
             if (run.id, sensor) in seen:
                 continue  # further logs of a sensor share its row
             seen.add((run.id, sensor))

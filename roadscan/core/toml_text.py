@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import json
 import re
+from pathlib import PurePath
 from typing import Any, Final
 
 _BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
@@ -40,6 +41,8 @@ def toml(value: Any) -> str:
         return value.isoformat().replace("+00:00", "Z")
     if isinstance(value, dt.date):
         return value.isoformat()
+    if isinstance(value, PurePath):
+        return toml(value.as_posix())
     if isinstance(value, str):  # TOML accepts all JSON escapes
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     raise TypeError(f"a value of type {type(value).__name__} has no form in TOML")

@@ -45,8 +45,11 @@ from tests.formats import (
     test_imu_csv,
     test_kitti,
     test_las,
+    test_livox_lvx,
     test_nmea,
     test_opencrg,
+    test_ouster_bag,
+    test_pcd,
     test_ply,
     test_ppk,
     test_psi,
@@ -61,6 +64,7 @@ from tests.formats import (
 )
 from tests.formats.e57_files import PAGE, PAYLOAD, small_e57
 from tests.formats.nmea_files import Fix, sentences
+from tests.formats.ouster_files import ouster
 from tests.formats.sick_files import encode_telegram, write_telegrams
 from tests.fuzz import bag_samples
 from tests.fuzz.mutations import Change, Inside
@@ -653,6 +657,23 @@ def _lidar() -> Iterator[Sample]:
         stated,
         fields=_PCAP_FIELDS,
     )
+    metadata, count = {"metadata": "a.json"}, {"clock": Clock(TimeSystem.FREE)}
+    yield Sample("ouster_pcap", "legacy", ouster("LEGACY"), metadata, count, fields=_PCAP_FIELDS)
+    dual = ouster("RNG19_RFL8_SIG16_NIR16_DUAL", checksum=True)
+    whole = 16 + 42 + 64 + 4 * (12 + 16 * 16)
+    yield Sample("ouster_pcap", "dual", dual, metadata, count, fields=_PCAP_FIELDS, spans=every(whole, 24))
+    low = ouster("RNG15_RFL8_NIR8")
+    yield Sample("ouster_pcap", "metadata", low, metadata, count, ("a.json",), text=True)
+    imu = count | {"sensor": Sensor(kind="imu")}
+    yield Sample("ouster_imu", "packets", ouster("LEGACY", imu=True), metadata, imu, fields=_PCAP_FIELDS)
+    yield Sample("ouster_imu", "metadata", ouster("LEGACY", imu=True), metadata, imu, ("a.json",), text=True)
+    for kind in ("ros1", "mcap", "sqlite"):
+        bag = functools.partial(test_ouster_bag.small_bag, kind)
+        parts = () if kind == "ros1" else ("bag/bag*",)
+        yield Sample("ouster_bag", kind, bag, {}, count, parts)
+        yield Sample("ouster_bag_imu", kind, functools.partial(bag, imu=True), {}, imu, parts)
+    yield Sample("livox_lvx", "lvx2", test_livox_lvx.sample, {}, count)
+    yield Sample("livox_lvx", "lvx", test_livox_lvx.old_sample, {}, count)
     by_rate = test_sick_lms.BY_RATE
     one = len(encode_scans(test_sick_lms.scans(1), "mm").tobytes())
     scan_clock = {"clock": GPS}
@@ -702,6 +723,13 @@ def _bags() -> Iterator[Sample]:
 
 
 def _clouds() -> Iterator[Sample]:
+    for coding in test_pcd.CODINGS:
+        make = functools.partial(test_pcd.sample, coding)
+        text = coding is test_pcd.CODINGS[0]
+        yield Sample("pcd", coding.value, make, {}, {"clock": test_pcd.FREE}, text=text)
+        scan = functools.partial(test_pcd.scan, coding)
+        local = {"crs": "local", "height": "ellipsoidal"}
+        yield Sample("pcd_cloud", coding.value, scan, test_pcd.CLOUD, local, text=text)
     cloud = {"clock": test_las.ADJUSTED, "height": "ellipsoidal"}
     for point_format in (3, 7):
         yield Sample("las", f"las{point_format}", las("a.las", point_format), {}, cloud, fields=_LAS_FIELDS)

@@ -31,6 +31,7 @@ ALL = (
     "tests/kernels/test_adjust_kernels.py",
     "tests/kernels/test_asset_kernels.py",
     "tests/kernels/test_natural_neighbour.py",
+    "tests/kernels/test_packet_kernels.py",
     "tests/kernels/test_upright_kernels.py",
 )
 

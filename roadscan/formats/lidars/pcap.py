@@ -7,7 +7,7 @@ reading goes on at the next record that looks like one of the sensor's data pack
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, TypeAlias
@@ -30,6 +30,8 @@ _LINK_HEADERS: Final = {0: 4, 1: 14, 101: 0, 113: 16, 228: 0, 276: 20}
 _ETHERNET: Final = 1  # link type of Ethernet
 _VLAN_TAGS: Final = (b"\x81\x00", b"\x88\xa8")
 _UDP: Final = 17  # IP protocol number of UDP
+_IPV6_FRAGMENT: Final = 44  # IP protocol number of a fragment (RFC 8200)
+_MOST_OPEN: Final = 64  # packets whose fragments are waited for: a sensor sends one after another
 _IPV4_WITHOUT_OPTIONS: Final = b"\x45"
 _MOST_ROUTES: Final = 4096  # routes that are remembered
 _READ_BYTES: Final = 4 << 20  # bytes that are read at once
@@ -51,7 +53,7 @@ class Datagram(NamedTuple):
     sender: str
     """IP address."""
     port: int
-    """Port from which it was sent."""
+    """Port to which it was sent."""
     payload: bytes
 
 
@@ -120,6 +122,126 @@ def _wanted_of(capture: _Capture, wanted: Wanted) -> Iterator[Datagram | Reject]
                 yield Reject("a data packet was sent to another port", number, offset)
             continue
         yield Datagram(number, offset, capture_ns, sender, port, payload)
+
+
+def datagrams_of_sizes(
+    path: Path, sizes: Collection[int] | None, port: int | None = None, sender: str | None = None
+) -> Iterator[Datagram | Reject]:
+    """Yield the packets of some lengths in file order, of any length, to any port and of any sender where it is None.
+
+    Packets in several fragments are put together (RFC 791, RFC 8200): they count as their first one. A record that is
+    none, and a packet whose fragments do not all arrive, are rejected; other traffic is ignored.
+
+    Raises
+    ------
+    FormatError
+        if the file is no capture that can be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            capture = _Capture.of(stream, path)
+            fragments = _Fragments(capture.link)
+            for item in capture.records():
+                whole = item if isinstance(item, Reject) else fragments.whole(item)
+                if isinstance(whole, Reject):
+                    yield whole
+                elif whole is not None and (found := _route(whole[3], capture.link)) is not None:
+                    sent_by, sent_to, start, end = found
+                    number, offset, capture_ns, frame = whole
+                    wanted = (port in {None, sent_to}) and (sender in {None, sent_by})
+                    if not wanted or (sizes is not None and end - start not in sizes):
+                        continue
+                    if len(frame) < end:
+                        yield Reject("the packet is cut off", number, offset)
+                        continue
+                    if not isinstance(item, Reject):
+                        capture.usual_bytes = len(item[3])
+                    yield Datagram(number, offset, capture_ns, sent_by, sent_to, frame[start:end])
+            yield from fragments.rejects()
+    except OSError as error:
+        raise FormatError(f"the capture cannot be read: {error.strerror or error}", file=path) from error
+
+
+@dataclass
+class _Fragments:
+    """Puts packets together that were sent in fragments."""
+
+    link: int
+    _open: dict[bytes, dict[int, tuple[bytes, bool]]] = field(default_factory=dict)
+    """Bytes by their offset, and whether more follow, of each packet that is not complete."""
+    _first: dict[bytes, _Record] = field(default_factory=dict)
+    """The record of each packet's first fragment to arrive."""
+    _lost: list[Reject] = field(default_factory=list)
+
+    def whole(self, record: _Record) -> _Record | None:
+        """Return the record with its whole packet; None for a fragment while others are missing."""
+        frame = record[3]
+        ip = _ip_start(frame, self.link)
+        if len(frame) < ip + 28:
+            return record
+        if frame[ip] >> 4 == 4:
+            word = int.from_bytes(frame[ip + 6 : ip + 8], "big")
+            start, more, head = (word & 0x1FFF) * 8, bool(word & 0x2000), ip + 4 * (frame[ip] & 0x0F)
+            end = ip + int.from_bytes(frame[ip + 2 : ip + 4], "big")
+            key, protocol = frame[ip + 4 : ip + 6] + frame[ip + 9 : ip + 10] + frame[ip + 12 : ip + 20], frame[ip + 9]
+        elif frame[ip] >> 4 == 6 and frame[ip + 6] == _IPV6_FRAGMENT and len(frame) >= ip + 48:
+            word = int.from_bytes(frame[ip + 42 : ip + 44], "big")
+            start, more, head, protocol = word & 0xFFF8, bool(word & 1), ip + 48, frame[ip + 40]
+            end = ip + 40 + int.from_bytes(frame[ip + 4 : ip + 6], "big")
+            key = frame[ip + 44 : ip + 48] + frame[ip + 8 : ip + 40]
+        else:
+            return record
+        if protocol != _UDP or (start == 0 and not more and frame[ip] >> 4 == 4):
+            return record
+        parts = self._open.setdefault(key, {})
+        parts[start] = frame[head:end], more
+        first = self._first.setdefault(key, record)
+        body = _body(parts)
+        if body is None:
+            self._forget()
+            return None
+        del self._open[key], self._first[key]
+        # As one packet without options: a link header, then IPv4 or IPv6 with the addresses, then UDP.
+        header = bytearray(first[3][: ip + (20 if frame[ip] >> 4 == 4 else 40)])
+        if frame[ip] >> 4 == 4:
+            header[ip], header[ip + 6 : ip + 8] = 0x45, b"\0\0"
+        else:
+            header[ip + 6] = _UDP
+        return (*first[:3], bytes(header) + body)
+
+    def _forget(self) -> None:
+        """Give up the oldest packet where too many are open."""
+        if len(self._open) > _MOST_OPEN:
+            key = next(iter(self._open))
+            number, offset, _, _ = self._first.pop(key)
+            self._lost.append(Reject("fragments of the packet are missing", number, offset, len(self._open.pop(key))))
+
+    def rejects(self) -> Iterator[Reject]:
+        """Yield the packets that were not completed."""
+        yield from self._lost
+        for key, (number, offset, _, _) in self._first.items():
+            yield Reject("fragments of the packet are missing", number, offset, len(self._open[key]))
+
+
+def _body(parts: dict[int, tuple[bytes, bool]]) -> bytes | None:
+    """Return the bytes of fragments that follow one another up to the last; None where some are missing."""
+    out, at = [], 0
+    while at in parts:
+        content, more = parts[at]
+        out.append(content)
+        if not more:
+            return b"".join(out)
+        at += max(len(content), 1)
+    return None
+
+
+def _ip_start(frame: bytes, link: int) -> int:
+    """Return where the IP header begins."""
+    at = _LINK_HEADERS[link]
+    if link == _ETHERNET:
+        while frame[at - 2 : at] in _VLAN_TAGS:
+            at += 4
+    return at
 
 
 @dataclass
@@ -247,10 +369,7 @@ class _Routes:
 
 
 def _route(frame: bytes, link: int) -> _Route | None:
-    at = _LINK_HEADERS[link]
-    if link == _ETHERNET:
-        while frame[at - 2 : at] in _VLAN_TAGS:
-            at += 4
+    at = _ip_start(frame, link)
     if len(frame) < at + 28:
         return None
     version = frame[at] >> 4

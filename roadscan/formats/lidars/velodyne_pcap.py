@@ -63,7 +63,7 @@ from roadscan.formats.lidars.velodyne_segments import (
 )
 from roadscan.formats.lidars.velodyne_sentences import SENTENCES, Sentences
 from roadscan.formats.lidars.view_gaps import Gap, gap_of
-from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside, log_formats
 from roadscan.ingest.reading.records import Sieve, options_of
 
 _CHUNK_PACKETS: Final = 640  # 245,760 slots
@@ -526,6 +526,15 @@ def _survey(path: Path, options: VelodyneOptions, packets_of: Source, whole_of: 
                 break
     known.parts.flush(last=True)
     if not known.parts.seen:
+        other = next(
+            (name for name, kind in log_formats().items() if name != VelodynePcap.name and kind.sniff(path)), ""
+        )
+        if other:
+            raise FormatError(
+                f"the capture's packets are no Velodyne's but those of {other}",
+                file=path,
+                missing=Missing("format", other),
+            )
         raise FormatError(
             f"no Velodyne data packet was sent to port {options.port}",
             expected=f"UDP packets of {DATA_BYTES} bytes",

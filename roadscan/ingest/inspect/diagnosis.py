@@ -277,12 +277,17 @@ def _lacking(like: Likeness, nearest: LogFormat, path: Path) -> FormatError:
 
 def _named(path: Path, stated: Stated) -> FormatError | None:
     """Return the reader's error for a file whose name indicates its format."""
+    refusals: dict[str, str] = {}
     for candidate in log_formats().values():
         if path.suffix.lower() in candidate.suffixes:
             opened, refusal = try_open(candidate, path, stated, _TRIALS)
             if opened is None:
-                said = refusal.removeprefix(f"{path.resolve()}: ")
-                return FormatError(f"by its name it is {candidate.name}, and its reader refuses it: {said}", file=path)
+                refusals[candidate.name] = refusal.removeprefix(f"{path.resolve()}: ")
+    if len(refusals) > 1:
+        said = "; ".join(f"{name}: {refusal}" for name, refusal in refusals.items())
+        return FormatError(f"by its name it may be {' or '.join(refusals)}, and all refuse it: {said}", file=path)
+    for name, refusal in refusals.items():
+        return FormatError(f"by its name it is {name}, and its reader refuses it: {refusal}", file=path)
     return None
 
 

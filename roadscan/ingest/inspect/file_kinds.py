@@ -390,6 +390,8 @@ def _text(path: Path, head: bytes) -> FileKind:
     if start[:1] in {b"{", b"["} and path.suffix.lower() in {".json", ".geojson"}:
         if b'"FeatureCollection"' in head or path.suffix.lower() == ".geojson":
             return _guarded(_vector, path, "a GeoJSON layer")
+        if b'"beam_altitude_angles"' in head:
+            return FileKind("the metadata of an Ouster, which its capture names as options.metadata")
         return FileKind("a JSON document")
     return _guarded(_columns, path, "text")
 

@@ -397,7 +397,7 @@ class _Search:
         choices = "" if said else " or ".join(toml(value) for value in option_choices(self._format, name))
         reason = f"{choices}: {_reason(error)}" if choices else _reason(error)
         proposed = [one.proposed for one in error.asks_for(f"options.{name}")]
-        value = next((one for one in proposed if one is True or isinstance(one, list)), "????")
+        value = next((one for one in proposed if one is True or isinstance(one, list | Path)), "????")
         return Need(f"options.{name}", f"options.{name} = {toml(value)}", reason, is_of_time), {name}
 
 

@@ -41,6 +41,7 @@ from tests.formats import (
     test_kitti,
     test_las,
     test_nmea,
+    test_office_text,
     test_opencrg,
     test_ply,
     test_psi,
@@ -520,6 +521,12 @@ def _poses() -> Iterator[Sample]:
     ms = {"clock": Clock(TimeSystem.GPS, unit="ms"), "crs": "EPSG:25832", "height": "ellipsoidal"}
     yield Sample("pospac", "plain", file("a.csv", pospac), axes, ms, **lines)
     sat = {"crs": "EPSG:4979"}
+    offices = {"inertial_explorer": (test_office_text.explorer, sat), "qinertia": (test_office_text.qinertia, sat)}
+    offices["pospac_text"] = (test_office_text.pospac, geographic)
+    for name, (write, known) in offices.items():
+        text = write(RECORDS).encode()
+        spans = lines_from(len(text.splitlines()) - RECORDS)
+        yield Sample(name, "plain", file("a.txt", text), {}, known, text=True, spans=spans)
     yield Sample(
         "rtklib_pos", "plain", file("a.pos", test_rtklib_pos.sample), {}, sat, text=True, spans=lines_from(2), share=2
     )

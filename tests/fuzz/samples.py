@@ -41,6 +41,7 @@ from tests.formats import (
     test_kitti,
     test_las,
     test_nmea,
+    test_novatel,
     test_office_text,
     test_opencrg,
     test_ply,
@@ -134,6 +135,15 @@ def nmea_inside(data: bytes, rng: random.Random, change: Change) -> bytes:
         return b"$%b*%02X" % (match[1], functools.reduce(lambda a, b: a ^ b, match[1], 0))
 
     return re.sub(rb"\$([^*$\r\n]*)\*[0-9A-Fa-f]{2}", sound, change(data, rng))
+
+
+def novatel_inside(data: bytes, rng: random.Random, change: Change) -> bytes:
+    """Messages changed, with checksums that fit."""
+
+    def sound(match: re.Match[bytes]) -> bytes:
+        return b"#%b*%08x" % (match[1], test_novatel.crc32(match[1]))
+
+    return re.sub(rb"#([^*#\r\n]*)\*[0-9A-Fa-f]{8}", sound, change(data, rng))
 
 
 def telegram_inside(data: bytes, rng: random.Random, change: Change) -> bytes:
@@ -527,6 +537,14 @@ def _poses() -> Iterator[Sample]:
         text = write(RECORDS).encode()
         spans = lines_from(len(text.splitlines()) - RECORDS)
         yield Sample(name, "plain", file("a.txt", text), {}, known, text=True, spans=spans)
+    for name, line, stamp in (
+        ("novatel_ins", test_novatel.INSPVAX, "2209,490782.000"),
+        ("novatel_ins", test_novatel.INSPVA, "2209,490558.000"),
+        ("novatel_bestpos", test_novatel.BESTPOS, "2404,603797.000"),
+    ):
+        log = test_novatel.drive(line, stamp, RECORDS)
+        form = line[1:].split(",")[0]
+        yield Sample(name, form, file("a.log", log), {}, sat, text=True, spans=lines_from(0), inside=novatel_inside)
     yield Sample(
         "rtklib_pos", "plain", file("a.pos", test_rtklib_pos.sample), {}, sat, text=True, spans=lines_from(2), share=2
     )

@@ -21,12 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import HeightKind, crs_from_text
-from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
-from roadscan.core.gpstime import NS_PER_S, WEEK_S, WEEKS_A_ROLLOVER, Clock, TimeSystem
+from roadscan.core.errors import ConfigError, FormatError, Missing
+from roadscan.core.gpstime import NS_PER_S, WEEK_S, Clock
 from roadscan.core.strict import Strict
 from roadscan.ingest.reading.columns import UNITS
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
-from roadscan.ingest.reading.gnss import utc_clock
+from roadscan.ingest.reading.gnss import gps_clock, utc_clock
 from roadscan.ingest.reading.poses import (
     North,
     Placement,
@@ -274,39 +274,6 @@ def _need_words(layout: TextLayout, lines: Sequence[str], file: Path) -> None:
 
 
 # --- time, place, attitude -----------------------------------------------------------------------------
-
-
-def gps_clock(source: LogSource, says: str, week: int | None = None) -> Clock:
-    """Return the clock of a log that states week and seconds of GPS time, in ns since 1980, whether stated or not.
-
-    Parameters
-    ----------
-    says : what states them, in words.
-    week : GPS week of the first record, where known.
-
-    Raises
-    ------
-    TimeSystemError
-        where the survey file states another time system, or another week.
-    """
-    stated = source.clock
-    if stated is not None and stated.system not in (TimeSystem.GPS, TimeSystem.GPS_WEEK):
-        raise TimeSystemError(
-            f"{says} GPS time, the clock says {stated.system}",
-            expected='clock.system = "gps", or no clock',
-            file=source.path,
-            missing=Missing("clock", {"system": "gps"}),
-        )
-    is_weekly = stated is not None and stated.system is TimeSystem.GPS_WEEK and stated.week != 0
-    if stated is not None and is_weekly and week is not None and (stated.first_week() - week) % WEEKS_A_ROLLOVER:
-        raise TimeSystemError(
-            f"the log begins in GPS week {week}, its clock says week {stated.first_week()}",
-            expected="one GPS week",
-            change="leave the clock out",
-            file=source.path,
-            missing=Missing("clock", {"system": "gps"}),
-        )
-    return replace(stated or Clock(TimeSystem.GPS), system=TimeSystem.GPS, unit="ns", week=None, date=None)
 
 
 def _clock(source: LogSource, columns: Mapping[str, _Column], preamble: Preamble, layout: TextLayout) -> Clock:

@@ -82,7 +82,7 @@ def test_what_is_no_pose_is_rejected(tmp_path: Path) -> None:
     aligning = sealed(INSPVAX.replace("INS_SOLUTION_GOOD", "INS_ALIGNING"))
     coarse = sealed(INSPVAX.replace("FINESTEERING", "COARSE"))
     content = (
-        f"$GPGGA,junk\r\n{INSPVAX}\r\n{aligning}\r\n{coarse}\r\n{INSPVAX.replace('51.15', '51.25')}\r\n{INSPVAX[:90]}"
+        f"$GPGGA,junk*00\r\n{INSPVAX}\r\n{aligning}\r\n{coarse}\r\n{INSPVAX.replace('51.15', '51.25')}\r\n{INSPVAX[:90]}"
     )
     log = read(tmp_path, "novatel_ins", content)
     assert log.epochs.size == 1

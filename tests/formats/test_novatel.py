@@ -81,9 +81,8 @@ def test_bestpos(tmp_path: Path) -> None:
 def test_what_is_no_pose_is_rejected(tmp_path: Path) -> None:
     aligning = sealed(INSPVAX.replace("INS_SOLUTION_GOOD", "INS_ALIGNING"))
     coarse = sealed(INSPVAX.replace("FINESTEERING", "COARSE"))
-    content = (
-        f"$GPGGA,junk*00\r\n{INSPVAX}\r\n{aligning}\r\n{coarse}\r\n{INSPVAX.replace('51.15', '51.25')}\r\n{INSPVAX[:90]}"
-    )
+    lines = ["$GPGGA,junk*00", INSPVAX, aligning, coarse, INSPVAX.replace("51.15", "51.25"), INSPVAX[:90]]
+    content = "\r\n".join(lines)
     log = read(tmp_path, "novatel_ins", content)
     assert log.epochs.size == 1
     assert {r.record: r.reason for r in log.rejects} == {

@@ -283,6 +283,21 @@ def pose_lines() -> bytes:
     return b"".join(b"%d.25 %d 2 3 0 0 0 1\n" % (1_400_000_000 + k, k) for k in range(RECORDS))
 
 
+def kitti_poses(folder: Path) -> Path:
+    (folder / "07.txt").write_text("".join(f"1 0 0 {k} 0 1 0 2 0 0 1 {k}\n" for k in range(RECORDS)))
+    (folder / "times.txt").write_text("".join(f"{1_400_000_000 + k}.5\n" for k in range(RECORDS)))
+    return folder / "07.txt"
+
+
+def euroc_poses() -> bytes:
+    names = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+    return table(names, lambda k: f"{1_400_000_000 + k}000000000,{k},2,3,1,0,0,0")
+
+
+def grid_poses() -> bytes:
+    return table("time_s,x,y,z,qx,qy,qz,qw", lambda k: f"{1_400_000_000 + k},{571600 + k}.5,5539000.5,150,0,0,0,1")
+
+
 def pospac() -> bytes:
     names = "GPSTime,easting,northing,altitude,vel_east,vel_north,vel_up,roll,pitch,heading,wz,wy,wx"
     return table(names, lambda k: f"{1_628_184_886_500 + k},571600.{k},5539000.5,150,0,0,0,0.1,0.2,0.3,0,0,0")
@@ -522,7 +537,14 @@ def _poses() -> Iterator[Sample]:
             "trajectory_csv", ending, file(f"a.csv.{ending}", pack(trajectory_csv())), {}, stated, inside=inside
         )
     axes = {"axes": "flu"}
+    ns = {"clock": Clock(TimeSystem.GPS, unit="ns"), "crs": "local"}
     yield Sample("pose_matrices", "plain", file("a.csv", pose_matrices), axes, _POSES, **lines)
+    kitti_options = {"axes": "rdf", "frame": "rdf"}
+    for form, damaged in (("kitti", "07.txt"), ("kitti times", "times.txt")):
+        yield Sample("pose_matrices", form, kitti_poses, kitti_options, _POSES, (damaged,), text=True)
+    yield Sample("pose_quaternions", "euroc", file("a.csv", euroc_poses), axes, ns, text=True, spans=lines_from(1))
+    utm = {"clock": GPS, "crs": "EPSG:25832", "height": "ellipsoidal"}
+    yield Sample("pose_quaternions", "grid", file("a.csv", grid_poses), axes | {"heading": "grid"}, utm, **lines)
     yield Sample("pose_quaternions", "lines", file("a.txt", pose_lines), axes, _POSES, text=True, spans=lines_from(0))
     yield Sample("pose_quaternions", "feather", file("a.feather", pose_feather), axes, _POSES)
     yield Sample("pose_quaternions", "parquet", file("a.parquet", pose_parquet), axes, _POSES)

@@ -44,6 +44,7 @@ from tests.formats import (
     test_novatel,
     test_office_text,
     test_opencrg,
+    test_picture_control,
     test_ply,
     test_psi,
     test_road_lines,
@@ -296,6 +297,10 @@ def euroc_poses() -> bytes:
 
 def grid_poses() -> bytes:
     return table("time_s,x,y,z,qx,qy,qz,qw", lambda k: f"{1_400_000_000 + k},{571600 + k}.5,5539000.5,150,0,0,0,1")
+
+
+def control_dms() -> bytes:
+    return table("name,latitude,longitude,height_m", lambda k: f"P{k},52°31'{k:02d}.37N,13 24 02.5,{30 + k}")
 
 
 def pospac() -> bytes:
@@ -598,6 +603,11 @@ def _tables() -> Iterator[Sample]:
         held=lines_of_table,
     )
     yield Sample("control_csv", "plain", file("a.csv", control_csv), {}, _UTM32, **lines)
+    dms = {"height": "ellipsoidal", "crs": "EPSG:4979", "map": MapFrame(crs="EPSG:32633")}
+    yield Sample("control_csv", "dms", file("a.csv", control_dms), {"role": "gcp"}, dms, **lines)
+    odm, opensfm = test_picture_control.ODM.encode(), test_picture_control.opensfm(RECORDS)
+    yield Sample("odm_gcp", "plain", file("gcp_list.txt", odm), {"role": "gcp"}, test_picture_control.UTM32, text=True)
+    yield Sample("opensfm_gcp", "plain", file("a.json", opensfm), {"role": "gcp"}, dms, text=True)
     yield Sample("control_vector", "geojson", vector(control_degrees, "a.geojson"), {}, _DEGREES, text=True)
     yield Sample("control_vector", "gpkg", vector(control_layer, "a.gpkg"), {}, _UTM32)
     yield Sample("control_lines", "gpkg", vector(surveyed_lines, "a.gpkg"), {}, _UTM32)

@@ -36,6 +36,7 @@ from tests.formats import (
     test_control_lines,
     test_control_vector,
     test_encoder_csv,
+    test_gpx,
     test_images,
     test_imu_csv,
     test_kitti,
@@ -578,6 +579,8 @@ def _poses() -> Iterator[Sample]:
     yield Sample(
         "rtklib_pos", "gz", file("a.pos.gz", lambda: gzip.compress(test_rtklib_pos.sample())), {}, sat, inside=GZIP
     )
+    gpx = {"height": "ellipsoidal"}
+    yield Sample("gpx", "plain", file("a.gpx", test_gpx.track(RECORDS).encode()), {"quality": "single"}, gpx, text=True)
     yield Sample("ubx", "plain", file("a.ubx", test_ubx.sample), {}, sat, spans=every(100))
     for untimed in ("before", "after"):
         yield Sample("nmea", untimed, file("a.nmea", nmea), {"untimed": untimed}, sat, text=True, inside=nmea_inside)

@@ -33,16 +33,11 @@ _KNOWN_OTHERS: Final = {
         'list the folder with format = "images", and a table with the columns file and time (options.stamps), or the '
         "pattern of the stamps in the pictures' names (options.pattern)",
     ),
-    "GPX": (
-        "its positions have no attitude and no σ, and are mostly those of a phone or a watch",
-        "the log of a survey's receiver",
-        "export the receiver's log as RTKLIB .pos or NMEA (`gpsbabel -i gpx -o nmea` makes NMEA of the track alone), "
-        "or the trajectory with roll, pitch and heading as trajectory_csv",
-    ),
+    "GPX": ("its beginning holds no track point with a time", "a track", "export the track, not the route"),
     "UBX": (
         "of the receiver's binary messages only its solutions (NAV-PVT) are read, and its beginning holds none",
         "positions",
-        "compute them with RTKLIB (convbin, rnx2rtkp) as .pos, or let the receiver write NMEA",
+        "let `roadscan ppk` compute them from raw measurements (RXM-RAWX), or let the receiver write NAV-PVT or NMEA",
     ),
 }
 """By a word of the kind of another file: why it is no log, what a log would be, and what to do."""

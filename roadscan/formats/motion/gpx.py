@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.errors import ConfigError, Missing
+from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.gnss import QUALITIES, GnssReader, RawSolutions, utc_clock
@@ -69,7 +69,9 @@ class Gpx(LogFormat):
         placement = _placement(source)
         utc_clock(source, "the times of GPX are UTC")
         first = _POINT.search(head_of(source.path))
-        is_stated = first is not None and _CHILD["fix"].search(first[2] or b"") is not None
+        if first is None:
+            raise FormatError("the beginning holds no track point", expected="<trkpt …>", file=source.path)
+        is_stated = _CHILD["fix"].search(first[2] or b"") is not None
         if not is_stated and options_of(source, GpxOptions).quality is None:
             raise ConfigError(
                 "the points do not say what kind of solution they are (fix)",

@@ -25,6 +25,7 @@ from roadscan.core.counted import counted
 from roadscan.core.errors import RoadscanError
 from roadscan.core.rig import Rig
 from roadscan.core.survey import Survey
+from roadscan.ingest.inspect.known_files import known_file
 from roadscan.ingest.reading.text_table import first_fields, sniff_layout
 from roadscan.store.schema import schema_names, table_schema
 
@@ -187,6 +188,9 @@ def kind_of(path: Path) -> FileKind:
         return FileKind(f"a file that cannot be opened: {error.strerror or error}")
     if not head:
         return FileKind("an empty file")
+    known = known_file(path, head)
+    if known is not None:
+        return FileKind(known.words)
     words = next((w for at, magic, w in _MAGICS if head[at : at + len(magic)] == magic), "")
     for word, look in _LOOKS.items():
         if word in words:

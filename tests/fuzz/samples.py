@@ -563,7 +563,7 @@ def _poses() -> Iterator[Sample]:
     offices["pospac_text"] = (test_office_text.pospac, geographic)
     for name, (write, known) in offices.items():
         text = write(RECORDS).encode()
-        spans = lines_from(len(text.splitlines()) - RECORDS)
+        spans = lines_from(sum(map(bool, text.splitlines())) - RECORDS)
         yield Sample(name, "plain", file("a.txt", text), {}, known, text=True, spans=spans)
     for name, line, stamp in (
         ("novatel_ins", test_novatel.INSPVAX, "2209,490782.000"),

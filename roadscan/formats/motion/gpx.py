@@ -40,7 +40,7 @@ class GpxOptions(Strict):
     """Settings of `gpx`."""
 
     quality: Literal["single", "sbas", "dgps", "float", "fixed", "ppp"] | None = None
-    """Kind of the solutions whose points state no `fix`: "single" for phones, watches and hand-held receivers."""
+    """Kind of the solutions whose points state no `fix`: "single" for phones, watches and portable receivers."""
 
 
 class Gpx(LogFormat):
@@ -75,7 +75,7 @@ class Gpx(LogFormat):
         if not is_stated and options_of(source, GpxOptions).quality is None:
             raise ConfigError(
                 "the points do not say what kind of solution they are (fix)",
-                expected='options.quality: "single" for phones, watches and hand-held receivers',
+                expected='options.quality: "single" for phones, watches and portable receivers',
                 file=source.path,
                 missing=Missing("options.quality", choices=("single", "sbas", "dgps", "float", "fixed", "ppp")),
             )
@@ -113,23 +113,23 @@ class Gpx(LogFormat):
 
 def _blocks(path: Path) -> Iterator[tuple[npt.NDArray[np.int64], list[dict[str, str]]] | Reject]:
     """Yield offsets (n,) and fields of track points block by block; a reject where the text is damaged."""
-    held, at = b"", 0
+    text, at = b"", 0
     for piece in byte_pieces(path):
         if isinstance(piece, Reject):
             yield Reject(piece.reason, offset=at)
             continue
-        held += piece
-        found = list(_POINT.finditer(held))
+        text += piece
+        found = list(_POINT.finditer(text))
         end = found[-1].end() if found else 0
-        damaged = max(held.count(_START, 0, end), held.count(b"</trkpt", 0, end)) - len(found)
+        damaged = max(text.count(_START, 0, end), text.count(b"</trkpt", 0, end)) - len(found)
         if damaged > 0:
             yield Reject("a track point is not closed, or not opened", offset=at, records=damaged)
         if found:
             yield at + np.array([m.start() for m in found], np.int64), [_fields(m) for m in found]
-        keep = end or max(0, len(held) - _LONGEST)
-        held, at = held[keep:], at + keep
-    if _START in held:
-        yield Reject("the file ends inside a track point", offset=at, records=held.count(_START))
+        keep = end or max(0, len(text) - _LONGEST)
+        text, at = text[keep:], at + keep
+    if _START in text:
+        yield Reject("the file ends inside a track point", offset=at, records=text.count(_START))
 
 
 def _fields(point: re.Match[bytes]) -> dict[str, str]:

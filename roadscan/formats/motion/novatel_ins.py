@@ -85,15 +85,15 @@ class NovatelIns(LogFormat):
 def _message(source: LogSource) -> str:
     stated = options_of(source, NovatelInsOptions).message
     counts = counted_messages(source.path)
-    held = [name for name in (*FIELDS, *FIELDS_OF_SHORT) if name.startswith("INSPVA") and counts[name]]
-    if stated is None and not held:
+    found = [name for name in (*FIELDS, *FIELDS_OF_SHORT) if name.startswith("INSPVA") and counts[name]]
+    if stated is None and not found:
         raise FormatError(
             "the beginning holds no sound INSPVAXA, INSPVAA or INSPVASA message",
             expected="one, with its right CRC-32",
             change="log INSPVAXA, or convert a binary log with NovAtel Convert",
             file=source.path,
         )
-    return stated or max(held, key=lambda name: counts[name])
+    return stated or max(found, key=lambda name: counts[name])
 
 
 def _placement(source: LogSource) -> GeodeticPlacement:
@@ -112,7 +112,7 @@ def _poses(block: TextBlock, sieve: Sieve) -> RawPoses:
     with np.errstate(invalid="ignore", over="ignore"):  # of damaged records, dropped above or below
         attitude = ned_from_rph(roll, pitch, azimuth)
         position = np.stack([*(np.radians(block.number(name)) for name in ("longitude", "latitude")), height_m(block)])
-    sigmas = {name: block.number(own) for name, own in _SIGMAS.items() if own in columns}
+    sigmas = {name: block.number(field) for name, field in _SIGMAS.items() if field in columns}
     velocity = np.stack([block.number("north"), block.number("east"), -block.number("up")])
     return RawPoses(block.records, block.offsets, epochs_ns(block, sieve), position, attitude, sigmas, velocity)
 

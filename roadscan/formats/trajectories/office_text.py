@@ -89,7 +89,7 @@ class OfficeOptions(Strict):
 
     heading: North | None = None
     """For a projected CRS: north that the heading is counted from, "true" or "grid". Programs export true north unless
-    they are told to apply the convergence of meridians."""
+    they are set to apply the convergence of meridians."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Preamble:
     """Lines above the first pose."""
     delimiter: str
     said: Mapping[str, str] = field(default_factory=dict)
-    """Statements of the preamble, by its own words: they are shown, not used."""
+    """Statements of the preamble, in its words: they are shown, not used."""
     date: dt.date | None = None
     """Date of the drive, where the preamble states it: a proposal for the week of the clock."""
     sigma_scale: Mapping[str, float] = field(default_factory=dict)

@@ -77,7 +77,7 @@ class _Plan:
     axes: str
     sensor_from_body: Float64
     times: npt.NDArray[np.float64] | None = None
-    """Stamp of each line, where they stand in a file of their own."""
+    """Stamp of each line, where they stand in another file."""
     up_from_frame: Float64 | None = None
     """(3, 3) local frame with z up from the poses' frame."""
 

@@ -34,7 +34,7 @@ class PospacText(OfficeTrajectory):
     TIME is seconds of the GPS week, whose week the clock states; the date of the mission is proposed. A file that was
     exported in UTC seconds needs a clock with offset_s, the leap seconds of its day. Positions are LATITUDE and
     LONGITUDE, or EASTING and NORTHING for the projected CRS of the export; ELLIPSOID HEIGHT is ellipsoidal. Attitude is
-    ROLL, PITCH and HEADING in degrees (x forward, y right, z down; heading from true north unless the export was told
+    ROLL, PITCH and HEADING in degrees (x forward, y right, z down; heading from true north unless the export was set
     to count from the grid's). The SD columns are σ. The boresight and lever arm that the preamble names are applied
     already, and are shown.
     """

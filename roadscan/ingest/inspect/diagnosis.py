@@ -1,7 +1,7 @@
 """Diagnoses why no raw format claims a file or folder: what it is instead, and what the nearest format misses in it.
 
 `roadscan inspect`, `init` and `run` give the same answer, the one that is found first: it cannot be opened, it is
-empty, it is of a maker's own format that is not read, its compression is damaged, its end is missing, its columns lack
+empty, it is of a maker's format that is not read, its compression is damaged, its end is missing, its columns lack
 names or units, its name promises a format that its content does not keep, a reader makes sense of it nevertheless, or
 it is of another kind.
 """
@@ -181,7 +181,7 @@ def unpack(path: Path, wrapper: str, target: Path, limit: int) -> str:
 
 
 def _known(path: Path, stated: Stated) -> FormatError | None:
-    """Return what a file of a maker's own format is, and the program that exports what is read."""
+    """Return what a file of a maker's format is, and the program that exports what is read."""
     known = known_file(path, head_of(path))
     return None if known is None else FormatError(known.sentence, change=known.way_out, file=path)
 

@@ -1,4 +1,4 @@
-"""Files of makers' own formats that are recognised and not read, each with the program that exports what is read.
+"""Files of makers' formats that are recognised and not read, each with the program that exports what is read.
 
 A file is recognised by bytes that its maker has published, or else by the ending of its name. The table is
 ``known_files.toml``.

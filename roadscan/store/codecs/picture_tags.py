@@ -11,7 +11,7 @@ _FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
 """Diagonal of the 35 mm film that FocalLengthIn35mmFilm refers to (CIPA DCG-001)."""
 _TURNED: Final = {3: "to be turned by 180°", 6: "to be turned by 90° clockwise", 8: "to be turned by 90° anticlockwise"}
 """How a picture becomes upright, by Orientation; 1 is upright, the others are mirrored."""
-_UPRIGHT: Final = 1
+_UPRIGHT: Final = 1  # Orientation of an upright picture
 
 
 def picture_tags(path: Path) -> dict[str, Any]:

@@ -149,6 +149,7 @@ def test_qinertia_in_utc(tmp_path: Path) -> None:
         ("inertial_explorer", explorer().replace("(m)", "(ft)"), {}, FormatError, "'ft'"),
         ("inertial_explorer", explorer(0) + "1 2 3\n4 5 6\n", {}, FormatError, "names 19 columns.*has 3"),
         ("pospac_text", pospac(), {}, TimeSystemError, "time system"),
+        ("pospac_text", pospac(), {"clock": Clock(TimeSystem.GPS_WEEK, week=2014)}, TimeSystemError, "08-07.*2013"),
         ("pospac_text", pospac().replace("long in Degrees", "long in Gons"), {}, RoadscanError, "Gons"),
         ("qinertia", qinertia().replace("(deg)", ""), {}, FormatError, "no unit"),
     ],

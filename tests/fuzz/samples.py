@@ -560,7 +560,8 @@ def _poses() -> Iterator[Sample]:
     yield Sample("pospac", "plain", file("a.csv", pospac), axes, ms, **lines)
     sat = {"crs": "EPSG:4979"}
     offices = {"inertial_explorer": (test_office_text.explorer, sat), "qinertia": (test_office_text.qinertia, sat)}
-    offices["pospac_text"] = (test_office_text.pospac, geographic)
+    of_2018 = {"clock": Clock(TimeSystem.GPS_WEEK, week=2013), "crs": "EPSG:4979"}
+    offices["pospac_text"] = (test_office_text.pospac, of_2018)
     for name, (write, known) in offices.items():
         text = write(RECORDS).encode()
         spans = lines_from(sum(map(bool, text.splitlines())) - RECORDS)

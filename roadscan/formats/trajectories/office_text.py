@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import HeightKind, crs_from_text
-from roadscan.core.errors import ConfigError, FormatError, Missing
-from roadscan.core.gpstime import NS_PER_S, WEEK_S, Clock
+from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
+from roadscan.core.gpstime import NS_PER_S, WEEK_S, Clock, TimeSystem, gps_week_of_date
 from roadscan.core.strict import Strict
 from roadscan.ingest.reading.columns import UNITS
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
@@ -288,14 +288,28 @@ def _clock(source: LogSource, columns: Mapping[str, _Column], preamble: Preamble
     if _has_utc(columns):
         return utc_clock(source, f"column '{columns['utc_time'].name}' is UTC")
     if "week_s" in columns:
-        known = {} if preamble.date is None else {"date": preamble.date}
-        return source.need_clock("gps_week_seconds", **known)
+        return _weekly_clock(source, preamble.date)
     raise FormatError(
         "no columns tell the time: of UTC, a date and the time of day as hh:mm:ss are needed",
         expected="GPS week and seconds of it, or UTC date and time of day",
         change="export them",
         file=source.path,
     )
+
+
+def _weekly_clock(source: LogSource, date: dt.date | None) -> Clock:
+    """Return the clock of seconds of an unnamed week; an error where its week is not that of the preamble's date."""
+    clock = source.need_clock("gps_week_seconds", **({} if date is None else {"date": date}))
+    is_stated = clock.system is TimeSystem.GPS_WEEK and clock.week != 0  # inspect assumes week 0
+    if date is not None and is_stated and clock.first_week() != gps_week_of_date(date):
+        raise TimeSystemError(
+            f"the preamble says {date.isoformat()}, of GPS week {gps_week_of_date(date)}, the clock says week "
+            f"{clock.first_week()}",
+            expected="one GPS week",
+            file=source.path,
+            missing=Missing("clock", {"system": "gps_week_seconds", "date": date}),
+        )
+    return clock
 
 
 def _has_utc(columns: Mapping[str, _Column]) -> bool:

@@ -25,7 +25,9 @@ _LIKE: Final = {
     "NORTH VELOCITY": "EAST VELOCITY", "UP VELOCITY": "EAST VELOCITY", "NORTH SD": "EAST SD", "HEIGHT SD": "EAST SD",
 }  # fmt: skip
 _DATE: Final = re.compile(r"\s*Date of Mission:\s*(\d{4})-(\d\d)-(\d\d)")
-_SAID: Final = re.compile(r"\s*(Mapping frame datum|POSPROC SBET file|Boresight values|Lever arm values):?\s+(.*)")
+_SAID: Final = re.compile(
+    r"\s*(Date of Mission|Mapping frame datum|POSPROC SBET file|Boresight values|Lever arm values):?\s+(.*)"
+)
 
 
 class PospacText(OfficeTrajectory):

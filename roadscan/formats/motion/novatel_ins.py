@@ -54,7 +54,7 @@ class NovatelIns(LogFormat):
     name = "novatel_ins"
     title = "NovAtel SPAN log (ASCII): position, velocity and attitude of INSPVAX, INSPVA or INSPVAS"
     yields = ("trajectory",)
-    time = "GPS week and seconds, in each message"
+    time = "GPS week and seconds, in each message; of INSPVA and INSPVAS those of the pose, not of the header"
     options = NovatelInsOptions
 
     def sniff(self, path: Path) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -31,8 +31,8 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
         "sigma_roll", "sigma_pitch", "sigma_azimuth", "extended", "age",
     ),
     "INSPVAA": (
-        "own_week", "own_seconds", "latitude", "longitude", "height", "north", "east", "up", "roll", "pitch", "azimuth",
-        "status",
+        "pose_week", "pose_seconds", "latitude", "longitude", "height", "north", "east", "up", "roll", "pitch",
+        "azimuth", "status",
     ),
     "BESTPOSA": (
         "status", "type", "latitude", "longitude", "above_sea", "undulation", "datum", "sigma_latitude",
@@ -79,8 +79,9 @@ def message_blocks(path: Path, name: str) -> Iterator[TextBlock | Reject]:
             yield Reject(data.reason, first, offset)
             first += 1
             continue
-        found = list(_found(data, name.encode(), first, offset))
-        first += data.count(b"\n")
+        lines = data.splitlines(keepends=True)
+        found = list(_found(lines, name.encode(), first, offset))
+        first += len(lines)
         yield from few_rejects([one for one in found if isinstance(one, Reject)])
         rows = [one for one in found if not isinstance(one, Reject)]
         if rows:
@@ -90,9 +91,9 @@ def message_blocks(path: Path, name: str) -> Iterator[TextBlock | Reject]:
             yield from parse_lines(b"".join(line for line, *_ in rows), starts, ends, layout, kinds, numbers, offsets)
 
 
-def _found(data: bytes, name: bytes, first: int, offset: int) -> Iterator[tuple[bytes, int, int] | Reject]:
+def _found(lines: Sequence[bytes], name: bytes, first: int, offset: int) -> Iterator[tuple[bytes, int, int] | Reject]:
     """Yield week, seconds and fields of each message of a name as a line of a table, with its record and offset."""
-    for record, line in enumerate(data.splitlines(keepends=True), first):
+    for record, line in enumerate(lines, first):
         messages = [message for message in _MESSAGE.finditer(line) if message[2] == name or _is_sound(message)]
         for message in messages:
             if message[2] == name:
@@ -124,8 +125,12 @@ def _row(message: re.Match[bytes]) -> tuple[str, bytes]:
 
 
 def epochs_ns(block: TextBlock, sieve: Sieve) -> Int64:
-    """Return GPS time (ns since 1980, (n,)) of a block's messages; those with an impossible one are dropped."""
-    week, seconds = block.number("week"), block.number("seconds")
+    """Return GPS time (ns since 1980, (n,)) of a block's messages; those with an impossible one are dropped.
+
+    INSPVA states the time of its pose to the nanosecond beside that of its header, which is rounded to milliseconds.
+    """
+    names = ("pose_week", "pose_seconds") if "pose_week" in block.columns else ("week", "seconds")
+    week, seconds = (block.number(name) for name in names)
     sieve.require("week", week, 0.0, 8191.0, "weeks")
     sieve.require("seconds", seconds, 0.0, float(WEEK_S), "s")
     whole = np.where(sieve.good, week, 0.0).astype(np.int64) * (WEEK_S * NS_PER_S)

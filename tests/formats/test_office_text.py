@@ -90,6 +90,18 @@ def test_inertial_explorer_in_degrees_minutes_and_seconds(tmp_path: Path) -> Non
     np.testing.assert_allclose(sigmas, [0.01, 0.02, 0.03, 0.05], rtol=1e-6)  # written as two σ of position
 
 
+def test_inertial_explorer_without_its_preamble_and_with_commas(tmp_path: Path) -> None:
+    whole = read(tmp_path, "inertial_explorer", explorer())
+    bare = "\n".join(explorer().splitlines()[9:]) + "\n"
+    assert read(tmp_path, "inertial_explorer", bare).epochs.tolist() == whole.epochs.tolist()
+    names = "Week,GPSTime,Latitude,Longitude,H-Ell,Roll,Pitch,Heading,Q"
+    units = "(weeks),(sec),(deg),(deg),(m),(deg),(deg),(deg),"
+    pose = "2158,455342.00,22.301558541667,-0.190308530556,2.894,-0.2074966655,-0.6303452479,-59.3645242579,1"
+    commas = read(tmp_path, "inertial_explorer", f"{names}\n{units}\n{pose}\n")
+    np.testing.assert_allclose(commas.positions[0], whole.positions[0], atol=1e-4)
+    assert commas.epochs[0] == whole.epochs[0]
+
+
 def test_inertial_explorer_by_date(tmp_path: Path) -> None:
     names = "   CorrTime       Date         Latitude        Longitude    H-MSL        Heading      Pitch       Roll\n"
     units = "     (sec)      (MDY)       (+/-D M S)       (+/-D M S)      (m)          (Deg)      (Deg)      (Deg)\n"

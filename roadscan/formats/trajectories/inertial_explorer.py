@@ -11,7 +11,8 @@ from roadscan.formats.trajectories.office_text import Cell, OfficeTrajectory, Pr
 _PROGRAM: Final = re.compile(r"Program:\s+(Inertial Explorer|GrafNav|Waypoint)")
 _UNITS: Final = re.compile(r"\((sec|deg|m|weeks|\+/-D M S|D-M-S|MDY|DMY|YMD|HMS|m/s)\)", re.IGNORECASE)
 _SAID: Final = re.compile(r"(Project|Program|Profile|Source|Datum|UTC Offset):\s+(\S.*)")
-_SCALING: Final = re.compile(r"\s+(Position|Attitude):\s+(\d+(?:\.\d+)?)")
+_OWN_NAMES: Final = re.compile(r"\b(H-Ell|H-MSL|GPSTime|CorrTime|UTCTime)\b")  # of exports without a preamble
+_SCALING: Final = re.compile(r"\s*(Position|Attitude):\s+(\d+(?:\.\d+)?)")
 
 
 class InertialExplorer(OfficeTrajectory):
@@ -42,7 +43,7 @@ class InertialExplorer(OfficeTrajectory):
     def preamble(self, lines: Sequence[str]) -> Preamble | None:
         """Return names and units of the two lines above the first pose, and what the preamble says."""
         units = next((k for k, line in enumerate(lines) if len(_UNITS.findall(line)) >= 3), 0)
-        if not units or not (any(_PROGRAM.match(line) for line in lines[:units]) or "H-Ell" in lines[units - 1]):
+        if not units or not (any(map(_PROGRAM.match, lines[:units])) or _OWN_NAMES.search(lines[units - 1])):
             return None
         names, below = lines[units - 1], lines[units]
         is_commas = names.count(",") >= 3

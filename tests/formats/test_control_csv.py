@@ -214,6 +214,17 @@ def test_the_files_of_surveyors_give_the_right_points(faults: Path) -> None:
             assert found[name] == pytest.approx(place, abs=1e-6)
 
 
+def test_a_unit_of_heights_that_the_file_contradicts_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", "name,easting,northing,height_m", "A,571600,5539000,300")
+    stated: dict[str, Any] = {"height": "ellipsoidal", "map": UTM32}
+    assert read_log("control_csv", path, {"role": "gcp", "height_unit": "m"}, crs="EPSG:25832", **stated).rejects == []
+    with pytest.raises(ConfigError, match="'height_m' says another unit"):
+        read_log("control_csv", path, {"role": "gcp", "height_unit": "ft"}, crs="EPSG:25832", **stated)
+    plain = write(tmp_path / "b.csv", "name,longitude,latitude,height", "A,10,50,300")
+    with pytest.raises(ConfigError, match="the CRS 'EPSG:4979' says another unit"):
+        read_log("control_csv", plain, {"role": "gcp", "height_unit": "ft"}, crs="EPSG:4979", **stated)
+
+
 def test_degrees_minutes_and_seconds(tmp_path: Path) -> None:
     rows = (
         "A,52°31'09.37\"N,13°24'02.5\"E,30", "B,52 31 09.37,-13 24 02.5,30", "C,N52-31-09.37,W13-24-02.5,30",

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import crs_from_text
-from roadscan.core.errors import FormatError, Missing
+from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.formats.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
 from roadscan.ingest.reading.columns import UNITS, ColumnOption, Found, Quantity, find_columns, fits
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
@@ -148,8 +148,9 @@ def _plan(source: LogSource) -> _Plan:
             missing=Missing("options.names", proposed or None, tuple(orders)),
         )
     quantities, units = (NAME, *WORDS, *position[frame.kind], *SIGMAS), units_of(frame)
-    if options.height_unit is not None:
-        units["height"] = UNITS["length"][options.height_unit]
+    stated = None if options.height_unit is None else UNITS["length"][options.height_unit]
+    if stated is not None and units.setdefault("height", stated) != stated:
+        raise _other_unit(options.height_unit, f"the CRS '{frame.crs}'", source.path)
     height = position[frame.kind][2]
     is_plain = not fits([height], layout.names) and fits([height], layout.names, (height.name,))
     if is_plain and "height" not in units and "height" not in options.columns:
@@ -159,8 +160,19 @@ def _plan(source: LogSource) -> _Plan:
             missing=Missing("options.height_unit", choices=("m", "ft", "ft_us")),
         )
     columns = find_columns(quantities, layout.names, options.columns, source.path, units)
+    if stated is not None and columns["height"].scale != stated:
+        raise _other_unit(options.height_unit, f"column '{columns['height'].column}'", source.path)
     need_role("role" in columns, options.role, source.path)
     return _Plan(layout, columns, frame, options.role or "", _sexagesimal(source.path, layout, columns))
+
+
+def _other_unit(stated: str | None, by: str, file: Path) -> ConfigError:
+    return ConfigError(
+        f'options.height_unit = "{stated}", and {by} says another unit of heights',
+        expected="one unit",
+        change="leave options.height_unit out",
+        file=file,
+    )
 
 
 def _sexagesimal(file: Path, layout: TextLayout, columns: dict[str, Found]) -> frozenset[str]:

@@ -30,6 +30,7 @@ from pydantic.fields import FieldInfo
 from roadscan.assets.kind import AssetKind, asset_kinds
 from roadscan.core.strict import meanings
 from roadscan.core.witness import Witness, witnesses
+from roadscan.ingest.inspect.known_files import known_files
 from roadscan.ingest.reading.format import LogFormat, log_formats
 from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.store.schema import TableSchema, schema_folder, schema_names, table_schema
@@ -322,6 +323,14 @@ def _format_section(kind: LogFormat) -> str:
     )
 
 
+def known_file_list(_: str) -> str:
+    """Files that are recognised and not read, with the way out of each."""
+    rows = (
+        (plain(one.words), ", ".join(f"`{e}`" for e in one.suffixes), markdown(one.way_out)) for one in known_files()
+    )
+    return markdown_table(("file", "names", "way out"), rows)
+
+
 def product_list(_: str) -> str:
     """Overview of the products and a section each."""
     found = _own(products(), "roadscan.products")
@@ -475,6 +484,7 @@ DIRECTIVES: Final[dict[str, Callable[[str], str]]] = {
     "members": members,
     "tables": tables,
     "formats": formats,
+    "known_files": known_file_list,
     "products": product_list,
     "include": include,
     "asset_columns": asset_columns,

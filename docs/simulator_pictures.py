@@ -130,7 +130,9 @@ def main(names: list[str]) -> None:
 def draw(name: str, folder: Path) -> None:
     """Simulate a scene, as far as its pictures need it, and draw them."""
     scene, view = Scene.load(name), VIEWS[name]
-    off: dict[str, Any] = {sensor: {"on": False} for sensor in ("lidar", "sick", "imu", "gnss", "encoder", "camera", "bag")}
+    off: dict[str, Any] = {
+        sensor: {"on": False} for sensor in ("lidar", "sick", "imu", "gnss", "encoder", "camera", "bag")
+    }
     off["profilers"] = {"on": False, "head_imus": None}
     whole = write(scene.changed(**off), folder / "whole")
     save(plan_figure(whole, view), f"{name}-plan")

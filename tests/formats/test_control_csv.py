@@ -153,7 +153,7 @@ def test_damage(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("names", "options", "stated", "error", "says"),
     [
-        ("name,easting,northing,height", {"role": "gcp"}, {"crs": "EPSG:25832"}, FormatError, "'height' says no unit"),
+        ("name,easting,northing,height", {"role": "gcp"}, {"crs": "EPSG:25832"}, FormatError, "height_unit"),
         ("name,easting,northing,height_m", {}, {"crs": "EPSG:25832"}, ConfigError, "ground control or check points"),
         ("name,easting,northing,height_m", {"role": "gcp"}, {}, ConfigError, "CRS of the log's positions"),
         (
@@ -191,3 +191,59 @@ def test_sniffing(tmp_path: Path, recordings: Path) -> None:
     assert not sniff(write(tmp_path / "b.csv", "Easting,Northing,Height", "1,2,3"))
     assert not sniff(write(tmp_path / "c.csv", "name,easting_m,northing_m,height_m,roll_deg", "A,1,2,3,4"))
     assert [p for p in recordings.rglob("*") if sniff(p)] == []
+
+
+def test_the_files_of_surveyors_give_the_right_points(faults: Path) -> None:
+    """Elevation and Höhe in a unit that the survey file states; the names of columns that no line names."""
+    stated: dict[str, Any] = {"crs": "EPSG:25832", "height": "ellipsoidal", "map": UTM32}
+    for file, options, points in (
+        ("pnezd_named.csv", {"height_unit": "m"}, {"1": (500001.234, 4100001.567, 50.123)}),
+        (
+            "german_semicolon_decimal_comma_bom.csv", {"height_unit": "m"},
+            {"P1": (500001.234, 4100001.567, 50.123), "P3": (500004.234, 4100001.067, 50.323)},
+        ),
+        ("pnezd_named.csv", {"height_unit": "ft"}, {"2": (500002.234, 4100002.567, 50.223 * 0.3048)}),
+        (
+            "pnezd_no_header.csv", {"names": ["point", "northing", "easting", "elevation_m", "description"]},
+            {"1": (673450.25, 2736120.40, 648.5), "3": (673470.25, 2736140.40, 648.7)},
+        ),
+    ):  # fmt: skip
+        log = read_log("control_csv", faults / file, {"role": "gcp", **options}, **stated)
+        found = {row["name"]: (row["easting_m"], row["northing_m"], row["height_m"]) for row in log.table.to_pylist()}
+        for name, place in points.items():
+            assert found[name] == pytest.approx(place, abs=1e-6)
+
+
+def test_a_unit_of_heights_that_the_file_contradicts_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", "name,easting,northing,height_m", "A,571600,5539000,300")
+    stated: dict[str, Any] = {"height": "ellipsoidal", "map": UTM32}
+    assert read_log("control_csv", path, {"role": "gcp", "height_unit": "m"}, crs="EPSG:25832", **stated).rejects == []
+    with pytest.raises(ConfigError, match="'height_m' says another unit"):
+        read_log("control_csv", path, {"role": "gcp", "height_unit": "ft"}, crs="EPSG:25832", **stated)
+    plain = write(tmp_path / "b.csv", "name,longitude,latitude,height", "A,10,50,300")
+    with pytest.raises(ConfigError, match="the CRS 'EPSG:4979' says another unit"):
+        read_log("control_csv", plain, {"role": "gcp", "height_unit": "ft"}, crs="EPSG:4979", **stated)
+
+
+def test_degrees_minutes_and_seconds(tmp_path: Path) -> None:
+    rows = (
+        "A,52°31'09.37\"N,13°24'02.5\"E,30", "B,52 31 09.37,-13 24 02.5,30", "C,N52-31-09.37,W13-24-02.5,30",
+        "D,52°31'09.37\"E,13°24'02.5\"E,30", "E,52°61'09.37\"N,13°24'02.5\"E,30", "F,52° 31′ 9,5″ S,0° 0′ 1″ W,30",
+    )  # fmt: skip
+    path = write(tmp_path / "b.csv", "name;latitude;longitude;height_m", *(";".join(_cells(row)) for row in rows))
+    log = read_log("control_csv", path, {"role": "gcp"}, crs="EPSG:4979", map=MapFrame(crs="EPSG:32633"))
+    assert log.column("name").tolist() == ["A", "B", "C", "F"]
+    assert [(r.record, r.records) for r in log.rejects] == [(3, 2)]
+    latitude, longitude = 52 + 31 / 60 + 9.37 / 3600, 13 + 24 / 60 + 2.5 / 3600
+    to_map = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:32633", always_xy=True)
+    places = ((longitude, latitude), (-longitude, latitude), (-longitude, latitude), (-1 / 3600, -52.51930555555))
+    for row, place in zip(log.table.to_pylist(), places, strict=True):
+        assert (row["easting_m"], row["northing_m"]) == pytest.approx(to_map.transform(*place), abs=1e-3)
+
+
+def _cells(row: str) -> list[str]:
+    """Name, latitude, longitude and height of a line whose latitude may hold a decimal comma."""
+    name, rest = row.split(",", 1)
+    head, height = rest.rsplit(",", 1)
+    latitude, longitude = head.rsplit(",", 1)
+    return [name, latitude, longitude, height]

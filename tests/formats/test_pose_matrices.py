@@ -101,3 +101,30 @@ def test_nothing_is_guessed(tmp_path: Path, names: str, options: dict, stated: d
     path.write_text(names + "\n" + line(0, Rotation.identity()))
     with pytest.raises(error, match=says):
         read_log("pose_matrices", path, options, **stated)
+
+
+def test_kitti_odometry(tmp_path: Path, recordings: Path) -> None:
+    """Poses in the frame of the first picture, stamps in a file beside: the car drives 59.860 m along its x axis."""
+    given = np.loadtxt(recordings / "pictures" / "drive_left" / "poses.txt")
+    (tmp_path / "07.txt").write_bytes((recordings / "pictures" / "drive_left" / "poses.txt").read_bytes())
+    path = tmp_path / "07.txt"
+    assert format_of(path).name == "pose_matrices"
+    stated = {"clock": Clock(TimeSystem.GPS), "crs": "local"}
+    options = {"axes": "rdf", "frame": "rdf"}
+    with pytest.raises(FormatError, match="no file of stamps"):
+        read_log("pose_matrices", path, options, **stated)
+    stamps = 1.4e9 + 0.1 * np.arange(len(given))
+    lines = [f"{stamp:.10e}" if k == 3 else f"{stamp:.6f}" for k, stamp in enumerate(stamps)]
+    (tmp_path / "times.txt").write_text("\n".join([*lines[:-1], ""]))
+    with pytest.raises(ConfigError, match="frame"):
+        read_log("pose_matrices", path, {"axes": "rdf"}, **stated)
+    log = read_log("pose_matrices", path, options, **stated)
+    assert [(r.record, r.reason) for r in log.rejects] == [
+        (len(given) - 1, "the file of stamps ends before this line"),
+    ]  # fmt: skip
+    np.testing.assert_allclose(np.diff(log.epochs), 1e8, atol=1e6)
+    np.testing.assert_array_equal(log.positions, np.stack([given[:, 11], -given[:, 3], -given[:, 7]], axis=1)[:-1])
+    step = np.diff(log.positions, axis=0)
+    forward = log.attitudes[:-1].inv().apply(step)
+    assert np.degrees(np.arctan2(np.hypot(forward[:, 1], forward[:, 2]), forward[:, 0])).max() < 3
+    assert (log.attitudes[0] * FLU_FROM_BODY.inv()).magnitude() < 1e-6  # forward, left, up at the first picture

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.feather
 import pyarrow.parquet
+import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -144,3 +145,39 @@ def test_nothing_is_guessed(tmp_path: Path) -> None:
     words = poses().set_column(1, "qw", pa.array(["a"] * N))
     with pytest.raises(FormatError, match="column 'qw' is string"):
         read_log("pose_quaternions", write(tmp_path / "b.feather", words), {"axes": "frd"}, **STATED)
+
+
+def test_euroc(tmp_path: Path) -> None:
+    # ASL data set format, state_groundtruth_estimate0/data.csv of EuRoC's MH_01: its names, and its first line
+    path = tmp_path / "data.csv"
+    names = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], ba_z"
+    first = "1403636580838555648,4.688319,-1.786938,0.783338,0.534108,-0.153029,-0.827383,-0.082152,-0.027876"
+    path.write_text(f"{names}\n{first}\n")
+    assert format_of(path).name == "pose_quaternions"
+    log = read_log("pose_quaternions", path, {"axes": "flu"}, clock=Clock(TimeSystem.UNIX_GPS, unit="ns"), crs="local")
+    assert log.epochs[0] == 1403636580838555648 - 315_964_800 * 10**9
+    np.testing.assert_array_equal(log.positions[0], [4.688319, -1.786938, 0.783338])
+    flu = Rotation.from_quat([-0.153029, -0.827383, -0.082152, 0.534108])  # the body is x forward, y right, z down
+    assert (log.attitudes[0] * Rotation.from_euler("x", 180, degrees=True) * flu.inv()).magnitude() < 1e-9
+
+
+@pytest.mark.parametrize("north", ["grid", "true"])
+def test_poses_on_a_grid(tmp_path: Path, north: str) -> None:
+    """Easting, northing and height with a quaternion from east, north and up, against pyproj and SciPy."""
+    longitude, latitude, height = 11.5, 48.1, 512.25
+    easting, northing = pyproj.Proj("EPSG:32632")(longitude, latitude)
+    heading = 30.0
+    q = Rotation.from_euler("z", 90 - heading, degrees=True).as_quat()  # flu, x forward
+    path = tmp_path / "slam.csv"
+    rows = "".join(f"{1.4e9 + k},{easting},{northing},{height},{q[0]},{q[1]},{q[2]},{q[3]}\n" for k in range(3))
+    path.write_text("time_s,x,y,z,qx,qy,qz,qw\n" + rows)
+    stated = {"clock": Clock(TimeSystem.GPS), "crs": "EPSG:32632", "height": "ellipsoidal"}
+    with pytest.raises(ConfigError, match="north"):
+        read_log("pose_quaternions", path, {"axes": "flu"}, **stated)
+    log = read_log("pose_quaternions", path, {"axes": "flu", "heading": north}, **stated)
+    place = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(latitude, longitude, height)
+    np.testing.assert_allclose(log.positions, [place] * 3, atol=1e-4)
+    ned = Rotation.from_euler("ZY", [longitude, -latitude - 90], degrees=True).inv() * log.attitudes
+    convergence = pyproj.Proj("EPSG:32632").get_factors(longitude, latitude).meridian_convergence
+    expected = heading + (convergence if north == "grid" else 0.0)
+    np.testing.assert_allclose(ned.as_euler("ZYX", degrees=True), [[expected, 0, 0]] * 3, atol=1e-6)

@@ -40,6 +40,7 @@ from tests.formats import (
     test_control_lines,
     test_control_vector,
     test_encoder_csv,
+    test_gpx,
     test_hesai,
     test_images,
     test_imu_csv,
@@ -47,9 +48,12 @@ from tests.formats import (
     test_las,
     test_livox_lvx,
     test_nmea,
+    test_novatel,
+    test_office_text,
     test_opencrg,
     test_ouster_bag,
     test_pcd,
+    test_picture_control,
     test_ply,
     test_ppk,
     test_psi,
@@ -145,6 +149,15 @@ def nmea_inside(data: bytes, rng: random.Random, change: Change) -> bytes:
         return b"$%b*%02X" % (match[1], functools.reduce(lambda a, b: a ^ b, match[1], 0))
 
     return re.sub(rb"\$([^*$\r\n]*)\*[0-9A-Fa-f]{2}", sound, change(data, rng))
+
+
+def novatel_inside(data: bytes, rng: random.Random, change: Change) -> bytes:
+    """Messages changed, with checksums that fit."""
+
+    def sound(match: re.Match[bytes]) -> bytes:
+        return b"#%b*%08x" % (match[1], test_novatel.crc32(match[1]))
+
+    return re.sub(rb"#([^*#\r\n]*)\*[0-9A-Fa-f]{8}", sound, change(data, rng))
 
 
 def telegram_inside(data: bytes, rng: random.Random, change: Change) -> bytes:
@@ -282,6 +295,25 @@ def pose_matrices() -> bytes:
 
 def pose_lines() -> bytes:
     return b"".join(b"%d.25 %d 2 3 0 0 0 1\n" % (1_400_000_000 + k, k) for k in range(RECORDS))
+
+
+def kitti_poses(folder: Path) -> Path:
+    (folder / "07.txt").write_text("".join(f"1 0 0 {k} 0 1 0 2 0 0 1 {k}\n" for k in range(RECORDS)))
+    (folder / "times.txt").write_text("".join(f"{1_400_000_000 + k}.5\n" for k in range(RECORDS)))
+    return folder / "07.txt"
+
+
+def euroc_poses() -> bytes:
+    names = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+    return table(names, lambda k: f"{1_400_000_000 + k}000000000,{k},2,3,1,0,0,0")
+
+
+def grid_poses() -> bytes:
+    return table("time_s,x,y,z,qx,qy,qz,qw", lambda k: f"{1_400_000_000 + k},{571600 + k}.5,5539000.5,150,0,0,0,1")
+
+
+def control_dms() -> bytes:
+    return table("name,latitude,longitude,height_m", lambda k: f"P{k},52°31'{k:02d}.37N,13 24 02.5,{30 + k}")
 
 
 def pospac() -> bytes:
@@ -523,7 +555,14 @@ def _poses() -> Iterator[Sample]:
             "trajectory_csv", ending, file(f"a.csv.{ending}", pack(trajectory_csv())), {}, stated, inside=inside
         )
     axes = {"axes": "flu"}
+    ns = {"clock": Clock(TimeSystem.GPS, unit="ns"), "crs": "local"}
     yield Sample("pose_matrices", "plain", file("a.csv", pose_matrices), axes, _POSES, **lines)
+    kitti_options = {"axes": "rdf", "frame": "rdf"}
+    for form, damaged in (("kitti", "07.txt"), ("kitti times", "times.txt")):
+        yield Sample("pose_matrices", form, kitti_poses, kitti_options, _POSES, (damaged,), text=True)
+    yield Sample("pose_quaternions", "euroc", file("a.csv", euroc_poses), axes, ns, text=True, spans=lines_from(1))
+    utm = {"clock": GPS, "crs": "EPSG:25832", "height": "ellipsoidal"}
+    yield Sample("pose_quaternions", "grid", file("a.csv", grid_poses), axes | {"heading": "grid"}, utm, **lines)
     yield Sample("pose_quaternions", "lines", file("a.txt", pose_lines), axes, _POSES, text=True, spans=lines_from(0))
     yield Sample("pose_quaternions", "feather", file("a.feather", pose_feather), axes, _POSES)
     yield Sample("pose_quaternions", "parquet", file("a.parquet", pose_parquet), axes, _POSES)
@@ -532,6 +571,21 @@ def _poses() -> Iterator[Sample]:
     ms = {"clock": Clock(TimeSystem.GPS, unit="ms"), "crs": "EPSG:25832", "height": "ellipsoidal"}
     yield Sample("pospac", "plain", file("a.csv", pospac), axes, ms, **lines)
     sat = {"crs": "EPSG:4979"}
+    offices = {"inertial_explorer": (test_office_text.explorer, sat), "qinertia": (test_office_text.qinertia, sat)}
+    of_2018 = {"clock": Clock(TimeSystem.GPS_WEEK, week=2013), "crs": "EPSG:4979"}
+    offices["pospac_text"] = (test_office_text.pospac, of_2018)
+    for name, (write, known) in offices.items():
+        text = write(RECORDS).encode()
+        spans = lines_from(sum(map(bool, text.splitlines())) - RECORDS)
+        yield Sample(name, "plain", file("a.txt", text), {}, known, text=True, spans=spans)
+    for name, line, stamp in (
+        ("novatel_ins", test_novatel.INSPVAX, "2209,490782.000"),
+        ("novatel_ins", test_novatel.INSPVA, "2209,490558.000"),
+        ("novatel_bestpos", test_novatel.BESTPOS, "2404,603797.000"),
+    ):
+        log = test_novatel.drive(line, stamp, RECORDS)
+        form = line[1:].split(",")[0]
+        yield Sample(name, form, file("a.log", log), {}, sat, text=True, spans=lines_from(0), inside=novatel_inside)
     yield Sample(
         "rtklib_pos", "plain", file("a.pos", test_rtklib_pos.sample), {}, sat, text=True, spans=lines_from(2), share=2
     )
@@ -542,6 +596,8 @@ def _poses() -> Iterator[Sample]:
     yield Sample("ppk", "rover", _with_rtklib(test_ppk.sample), text=True, **ppk)
     yield Sample("ppk", "base", _with_rtklib(test_ppk.sample), text=True, damaged=("base.obs", "brdc.nav"), **ppk)
     yield Sample("ppk", "ubx", _with_rtklib(test_ppk.sample_ubx), **ppk)
+    gpx = {"height": "ellipsoidal"}
+    yield Sample("gpx", "plain", file("a.gpx", test_gpx.track(RECORDS).encode()), {"quality": "single"}, gpx, text=True)
     yield Sample("ubx", "plain", file("a.ubx", test_ubx.sample), {}, sat, spans=every(100))
     for untimed in ("before", "after"):
         yield Sample("nmea", untimed, file("a.nmea", nmea), {"untimed": untimed}, sat, text=True, inside=nmea_inside)
@@ -578,6 +634,11 @@ def _tables() -> Iterator[Sample]:
         held=lines_of_table,
     )
     yield Sample("control_csv", "plain", file("a.csv", control_csv), {}, _UTM32, **lines)
+    dms = {"height": "ellipsoidal", "crs": "EPSG:4979", "map": MapFrame(crs="EPSG:32633")}
+    yield Sample("control_csv", "dms", file("a.csv", control_dms), {"role": "gcp"}, dms, **lines)
+    odm, opensfm = test_picture_control.ODM.encode(), test_picture_control.opensfm(RECORDS)
+    yield Sample("odm_gcp", "plain", file("gcp_list.txt", odm), {"role": "gcp"}, test_picture_control.UTM32, text=True)
+    yield Sample("opensfm_gcp", "plain", file("a.json", opensfm), {"role": "gcp"}, dms, text=True)
     yield Sample("control_vector", "geojson", vector(control_degrees, "a.geojson"), {}, _DEGREES, text=True)
     yield Sample("control_vector", "gpkg", vector(control_layer, "a.gpkg"), {}, _UTM32)
     yield Sample("control_lines", "gpkg", vector(surveyed_lines, "a.gpkg"), {}, _UTM32)

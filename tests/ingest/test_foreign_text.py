@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -316,9 +315,10 @@ def test_points_that_no_line_names_are_read_in_the_order_that_their_size_tells(
         assert own.code == "Corner"
 
 
-def test_other_files_say_what_to_do(faults: Path) -> None:
-    said: dict[str, Any] = {"track.gpx": "a GPX track", "ublox_ubx_nmea_mixed.log": "u-blox"}
-    for name, part in said.items():
-        words = words_of(faults / name)
-        assert part in words
-        assert "NMEA" in words
+def test_other_files_say_what_to_do(faults: Path, tmp_path: Path) -> None:
+    words = words_of(faults / "ublox_ubx_nmea_mixed.log")
+    assert "u-blox" in words and "NMEA" in words
+    (tmp_path / "route.gpx").write_text('<?xml version="1.0"?><gpx><rte><rtept lat="1" lon="2"/></rte></gpx>')
+    assert "no track point with a time" in words_of(tmp_path / "route.gpx")
+    (tmp_path / "raw.ubx").write_bytes(b"\xb5\x62\x02\x15" + bytes(300))
+    assert "roadscan ppk" in words_of(tmp_path / "raw.ubx")

@@ -20,7 +20,7 @@ from roadscan.cli import app
         ("opencrg_handmade_platform.crg", "161 rows of cloud"),
         ("pnezd_named.csv", "Ground control and check points as CSV"),
         ("german_semicolon_decimal_comma_bom.csv", "Ground control and check points as CSV"),
-        ("track.gpx", "gpsbabel -i gpx -o nmea"),
+        ("track.gpx", "104 rows of gnss"),
         ("ublox_ubx_nmea_mixed.log", "u-blox recording (UBX): navigation solutions of NAV-PVT"),
     ],
 )

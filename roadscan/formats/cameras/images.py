@@ -28,7 +28,8 @@ from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.stamps import CALENDAR_SCALES, TIME, StampColumn, calendar_clock, parse_calendar
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, TextOptions, text_blocks, text_layout
-from roadscan.store.codecs.image_files import SUFFIXES, ImageError, ImageSize, image_size, is_image, time_taken
+from roadscan.store.codecs.image_files import SUFFIXES, ImageError, ImageSize, image_size, is_image
+from roadscan.store.codecs.picture_tags import picture_tags, tags_in_words
 
 Int64 = npt.NDArray[np.int64]
 
@@ -74,8 +75,9 @@ class Images(LogFormat):
 
     **Folder.** The stamps come from a table that names each file (relative to the folder) and its time, or from the
     files' names. An image without a stamp, a stamp without an image, and an image that is cut off are
-    rejected by name. Images in folders below are read too, once `format = "images"` is stated. Width, height and
-    completeness are read from the files' structure; no image is decoded.
+    rejected by name. What the EXIF tags of the first image state (time, focal length, orientation, position) is shown,
+    and proposed by `roadscan init`; none of it is used. Images in folders below are read too, once `format = "images"`
+    is stated. Width, height and completeness are read from the files' structure; no image is decoded.
 
     **Video** (MP4, AVI, MKV). The first frame was taken at the video's end stamp less its duration, frame k at
     k / fps after it (*Sensors* 2016, 16, 367, section 3.2.2); the clock's `offset_s` is the camera's
@@ -127,11 +129,14 @@ class Images(LogFormat):
             return _video_header(_VideoLog.of(source, options))
         if options.end is not None:
             raise ConfigError("options.end is the end of a video, and the log is a folder", file=source.path)
+        images = _images(source.path)
+        tags = _first_tags(images)
+        attributes: dict[str, object] = {"kind": "folder"} | ({"exif": tags} if tags else {})
         if options.pattern is not None:
-            pattern, _ = _pattern(source, options, _images(source.path))
-            return LogHeader({"kind": "folder", "pattern": pattern.text})
+            pattern, _ = _pattern(source, options, images)
+            return LogHeader(attributes | {"pattern": pattern.text})
         table = _StampTable.of(source, options)
-        return LogHeader({"kind": "folder", "stamps": table.name, "columns": [table.file_column, table.stamps.column]})
+        return LogHeader(attributes | {"stamps": table.name, "columns": [table.file_column, table.stamps.column]})
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream images or frames; those that are incomplete or without a stamp are rejected."""
@@ -225,17 +230,21 @@ def _only_table(folder: Path, options: ImagesOptions) -> tuple[Path, TextLayout,
 
 
 def _without_stamps(folder: Path) -> str:
-    """Return what a folder without a table of stamps contains, and what its first image says about its time."""
+    """Return what a folder without a table of stamps contains, and what its first image says of itself."""
     images = _images(folder)
     said = f"the folder holds {counted(len(images), 'image')}, and the images' stamps are not stated"
-    first = next(iter(images.values()), None)
-    taken = "" if first is None else time_taken(first)
-    if first is None or not taken:
+    tags = _first_tags(images)
+    if not tags:
         return said
-    return (
-        f"{said}; the EXIF tags of {first.name} say {taken} on the camera's own clock, which is too coarse to find "
-        "the pose of a moving vehicle"
-    )
+    coarse = " (its time is too coarse to find the pose of a moving vehicle)" if "taken" in tags else ""
+    return f"{said}; the EXIF tags of {tags['file']} say {tags_in_words(tags)}{coarse}"
+
+
+def _first_tags(images: Mapping[str, Path]) -> dict[str, object]:
+    """Return the EXIF tags of the first image, with its name; nothing where it has none."""
+    name, path = next(iter(images.items()), ("", None))
+    tags = {} if path is None else picture_tags(path)
+    return {"file": name, **tags} if tags else {}
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,9 @@ _CARRIER: Final = {1: "float", 2: "fixed"}  # quality by the carrier solution in
 _UNIX_DAY: Final = dt.date(1970, 1, 1).toordinal()  # ordinal of 1970-01-01
 _SNIFF_BYTES: Final = 1 << 16  # bytes from which the format is recognised
 _BLOCK_BYTES: Final = 4 << 20  # bytes that are read at once
+RAW: Final = b"\xb5\x62\x02\x15"
+"""Sync characters, class and identifier of RXM-RAWX, the raw measurements."""
+RAW_WAY: Final = "raw measurements (RXM-RAWX), of which `roadscan ppk` computes positions"
 _NMEA: Final = re.compile(rb"\$G[A-Z]GGA,")
 
 
@@ -50,7 +53,8 @@ class Ubx(LogFormat):
     """Frames of UBX, between which sentences of NMEA and other bytes may stand.
 
     NAV-PVT gives UTC, position with its ellipsoidal height, velocity, σ of both, kind of the solution and satellites.
-    Other messages are passed over, and so is NMEA: NAV-PVT states the same with more decimals. A log whose beginning
+    Other messages are passed over, and so is NMEA: NAV-PVT states the same with more decimals. Raw measurements
+    (RXM-RAWX) are named: `roadscan ppk` computes positions of them. A log whose beginning
     holds sentences of NMEA that can be used is read as `nmea` unless format = "ubx" is stated. A record is a NAV-PVT.
     σ of the plane is divided between north and east. The datum is the receiver's or its corrections': state it as crs.
     """
@@ -75,8 +79,9 @@ class Ubx(LogFormat):
         if HEADER[:2] not in head:
             raise FormatError("the beginning holds no UBX message", expected="bytes b5 62", file=source.path)
         attributes = {"world_frame": placement.world, "read": "UBX NAV-PVT"}
-        if _NMEA.search(head):
-            attributes["not_read"] = "NMEA sentences between the UBX messages"
+        others = {"NMEA sentences between the UBX messages": bool(_NMEA.search(head)), RAW_WAY: RAW in head}
+        if any(others.values()):
+            attributes["not_read"] = "; ".join(words for words, is_there in others.items() if is_there)
         return LogHeader(attributes)
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
@@ -99,9 +104,13 @@ class Ubx(LogFormat):
             raise FormatError(
                 "the recording holds no navigation solution (NAV-PVT)",
                 expected="UBX-NAV-PVT",
-                change='state format = "ppk" to post-process its raw observations (RXM-RAWX), or record NAV-PVT',
+                change=f"it holds {RAW_WAY}" if _holds_raw(source.path) else "let the receiver write NAV-PVT",
                 file=source.path,
             )
+
+
+def _holds_raw(path: Path) -> bool:
+    return RAW in head_of(path, _SNIFF_BYTES)
 
 
 def _blocks(path: Path) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.void]]]:

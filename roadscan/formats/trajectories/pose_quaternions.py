@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -12,16 +13,21 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import FormatError
+from roadscan.core.frames import ENU_FROM_NED, quaternion_from_rotation
 from roadscan.core.gpstime import UNIT_NS, Clock
 from roadscan.ingest.reading.column_table import Lost, is_number, need_table
 from roadscan.ingest.reading.columns import Found, check_keys, named_column, need_stamp_unit, stamp_column
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import (
+    North,
+    Placement,
     PoseReader,
     RawPoses,
     WorldPlacement,
     body_quaternion,
+    level_placement,
     quaternion_product,
     unit_quaternions,
 )
@@ -52,6 +58,16 @@ AV2_COLUMNS: Final = ("timestamp_ns", *QUATERNION, "tx_m", "ty_m", "tz_m")
 AV2_AXES: Final = "flu"
 """Argoverse 2 documents its ego-vehicle frame as x forward, y left, z up."""
 
+_GRID_NAMES: Final = {
+    "tx": ("easting", "utm_x"),
+    "ty": ("northing", "utm_y"),
+    "tz": ("height", "altitude", "elevation"),
+}
+"""Further names of a position's columns, for poses in a projected CRS."""
+_BRACKETS: Final = re.compile(r"\s*[(\[]([^)\]]*)[)\]]$")
+_EUROC: Final = re.compile(r"([pq])_RS(?:_R)?_([wxyz])")
+_NED_FROM_ENU: Final = quaternion_from_rotation(ENU_FROM_NED.T)
+
 BATCH_ROWS: Final = 65_536  # rows of a batch
 
 
@@ -65,18 +81,22 @@ class PoseQuaternionsOptions(TextOptions):
     """Names of columns that are called otherwise: stamp, qw, qx, qy, qz, tx, ty, tz. For example
     { stamp = "t", tx = "px" }. Found by themselves: the quaternion under these names, the translation
     also as tx_m or x_m or x …, the stamp as timestamp_ns, timestamp, time_s, time, stamp …"""
+    heading: North | None = None
+    """For a projected CRS, as SLAM with RTK writes: whether y of the quaternion's frame points to grid north ("grid")
+    or true north ("true"); x points east, z up. Has to be stated."""
 
 
 class PoseQuaternions(LogFormat):
     """A record a pose: a stamp, a quaternion world-from-sensor and a translation in metres.
 
-    Text (CSV, or TUM: ``time tx ty tz qx qy qz qw`` between blanks, without column names), Feather
-    or Parquet. The world is a local frame (``crs = "local"``) or geocentric. The posed frame becomes
-    the body; `axes` says where its axes point.
+    Text (CSV; EuRoC: ``#timestamp [ns], p_RS_R_x [m], …, q_RS_w [], …``; or TUM: ``time tx ty tz qx qy qz qw`` between
+    blanks, without column names), Feather or Parquet. The world is a local frame (``crs = "local"``), geocentric, or
+    projected: then tx, ty, tz are easting, northing and height, and the quaternion counts from east, north and up. The
+    posed frame becomes the body; `axes` says where its axes point.
     """
 
     name = "pose_quaternions"
-    title = "Poses as quaternions (CSV, TUM, Feather, Parquet; Argoverse 2) in a local or geocentric frame"
+    title = "Poses as quaternions (CSV, TUM, EuRoC, Feather, Parquet; Argoverse 2): local, geocentric or projected"
     yields = ("trajectory",)
     time = "numbers: state clock.system and clock.unit"
     options = PoseQuaternionsOptions
@@ -106,6 +126,8 @@ class PoseQuaternions(LogFormat):
             sieve = Sieve(block.records.size)
             sieve.drop(block.without_stamp, "time stamp is missing")
             attitude = quaternion_product(unit_quaternions(block.quaternion, sieve), plan.sensor_from_body)
+            if plan.is_level:
+                attitude = quaternion_product(_NED_FROM_ENU, attitude)
             raw = RawPoses(block.records, block.offsets, block.stamps, block.translation, attitude, {})
             yield from reader.items(raw, sieve)
 
@@ -117,7 +139,9 @@ class _Plan:
     table: _Table
     columns: dict[str, str]
     clock: Clock
-    placement: WorldPlacement
+    placement: Placement
+    is_level: bool
+    """The placement wants north-east-down from body."""
     axes: str
     sensor_from_body: Float64
 
@@ -131,11 +155,14 @@ def _plan(source: LogSource) -> _Plan:
         axes = AV2_AXES
     clock = source.need_clock("unix_utc", unit=table.stamp_unit(stamp))
     need_stamp_unit(stamp, clock, source.path)
+    crs = source.need_crs("local")
+    is_level = crs != LOCAL_WORLD and crs_from_text(crs).is_projected
     return _Plan(
         table=table,
         columns=columns,
         clock=clock,
-        placement=WorldPlacement(source.need_crs("local"), source.path),
+        placement=level_placement(source, options.heading) if is_level else WorldPlacement(crs, source.path),
+        is_level=is_level,
         axes=axes or "",
         sensor_from_body=body_quaternion(axes, source.path),
     )
@@ -144,12 +171,25 @@ def _plan(source: LogSource) -> _Plan:
 def _columns(names: tuple[str, ...], options: PoseQuaternionsOptions, file: Path) -> tuple[dict[str, str], Found]:
     """Return the column of each part of a pose, and the stamp's with the unit in its name."""
     check_keys(options.columns, ("stamp", *QUATERNION, *TRANSLATION), file)
-    stamp = stamp_column(options.columns.get("stamp"), names, STAMPS, file)
-    found = {"stamp": stamp.column}
+    written = {_plain(name): name for name in names}
+    stated = {part: _plain(name) for part, name in options.columns.items()}
+    stamp = stamp_column(stated.get("stamp"), tuple(written), STAMPS, file)
+    found = {"stamp": written[stamp.column]}
     for part in (*QUATERNION, *TRANSLATION):
-        known = (part, f"{part}_m", part[1:], f"{part[1:]}_m") if part in TRANSLATION else (part,)
-        found[part] = named_column(part, options.columns.get(part), known, names, file)
-    return found, stamp
+        stems = (part, part[1:], *_GRID_NAMES[part]) if part in TRANSLATION else (part,)
+        known = (name for stem in stems for name in ((stem, f"{stem}_m") if part in TRANSLATION else (stem,)))
+        found[part] = written[named_column(part, stated.get(part), known, tuple(written), file)]
+    return found, replace(stamp, column=found["stamp"])
+
+
+def _plain(name: str) -> str:
+    """Return a column's name with its bracketed unit as an ending (timestamp [ns]: timestamp_ns), EuRoC's as TUM's."""
+    unit = _BRACKETS.search(name)
+    stem = name if unit is None else name[: unit.start()]
+    euroc = _EUROC.fullmatch(stem)
+    if euroc is not None:
+        return f"{'t' if euroc[1] == 'p' else 'q'}{euroc[2]}"
+    return stem if unit is None or not unit[1] else f"{stem}_{unit[1]}"
 
 
 # --- the three containers ---------------------------------------------------------------------------
@@ -193,7 +233,7 @@ class _Text(_Table):
     def __init__(self, path: Path, options: TextOptions) -> None:
         self._path = path
         delimiter, words = first_words(path, options)
-        is_named = set(QUATERNION) <= set(words)
+        is_named = set(QUATERNION) <= {_plain(word) for word in words}
         words = words if is_named else first_record(path, options)
         self._tum = options.names is None and delimiter == " " and len(words) == len(TUM_NAMES) and _are_numbers(words)
         named = options.model_copy(update={"names": list(TUM_NAMES)}) if self._tum else options

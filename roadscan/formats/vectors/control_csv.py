@@ -6,23 +6,25 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import crs_from_text
-from roadscan.core.errors import FormatError, Missing
+from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.formats.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
-from roadscan.ingest.reading.columns import ColumnOption, Found, Quantity, find_columns, fits
+from roadscan.ingest.reading.columns import UNITS, ColumnOption, Found, Quantity, find_columns, fits
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M
 from roadscan.ingest.reading.records import options_of
+from roadscan.ingest.reading.sexagesimal import degrees_of, is_sexagesimal
 from roadscan.ingest.reading.text_table import (
     Kind,
     TextBlock,
     TextLayout,
     TextOptions,
+    first_fields,
     sniff_layout,
     text_blocks,
     text_layout,
@@ -65,6 +67,8 @@ class ControlCsvOptions(TextOptions):
     For example { height = { name = "H", unit = "m" } }."""
     role: Role | None = None
     """Role of all points ("gcp" or "check") where the file has no column for it."""
+    height_unit: Literal["m", "ft", "ft_us"] | None = None
+    """Unit of heights where neither the column's name nor the CRS says it (ft_us: US survey foot)."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,8 @@ class _Plan:
     columns: dict[str, Found]
     frame: ControlFrame
     role: str
+    sexagesimal: frozenset[str]
+    """Those of longitude and latitude that stand in degrees, minutes and seconds."""
 
 
 class ControlCsv(LogFormat):
@@ -82,7 +88,8 @@ class ControlCsv(LogFormat):
 
     Columns are found by names that carry the unit (``easting_m``, ``height_m``, ``latitude_deg``).
     Columns called just easting, northing, longitude or latitude are in the unit of the stated CRS;
-    so is a height, where the CRS has a height axis or is a local frame. The words of surveyors are known, too:
+    so is a height, where the CRS has a height axis or is a local frame. Longitude and latitude may also stand in
+    degrees, minutes and seconds (52°31'09.37"N, 52 31 09.37). The words of surveyors are known, too:
     point, elevation and description; Punkt, Rechtswert, Hochwert and Höhe. Where no line names the columns (PNEZD:
     point, northing, easting, elevation, description), options.names states their order.
     """
@@ -114,7 +121,7 @@ class ControlCsv(LogFormat):
         """Stream points; a line without a name, position or height is rejected."""
         plan = _plan(source)
         reader = ControlReader(plan.frame)
-        words = {"name", "code", "role"}
+        words = {"name", "code", "role", *plan.sexagesimal}
         kinds: dict[str, Kind] = {
             found.column: "text" if quantity in words else "number" for quantity, found in plan.columns.items()
         }
@@ -140,11 +147,42 @@ def _plan(source: LogSource) -> _Plan:
             file=source.path,
             missing=Missing("options.names", proposed or None, tuple(orders)),
         )
-    columns = find_columns(
-        (NAME, *WORDS, *position[frame.kind], *SIGMAS), layout.names, options.columns, source.path, units_of(frame)
-    )
+    quantities, units = (NAME, *WORDS, *position[frame.kind], *SIGMAS), units_of(frame)
+    stated = None if options.height_unit is None else UNITS["length"][options.height_unit]
+    if stated is not None and units.setdefault("height", stated) != stated:
+        raise _other_unit(options.height_unit, f"the CRS '{frame.crs}'", source.path)
+    height = position[frame.kind][2]
+    is_plain = not fits([height], layout.names) and fits([height], layout.names, (height.name,))
+    if is_plain and "height" not in units and "height" not in options.columns:
+        raise FormatError(
+            "neither the name of the heights' column nor the CRS says their unit",
+            file=source.path,
+            missing=Missing("options.height_unit", choices=("m", "ft", "ft_us")),
+        )
+    columns = find_columns(quantities, layout.names, options.columns, source.path, units)
+    if stated is not None and columns["height"].scale != stated:
+        raise _other_unit(options.height_unit, f"column '{columns['height'].column}'", source.path)
     need_role("role" in columns, options.role, source.path)
-    return _Plan(layout, columns, frame, options.role or "")
+    return _Plan(layout, columns, frame, options.role or "", _sexagesimal(source.path, layout, columns))
+
+
+def _other_unit(stated: str | None, by: str, file: Path) -> ConfigError:
+    return ConfigError(
+        f'options.height_unit = "{stated}", and {by} says another unit of heights',
+        expected="one unit",
+        change="leave options.height_unit out",
+        file=file,
+    )
+
+
+def _sexagesimal(file: Path, layout: TextLayout, columns: dict[str, Found]) -> frozenset[str]:
+    """Return which of longitude and latitude stand in degrees, minutes and seconds, by the first points."""
+    lines = first_fields(file, layout, 5)
+    found = {}
+    for name in ("longitude", "latitude"):
+        words = [fields[layout.names.index(columns[name].column)] for fields in lines] if name in columns else []
+        found[name] = any(is_sexagesimal(word) for word in words)
+    return frozenset(name for name, is_found in found.items() if is_found)
 
 
 def _nameless(first: Sequence[str]) -> list[str] | None:
@@ -190,6 +228,8 @@ def _raw(block: TextBlock, plan: _Plan) -> RawControl:
         if name not in plan.columns:
             return np.full(block.records.size, np.nan)
         found = plan.columns[name]
+        if name in plan.sexagesimal:
+            return np.radians(degrees_of(block.text(found.column), "latitude" if name == "latitude" else "longitude"))
         with np.errstate(over="ignore"):
             return block.number(found.column) * found.scale
 

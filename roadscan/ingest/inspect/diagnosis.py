@@ -1,8 +1,9 @@
 """Diagnoses why no raw format claims a file or folder: what it is instead, and what the nearest format misses in it.
 
 `roadscan inspect`, `init` and `run` give the same answer, the one that is found first: it cannot be opened, it is
-empty, its compression is damaged, its end is missing, its columns lack names or units, its name promises a format
-that its content does not keep, a reader makes sense of it nevertheless, or it is of another kind.
+empty, it is of a maker's format that is not read, its compression is damaged, its end is missing, its columns lack
+names or units, its name promises a format that its content does not keep, a reader makes sense of it nevertheless, or
+it is of another kind.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from typing import Final
 
 from roadscan.core.errors import FormatError, Missing, RoadscanError
 from roadscan.core.toml_text import toml
-from roadscan.ingest.inspect.file_kinds import UNPACKING_ERRORS, is_cut_off, kind_of, open_wrapped, wrapper_of
+from roadscan.ingest.inspect.file_kinds import UNPACKING_ERRORS, head_of, is_cut_off, kind_of, open_wrapped, wrapper_of
+from roadscan.ingest.inspect.known_files import known_file
 from roadscan.ingest.inspect.log_figures import LogFigures
 from roadscan.ingest.inspect.provisional import OpenedLog, Stated, open_log
 from roadscan.ingest.reading.columns import Likeness, likeness
@@ -33,16 +35,11 @@ _KNOWN_OTHERS: Final = {
         'list the folder with format = "images", and a table with the columns file and time (options.stamps), or the '
         "pattern of the stamps in the pictures' names (options.pattern)",
     ),
-    "GPX": (
-        "its positions have no attitude and no σ, and are mostly those of a phone or a watch",
-        "the log of a survey's receiver",
-        "export the receiver's log as RTKLIB .pos or NMEA (`gpsbabel -i gpx -o nmea` makes NMEA of the track alone), "
-        "or the trajectory with roll, pitch and heading as trajectory_csv",
-    ),
+    "GPX": ("its beginning holds no track point with a time", "a track", "export the track, not the route"),
     "UBX": (
         "of the receiver's binary messages only its solutions (NAV-PVT) are read, and its beginning holds none",
         "positions",
-        "compute them with RTKLIB (convbin, rnx2rtkp) as .pos, or let the receiver write NMEA",
+        "let `roadscan ppk` compute them from raw measurements (RXM-RAWX), or let the receiver write NAV-PVT or NMEA",
     ),
 }
 """By a word of the kind of another file: why it is no log, what a log would be, and what to do."""
@@ -143,7 +140,14 @@ def specific_fault(path: Path, stated: Stated | None = None) -> FormatError | No
     cannot = cannot_be_opened(path)
     if cannot is not None or path.is_dir():
         return cannot
-    looks: tuple[Callable[[Path, Stated], FormatError | None], ...] = (_packed, _cut, _columns, _named, _sensible)
+    looks: tuple[Callable[[Path, Stated], FormatError | None], ...] = (
+        _known,
+        _packed,
+        _cut,
+        _columns,
+        _named,
+        _sensible,
+    )
     found = (look(path, stated or Stated()) for look in looks)
     return next((error for error in found if error is not None), None)
 
@@ -174,6 +178,12 @@ def unpack(path: Path, wrapper: str, target: Path, limit: int) -> str:
             how = "cut off" if isinstance(error, EOFError) else "damaged"
             return f"the {wrapper} file is {how} after {written:,} unpacked bytes: {error}"
     return f"only the first {limit:,} unpacked bytes were read" if written >= limit else ""
+
+
+def _known(path: Path, stated: Stated) -> FormatError | None:
+    """Return what a file of a maker's format is, and the program that exports what is read."""
+    known = known_file(path, head_of(path))
+    return None if known is None else FormatError(known.sentence, change=known.way_out, file=path)
 
 
 def _packed(path: Path, stated: Stated) -> FormatError | None:

@@ -25,7 +25,9 @@ from roadscan.core.counted import counted
 from roadscan.core.errors import RoadscanError
 from roadscan.core.rig import Rig
 from roadscan.core.survey import Survey
+from roadscan.ingest.inspect.known_files import known_file
 from roadscan.ingest.reading.text_table import first_fields, sniff_layout
+from roadscan.store.codecs.picture_tags import picture_tags, tags_in_words
 from roadscan.store.schema import schema_names, table_schema
 
 HEAD_BYTES: Final = 4096  # bytes at a file's start by which it is identified
@@ -193,6 +195,9 @@ def kind_of(path: Path) -> FileKind:
         return FileKind(f"a file that cannot be opened: {error.strerror or error}")
     if not head:
         return FileKind("an empty file")
+    known = known_file(path, head)
+    if known is not None:
+        return FileKind(known.words)
     words = next((w for at, magic, w in _MAGICS if head[at : at + len(magic)] == magic), "")
     for word, look in _LOOKS.items():
         if word in words:
@@ -240,7 +245,8 @@ def _picture(path: Path, words: str) -> FileKind:
     size = _png_size(path) if "PNG" in words else _jpeg_size(path)
     if size is None:
         return FileKind(words, faults=("the file ends before the picture's size",))
-    return FileKind(words, {"size": f"{size[0]:,} × {size[1]:,} pixels"})
+    said = tags_in_words(picture_tags(path))
+    return FileKind(words, _filled({"size": f"{size[0]:,} × {size[1]:,} pixels", "EXIF": said}))
 
 
 def _png_size(path: Path) -> tuple[int, int] | None:

@@ -8,10 +8,10 @@ line that begins with ``#?`` and holds the setting with ???? for the unknown. Su
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,7 @@ from roadscan.ingest.inspect.inspect import LogReport
 from roadscan.ingest.inspect.log_figures import Extent
 from roadscan.ingest.inspect.provisional import Need
 from roadscan.ingest.reading.format import LogFormat, Part
+from roadscan.store.codecs.picture_tags import tags_in_words
 
 Float64 = npt.NDArray[np.float64]
 
@@ -323,6 +324,23 @@ def _sensor(name: str, log: FoundLog) -> Iterator[str]:
         yield from _mounting(kind, log)
     if kind in {"profiler", "lidar"}:
         yield from _ranges(log.report)
+    if isinstance(header.get("exif"), dict):
+        yield from _interior(header["exif"])
+
+
+def _interior(tags: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what a picture's tags state, and the interior orientation that follows, to be confirmed."""
+    yield from _remark(f"The EXIF tags of {tags['file']} say: {tags_in_words(tags)}. None of it is used.")
+    if "focal_px" in tags:
+        width, height = tags["size_px"]
+        interior = {
+            "width_px": width,
+            "height_px": height,
+            "focal_px": [tags["focal_px"]] * 2,
+            "principal_px": [(width - 1) / 2, (height - 1) / 2],
+        }
+        yield f"# interior = {toml(interior)}"
+        yield from _remark("if they are right: to some per cent, without distortion. `roadscan camera` calibrates.")
 
 
 def _mounting(kind: str, log: FoundLog) -> Iterator[str]:

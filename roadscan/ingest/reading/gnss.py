@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text, geodetic_from_world, world_frame_of
 from roadscan.core.errors import ConfigError, CrsError, Missing, TimeSystemError
-from roadscan.core.gpstime import Clock, TimeSystem
+from roadscan.core.gpstime import WEEKS_A_ROLLOVER, Clock, TimeSystem
 from roadscan.ingest.reading.format import Item, LogSource
 from roadscan.ingest.reading.poses import BlockPlacer, Placement, WorldPlacement, block_rows, check_sigmas
 from roadscan.ingest.reading.records import Sieve
@@ -74,6 +74,39 @@ def utc_clock(source: LogSource, says: str) -> Clock:
             missing=Missing("clock", {"system": "unix_utc"}),
         )
     return replace(stated or Clock(TimeSystem.UNIX_UTC), unit="ns")
+
+
+def gps_clock(source: LogSource, says: str, week: int | None = None) -> Clock:
+    """Return the clock of a log that states week and seconds of GPS time, in ns since 1980, whether stated or not.
+
+    Parameters
+    ----------
+    says : what states them, in words.
+    week : GPS week of the first record, where known.
+
+    Raises
+    ------
+    TimeSystemError
+        where the survey file states another time system, or another week.
+    """
+    stated = source.clock
+    if stated is not None and stated.system not in (TimeSystem.GPS, TimeSystem.GPS_WEEK):
+        raise TimeSystemError(
+            f"{says} GPS time, the clock says {stated.system}",
+            expected='clock.system = "gps", or no clock',
+            file=source.path,
+            missing=Missing("clock", {"system": "gps"}),
+        )
+    is_weekly = stated is not None and stated.system is TimeSystem.GPS_WEEK and stated.week != 0
+    if stated is not None and is_weekly and week is not None and (stated.first_week() - week) % WEEKS_A_ROLLOVER:
+        raise TimeSystemError(
+            f"the log begins in GPS week {week}, its clock says week {stated.first_week()}",
+            expected="one GPS week",
+            change="leave the clock out",
+            file=source.path,
+            missing=Missing("clock", {"system": "gps"}),
+        )
+    return replace(stated or Clock(TimeSystem.GPS), system=TimeSystem.GPS, unit="ns", week=None, date=None)
 
 
 class GnssReader:

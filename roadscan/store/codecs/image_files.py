@@ -269,16 +269,3 @@ def _tiff(stream: BinaryIO, size: int) -> ImageSize:
     if not sum(counts):
         raise ImageError("the image holds no pixels")
     return ImageSize(width, height)
-
-
-def time_taken(path: Path) -> str:
-    """Return the time at which an image was taken, as in its EXIF tags (``2026:05:04 11:30:00``); "" without one."""
-    from PIL import ExifTags, Image
-
-    try:
-        with Image.open(path) as image:
-            tags = image.getexif()
-            taken = tags.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.DateTimeOriginal)
-            return str(taken or tags.get(ExifTags.Base.DateTime) or "").strip(" \0")
-    except Exception:  # noqa: BLE001 — Pillow raises anything on damaged bytes
-        return ""

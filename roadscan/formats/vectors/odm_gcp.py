@@ -1,0 +1,150 @@
+"""Ground control of OpenDroneMap: gcp_list.txt."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyproj
+from pyproj.exceptions import CRSError as ProjCrsError
+
+from roadscan.core.errors import CrsError, FormatError, Missing
+from roadscan.core.strict import Strict
+from roadscan.formats.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
+from roadscan.ingest.reading.records import options_of
+from roadscan.ingest.reading.text_table import head_of, is_number, line_blocks
+
+_UTM: Final = re.compile(r"WGS84 UTM (\d{1,2})([NS])", re.IGNORECASE)
+_FEWEST: Final = 6  # words of a line: easting, northing, height, x and y in the picture, and the picture
+
+
+class OdmGcpOptions(Strict):
+    """Settings of `odm_gcp`."""
+
+    role: Role | None = None
+    """Role of all points: "gcp" or "check". Has to be stated."""
+
+
+class OdmGcp(LogFormat):
+    """A line with the CRS; then a line for each picture of a point: x, y, z, column, row, picture, name.
+
+    The CRS is an EPSG code, a PROJ string or ``WGS84 UTM 32N``, as OpenDroneMap has it; x is easting or longitude. A
+    point without a name is called by its number among the points of other coordinates. Its places in pictures are not
+    read. The file does not say whether heights are ellipsoidal: state it.
+    """
+
+    name = "odm_gcp"
+    title = "OpenDroneMap ground control (gcp_list.txt): a CRS, then a line for each picture of a point"
+    yields = ("control_points",)
+    time = "holds no time"
+    options = OdmGcpOptions
+
+    def sniff(self, path: Path) -> bool:
+        """True if the first line is a CRS and the second one a point in a picture."""
+        lines = (
+            head_of(path, 1 << 12).decode("utf-8", "replace").lstrip("\ufeff").splitlines() if path.is_file() else []
+        )
+        rows = [line.split() for line in lines[1:-1] or lines[1:] if line.strip()]
+        return bool(rows) and _is_row(rows[0]) and _crs(lines[0].strip()) is not None
+
+    def header(self, source: LogSource) -> LogHeader:
+        """Check CRS, heights and roles."""
+        frame = _frame(source)
+        return LogHeader({"crs": frame.crs, "height": frame.height})
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream points; a line that is none is rejected."""
+        frame, role = _frame(source), options_of(source, OdmGcpOptions).role
+        reader = ControlReader(frame)
+        known: dict[tuple[float, ...], str] = {}
+        points: dict[str, tuple[int, int, tuple[float, ...]]] = {}
+        for record, line in enumerate(_lines(source.path)):
+            if isinstance(line, Reject):
+                yield replace(line, record=record)
+                continue
+            offset, words = line
+            if not _is_row(words):
+                yield Reject("the line is not x, y, z, column, row and picture of a point", record, offset)
+                continue
+            place = tuple(float(word) for word in words[:3])
+            name = words[6] if len(words) > _FEWEST else known.get(place, f"gcp_{len(known) + 1}")
+            known.setdefault(place, name)
+            if points.setdefault(name, (record, offset, place))[2] != place:
+                yield Reject("a point of this name has other coordinates above", record, offset)
+        if points:
+            yield from reader.items(_raw(points, frame, role or ""))
+        yield from reader.findings()
+
+
+def _lines(path: Path) -> Iterator[tuple[int, list[str]] | Reject]:
+    """Yield offset and words of each line below that of the CRS, without blank ones and comments."""
+    is_first = True
+    for start, data in line_blocks(path):
+        if isinstance(data, Reject):
+            yield replace(data, offset=start)
+            continue
+        ends = start + np.cumsum([0, *(len(line) for line in data.splitlines(keepends=True))])
+        for offset, line in zip(ends.tolist(), data.splitlines(), strict=False):
+            words = line.decode("utf-8", "replace").split()
+            if words and not is_first and not words[0].startswith("#"):
+                yield offset, words
+            is_first = is_first and not words
+
+
+def _raw(points: Mapping[str, tuple[int, int, tuple[float, ...]]], frame: ControlFrame, role: str) -> RawControl:
+    records, offsets, places = zip(*points.values(), strict=True)
+    missing = np.full(len(points), np.nan)
+    return RawControl(
+        records=np.array(records, np.int64),
+        offsets=np.array(offsets, np.int64),
+        names=list(points),
+        roles=[role] * len(points),
+        codes=[None] * len(points),
+        coordinates=np.array(places).T * np.array([[frame.horizontal_scale], [frame.horizontal_scale], [1.0]]),
+        sigma_horizontal_m=missing,
+        sigma_height_m=missing,
+    )
+
+
+def _is_row(words: Sequence[str]) -> bool:
+    return len(words) >= _FEWEST and all(is_number(word) for word in words[:5]) and not is_number(words[5])
+
+
+def _crs(text: str) -> str | None:
+    """Return the CRS of a first line; None where it is none."""
+    utm = _UTM.fullmatch(text)
+    if utm is not None:
+        return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}"
+    if not text.upper().startswith(("EPSG:", "+PROJ=")):
+        return None
+    try:
+        pyproj.CRS.from_user_input(text)
+    except ProjCrsError:
+        return None
+    return text
+
+
+def _frame(source: LogSource) -> ControlFrame:
+    source.need_file()
+    first = next((line for line in head_of(source.path).decode("utf-8", "replace").lstrip("\ufeff").splitlines()), "")
+    crs = _crs(first.strip())
+    if crs is None:
+        raise FormatError(
+            f"the first line, '{first[:60]}', is no CRS",
+            expected="such as EPSG:32632 or WGS84 UTM 32N",
+            file=source.path,
+        )
+    if source.crs is not None and not pyproj.CRS(source.crs).equals(pyproj.CRS(crs), ignore_axis_order=True):
+        raise CrsError(
+            f"the file's first line says {crs}, the survey file '{source.crs}'",
+            expected="one CRS",
+            file=source.path,
+            missing=Missing("crs", crs),
+        )
+    need_role(False, options_of(source, OdmGcpOptions).role, source.path)
+    return ControlFrame.of(replace(source, crs=crs))

@@ -32,7 +32,9 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 RANGE_NODES_M: Final = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 13.0, 17.0, 23.0, 32.0, 45.0, 64.0, 90.0])
+"""Ranges of the gain curve (m): a quarter to a third apart, as the return falls with a power of the range."""
 INCIDENCE_NODES_DEG: Final = np.array([0.0, 20.0, 40.0, 50.0, 60.0, 65.0, 70.0, 75.0, 79.0, 82.0, 85.0, 88.0, 90.0])
+"""Angles of incidence of the gain curve (degrees): closer towards grazing, where it is steep."""
 PLACE_M: Final = 0.5  # Edge of a place (m).
 ON_GROUND_M: Final = 0.1
 """Returns within this height of the ground model (m) determine gains, and are on the ground."""

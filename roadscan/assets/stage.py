@@ -35,6 +35,7 @@ from roadscan.tiles.tasks.tiles import run_tasks
 _MOST_ROUGH: Final = 0.5
 """Share of rough ground from which readings are suspect: verges and kerbs are rough, but not half of the ground."""
 
+# The figure in its words is `ROUGHEST_M` in millimetres.
 ROUGH_READINGS: Final = Witness(
     "rough_readings",
     "lidar",

@@ -31,11 +31,11 @@ _COVER: Final = (6, 4)
 """Columns and rows of the cells by which coverage is counted."""
 _WINDOW: Final = 0.3
 """Half the window that a corner is refined in, as a share of the least distance between corners."""
-_LEAP_PX: Final = 1.0
-_SIGNIFICANT: Final = 2.0
-_ROUNDS: Final = 4
-_MOST_STEPS: Final = 200
-_SETTLED: Final = 1e-12
+_LEAP_PX: Final = 1.0  # a corner that refinement moves farther (pixels) was found on something else
+_SIGNIFICANT: Final = 2.0  # a distortion coefficient counts from twice its σ on
+_ROUNDS: Final = 4  # rounds of leaving out outliers: later ones change nothing
+_MOST_STEPS: Final = 200  # most steps of the solver
+_SETTLED: Final = 1e-12  # relative change at which the solver ends
 
 
 class Board(Strict):

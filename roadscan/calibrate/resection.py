@@ -43,16 +43,16 @@ _START_GATE: Final = 0.02
 _START_GATE_PX: Final = 8.0  # Least such distance, and the limit for outliers in RANSAC.
 _REACH: Final = 3.0
 """With the rig file's mounting measurements may lie off by this many of its σ."""
-_RANSAC_ROUNDS: Final = 500
-_OUTLIER: Final = 4.0
-_OUTLIER_ROUNDS: Final = 10
-_WRONG_TURN_RAD: Final = np.radians(20.0)
-_WIDE_M: Final = (1.0, 1.0, 1.0)
-_WIDE_RAD: Final = (0.2, 0.2, 0.2)
-_BEHIND_M: Final = 0.1
-_INVERTED_PX: Final = 0.05
-_ROUNDS: Final = 200
-_SETTLED: Final = 1e-13
+_RANSAC_ROUNDS: Final = 500  # samples: with half of the points wrong, one in 32 of four is right
+_OUTLIER: Final = 4.0  # normalised residual from which a point is left out (σ)
+_OUTLIER_ROUNDS: Final = 10  # most rounds of leaving out points
+_WRONG_TURN_RAD: Final = np.radians(20.0)  # a found turn that differs more from the stated one contradicts it (rad)
+_WIDE_M: Final = (1.0, 1.0, 1.0)  # σ of a lever arm that is not believed (m)
+_WIDE_RAD: Final = (0.2, 0.2, 0.2)  # σ of a boresight that is not believed (rad)
+_BEHIND_M: Final = 0.1  # nearest depth that a camera sees (m)
+_INVERTED_PX: Final = 0.05  # largest error of inverting the distortion (pixels)
+_ROUNDS: Final = 200  # most steps of that inversion
+_SETTLED: Final = 1e-13  # change at which it ends
 
 
 @dataclass(frozen=True)

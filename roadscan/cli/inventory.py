@@ -23,7 +23,7 @@ Home = Annotated[
     ),
 ]
 _PAGE_EDITS = (".geojson", ".json")
-_MOST_LINES = 200
+_MOST_LINES = 200  # lines that a terminal shows
 
 
 def publish(

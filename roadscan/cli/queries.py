@@ -13,7 +13,7 @@ from roadscan.cli.terminal import print_table, print_whole
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_MOST_ROWS = 200
+_MOST_ROWS = 200  # rows that a terminal shows
 
 
 def sql(

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from roadscan.report.summary import LogSummary, Spread, SurveySummary, TilesSummary
     from roadscan.store.store import Store
 
-_MOST_REASONS = 10
-_MOST_FINDINGS = 20
-_WIDTH = 14
+_MOST_REASONS = 10  # reasons of rejects that are listed
+_MOST_FINDINGS = 20  # findings that are listed
+_WIDTH = 14  # least width of the first column (characters)
 
 
 def print_summary(survey: Survey, store: Store, *, as_json: bool = False, beside: dict[str, Any] | None = None) -> None:

@@ -56,7 +56,9 @@ LAS_CLASSES: Final = np.zeros(256, dtype=np.uint8)
 """Class in LAS (ASPRS LAS 1.4 R15, table 17) of points that are kept marked, by class of the reading: 7 low noise and
 18 high noise for unrealistic heights; of the classes free for users 64 too near, 65 too far, 66 off the centre line,
 67 above the surface, 68 scattered, 69 grazing, 70 off the carriageway, 71 overlapping."""
+# 7 low noise, 18 high noise; from 64 on free for users.
 LAS_CLASSES[[CLASS_TOO_LOW, CLASS_TOO_HIGH, CLASS_TOO_NEAR, CLASS_TOO_FAR, OFF_CENTRE_LINE]] = [7, 18, 64, 65, 66]
+# Free for users.
 LAS_CLASSES[[CLASS_ABOVE, CLASS_SCATTERED, CLASS_GRAZING, CLASS_OFF_ROAD, OVERLAPPING]] = [67, 68, 69, 70, 71]
 
 WITHHELD_FLAG: Final = 16

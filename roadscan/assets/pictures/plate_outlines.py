@@ -52,6 +52,7 @@ def _polygon(count: int, first_deg: float) -> Float64:
     return np.asarray((corners - (low + high) / 2) / (high - low))
 
 
+# Corners of plates, in shares of their width and height from the middle.
 _CORNERS: Final[Mapping[str, Float64]] = {
     "rectangle": np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]),
     "round": _polygon(_POINTS, 0.0),

@@ -35,10 +35,10 @@ Float64 = npt.NDArray[np.float64]
 TOLD: Final = pa.schema([("object", pa.string()), ("pictures", pa.string()), ("told", pa.string())])
 """What pictures show of objects: `told` contains columns of the kind as JSON."""
 FOLDER: Final = "products/asset_pictures"
-_JPEG_QUALITY: Final = 90
-_LEAST_MARGIN_PX: Final = 6.0
-_GREY_STEP: Final = 16
-_GREY_WITHIN: Final = 3
+_JPEG_QUALITY: Final = 90  # quality of cut-outs: writing on signs stays readable
+_LEAST_MARGIN_PX: Final = 6.0  # least margin around an object (pixels)
+_GREY_STEP: Final = 16  # each 16th pixel is looked at for colour
+_GREY_WITHIN: Final = 3  # largest difference of the channels of a grey picture (digital numbers): JPEG rounds
 
 
 def find_pictures(task: PictureTask) -> TaskResult:

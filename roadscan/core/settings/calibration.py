@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from roadscan.core.strict import Strict
 
+# Three σ: larger than 10 m or 10° says nothing.
 _Sigma3 = tuple[
     Annotated[float, Field(ge=0.0, le=10.0)],
     Annotated[float, Field(ge=0.0, le=10.0)],

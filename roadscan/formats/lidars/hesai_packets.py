@@ -60,7 +60,7 @@ _LARGEST_ANGLE_DEG: Final = 180.0  # an angle file with larger ones is none
 _SEQUENCE, _IMU, _SAFETY, _SIGNED, _CONFIDENCE = 0x01, 0x02, 0x04, 0x08, 0x10
 """Bits of the head's flags: what else the packet holds."""
 _POLYNOMIAL: Final = 0x04C1_1DB7  # of CRC-32/MPEG-2, most significant bit first
-_DATE: Final = ("date", "u1", (6,))
+_DATE: Final = ("date", "u1", (6,))  # year less 1900, month, day, hour, minute, second
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,7 @@ def _before(row: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(-k for k in row)
 
 
+# Firing times of an OT128 past the start of its block (ns).
 _OT128_OUTER: Final = (46_645, 34_067, 18_867, 6_289, 40_356, 27_778, 12_578, 0)
 _OT128_INNER: Final = (
     20_520, 16_549, 10_260, 16_549, 20_520, 3_971, 14_231, 7_942, 14_231, 7_942, 10_260, 1_653, 1_653, 3_971, 22_838,
@@ -268,7 +269,7 @@ def _fields(sequenced: bool, **at: int) -> dict[str, int]:
     return {name: offset for name, offset in at.items() if sequenced or name != "sequence"}
 
 
-_OLD_TAIL: Final = {"speed": 8, "stamp_us": 10, "mode": 14, "date": 16, "sequence": 22}
+_OLD_TAIL: Final = {"speed": 8, "stamp_us": 10, "mode": 14, "date": 16, "sequence": 22}  # offsets in the tail (bytes)
 
 
 def _pandar40p(payload: bytes) -> Layout | None:

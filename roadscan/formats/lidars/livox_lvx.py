@@ -24,7 +24,7 @@ from roadscan.core.toml_text import UNKNOWN
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
 
-_SIGNATURE: Final = b"livox_tech".ljust(16, b"\0")
+_SIGNATURE: Final = b"livox_tech".ljust(16, b"\0")  # first bytes of a file
 _MAGIC: Final = 0xAC0EA767  # behind signature and version
 _PUBLIC_BYTES: Final = 24  # bytes of signature, version and magic number
 _MOST_FRAME_BYTES: Final = 64 << 20  # larger frames are damage: 50 ms of ten sensors are 2 MB
@@ -64,7 +64,7 @@ def _angles(returns: int) -> np.dtype[Any]:
 _SPHERE: Final = np.dtype([("depth", "<u4"), ("zenith", "<u2"), ("azimuth", "<u2"), ("bright", "u1")])
 """Point of data type 1 of LVX; with a tag behind it, of data type 3."""
 _TAGGED_SPHERE: Final = np.dtype([*_SPHERE.descr, ("tag", "u1")])
-_IMU: Final = _Points(1, np.dtype("V24"), 0.0)
+_IMU: Final = _Points(1, np.dtype("V24"), 0.0)  # data type 6: skipped by its size
 _LVX: Final = {
     0: _Points(100, _xyz("i4", 1, tag=False), _MM),
     1: _Points(100, _SPHERE, 0.0),

@@ -70,9 +70,10 @@ class Profile(NamedTuple):
     returns: tuple[Return, ...]
 
 
+# Layouts of a return, as `Return` lists them: RNG15, RNG19, and the two of a dual profile.
 _NARROW: Final = Return(0, 15, 8, 2, -1)
-_WIDE: Final = Return(0, 19, 1, 4, 6)
-_FIRST, _SECOND = Return(0, 19, 1, 3, 8), Return(4, 19, 1, 7, 10)
+_WIDE: Final = Return(0, 19, 1, 4, 6)  # RNG19_RFL8_SIG16_NIR16
+_FIRST, _SECOND = Return(0, 19, 1, 3, 8), Return(4, 19, 1, 7, 10)  # RNG19_RFL8_SIG16_NIR16_DUAL
 PROFILES: Final = {
     LEGACY: Profile(12, (Return(0, 20, 1, 4, 6),)),
     "RNG19_RFL8_SIG16_NIR16": Profile(12, (_WIDE,)),

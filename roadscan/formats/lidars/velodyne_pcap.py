@@ -76,6 +76,7 @@ _FASTEST_DRIFT: Final = 6e-4
 """Largest rate between clocks: NTP moves a computer's clock by up to 500 ppm, and a quartz drifts by up to 100."""
 _LEAST_DRIFT_S: Final = 0.05  # smaller gains of the capture's clock are ignored
 _NAMES_IN_RIG_FILES: Final = ("HDL32", "VLP16", "HDL64", "VLP32", "VLS128", "PUCKHIRES")
+# Product codes of models that are not read.
 _OTHER_PRODUCTS: Final = {0x23: "VLP-32A/B", 0x24: "Puck Hi-Res", 0x31: "Velarray"}
 
 Source: TypeAlias = Callable[[Wanted], Iterator[Datagram | Reject]]

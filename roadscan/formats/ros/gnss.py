@@ -18,12 +18,12 @@ from roadscan.ingest.reading.poses import GeodeticPlacement
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 
 _NO_FIX: Final = -1  # status of sensor_msgs/NavSatStatus
-_FIX: Final = 0
-_SBAS: Final = 1
-_GBAS: Final = 2
+_FIX: Final = 0  # without augmentation
+_SBAS: Final = 1  # with augmentation from satellites
+_GBAS: Final = 2  # with augmentation from the ground
 _UNKNOWN: Final = -2  # status since ROS 2 Kilted: not yet known
 _NO_COVARIANCE: Final = 0  # kinds of covariances in sensor_msgs/NavSatFix
-_WHOLE_COVARIANCE: Final = 3
+_WHOLE_COVARIANCE: Final = 3  # COVARIANCE_TYPE_KNOWN
 
 
 class RosGnssOptions(TopicOptions):

@@ -19,15 +19,15 @@ from roadscan.ingest.reading.format import Reject
 MAGIC: Final = b"\x89MCAP0\r\n"
 
 _HEADER: Final = 1  # kinds of records
-_FOOTER: Final = 2
-_SCHEMA: Final = 3
-_CHANNEL: Final = 4
-_MESSAGE: Final = 5
-_CHUNK: Final = 6
-_MESSAGE_INDEX: Final = 7
-_CHUNK_INDEX: Final = 8
-_STATISTICS: Final = 11
-_DATA_END: Final = 15
+_FOOTER: Final = 2  # ends the file
+_SCHEMA: Final = 3  # a type of messages
+_CHANNEL: Final = 4  # a topic
+_MESSAGE: Final = 5  # outside chunks
+_CHUNK: Final = 6  # packed records
+_MESSAGE_INDEX: Final = 7  # of one topic in one chunk
+_CHUNK_INDEX: Final = 8  # in the summary
+_STATISTICS: Final = 11  # counts, in the summary
+_DATA_END: Final = 15  # before the summary
 _LAST_KIND: Final = 0x7F  # kinds from 0x80 on are private
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time

@@ -19,10 +19,10 @@ MAGIC: Final = b"#ROSBAG V2.0\n"
 OLDER: Final = b"#ROSBAG V"  # first bytes of bags of all versions
 
 _MESSAGE: Final = 2  # kinds of records, by their field `op`
-_INDEX: Final = 4
-_CHUNK: Final = 5
-_CHUNK_INFO: Final = 6
-_CONNECTION: Final = 7
+_INDEX: Final = 4  # of one connection in one chunk
+_CHUNK: Final = 5  # packed records
+_CHUNK_INFO: Final = 6  # at the file's end
+_CONNECTION: Final = 7  # a topic
 _MOST_HEADER_BYTES: Final = 1 << 20  # longer headers count as damage (bytes)
 _INDEX_ENTRY: Final = struct.Struct("<III")  # seconds, nanoseconds, offset in the chunk
 _LENGTH: Final = struct.Struct("<I")

@@ -31,6 +31,7 @@ _STYLES = (
 """Limits of good, fair and poor for IRI, rutting, cracking and faulting are those of 23 CFR 490.313 (IRI 95 and 170
 in/mi, rutting 0.20 and 0.40 in, cracking 5 and 20 %, faulting 0.10 and 0.15 in); the others only divide the colours."""
 
+# Lines of 6 pixels.
 _BY_TILE = (_ROUGHNESS, Style("Rut depth (mm)", 6, by="rut_depth_mean_mm", limits=_RUTS_MM))
 
 

@@ -38,6 +38,7 @@ BLOCK: Final = 512
 _SMALLEST_OVERVIEW: Final = 128  # overviews are made until the longer edge (pixels) is not larger than this
 _DEFLATE, _ZSTD = 8, 50000  # TIFF compression codes
 _NEW_SUBFILE, _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _PHOTOMETRIC = 254, 256, 257, 258, 259, 262  # TIFF tags
+# Further tags (TIFF 6.0, section 8).
 _SAMPLES, _PLANES, _SOFTWARE, _DATE, _PREDICTOR, _BLOCK_WIDTH, _BLOCK_HEIGHT = 277, 284, 305, 306, 317, 322, 323
 _EXTRA_SAMPLES, _SAMPLE_FORMAT, _PIXEL_SCALE, _TIE_POINT, _GDAL_METADATA, _GDAL_NODATA = (
     338, 339, 33550, 33922, 42112, 42113

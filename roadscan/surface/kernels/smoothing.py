@@ -13,6 +13,7 @@ from roadscan.compute.kernel_options import inner, kernel
 
 REACH = 4
 """Cells to each side on which a step depends: a filter and its transpose."""
+# Weights of the smoothing stencils, as float32: the kernel stays in single precision.
 _NONE, _TWELFTH, _SIXTEENTH, _FIFTY_SIXTH = (np.float32(v) for v in (0.0, 1.0 / 12.0, 1.0 / 16.0, 1.0 / 56.0))
 _TWO, _C1, _C2, _C3, _C4, _C5 = (np.float32(v) for v in (2.0, 1.0, 2.0, 3.0, 4.0, 5.0))  # as float32
 

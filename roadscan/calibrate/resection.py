@@ -43,7 +43,7 @@ _START_GATE: Final = 0.02
 _START_GATE_PX: Final = 8.0  # Least such distance, and the limit for outliers in RANSAC.
 _REACH: Final = 3.0
 """With the rig file's mounting measurements may lie off by this many of its σ."""
-_RANSAC_ROUNDS: Final = 500  # samples: with half of the points wrong, one in 32 of four is right
+_RANSAC_ROUNDS: Final = 500  # samples: with half of the points wrong, one of 16 samples of four is right
 _OUTLIER: Final = 4.0  # normalised residual from which a point is left out (σ)
 _OUTLIER_ROUNDS: Final = 10  # most rounds of leaving out points
 _WRONG_TURN_RAD: Final = np.radians(20.0)  # a found turn that differs more from the stated one contradicts it (rad)

@@ -184,6 +184,15 @@ def makers() -> dict[str, Callable[[Path], Log]]:
     }  # fmt: skip
 
 
+UNTIMED = frozenset({
+    "gpx", "hesai_pcap", "hesai_scans", "inertial_explorer", "livox_lvx", "novatel_bestpos", "novatel_ins",
+    "odm_gcp", "opensfm_gcp", "ouster_bag", "ouster_bag_imu", "ouster_imu", "ouster_pcap", "pcd", "pcd_cloud",
+    "pospac_text", "ppk", "qinertia", "ros_gnss", "ros_imu", "ros_livox", "ros_nmea", "ros_points", "ros_poses",
+    "velodyne_scans",
+})  # fmt: skip
+"""Formats that have no maker of logs here yet."""
+
+
 def moving(n: int) -> tuple[Float64, Float64, Float64]:
     """Stamp after the first (s), and a smooth course: metres east and north, (n,)."""
     t = np.arange(n) * 0.005

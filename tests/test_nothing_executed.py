@@ -16,9 +16,11 @@ from roadscan.cli import app
 
 FORBIDDEN_NAMES = {"eval", "exec", "execfile", "__import__"}
 FORBIDDEN_MODULES = {
-    "pickle", "cPickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "torch", "yaml", "code", "runpy",
+    "pickle", "cPickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "torch", "code", "runpy",
 }  # fmt: skip
-FORBIDDEN_CALLS = {"read_pickle", "to_pickle", "unpickle", "load_module", "exec_module", "fromfile_pickle"}
+FORBIDDEN_CALLS = {
+    "unsafe_load", "full_load", "read_pickle", "to_pickle", "unpickle", "load_module", "exec_module", "fromfile_pickle",
+}  # fmt: skip
 SOURCES = [file for package in (roadscan, flows) for file in sorted(Path(str(package.__file__)).parent.rglob("*.py"))]
 
 
@@ -38,6 +40,8 @@ def executes(tree: ast.AST) -> list[str]:
             pickles = [k for k in node.keywords if k.arg == "allow_pickle"]
             found += [f"{k.arg} at line {node.lineno}" for k in shells + pickles if getattr(k.value, "value", 1)]
             base = node.func.value if isinstance(node.func, ast.Attribute) else None
+            if isinstance(base, ast.Name) and base.id == "yaml" and name != "safe_load":
+                found.append(f"yaml.{name}")
             if name == "system" and isinstance(base, ast.Name) and base.id == "os":
                 found.append("os.system")
     return found
@@ -52,7 +56,8 @@ def test_no_source_unpickles_or_executes_data() -> None:
 @pytest.mark.parametrize(
     "line",
     ["import pickle", "from torch import load", "eval(text)", "np.load(f, allow_pickle=True)", "pd.read_pickle(f)",
-     "subprocess.run(text, shell=True)", "os.system(text)"],
+     "subprocess.run(text, shell=True)", "os.system(text)",
+     "yaml.load(text)"],
 )  # fmt: skip
 def test_the_search_finds_such_calls(line: str) -> None:
     assert executes(ast.parse(line))

@@ -26,10 +26,11 @@ PROBES: tuple[Any, ...] = (
 )  # fmt: skip
 """What TOML can hold, of every kind."""
 
+# "float" in a list of choices is a kind of GNSS solution.
 RAW = re.compile(
     r"[Ii]nput should|[Ss]tring should|List should|Tuple should|Value error|[Aa]ssertion|unable to parse|valid (number|"
     r"string|integer|boolean|list|dictionary|tuple|date|datetime|path)|match pattern|\^|\[A-Z|pydantic|"
-    r"instance of|NoneType|\bstr\b|\bint\b|\bfloat\b|\bdict\b|another kind of value|another form"
+    r"instance of|NoneType|\bstr\b|\bint\b|(?<!, )\bfloat\b|\bdict\b|another kind of value|another form"
 )
 
 

@@ -321,4 +321,4 @@ def test_other_files_say_what_to_do(faults: Path, tmp_path: Path) -> None:
     (tmp_path / "route.gpx").write_text('<?xml version="1.0"?><gpx><rte><rtept lat="1" lon="2"/></rte></gpx>')
     assert "no track point with a time" in words_of(tmp_path / "route.gpx")
     (tmp_path / "raw.ubx").write_bytes(b"\xb5\x62\x02\x15" + bytes(300))
-    assert "roadscan ppk" in words_of(tmp_path / "raw.ubx")
+    assert "raw GNSS observations (RINEX, UBX)" in words_of(tmp_path / "raw.ubx")

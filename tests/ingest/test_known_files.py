@@ -13,7 +13,6 @@ from tests.answers import roadscan
 
 # First bytes as their makers publish them
 FIRST_BYTES = {
-    "a.25o": (b"     2.10           OBSERVATION DATA    G (GPS)             RINEX VERSION / TYPE\n", "RINEX", "ppk"),
     "a.sbf": (b"$@\x1c\x35\xa7\x0f\x60\x00" + bytes(90), "Septentrio", "RINEX"),
     "span.log": (b"\xaa\x44\x12\x1c\x2a\x00" + bytes(200), "NovAtel", "novatel_ins"),
     "pos.000": (b"$GRP\x01\x00" + bytes(200), "Applanix", "SBET"),
@@ -54,11 +53,6 @@ def test_endings_tell(tmp_path: Path, name: str) -> None:
     maker, way = ENDINGS[name]
     said = words_of(tmp_path / name)
     assert maker in said and way in said and "which roadscan does not read" in said
-
-
-def test_recordings_of_receivers(recordings: Path) -> None:
-    for path in sorted((recordings / "rinex").glob("*.05?")):
-        assert "`roadscan ppk` computes positions of it" in words_of(path)
 
 
 def test_the_table_names_formats_that_are_read() -> None:

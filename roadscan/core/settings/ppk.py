@@ -7,11 +7,14 @@ from typing import Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.core.strict import Strict
+from roadscan.core.strict import Strict, pattern_in_words
 
 ANTENNA_HEIGHT_MAX_M: Final = 100.0
 """No antenna stands higher above its mark (m): a larger number is in another unit."""
 
+_SYSTEMS: Final = pattern_in_words(
+    "^[GREJC]+$", "letters of satellite systems: G GPS, R GLONASS, E Galileo, J QZSS, C BeiDou"
+)
 _GEOCENTRIC: Final = ("x_m", "y_m", "z_m")
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
 
@@ -87,7 +90,7 @@ class PpkSettings(Strict):
     """Type of the rover's antenna as `antenna_calibration` names it."""
     antenna_calibration: Path | None = None
     """Phase centres of antennas (ANTEX, or NGS with the ending .pcv), for different antennas on rover and base."""
-    systems: str = Field(default="GREJC", pattern="^[GREJC]+$")
+    systems: str = Field(default="GREJC", pattern=_SYSTEMS)
     """Satellite systems: G GPS, R GLONASS, E Galileo, J QZSS, C BeiDou."""
     frequencies: int = Field(default=2, ge=1, le=3)
     """Number of frequencies: 1 is L1/E1/B1, 2 adds L2/E5b/B2, 3 adds L5/E5a."""

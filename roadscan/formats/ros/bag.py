@@ -17,15 +17,15 @@ from typing import Any, Final, NamedTuple, Self
 from roadscan.core.errors import FormatError, nearest
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.formats.lidars.pcap import Datagram
-from roadscan.formats.ros.compression import ZSTD, unpack_file, unpacked
+from roadscan.formats.ros.containers.compression import ZSTD, unpack_file, unpacked
+from roadscan.formats.ros.containers.mcap_file import MAGIC as MCAP
+from roadscan.formats.ros.containers.mcap_file import McapFile
+from roadscan.formats.ros.containers.ros1_file import OLDER as ROS1
+from roadscan.formats.ros.containers.ros1_file import Ros1File
+from roadscan.formats.ros.containers.sqlite_file import MAGIC as SQLITE
+from roadscan.formats.ros.containers.sqlite_file import SqliteFile
+from roadscan.formats.ros.containers.storage import Connection, Container, Held
 from roadscan.formats.ros.definitions import Decode, decoder, type_name
-from roadscan.formats.ros.mcap_file import MAGIC as MCAP
-from roadscan.formats.ros.mcap_file import McapFile
-from roadscan.formats.ros.ros1_file import OLDER as ROS1
-from roadscan.formats.ros.ros1_file import Ros1File
-from roadscan.formats.ros.sqlite_file import MAGIC as SQLITE
-from roadscan.formats.ros.sqlite_file import SqliteFile
-from roadscan.formats.ros.storage import Connection, Container, Held
 from roadscan.ingest.reading.format import Reject
 
 METADATA: Final = "metadata.yaml"

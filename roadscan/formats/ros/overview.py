@@ -14,9 +14,9 @@ from roadscan.core.counted import counted
 from roadscan.core.frames import BODY_FROM_AXES, rotation_from_quaternion, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.formats.ros.bag import Bag, Topic, bag_files
-from roadscan.formats.ros.mcap_file import McapFile
-from roadscan.formats.ros.ros1_file import Ros1File
-from roadscan.formats.ros.sqlite_file import SqliteFile
+from roadscan.formats.ros.containers.mcap_file import McapFile
+from roadscan.formats.ros.containers.ros1_file import Ros1File
+from roadscan.formats.ros.containers.sqlite_file import SqliteFile
 from roadscan.ingest.reading.format import Contents, Part, Reject
 
 Float64 = npt.NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +51,8 @@ ORTHONORMAL_TOLERANCE: Final = 1e-3
 
 class PoseMatricesOptions(TextOptions):
     """Settings of `pose_matrices`."""
+
+    later: ClassVar[frozenset[str]] = TextOptions.later | {"frame", "times"}
 
     axes: str | None = None
     """Where x, y, z of the posed frame point on the vehicle, such as frd, flu or rfu. Has to be stated."""

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -73,6 +73,8 @@ BATCH_ROWS: Final = 65_536  # rows of a batch
 
 class PoseQuaternionsOptions(TextOptions):
     """Settings of `pose_quaternions`."""
+
+    later: ClassVar[frozenset[str]] = TextOptions.later | {"heading"}
 
     axes: str | None = None
     """Where x, y, z of the posed frame point on the vehicle, such as frd, flu or rfu. Has to be stated;

@@ -61,6 +61,8 @@ _NOT_CONTROL: Final = ("roll", "pitch", "heading", "qw", "r11", "gpstime", "time
 class ControlCsvOptions(TextOptions):
     """Settings of `control_csv`."""
 
+    later: ClassVar[frozenset[str]] = TextOptions.later | {"height_unit"}
+
     columns: dict[str, ColumnOption] = {}
     """Which column holds which quantity, where its name does not say so: name, code, role; longitude,
     latitude, or easting, northing; height; sigma_horizontal, sigma_height.

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from typing import BinaryIO, Final
 
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.formats.ros.compression import unpacked
-from roadscan.formats.ros.storage import BROKEN, Chunk, ChunkedContainer, Connection, Held, Raw, exactly
+from roadscan.formats.ros.containers.compression import unpacked
+from roadscan.formats.ros.containers.storage import BROKEN, Chunk, ChunkedContainer, Connection, Held, Raw, exactly
 from roadscan.ingest.reading.format import Reject
 
 MAGIC: Final = b"#ROSBAG V2.0\n"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from roadscan.core.extras import needed
-from roadscan.formats.ros.storage import MOST_CHUNK_BYTES
+from roadscan.formats.ros.containers.storage import MOST_CHUNK_BYTES
 
 WHAT: Final = "a compressed bag"  # as the error of a missing package names it
 ZSTD: Final = b"\x28\xb5\x2f\xfd"  # first bytes of a Zstandard frame (RFC 8878, 3.1.1)

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import BinaryIO, Final
 
-from roadscan.formats.ros.compression import unpacked
-from roadscan.formats.ros.storage import BROKEN, Chunk, ChunkedContainer, Connection, Held, Raw, exactly
+from roadscan.formats.ros.containers.compression import unpacked
+from roadscan.formats.ros.containers.storage import BROKEN, Chunk, ChunkedContainer, Connection, Held, Raw, exactly
 from roadscan.ingest.reading.format import Reject
 
 MAGIC: Final = b"\x89MCAP0\r\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -12,7 +11,7 @@ import numpy.typing as npt
 
 from roadscan.calibrate.estimator import Calibrated, Calibration, Figures
 from roadscan.calibrate.rotations import logarithm
-from roadscan.core.canvas import empty_figure
+from roadscan.core.canvas import empty_figure, save_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,12 +76,7 @@ def draw_calibration(path: Path, calibration: CalibrationPicture) -> None:
     _draw_changes(figure.add_subplot(grid[0, 0]), calibration, slice(0, 3), 1e3, "mm", _LEVER)
     _draw_changes(figure.add_subplot(grid[0, 1]), calibration, slice(3, 6), 180.0 / np.pi, "°", _ANGLES)
     _draw_residuals(figure.add_subplot(grid[1, :]), calibration)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        figure.savefig(part, format="png", metadata={"Software": None})
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    save_whole(figure, path)
 
 
 def _draw_changes(

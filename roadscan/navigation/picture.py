@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.canvas import empty_figure
+from roadscan.core.canvas import empty_figure, save_whole
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
@@ -94,12 +93,7 @@ def draw_navigation(path: Path, picture: NavigationPicture) -> None:
     _draw_residuals(panels[2], residuals, axis)
     _draw_innovations(panels[3], picture.solution.innovations, axis)
     _draw_odometer(panels[4], picture.solution, axis)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        figure.savefig(part, format="png", metadata={"Software": None})
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    save_whole(figure, path)
 
 
 def _axis(picture: NavigationPicture) -> _Axis:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.core.canvas import empty_figure
+from roadscan.core.canvas import empty_figure, save_whole
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.navigation.picture import OTHER_COLOUR, QUALITY_COLOURS
 
@@ -77,12 +76,7 @@ def draw_ppk(path: Path, picture: PpkPicture) -> None:
     _finish(ratio, "Ratio of the ambiguity test", "1")
     _draw_apart(apart, picture)
     apart.set_xlabel(f"s since {iso_from_gps_ns(picture.begin_gps_ns)[:23].rstrip('Z')} UTC", fontsize=8)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        figure.savefig(part, format="png", metadata={"Software": None})
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    save_whole(figure, path)
 
 
 def _summary(picture: PpkPicture) -> str:

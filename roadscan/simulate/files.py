@@ -17,8 +17,9 @@ from roadscan.simulate.earth import Earth
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.logs import SimulatedLog
 from roadscan.simulate.noise import stream
-from roadscan.simulate.scene import Camera, Mount, MountError, Scene
+from roadscan.simulate.scene import Camera, Mount, Scene
 from roadscan.simulate.sensors import sick
+from roadscan.simulate.sensors.gnss import antenna_mount
 from roadscan.simulate.sensors.imu import AT_BODY, head_imus
 from roadscan.simulate.sensors.lens import Lens
 from roadscan.simulate.sensors.profiler import Head, heads
@@ -86,9 +87,7 @@ def write_rig(scene: Scene, file: Path, *, nominal: bool = True) -> None:
         lines += _sensor(imu.name, "imu", "IMU of a profiler head", "frd", mounted(imu.mount))
         lines.append(_imu_errors(scene.profilers.head_imus or "perfect"))
     if scene.gnss.on:
-        error = MountError(lever_arm_body_m=scene.gnss.lever_arm_error_m)
-        mount = Mount(lever_arm_body_m=scene.gnss.lever_arm_body_m, error=error)
-        lines += _sensor("gnss", "gnss", "RTK receiver", "frd", mounted(mount))
+        lines += _sensor("gnss", "gnss", "RTK receiver", "frd", mounted(antenna_mount(scene)))
     if scene.encoder.on:
         mount = Mount(lever_arm_body_m=(-1.4, scene.encoder.side_m, scene.vehicle.imu_height_m))
         lines += _sensor("encoder", "encoder", "wheel encoder", "frd", mount)

@@ -148,7 +148,7 @@ class Pass:
         }
         listed = [(form, *one) for form, one in stated.items() if one[1]]
         for form, sensor, _, error, crs in listed:
-            clock = SensorClock.of(scene, error.model_copy(update={"system": None}), TimeSystem.UNIX_UTC)
+            clock = bag.bag_clock(scene, error)
 
             def write(is_first: bool = form == listed[0][0]) -> Iterator[int]:
                 yield from (

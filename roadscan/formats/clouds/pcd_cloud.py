@@ -13,7 +13,6 @@ from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.formats.clouds.las_crs import UNIT_M, LengthUnit
 from roadscan.formats.clouds.pcd_file import (
-    INTENSITIES,
     TIMES,
     PcdHeader,
     Points,
@@ -34,9 +33,9 @@ from roadscan.formats.clouds.reference_scan import (
     stated_epoch_gps_ns,
 )
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject
+from roadscan.ingest.reading.point_fields import AXES, INTENSITIES
 from roadscan.ingest.reading.records import Sieve, options_of
 
-_AXES: Final = ("x", "y", "z")
 _PACKED: Final = ("rgb", "rgba")  # names of a field of 32 bits with blue, green and red in its lowest bytes
 _COLOURS: Final = {"red": 16, "green": 8, "blue": 0}  # bits before each colour
 _FULL_BYTE: Final = 257  # scales 255 to 65,535
@@ -99,7 +98,7 @@ class PcdCloud(LogFormat):
                 "height": height,
                 "geoid": source.geoid.grid if source.geoid and height == "orthometric" else None,
                 "points": head.points,
-                "taken": [name for name in (*_AXES, *INTENSITIES, *_PACKED) if name in head.kinds],
+                "taken": [name for name in (*AXES, *INTENSITIES, *_PACKED) if name in head.kinds],
             }
         )
 
@@ -109,7 +108,7 @@ class PcdCloud(LogFormat):
         options, epoch, scale = _checked(head, source)
         intensity = _intensity(head) if options.intensity else None
         packed = next((name for name in _PACKED if head.kinds.get(name, "")[2:] == "4"), None)
-        for item in points(source.path, head, [*_AXES, *(name for name in (intensity, packed) if name)]):
+        for item in points(source.path, head, [*AXES, *(name for name in (intensity, packed) if name)]):
             if isinstance(item, Reject):
                 yield item
                 continue
@@ -133,7 +132,7 @@ def _checked(head: PcdHeader, source: LogSource) -> tuple[PcdCloudOptions, int, 
         where the file lacks coordinates, or something is not stated.
     """
     options, file = options_of(source, PcdCloudOptions), source.path
-    if lacking := [axis for axis in _AXES if axis not in head.kinds]:
+    if lacking := [axis for axis in AXES if axis not in head.kinds]:
         raise FormatError(f"the points have no field '{lacking[0]}'", expected="x, y and z", file=file)
     if options.unit is None:
         raise ConfigError(
@@ -160,7 +159,7 @@ def _checked(head: PcdHeader, source: LogSource) -> tuple[PcdCloudOptions, int, 
 
 def _present(part: Points) -> Points:
     """Return the points without those of an organised cloud where nothing was measured: their coordinates are NaN."""
-    kept = np.flatnonzero(~np.any([np.isnan(part.columns[axis]) for axis in _AXES], axis=0))
+    kept = np.flatnonzero(~np.any([np.isnan(part.columns[axis]) for axis in AXES], axis=0))
     columns = {name: values[kept] for name, values in part.columns.items()}
     return Points(columns, part.records[kept], part.offsets[kept])
 
@@ -172,7 +171,7 @@ def _intensity(head: PcdHeader) -> str | None:
 def _columns(part: Points, options: PcdCloudOptions, epoch_gps_ns: int) -> Columns:
     """Return coordinates, epoch and number of the scan, (n,) each."""
     columns: Columns = {}
-    for axis, shift in zip(_AXES, options.shift, strict=True):
+    for axis, shift in zip(AXES, options.shift, strict=True):
         with np.errstate(invalid="ignore", over="ignore"):  # damaged coordinates are dropped
             columns[f"{axis}_m"] = (part.columns[axis].astype(np.float64) + shift) * UNIT_M[options.unit or "metre"]
     columns["epoch_gps_ns"] = np.full(part.records.size, epoch_gps_ns, np.int64)

@@ -24,8 +24,6 @@ Int64 = npt.NDArray[np.int64]
 
 TIMES: Final = ("t", "time", "timestamp", "time_stamp", "offset_time", "gps_time", "point_time", "time_offset")
 """Names by which a field with times of points is known."""
-INTENSITIES: Final = ("intensity", "intensities", "reflectivity", "signal")
-"""Names of a field with the intensity."""
 
 _HEADER_BYTES_MAX: Final = 1 << 16  # bytes in which the header has to end
 _RECORD_BYTES_MAX: Final = 1 << 16  # bytes of a point; more is damage

@@ -25,6 +25,7 @@ import pyarrow as pa
 
 from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.toml_text import toml
+from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.arrow_batches import unlisted_batches, unlisted_reason
 from roadscan.ingest.reading.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve
@@ -184,17 +185,14 @@ def _chunk(batch: pa.RecordBatch, stamp_gps_ns: int, number: int, name: str, fir
     offset = offset[good]
     if not offset.size:
         return
-    columns: dict[str, npt.NDArray[Any]] = {
-        "epoch_gps_ns": stamp_gps_ns + offset,
-        "pose_epoch_gps_ns": np.full(offset.size, stamp_gps_ns, dtype=np.int64),
-        "x_sensor_m": xyz[0, good],
-        "y_sensor_m": xyz[1, good],
-        "z_sensor_m": xyz[2, good],
-        "intensity": intensity[good].astype(np.uint16) * np.uint16(_EIGHT_TO_SIXTEEN_BITS),
-        "laser": laser[good].astype(np.uint8),
-        "sweep": np.full(offset.size, number, dtype=np.int32),
-    }
-    rows = pa.RecordBatch.from_pydict({k: pa.array(v) for k, v in columns.items()})
+    rows = returns_batch(
+        stamp_gps_ns + offset,
+        list(xyz[:, good]),
+        intensity[good].astype(np.uint16) * np.uint16(_EIGHT_TO_SIXTEEN_BITS),
+        laser[good].astype(np.uint8),
+        np.full(offset.size, number, dtype=np.int32),
+        np.full(offset.size, stamp_gps_ns, dtype=np.int64),
+    )
     yield Rows("returns", rows, name, int(records[np.argmax(sieve.good)]))
 
 

@@ -30,13 +30,14 @@ import csv
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.core.errors import ConfigError
+from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, steps, waits_ns
 
 Bool: TypeAlias = npt.NDArray[np.bool_]
@@ -499,17 +500,13 @@ def decode(
         waits = waits_ns(raw["block"]["azimuth"], odd, rate, model.cycle_ns)
         epoch += (waits if model.forward else waits - waits[:, -1:])[:, :, None]
     epoch = epoch.reshape(-1)[rows]
-    columns: dict[str, npt.NDArray[Any]] = {
-        "epoch_gps_ns": epoch,
-        "pose_epoch_gps_ns": epoch,
-        "x_sensor_m": x.reshape(-1)[rows],
-        "y_sensor_m": y.reshape(-1)[rows],
-        "z_sensor_m": z.reshape(-1)[rows],
-        "intensity": reflectivity.reshape(-1)[rows] * _EIGHT_TO_SIXTEEN_BITS,
-        "laser": np.broadcast_to(np.arange(model.channels, dtype=np.uint8), distance.shape).reshape(-1)[rows],
-        "sweep": np.broadcast_to(sweeps[:, :, None], distance.shape).reshape(-1)[rows],
-    }
-    return pa.RecordBatch.from_pydict({k: pa.array(v) for k, v in columns.items()})
+    return returns_batch(
+        epoch,
+        [one.reshape(-1)[rows] for one in (x, y, z)],
+        reflectivity.reshape(-1)[rows] * _EIGHT_TO_SIXTEEN_BITS,
+        np.broadcast_to(np.arange(model.channels, dtype=np.uint8), distance.shape).reshape(-1)[rows],
+        np.broadcast_to(sweeps[:, :, None], distance.shape).reshape(-1)[rows],
+    )
 
 
 def _positions(

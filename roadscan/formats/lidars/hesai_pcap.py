@@ -54,7 +54,7 @@ from roadscan.formats.lidars.hesai_packets import (
     odd_steps,
     posix_us,
 )
-from roadscan.formats.lidars.pcap import MAGICS, PCAPNG, Datagram, Wanted, datagrams
+from roadscan.formats.lidars.pcap import MAGICS, PCAPNG, Datagram, Wanted, batches, datagrams
 from roadscan.formats.lidars.view_gaps import TURN, Gap, gap_of, mean_rate
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
@@ -193,17 +193,8 @@ class HesaiPcap(LogFormat):
         epochs = EpochReader(clock, source.path)
         decoder = _Decoder(layout, geometry, epochs, known.first, known.checksum, known.gap)
         chunk = max(1, _CHUNK_SLOTS // (layout.blocks * model.channels))
-        packets: list[Datagram] = []
-        for item in self.packets(source)(layout.packet.itemsize, at["sender"]):
-            if isinstance(item, Reject):
-                yield item
-                continue
-            packets.append(item)
-            if len(packets) == chunk:
-                yield from decoder.items(packets)
-                packets = []
-        if packets:
-            yield from decoder.items(packets)
+        for packets in batches(self.packets(source)(layout.packet.itemsize, at["sender"]), chunk):
+            yield from (packets,) if isinstance(packets, Reject) else decoder.items(packets)
         yield from decoder.findings()
 
 

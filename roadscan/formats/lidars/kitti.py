@@ -30,12 +30,12 @@ from typing import ClassVar, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 from pydantic import Field
 
 from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
 from roadscan.core.strict import Strict
+from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import Sieve, options_of
 
@@ -161,17 +161,14 @@ class _Sweep:
         if turn_ns:
             turned = np.arctan2(y.astype(np.float64), x) * (turn_ns / (2 * np.pi))
             epochs = pose_epochs = pose_epochs + np.rint(turned).astype(np.int64)
-        columns = {
-            "epoch_gps_ns": epochs,
-            "pose_epoch_gps_ns": pose_epochs,
-            "x_sensor_m": np.ascontiguousarray(x),
-            "y_sensor_m": np.ascontiguousarray(y),
-            "z_sensor_m": np.ascontiguousarray(z),
-            "intensity": np.rint(intensity * np.float32(65_535)).astype(np.uint16),
-            "laser": np.zeros(len(kept), dtype=np.uint8),
-            "sweep": np.full(len(kept), self.number, dtype=np.int32),
-        }
-        batch = pa.RecordBatch.from_pydict({k: pa.array(v) for k, v in columns.items()})
+        batch = returns_batch(
+            epochs,
+            (x, y, z),
+            np.rint(intensity * np.float32(65_535)).astype(np.uint16),
+            np.zeros(len(kept), dtype=np.uint8),
+            np.full(len(kept), self.number, dtype=np.int32),
+            pose_epochs,
+        )
         start = int(records[np.argmax(sieve.good)])
         yield Rows("returns", batch, self.name, start, start * RECORD_BYTES, RECORD_BYTES)
 

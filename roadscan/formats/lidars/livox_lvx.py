@@ -15,12 +15,12 @@ from typing import Any, BinaryIO, ClassVar, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 
 from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem
 from roadscan.core.strict import Strict
 from roadscan.core.toml_text import UNKNOWN
+from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
 
@@ -81,7 +81,6 @@ _LVX_1_0: Final = {0: _Points(100, _xyz("f4", 1, tag=False), _M)}
 """Points of LVX 1.0: metres in single precision."""
 _LVX2: Final = {1: _Points(0, _xyz("i4", 1, tag=True), _MM), 2: _Points(0, _xyz("i2", 1, tag=True), _CM)}
 """Points by data type (LVX2 specifications)."""
-_IMU_TYPE: Final = 6  # data type of IMU readings in LVX
 
 _DEVICES: Final = {
     1: "Mid-40 or Mid-100", 2: "Tele-15", 3: "Horizon", 6: "Mid-70", 7: "Avia", 9: "Mid-360", 10: "HAP", 15: "HAP",
@@ -469,15 +468,13 @@ def _rows(packages: list[_Package], epoch: npt.NDArray[np.int64], points: _Point
         return
     when = epoch[package] + np.rint(pulse * pulse_ns).astype(np.int64)
     own = package[kept[0]]
-    columns: dict[str, npt.NDArray[Any]] = {
-        "epoch_gps_ns": when[kept[0]],
-        "pose_epoch_gps_ns": when[kept[0]],
-        **{f"{axis}_sensor_m": values[kept] for axis, values in zip("xyz", xyz, strict=True)},
-        "intensity": bright[kept].astype(np.uint16) * np.uint16(_FULL_BYTE),
-        "laser": np.zeros(own.size, np.uint8),
-        "sweep": np.array([p.sweep for p in packages], dtype=np.int32)[own],
-    }
-    batch = pa.RecordBatch.from_pydict({name: pa.array(values) for name, values in columns.items()})
+    batch = returns_batch(
+        when[kept[0]],
+        [values[kept] for values in xyz],
+        bright[kept].astype(np.uint16) * np.uint16(_FULL_BYTE),
+        np.zeros(own.size, np.uint8),
+        np.array([p.sweep for p in packages], dtype=np.int32)[own],
+    )
     numbers = np.array([p.number for p in packages])[own]
     yield Rows("returns", batch, first_record=int(numbers[0]), records=numbers)
 

@@ -33,6 +33,7 @@ from roadscan.core.witness import Finding, Witness
 from roadscan.formats.lidars.kernels.ouster import Layout, Optics, Returns, checksum_tables, checksums, decode
 from roadscan.formats.lidars.ouster_metadata import LEGACY, PROFILES, OusterMetadata
 from roadscan.formats.lidars.pcap import Datagram
+from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.format import Item, LogSource, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects
 
@@ -501,8 +502,10 @@ def _room(size: int) -> Returns:
 
 
 def _batch(room: Returns, count: int) -> pa.RecordBatch:
-    columns: dict[str, npt.NDArray[Any]] = {name: values[:count] for name, values in room._asdict().items()}
-    names = {f"{axis}_m": f"{axis}_sensor_m" for axis in "xyz"}
-    named = {names.get(name, name): values for name, values in columns.items()}
-    named["pose_epoch_gps_ns"] = named["epoch_gps_ns"]
-    return pa.RecordBatch.from_pydict({name: pa.array(values) for name, values in named.items()})
+    return returns_batch(
+        room.epoch_gps_ns[:count],
+        [one[:count] for one in (room.x_m, room.y_m, room.z_m)],
+        room.intensity[:count],
+        room.laser[:count],
+        room.sweep[:count],
+    )

@@ -25,7 +25,7 @@ from roadscan.formats.lidars.ouster_packets import (
     sensor_clock,
     serial_of,
 )
-from roadscan.formats.lidars.pcap import Datagram, datagrams_of_sizes
+from roadscan.formats.lidars.pcap import Datagram, batches, datagrams_of_sizes
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, beside
 from roadscan.ingest.reading.records import options_of
 
@@ -116,16 +116,8 @@ class OusterPcap(LogFormat):
 
 def decoded(found: Iterator[Datagram | Reject], decoder: OusterDecoder) -> Iterator[Item]:
     """Yield rows, rejects and findings of lidar packets."""
-    packets: list[Datagram] = []
-    for item in found:
-        if isinstance(item, Reject):
-            yield item
-            continue
-        packets.append(item)
-        if len(packets) == decoder.chunk_packets:
-            yield from decoder.items(packets)
-            packets = []
-    yield from decoder.items(packets)
+    for packets in batches(found, decoder.chunk_packets):
+        yield from (packets,) if isinstance(packets, Reject) else decoder.items(packets)
     yield from decoder.findings()
 
 

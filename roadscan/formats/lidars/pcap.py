@@ -7,7 +7,7 @@ reading goes on at the next record that looks like one of the sensor's data pack
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, TypeAlias
@@ -55,6 +55,21 @@ class Datagram(NamedTuple):
     port: int
     """Port to which it was sent."""
     payload: bytes
+
+
+def batches(items: Iterable[Datagram | Reject], size: int) -> Iterator[list[Datagram] | Reject]:
+    """Yield lists of `size` packets, the last one shorter, and rejects where they stand between them."""
+    held: list[Datagram] = []
+    for item in items:
+        if isinstance(item, Reject):
+            yield item
+            continue
+        held.append(item)
+        if len(held) == size:
+            yield held
+            held = []
+    if held:
+        yield held
 
 
 _Record: TypeAlias = tuple[int, int, int, bytes]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -11,13 +11,11 @@ from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 
-from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
+from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import UNIT_NS, Clock
 from roadscan.core.strict import Strict
 from roadscan.formats.clouds.pcd_file import (
-    INTENSITIES,
     TIMES,
     PcdHeader,
     Points,
@@ -28,13 +26,13 @@ from roadscan.formats.clouds.pcd_file import (
     sixteen_bits,
 )
 from roadscan.formats.clouds.reference_scan import Brightness
+from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
+from roadscan.ingest.reading.point_fields import AXES, INTENSITIES, LASERS, field_named
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
 
-_LASERS: Final = ("ring", "channel", "line", "laser_id", "laser")  # names of a field with the laser's number
-_AXES: Final = ("x", "y", "z")
 _FARTHEST_M: Final = 10_000.0  # farther positions count as damage
-_MOST_LASERS: Final = 255  # greatest number of a laser
+_MOSTLASERS: Final = 255  # greatest number of a laser
 _LATEST_NS: Final = 10_000_000_000  # points measured longer before or after a sweep's stamp count as damage
 _MOST_COMMON: Final = 0.5  # share of a sweep's time that the next one may have in common
 _LOOKED_AT: Final = 2  # files whose times are compared
@@ -131,7 +129,7 @@ def kinds_of(path: Path) -> Mapping[str, str]:
         kinds = read_header(files[0]).kinds if files and is_pcd(files[0]) else {}
     except (FormatError, OSError):
         return {}
-    return kinds if set(_AXES) <= kinds.keys() else {}
+    return kinds if set(AXES) <= kinds.keys() else {}
 
 
 def pcd_files(path: Path) -> list[Path]:
@@ -167,9 +165,9 @@ class _Plan:
         """
         options = options_of(source, PcdOptions)
         kinds, file = head.kinds, source.path
-        if lacking := [axis for axis in _AXES if axis not in kinds]:
+        if lacking := [axis for axis in AXES if axis not in kinds]:
             raise FormatError(f"the points have no field '{lacking[0]}'", expected="x, y, z in metres", file=file)
-        time = _field(options.time_field, "time_field", TIMES, kinds, file)
+        time = field_named(options.time_field, "time_field", TIMES, kinds, file)
         if time is None:
             raise FormatError(
                 "the points have no time, among their fields " + ", ".join(kinds),
@@ -178,7 +176,7 @@ class _Plan:
                 file=file,
                 missing=Missing("options.time_field", choices=tuple(kinds)),
             )
-        intensity = _field(options.intensity_field, "intensity_field", INTENSITIES, kinds, file)
+        intensity = field_named(options.intensity_field, "intensity_field", INTENSITIES, kinds, file)
         used = intensity if options.intensity else None
         scale = None if used is None else scale_of(used, kinds[used], options.intensity_range, file)
         clock = source.need_clock("unix_utc", unit="s")
@@ -196,13 +194,13 @@ class _Plan:
                 file=file,
                 missing=Missing("options.time_from", "file_name", ("file_name",)),
             )
-        laser = _field(options.laser_field, "laser_field", _LASERS, kinds, file)
+        laser = field_named(options.laser_field, "laser_field", LASERS, kinds, file)
         return cls(tuple(kinds), time, laser, used, scale, options, clock)
 
     @property
     def names(self) -> list[str]:
         """Return the fields that are read."""
-        return [*_AXES, self.time, *(name for name in (self.laser, self.intensity) if name is not None)]
+        return [*AXES, self.time, *(name for name in (self.laser, self.intensity) if name is not None)]
 
     def stamp_ns(self, file: Path) -> int:
         """Return the stamp (ns of the clock's count) that is the file's name; 0 where times do not count from it.
@@ -238,7 +236,7 @@ class _Plan:
 def _items(part: Points, plan: _Plan, stamp_ns: int, sweep: int, epochs: EpochReader) -> Iterator[Item]:
     """Yield rejects, then rows of the sound points that are returns."""
     with np.errstate(invalid="ignore", over="ignore"):
-        xyz = [part.columns[axis].astype(np.float32) for axis in _AXES]
+        xyz = [part.columns[axis].astype(np.float32) for axis in AXES]
         farthest = np.max(np.abs(xyz), axis=0)  # NaN where one of them is
     returned = np.flatnonzero(farthest > 0.0)  # neither 0, 0, 0 nor NaN
     if not returned.size:
@@ -249,24 +247,23 @@ def _items(part: Points, plan: _Plan, stamp_ns: int, sweep: int, epochs: EpochRe
     sieve.drop(~(farthest[returned] <= _FARTHEST_M), "the position is beyond 10 km")
     with np.errstate(invalid="ignore"):
         laser = np.zeros(returned.size) if plan.laser is None else own[plan.laser].astype(np.float64)
-    sieve.drop(~((laser >= 0) & (laser <= _MOST_LASERS)), "the laser's number is outside 0 to 255")
+    sieve.drop(~((laser >= 0) & (laser <= _MOSTLASERS)), "the laser's number is outside 0 to 255")
     stamps = plan.counted(own[plan.time], stamp_ns, sieve)
     epoch = epochs.epochs(stamps, sieve, records) if sieve.good.any() else np.zeros(returned.size, np.int64)
     yield from few_rejects(list(sieve.rejects(records, offsets)))
     good = np.flatnonzero(sieve.good)
     if not good.size:
         return
-    columns: dict[str, npt.NDArray[Any]] = {
-        "epoch_gps_ns": epoch[good],
-        "pose_epoch_gps_ns": epoch[good],
-        **{f"{axis}_sensor_m": xyz[k][returned][good] for k, axis in enumerate(_AXES)},
-        "intensity": np.zeros(good.size, np.uint16),
-        "laser": laser[good].astype(np.uint8),
-        "sweep": np.full(good.size, sweep, np.int32),
-    }
+    bright = np.zeros(good.size, np.uint16)
     if plan.intensity is not None:
-        columns["intensity"] = sixteen_bits(own[plan.intensity][good], plan.brightness)
-    batch = pa.RecordBatch.from_pydict({name: pa.array(values) for name, values in columns.items()})
+        bright = sixteen_bits(own[plan.intensity][good], plan.brightness)
+    batch = returns_batch(
+        epoch[good],
+        [one[returned][good] for one in xyz],
+        bright,
+        laser[good].astype(np.uint8),
+        np.full(good.size, sweep, np.int32),
+    )
     yield Rows("returns", batch, first_record=int(records[good][0]), records=records[good])
 
 
@@ -312,16 +309,3 @@ def _check_order(files: Sequence[Path], plan: _Plan, source: LogSource) -> None:
             file=source.path,
             missing=Missing("options.time_from", "file_name", ("file_name",)),
         )
-
-
-def _field(stated: str | None, option: str, usual: tuple[str, ...], names: Collection[str], file: Path) -> str | None:
-    """Return a field's name, as stated or one of the usual ones; None where there is none."""
-    if stated is None:
-        return next((name for name in usual if name in names), None)
-    if stated not in names:
-        raise ConfigError(
-            f"options.{option} = '{stated}'{nearest(stated, names)}: the points have no such field",
-            expected="one of: " + ", ".join(names),
-            file=file,
-        )
-    return stated

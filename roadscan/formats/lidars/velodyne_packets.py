@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +38,7 @@ import yaml
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
+from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, mean_rate, steps, waits_ns
 
 Bool = npt.NDArray[np.bool_]
@@ -313,17 +314,13 @@ def decode(
         rate = mean_rate(blocks["azimuth"], epochs)
         epoch += waits_ns(blocks["azimuth"], odd, rate, max(1, SLOTS // model.lasers) * model.cycle_ns)[:, :, None]
     epoch = epoch.reshape(-1)[rows]
-    columns: dict[str, npt.NDArray[Any]] = {
-        "epoch_gps_ns": epoch,
-        "pose_epoch_gps_ns": epoch,
-        "x_sensor_m": x.reshape(-1)[rows],
-        "y_sensor_m": y.reshape(-1)[rows],
-        "z_sensor_m": z.reshape(-1)[rows],
-        "intensity": reflectivity.reshape(-1)[rows] * _EIGHT_TO_SIXTEEN_BITS,
-        "laser": np.broadcast_to(lasers, shape).reshape(-1)[rows],
-        "sweep": np.broadcast_to(sweeps[:, : shape[1], None], shape).reshape(-1)[rows],
-    }
-    return pa.RecordBatch.from_pydict({k: pa.array(v) for k, v in columns.items()})
+    return returns_batch(
+        epoch,
+        [one.reshape(-1)[rows] for one in (x, y, z)],
+        reflectivity.reshape(-1)[rows] * _EIGHT_TO_SIXTEEN_BITS,
+        np.broadcast_to(lasers, shape).reshape(-1)[rows],
+        np.broadcast_to(sweeps[:, : shape[1], None], shape).reshape(-1)[rows],
+    )
 
 
 def _positions(

@@ -17,7 +17,7 @@ from roadscan.core.strict import Strict
 from roadscan.formats.lidars.ouster_metadata import IMU_SAMPLES, LEGACY, OusterMetadata
 from roadscan.formats.lidars.ouster_packets import joined, sensor_clock, serials
 from roadscan.formats.lidars.ouster_pcap import chosen, has_lidar_packet, stated_metadata
-from roadscan.formats.lidars.pcap import Datagram, datagrams_of_sizes
+from roadscan.formats.lidars.pcap import Datagram, batches, datagrams_of_sizes
 from roadscan.formats.motion.imu_csv import FORCE_MAX_M_PER_S2, RATE_MAX_RAD_PER_S
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
@@ -145,17 +145,8 @@ def imu_packet_bytes(metadata: OusterMetadata, path: Path) -> int:
 
 def imu_items(found: Iterator[Datagram | Reject], metadata: OusterMetadata, epochs: EpochReader) -> Iterator[Item]:
     """Yield rows of ``imu`` and rejects of IMU packets of one length."""
-    packets: list[Datagram] = []
-    for item in found:
-        if isinstance(item, Reject):
-            yield item
-            continue
-        packets.append(item)
-        if len(packets) == _CHUNK_PACKETS:
-            yield from _items(packets, metadata, epochs)
-            packets = []
-    if packets:
-        yield from _items(packets, metadata, epochs)
+    for packets in batches(found, _CHUNK_PACKETS):
+        yield from (packets,) if isinstance(packets, Reject) else _items(packets, metadata, epochs)
 
 
 def _items(packets: Sequence[Datagram], metadata: OusterMetadata, epochs: EpochReader) -> Iterator[Item]:

@@ -22,7 +22,6 @@ _EPOCH: Final = re.compile(
 )
 """Line of an epoch with observations: RINEX 3 begins it with ">" and four digits of the year, RINEX 2 with two."""
 _BLOCK_BYTES: Final = 4 << 20  # bytes that are read at once
-_LINE_BYTES: Final = 80  # an epoch line's time is in fewer
 _TWO_DIGITS: Final = 80  # years 80 to 99 of RINEX 2 are of the 20th century
 
 

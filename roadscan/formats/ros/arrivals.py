@@ -29,9 +29,8 @@ _STEP_NS: Final = 50_000_000
 10 s, and at 20 m/s it is 1 m."""
 _DRIFT_NS: Final = 20_000_000
 """Change of the least latency over the log that is named a drift (ns), where no step explains it."""
-_EARLY_NS: Final = (
-    2_000_000  # a message that was received so long before its stamp (ns) is named: clocks of NTP agree better
-)
+_EARLY_NS: Final = 2_000_000
+"""A message that was received so long before its stamp (ns) is named: clocks of NTP agree better."""
 _LATE_NS: Final = 2 * NS_PER_S  # a least latency of so much (ns) is named
 _SAME_SCALE_NS: Final = NS_PER_S // 2  # an offset so near to one of two scales is taken for it (ns)
 _OWN_COUNT_NS: Final = 86_400 * NS_PER_S  # stamps farther apart count from another origin, such as power-on

@@ -29,16 +29,6 @@ from roadscan.formats.ros.definitions import Decode, decoder, type_name
 from roadscan.ingest.reading.format import Reject
 
 METADATA: Final = "metadata.yaml"
-PACKETS: Final = (
-    "velodyne_msgs/msg/VelodyneScan",
-    "pandar_msgs/msg/PandarScan",
-    "hesai_lidar/msg/PandarScan",
-    "nebula_msgs/msg/NebulaPackets",
-    "ouster_ros/msg/PacketMsg",
-    "ouster_msgs/msg/PacketMsg",
-    "ouster_sensor_msgs/msg/PacketMsg",
-)
-"""Types whose messages are a lidar's packets as it sent them."""
 
 _CONTAINERS: Final[tuple[tuple[bytes, type[Container]], ...]] = (
     (ROS1, Ros1File),

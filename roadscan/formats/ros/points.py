@@ -10,20 +10,18 @@ from typing import Any, ClassVar, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.errors import ConfigError, FormatError, Missing, nearest
+from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.formats.ros.bag import Bag, Topic, stamp_ns
 from roadscan.formats.ros.point_times import FIELDS, Origin, PointTimes, Sample, found
 from roadscan.formats.ros.return_rows import INTENSITY_MAX, ReturnRows
 from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
+from roadscan.ingest.reading.point_fields import AXES, INTENSITIES, LASERS, field_named
 from roadscan.ingest.reading.records import options_of
 
 _TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Number types of sensor_msgs/PointField by its constants."""
-_AXES: Final = ("x", "y", "z")
-_LASERS: Final = ("ring", "channel", "line", "laser_id", "laser")  # names of a field with the laser's number
-_INTENSITIES: Final = ("intensity", "intensities", "reflectivity", "signal")  # names of a field with the intensity
 _LOOKED_AT: Final = 8  # messages from which units are found
 _MAP_FRAMES: Final = ("map", "odom", "world", "earth", "utm")
 """Frames that are not of a sensor: a cloud in one of them was placed by another program already (REP 105)."""
@@ -101,7 +99,7 @@ class RosPoints(TopicFormat):
                     own_ns = item.stamp_ns if options.stamps == "header" else stamp_ns(item.content.header.stamp)
                     offsets_ns = plan.times.offsets_ns(cloud[plan.times.field], own_ns)
                 yield from rows.items(
-                    message, item.stamp_ns, [cloud[axis] for axis in _AXES], offsets_ns,
+                    message, item.stamp_ns, [cloud[axis] for axis in AXES], offsets_ns,
                     plan.intensity(cloud), None if plan.laser is None else cloud[plan.laser],
                 )  # fmt: skip
 
@@ -119,7 +117,7 @@ class _Plan:
     def check(self, cloud: npt.NDArray[np.void]) -> None:
         """Raise ValueError where a field that is read is missing."""
         names = cloud.dtype.names or ()
-        wanted = (*_AXES, self.laser, self.brightness, None if self.times is None else self.times.field)
+        wanted = (*AXES, self.laser, self.brightness, None if self.times is None else self.times.field)
         missing = [name for name in wanted if name is not None and name not in names]
         if missing:
             raise ValueError(f"the cloud has no field '{missing[0]}', as the first one has")
@@ -150,16 +148,16 @@ def _plan(source: LogSource, bag: Bag, topic: Topic) -> _Plan:
             file=source.path,
         )
     names = cloud.dtype.names or ()
-    if missing := [axis for axis in _AXES if axis not in names]:
+    if missing := [axis for axis in AXES if axis not in names]:
         raise FormatError(f"the clouds have no field '{missing[0]}'", expected="x, y, z in metres", file=source.path)
-    brightness = _field(options.intensity_field, "intensity_field", _INTENSITIES, names, source)
+    brightness = field_named(options.intensity_field, "intensity_field", INTENSITIES, names, source.path)
     full = options.intensity_full
     if brightness is not None and full is None:
         full = _full(np.concatenate([one[brightness].astype(np.float64) for _, one in first]), brightness, source)
     return _Plan(
         fields=names,
         times=_times(options, first, names, source),
-        laser=_field(options.laser_field, "laser_field", _LASERS, names, source),
+        laser=field_named(options.laser_field, "laser_field", LASERS, names, source.path),
         brightness=brightness,
         intensity_full=full,
     )
@@ -177,26 +175,11 @@ def _first_clouds(bag: Bag, topic: Topic) -> Iterator[tuple[Any, npt.NDArray[np.
             yield item[1], cloud
 
 
-def _field(
-    stated: str | None, option: str, usual: tuple[str, ...], names: tuple[str, ...], source: LogSource
-) -> str | None:
-    """Return a field's name, as stated or one of the usual ones; None where there is none."""
-    if stated is None:
-        return next((name for name in usual if name in names), None)
-    if stated not in names:
-        raise ConfigError(
-            f"options.{option} = '{stated}'{nearest(stated, names)}: the clouds have no such field",
-            expected="one of: " + ", ".join(names),
-            file=source.path,
-        )
-    return stated
-
-
 def _times(
     options: RosPointsOptions, first: list[tuple[Any, npt.NDArray[np.void]]], names: tuple[str, ...], source: LogSource
 ) -> PointTimes | None:
     """Return how the points' times are written; None where options say that there are none."""
-    name = _field(options.time_field, "time_field", FIELDS, names, source)
+    name = field_named(options.time_field, "time_field", FIELDS, names, source.path)
     if name is None or (options.untimed is not None and options.time_field is None):
         if options.untimed is None:
             raise ConfigError(
@@ -210,7 +193,7 @@ def _times(
         return None
     samples = []
     for content, cloud in first:
-        place = np.abs([cloud[axis] for axis in _AXES]).max(axis=0)
+        place = np.abs([cloud[axis] for axis in AXES]).max(axis=0)
         values = cloud[name].astype(np.float64)[place > 0.0]  # what is no return may have any time
         values = values[np.isfinite(values)]
         if values.size:

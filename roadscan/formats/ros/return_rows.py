@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 
+from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.formats.ros.bag import Message
 from roadscan.formats.ros.topics import message_clock
 from roadscan.ingest.reading.format import Item, LogSource, Rows
@@ -101,19 +101,18 @@ class ReturnRows:
             if late is None
             else stamps + (late if self._rate == 1.0 else np.rint(late * self._rate).astype(np.int64))
         )
-        columns = {
-            "epoch_gps_ns": epochs,
-            "pose_epoch_gps_ns": stamps if self._compensated else epochs,
-            **{f"{axis}_sensor_m": values for axis, values in zip("xyz", xyz, strict=True)},
-            "intensity": np.zeros(count, np.uint16) if intensity is None else intensity,
-            "laser": np.zeros(count, np.uint8) if laser is None else laser.astype(np.uint8),
-            "sweep": np.full(count, message.number, dtype=np.int32),
-        }
+        batch = returns_batch(
+            epochs,
+            xyz,
+            np.zeros(count, np.uint16) if intensity is None else intensity,
+            np.zeros(count, np.uint8) if laser is None else laser.astype(np.uint8),
+            np.full(count, message.number, dtype=np.int32),
+            stamps if self._compensated else epochs,
+        )
         unbroken = int(records[-1] - records[0]) == count - 1
         return Rows(
-            "returns", pa.RecordBatch.from_pydict({k: pa.array(v) for k, v in columns.items()}), message.file,
-            int(records[0]), message.offset, records=None if unbroken else records,
-        )  # fmt: skip
+            "returns", batch, message.file, int(records[0]), message.offset, records=None if unbroken else records
+        )
 
 
 def _bright(intensity: Numbers | None, kept: npt.NDArray[np.int64] | slice) -> Numbers | None:

@@ -37,12 +37,6 @@ _LINES_BYTES: Final = 1 << 22  # bytes at a text's start in which lines are coun
 _LONGEST_NAME: Final = 40  # a longer column name indicates prose instead of a table
 
 _MAGICS: Final[tuple[tuple[int, bytes, str], ...]] = (
-    (60, b"CRINEX VERS", "GNSS observations in Hatanaka's compression; crx2rnx makes RINEX of them for `roadscan ppk`"),
-    (60, b"RINEX VERSION", "RINEX data other than observations; `roadscan ppk` takes orbits (navigation) and clocks"),
-    *(
-        (0, b"#" + one, "precise orbits (SP3), for `roadscan ppk`")
-        for one in (b"aP", b"bP", b"cP", b"dP", b"dV", b"cV")
-    ),
     (0, b"\x89PNG\r\n\x1a\n", "a PNG picture"),
     (0, b"\xff\xd8\xff", "a JPEG picture"),
     (0, b"GIF8", "a GIF picture"),

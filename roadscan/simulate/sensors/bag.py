@@ -26,6 +26,7 @@ from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import ClockError, Mount, Scene
 from roadscan.simulate.sensors import gnss, imu, lidar
 from roadscan.simulate.sensors.clock import SensorClock
+from roadscan.simulate.sensors.lidar import BODY_FROM_AXES
 
 Float64 = npt.NDArray[np.float64]
 
@@ -37,12 +38,11 @@ _TYPES: Final = {
     CLOUDS: "sensor_msgs/msg/PointCloud2", IMU: "sensor_msgs/msg/Imu", POSITIONS: "sensor_msgs/msg/NavSatFix",
     MOUNTINGS: "tf2_msgs/msg/TFMessage",
 }  # fmt: skip
-_POINT: Final = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4"), ("ring", "<u2")]
-)
-_FIELD_TYPES: Final = {"<f4": 7, "<u4": 6, "<u2": 4}  # constants of sensor_msgs/PointField
-_FLU: Final = np.diag([1.0, -1.0, -1.0])
-"""Turns forward, right, down into forward, left, up, and back."""
+_FIELDS: Final = (
+    ("x", "<f4", 7), ("y", "<f4", 7), ("z", "<f4", 7), ("intensity", "<f4", 7), ("t", "<u4", 6), ("ring", "<u2", 4),
+)  # fmt: skip
+"""Fields of a point: name, type, and the type's constant in sensor_msgs/PointField."""
+_POINT: Final = np.dtype([(name, kind) for name, kind, _ in _FIELDS])
 _STATUS: Final = {gnss.FIXED: 2, gnss.FLOAT: 0}
 """sensor_msgs/NavSatStatus of a solution: GBAS_FIX of a fixed one, FIX of a float one."""
 
@@ -51,7 +51,6 @@ class _Sent(NamedTuple):
     """A message on its way to the recording computer."""
 
     arrival_ns: int
-    number: int
     topic: str
     content: Any
     returns: int
@@ -60,6 +59,11 @@ class _Sent(NamedTuple):
 def file_name(scene: Scene) -> str:
     """Return the name of a pass's bag: a file of ROS 1, a folder of ROS 2."""
     return "rig.bag" if scene.bag.container == "ros1" else "rig"
+
+
+def bag_clock(scene: Scene, error: ClockError) -> SensorClock:
+    """Return the clock of a sensor that a computer stamps: Unix UTC, with the sensor's error."""
+    return SensorClock.of(scene, error.model_copy(update={"system": None}), TimeSystem.UNIX_UTC)
 
 
 def write_bag(scene: Scene, world: World | None, drive: Drive, bag: Path, hits_file: Path | None) -> Iterator[int]:
@@ -99,17 +103,13 @@ class _Messages:
     def __init__(self, scene: Scene, drive: Drive, types: dict[str, Any]) -> None:
         self.scene, self.drive, self.types = scene, drive, types
 
-    def _clock(self, error: ClockError) -> SensorClock:
-        plain = error.model_copy(update={"system": None})
-        return SensorClock.of(self.scene, plain, TimeSystem.UNIX_UTC)
-
     def _sent(self, topic: str, numbered: Iterator[tuple[int, Any, int]]) -> Iterator[_Sent]:
         """Yield contents with their stamps (ns) and returns, each with its arrival: later than all before it."""
         rng, last = stream(self.scene.seed, self.drive.number, f"bag {topic}"), 0
         delay_ns = self.scene.bag.delay_s * NS_PER_S
-        for number, (stamp, content, returns) in enumerate(numbered):
+        for stamp, content, returns in numbered:
             last = max(last + 1, stamp + round(delay_ns * (0.5 + rng.random())))
-            yield _Sent(last, number, topic, content, returns)
+            yield _Sent(last, topic, content, returns)
 
     def _header(self, stamp_ns: int, frame: str, number: int) -> Any:
         time = self.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NS_PER_S))
@@ -120,16 +120,16 @@ class _Messages:
     def mountings(self) -> Iterator[_Sent]:
         """Yield the transforms from the vehicle to the sensors, once."""
         rig = {"lidar": self.scene.lidar.mount, "imu_link": imu.AT_BODY,
-               "gnss": Mount(lever_arm_body_m=self.scene.gnss.lever_arm_body_m)}  # fmt: skip
-        stamp = int(self._clock(ClockError()).stamps_ns(np.array([lidar.starts_gps_ns(self.drive)]))[0])
+               "gnss": gnss.antenna_mount(self.scene)}  # fmt: skip
+        stamp = int(bag_clock(self.scene, ClockError()).stamps_ns(np.array([lidar.starts_gps_ns(self.drive)]))[0])
         made = self.types["tf2_msgs/msg/TFMessage"]([self._mounting(stamp, n, m.nominal()) for n, m in rig.items()])
         yield from self._sent(MOUNTINGS, iter([(stamp - NS_PER_S, made, 0)]))
 
     def _mounting(self, stamp_ns: int, frame: str, mount: Mount) -> Any:
         get = self.types
-        x, y, z = _FLU @ mount.lever_arm_body_m
+        x, y, z = BODY_FROM_AXES @ mount.lever_arm_body_m
         boresight = Rotation.from_euler("ZYX", [mount.heading_deg, mount.pitch_deg, mount.roll_deg], degrees=True)
-        turn = Rotation.from_matrix(_FLU @ boresight.as_matrix() @ _FLU).as_quat()
+        turn = Rotation.from_matrix(BODY_FROM_AXES @ boresight.as_matrix() @ BODY_FROM_AXES).as_quat()
         return get["geometry_msgs/msg/TransformStamped"](
             self._header(stamp_ns, "base_link", 0), frame,
             get["geometry_msgs/msg/Transform"](
@@ -143,13 +143,14 @@ class _Messages:
             yield from self._sent(IMU, self._rates())
 
     def _rates(self) -> Iterator[tuple[int, Any, int]]:
-        get, clock, unknown = self.types, self._clock(self.scene.imu.clock), np.zeros(9)
+        get, clock, unknown = self.types, bag_clock(self.scene, self.scene.imu.clock), np.zeros(9)
         vector, kind = get["geometry_msgs/msg/Vector3"], get["sensor_msgs/msg/Imu"]
         none = get["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
         no_attitude = np.array([-1.0, *[0.0] * 8])
         number = 0
         for epochs, rate, force in imu.samples(self.scene, self.drive, imu.imu_of(self.scene)):
-            for stamp, w, f in zip(clock.stamps_ns(epochs).tolist(), rate @ _FLU, force @ _FLU, strict=True):
+            rates, forces = rate @ BODY_FROM_AXES, force @ BODY_FROM_AXES
+            for stamp, w, f in zip(clock.stamps_ns(epochs).tolist(), rates, forces, strict=True):
                 header = self._header(stamp, "imu_link", number)
                 yield stamp, kind(header, none, no_attitude, vector(*w), unknown, vector(*f), unknown), 0
                 number += 1
@@ -161,7 +162,7 @@ class _Messages:
 
     def _positions(self) -> Iterator[tuple[int, Any, int]]:
         get, found = self.types, gnss.solve(self.scene, self.drive)
-        clock = self._clock(ClockError())
+        clock = bag_clock(self.scene, ClockError())
         for i, stamp in enumerate(clock.stamps_ns(found.epoch_gps_ns).tolist()):
             longitude, latitude, height = found.geographic[i]
             north, east, down = found.sigma_ned_m[i] ** 2
@@ -178,7 +179,7 @@ class _Messages:
             yield from self._sent(CLOUDS, self._clouds(world, hits))
 
     def _clouds(self, world: World, hits: pq.ParquetWriter | None) -> Iterator[tuple[int, Any, int]]:
-        clock, first = self._clock(self.scene.lidar.clock), lidar.starts_gps_ns(self.drive)
+        clock, first = bag_clock(self.scene, self.scene.lidar.clock), lidar.starts_gps_ns(self.drive)
         turn_ns, begun, number = round(NS_PER_S / self.scene.lidar.turns_per_s), first, 0
         held: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.void]]] = []
 
@@ -203,10 +204,8 @@ class _Messages:
 
     def _cloud(self, stamp_ns: int, points: npt.NDArray[np.void], number: int) -> Any:
         kind, field = self.types["sensor_msgs/msg/PointCloud2"], self.types["sensor_msgs/msg/PointField"]
-        fields = [
-            field(name, int(_POINT.fields[name][1]), _FIELD_TYPES[_POINT.fields[name][0].str], 1)
-            for name in _POINT.names or () if _POINT.fields is not None
-        ]  # fmt: skip
+        offsets = np.cumsum([0, *(np.dtype(kind).itemsize for _, kind, _ in _FIELDS)]).tolist()
+        fields = [field(name, offset, kind, 1) for (name, _, kind), offset in zip(_FIELDS, offsets, strict=False)]
         size = points.size * _POINT.itemsize
         header = self._header(stamp_ns, "lidar", number)
         data = points.view(np.uint8).reshape(size)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, utc_from_gps_ns
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import GaussMarkov, stream
-from roadscan.simulate.scene import Mount, Scene
+from roadscan.simulate.scene import Mount, MountError, Scene
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -50,6 +50,12 @@ class Solutions:
     """(n, 3) multipath error within the position, for the truth."""
 
 
+def antenna_mount(scene: Scene) -> Mount:
+    """Return the antenna's mounting."""
+    error = MountError(lever_arm_body_m=scene.gnss.lever_arm_error_m)
+    return Mount(lever_arm_body_m=scene.gnss.lever_arm_body_m, error=error)
+
+
 def solve(scene: Scene, drive: Drive) -> Solutions:
     """Return the solutions of a whole pass at the antenna, in the datum of the scene's CRS."""
     gnss = scene.gnss
@@ -64,7 +70,7 @@ def solve(scene: Scene, drive: Drive) -> Solutions:
     adrift = GaussMarkov(rng, np.full(3, gnss.float_sigma_m), gnss.time_constant_s, 1.0 / gnss.rate_hz)
     error += adrift.take(epochs.size) * (quality == FLOAT)[:, None]
     jumps = _jumps(scene, epochs, rng)
-    mount = Mount(lever_arm_body_m=gnss.lever_arm_body_m)
+    mount = antenna_mount(scene)
     before, here, after = (
         drive.poses(epochs + shift).sensor(mount, np.eye(3))[0] for shift in (-_DIFFERENCE_NS, 0, _DIFFERENCE_NS)
     )

@@ -333,7 +333,7 @@ class Bag(Strict):
     container: Literal["mcap", "sqlite", "ros1"] = "mcap"
     """A ROS 2 bag of MCAP or SQLite, or a bag of ROS 1."""
     delay_s: float = Field(default=0.01, ge=0.0)
-    """Mean time from a stamp to the message's arrival at the recording computer; single ones vary by its half (s)."""
+    """Mean time from when a message is whole to its arrival at the recording computer; single ones vary by half (s)."""
 
 
 class Control(Strict):

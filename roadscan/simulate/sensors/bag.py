@@ -51,6 +51,7 @@ class _Sent(NamedTuple):
     """A message on its way to the recording computer."""
 
     arrival_ns: int
+    """By that computer's clock (POSIX ns)."""
     topic: str
     content: Any
     returns: int
@@ -103,27 +104,34 @@ class _Messages:
     def __init__(self, scene: Scene, drive: Drive, types: dict[str, Any]) -> None:
         self.scene, self.drive, self.types = scene, drive, types
 
-    def _sent(self, topic: str, numbered: Iterator[tuple[int, Any, int]]) -> Iterator[_Sent]:
-        """Yield contents with their stamps (ns) and returns, each with its arrival: later than all before it."""
+    def _sent(self, topic: str, measured: Iterator[tuple[int, Any, int]]) -> Iterator[_Sent]:
+        """Yield messages with their arrivals by the computer's clock, which is right; none overtakes another.
+
+        measured : when each was whole in truth (GPS ns), its content, and its returns.
+        """
         rng, last = stream(self.scene.seed, self.drive.number, f"bag {topic}"), 0
         delay_ns = self.scene.bag.delay_s * NS_PER_S
-        for stamp, content, returns in numbered:
-            last = max(last + 1, stamp + round(delay_ns * (0.5 + rng.random())))
+        for epoch, content, returns in measured:
+            last = max(last + 1, self._utc_ns(epoch) + round(delay_ns * (0.5 + rng.random())))
             yield _Sent(last, topic, content, returns)
+
+    def _utc_ns(self, epoch_gps_ns: int) -> int:
+        return int(bag_clock(self.scene, ClockError()).stamps_ns(np.array([epoch_gps_ns]))[0])
 
     def _header(self, stamp_ns: int, frame: str, number: int) -> Any:
         time = self.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NS_PER_S))
-        header = self.types["std_msgs/msg/Header"]
-        return header(seq=number, stamp=time, frame_id=frame) if "seq" in header.__dataclass_fields__ else header(
-            stamp=time, frame_id=frame)  # fmt: skip
+        kind = self.types["std_msgs/msg/Header"]
+        sequence = {"seq": number} if "seq" in kind.__dataclass_fields__ else {}  # of ROS 1
+        return kind(**sequence, stamp=time, frame_id=frame)
 
     def mountings(self) -> Iterator[_Sent]:
         """Yield the transforms from the vehicle to the sensors, once."""
         rig = {"lidar": self.scene.lidar.mount, "imu_link": imu.AT_BODY,
                "gnss": gnss.antenna_mount(self.scene)}  # fmt: skip
-        stamp = int(bag_clock(self.scene, ClockError()).stamps_ns(np.array([lidar.starts_gps_ns(self.drive)]))[0])
+        epoch = lidar.starts_gps_ns(self.drive) - NS_PER_S  # before all others
+        stamp = self._utc_ns(epoch)
         made = self.types["tf2_msgs/msg/TFMessage"]([self._mounting(stamp, n, m.nominal()) for n, m in rig.items()])
-        yield from self._sent(MOUNTINGS, iter([(stamp - NS_PER_S, made, 0)]))
+        yield from self._sent(MOUNTINGS, iter([(epoch, made, 0)]))
 
     def _mounting(self, stamp_ns: int, frame: str, mount: Mount) -> Any:
         get = self.types
@@ -150,9 +158,10 @@ class _Messages:
         number = 0
         for epochs, rate, force in imu.samples(self.scene, self.drive, imu.imu_of(self.scene)):
             rates, forces = rate @ BODY_FROM_AXES, force @ BODY_FROM_AXES
-            for stamp, w, f in zip(clock.stamps_ns(epochs).tolist(), rates, forces, strict=True):
+            stamps = clock.stamps_ns(epochs).tolist()
+            for epoch, stamp, w, f in zip(epochs.tolist(), stamps, rates, forces, strict=True):
                 header = self._header(stamp, "imu_link", number)
-                yield stamp, kind(header, none, no_attitude, vector(*w), unknown, vector(*f), unknown), 0
+                yield epoch, kind(header, none, no_attitude, vector(*w), unknown, vector(*f), unknown), 0
                 number += 1
 
     def positions(self) -> Iterator[_Sent]:
@@ -162,16 +171,15 @@ class _Messages:
 
     def _positions(self) -> Iterator[tuple[int, Any, int]]:
         get, found = self.types, gnss.solve(self.scene, self.drive)
-        clock = bag_clock(self.scene, ClockError())
-        for i, stamp in enumerate(clock.stamps_ns(found.epoch_gps_ns).tolist()):
+        for i, epoch in enumerate(found.epoch_gps_ns.tolist()):
             longitude, latitude, height = found.geographic[i]
             north, east, down = found.sigma_ned_m[i] ** 2
             status = get["sensor_msgs/msg/NavSatStatus"](_STATUS[int(found.quality[i])], 1)
             fix = get["sensor_msgs/msg/NavSatFix"](
-                self._header(stamp, "gnss", i), status, latitude, longitude, height,
+                self._header(self._utc_ns(epoch), "gnss", i), status, latitude, longitude, height,
                 np.diag([east, north, down]).ravel(), 2,
             )  # fmt: skip
-            yield stamp, fix, 0
+            yield epoch, fix, 0
 
     def clouds(self, world: World | None, hits: pq.ParquetWriter | None) -> Iterator[_Sent]:
         """Yield the lidar's turns."""
@@ -191,7 +199,7 @@ class _Messages:
             stamp = int(clock.stamps_ns(np.array([begun]))[0])
             own = points[now].copy()
             own["t"] = clock.stamps_ns(epochs[now]) - stamp
-            yield stamp, self._cloud(stamp, own, number), own.size
+            yield begun + turn_ns, self._cloud(stamp, own, number), own.size
 
         for block in lidar.measure(self.scene, world, self.drive):
             if hits is not None:

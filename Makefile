@@ -105,7 +105,7 @@ install_into_venv = { command -v uv >/dev/null && uv pip install --quiet --compi
 
 $(VENV)/.installed: $(VENV)/.created pyproject.toml constraints.txt
 	@echo "installing roadscan (one to two minutes the first time)"
-	@$(call install_into_venv,.[frames$(comma)icp$(comma)opencv$(comma)pictures])
+	@$(call install_into_venv,.[frames$(comma)icp$(comma)opencv$(comma)pictures$(comma)ros])
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.created pyproject.toml constraints.txt

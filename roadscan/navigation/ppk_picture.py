@@ -86,7 +86,7 @@ def _summary(picture: PpkPicture) -> str:
     return (
         f"{f['positions']:,} positions of {f['epochs']:,} epochs: {kinds}. {f['mode']}, {f['direction']}. Median σ "
         f"{np.nanmedian(picture.sigma_horizontal_m):.3f} m horizontal, {np.nanmedian(picture.sigma_down_m):.3f} m "
-        f"down. The base is {f['baseline_km']:.1f} km away, and {f['base_from_code_m']:.1f} m from its own code "
+        f"down.\nThe base is {f['baseline_km']:.1f} km away, and {f['base_from_code_m']:.1f} m from its own code "
         "solution."
     )
 

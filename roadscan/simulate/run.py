@@ -68,10 +68,12 @@ def simulate(
     ------
     ConfigError
         where the folder holds something else, one of these files was edited, or the map's CRS cannot be used; where
-        the scene has a camera, and OpenCV is not installed.
+        the scene has a camera or a bag, and OpenCV or rosbags is not installed.
     """
     if scene.camera.on:
         need("cv2", "a simulated camera")
+    if scene.bag.on:
+        need("rosbags.typesys", "a simulated bag")
     target = Path(folder)
     _prepare(scene, target, overwrite)
     earth = Earth(scene.map.crs)

@@ -18,7 +18,6 @@ import numpy.typing as npt
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
-from roadscan.core.extras import need
 from roadscan.core.gpstime import NS_PER_S, TimeSystem
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive
@@ -69,7 +68,6 @@ def bag_clock(scene: Scene, error: ClockError) -> SensorClock:
 
 def write_bag(scene: Scene, world: World | None, drive: Drive, bag: Path, hits_file: Path | None) -> Iterator[int]:
     """Write the bag of one pass, a message a step; yields the returns of each."""
-    need("rosbags.typesys", "a simulated bag")
     from rosbags.typesys import Stores, get_typestore
 
     is_ros1 = scene.bag.container == "ros1"

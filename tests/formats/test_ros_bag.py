@@ -66,9 +66,9 @@ def test_a_bag_of_each_kind_gives_what_was_written(kind: str, tmp_path: Path) ->
         assert {t: topic.count for t, topic in bag.topics.items()} == {t: len(rows) for t, rows in expected.items()}
         for topic, rows in expected.items():
             assert [(m.receive_ns, m.data) for m in _messages(bag, topic)] == rows
-            held = bag.topics[topic].held
-            assert held is not None
-            assert (held.first_ns, held.last_ns) == (rows[0][0], rows[-1][0])
+            span = bag.topics[topic].span
+            assert span is not None
+            assert (span.first_ns, span.last_ns) == (rows[0][0], rows[-1][0])
         last = [item for item in bag.decoded("/imu") if not isinstance(item, Reject)][-1]
         assert last[1].linear_acceleration.y == 0.5 * 3_999
         assert last[1].header.frame_id == "imu"

@@ -230,10 +230,10 @@ def _packets(source: LogSource, options: OusterPcapOptions, metadata: OusterMeta
 def _none_of_length(path: Path, metadata: OusterMetadata) -> FormatError:
     first = itertools.islice(datagrams_of_sizes(path, None), _SNIFFED)
     lengths = Counter(len(p.payload) for p in first if isinstance(p, Datagram))
-    held = ", ".join(f"{count} of {length:,}" for length, count in lengths.most_common(3))
+    found_lengths = ", ".join(f"{count} of {length:,}" for length, count in lengths.most_common(3))
     return FormatError(
         f"no packet has the {packet_bytes(metadata):,} bytes of {metadata.product} in {metadata.profile_name} (UDP "
-        f"packets by bytes: {held or 'none'})",
+        f"packets by bytes: {found_lengths or 'none'})",
         expected="the metadata that were saved with this capture",
         file=path,
         missing=Missing("options.metadata"),

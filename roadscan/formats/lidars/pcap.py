@@ -59,17 +59,17 @@ class Datagram(NamedTuple):
 
 def batches(items: Iterable[Datagram | Reject], size: int) -> Iterator[list[Datagram] | Reject]:
     """Yield lists of `size` packets, the last one shorter, and rejects where they stand between them."""
-    held: list[Datagram] = []
+    pending: list[Datagram] = []
     for item in items:
         if isinstance(item, Reject):
             yield item
             continue
-        held.append(item)
-        if len(held) == size:
-            yield held
-            held = []
-    if held:
-        yield held
+        pending.append(item)
+        if len(pending) == size:
+            yield pending
+            pending = []
+    if pending:
+        yield pending
 
 
 _Record: TypeAlias = tuple[int, int, int, bytes]

@@ -217,11 +217,11 @@ def _recorded(path: Path) -> int:
     """Return how many epochs a UBX recording has; 0 for other files."""
     if not is_ubx(path):
         return 0
-    count, held = 0, b""
+    count, rest = 0, b""
     with open_text(path) as stream:
         while block := stream.read(_BLOCK_BYTES):
-            count += (held + block).count(RAWX)
-            held = block[-len(RAWX) + 1 :]
+            count += (rest + block).count(RAWX)
+            rest = block[-len(RAWX) + 1 :]
     return count
 
 

@@ -76,13 +76,13 @@ def observed_epochs(path: Path) -> npt.NDArray[np.int64]:
     """
     parts: list[npt.NDArray[np.int64]] = []
     with open_text(path) as stream:
-        held = b""
+        pending = b""
         while block := stream.read(_BLOCK_BYTES):
-            held += block
-            end = held.rfind(b"\n") + 1
-            parts.append(_epochs(held[:end]))
-            held = held[max(end, len(held) - _BLOCK_BYTES) :]
-    parts.append(_epochs(held))
+            pending += block
+            end = pending.rfind(b"\n") + 1
+            parts.append(_epochs(pending[:end]))
+            pending = pending[max(end, len(pending) - _BLOCK_BYTES) :]
+    parts.append(_epochs(pending))
     return np.concatenate(parts)
 
 

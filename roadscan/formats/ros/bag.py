@@ -24,7 +24,7 @@ from roadscan.formats.ros.containers.ros1_file import OLDER as ROS1
 from roadscan.formats.ros.containers.ros1_file import Ros1File
 from roadscan.formats.ros.containers.sqlite_file import MAGIC as SQLITE
 from roadscan.formats.ros.containers.sqlite_file import SqliteFile
-from roadscan.formats.ros.containers.storage import Connection, Container, Held
+from roadscan.formats.ros.containers.storage import Connection, Container, MessageSpan
 from roadscan.formats.ros.definitions import Decode, decoder, type_name
 from roadscan.ingest.reading.format import Reject
 
@@ -70,20 +70,20 @@ class Topic:
     """How its messages are serialised: `ros1` or `cdr`."""
     definition: str = ""
     definition_language: str = "msg"
-    held: Held | None = None
+    span: MessageSpan | None = None
     """Number of its messages, and their first and last receive stamp (POSIX ns); None where it has none."""
 
     @property
     def count(self) -> int:
         """Number of messages."""
-        return 0 if self.held is None else self.held.count
+        return 0 if self.span is None else self.span.count
 
     @property
     def rate_hz(self) -> float | None:
         """Messages a second by the receive stamps; None for fewer than two."""
-        if self.held is None or self.held.count < 2 or self.held.last_ns <= self.held.first_ns:
+        if self.span is None or self.span.count < 2 or self.span.last_ns <= self.span.first_ns:
             return None
-        return (self.held.count - 1) * NS_PER_S / (self.held.last_ns - self.held.first_ns)
+        return (self.span.count - 1) * NS_PER_S / (self.span.last_ns - self.span.first_ns)
 
     def decoder(self) -> Decode:
         """What reads its messages; raises FormatError where nothing can."""
@@ -224,8 +224,8 @@ class Bag:
         )
         if topic.type != kind:
             self.faults.append(Reject(f"the topic {topic.name} is of two types: {topic.type} is read, {kind} is not"))
-        elif connection.held is not None:
-            topic.held = connection.held.joined(topic.held)
+        elif connection.span is not None:
+            topic.span = connection.span.joined(topic.span)
 
     def _find_missing(self) -> None:
         """Note files that the folder's metadata name, and messages that they count, and that are not there."""

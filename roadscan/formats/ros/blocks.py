@@ -13,16 +13,16 @@ _MESSAGES: Final = 8_192  # messages of a block
 
 def blocks(items: Iterator[Timed | Item]) -> Iterator[list[Timed] | Item]:
     """Yield lists of messages, and between them what is not a message."""
-    held: list[Timed] = []
+    pending: list[Timed] = []
     file = ""
     for item in items:
         if not isinstance(item, Timed):
             yield item
             continue
-        if held and (len(held) >= _MESSAGES or item.message.file != file):
-            yield held
-            held = []
+        if pending and (len(pending) >= _MESSAGES or item.message.file != file):
+            yield pending
+            pending = []
         file = item.message.file
-        held.append(item)
-    if held:
-        yield held
+        pending.append(item)
+    if pending:
+        yield pending

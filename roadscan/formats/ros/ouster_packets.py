@@ -136,9 +136,9 @@ def topic_of_length(bag: Bag, options: BagPacketsOptions, length: int) -> Topic:
     lengths = {length, length + 1}
     fitting = [name for name, own in firsts.items() if len(own) in lengths and options.topic in {None, name}]
     if len(fitting) != 1:
-        held = ", ".join(f"{name}: {len(payload):,} bytes" for name, payload in firsts.items()) or "none"
+        found_lengths = ", ".join(f"{name}: {len(payload):,} bytes" for name, payload in firsts.items()) or "none"
         raise FormatError(
-            f"{len(fitting)} topics hold packets of {length:,} bytes, as the metadata say ({held})",
+            f"{len(fitting)} topics hold packets of {length:,} bytes, as the metadata say ({found_lengths})",
             expected="one topic a log",
             file=bag.path,
             missing=Missing("options.topic", choices=tuple(firsts)),

@@ -74,8 +74,8 @@ def _part(bag: Bag, topic: Topic, readers: tuple[Reader, ...], mountings: dict[s
 
 def _words(topic: Topic) -> str:
     words = f"{topic.type.replace('/msg/', '/')}, {counted(topic.count, 'message')}"
-    if topic.held is not None and topic.rate_hz is not None:
-        words += f", {topic.rate_hz:.4g} Hz, {(topic.held.last_ns - topic.held.first_ns) / NS_PER_S:,.1f} s"
+    if topic.span is not None and topic.rate_hz is not None:
+        words += f", {topic.rate_hz:.4g} Hz, {(topic.span.last_ns - topic.span.first_ns) / NS_PER_S:,.1f} s"
     if topic.type in _UNPACKED:
         words += ", `roadscan unpack` makes files of them"
     return words

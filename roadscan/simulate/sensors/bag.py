@@ -187,13 +187,13 @@ class _Messages:
     def _clouds(self, world: World, hits: pq.ParquetWriter | None) -> Iterator[tuple[int, Any, int]]:
         clock, first = bag_clock(self.scene, self.scene.lidar.clock), lidar.starts_gps_ns(self.drive)
         turn_ns, begun, number = round(NS_PER_S / self.scene.lidar.turns_per_s), first, 0
-        held: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.void]]] = []
+        pending: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.void]]] = []
 
         def cloud(upto: int) -> Iterator[tuple[int, Any, int]]:
-            epochs = np.concatenate([one[0] for one in held])
-            points = np.concatenate([one[1] for one in held])
+            epochs = np.concatenate([one[0] for one in pending])
+            points = np.concatenate([one[1] for one in pending])
             now = epochs < upto
-            held[:] = [(epochs[~now], points[~now])]
+            pending[:] = [(epochs[~now], points[~now])]
             stamp = int(clock.stamps_ns(np.array([begun]))[0])
             own = points[now].copy()
             own["t"] = clock.stamps_ns(epochs[now]) - stamp
@@ -202,7 +202,7 @@ class _Messages:
         for block in lidar.measure(self.scene, world, self.drive):
             if hits is not None:
                 hits.write_batch(lidar.hits_of(block))
-            held.append(_points(block))
+            pending.append(_points(block))
             while block.epoch_gps_ns[-1] >= begun + turn_ns:
                 yield from cloud(begun + turn_ns)
                 begun, number = begun + turn_ns, number + 1

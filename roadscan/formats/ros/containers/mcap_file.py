@@ -13,7 +13,15 @@ from dataclasses import replace
 from typing import BinaryIO, Final
 
 from roadscan.formats.ros.containers.compression import unpacked
-from roadscan.formats.ros.containers.storage import BROKEN, Chunk, ChunkedContainer, Connection, Held, Raw, exactly
+from roadscan.formats.ros.containers.storage import (
+    BROKEN,
+    Chunk,
+    ChunkedContainer,
+    Connection,
+    MessageSpan,
+    Raw,
+    exactly,
+)
 from roadscan.ingest.reading.format import Reject
 
 MAGIC: Final = b"\x89MCAP0\r\n"
@@ -98,7 +106,7 @@ class McapFile(ChunkedContainer):
                     counts = dict(struct.iter_unpack("<HQ", content[46:]))
             if chunked != len(self.chunks) or sum(counts.values()) != stated or (stated and not self.chunks):
                 return False
-            if not self.connections.keys() >= counts.keys() or any(not chunk.held for chunk in self.chunks):
+            if not self.connections.keys() >= counts.keys() or any(not chunk.spans for chunk in self.chunks):
                 return False
             self._sharpen(stream, indexes, counts)
         except BROKEN:
@@ -110,15 +118,15 @@ class McapFile(ChunkedContainer):
         self.chunks.sort(key=lambda chunk: chunk.offset)
         ends: dict[int, tuple[Chunk, Chunk]] = {}
         for chunk in self.chunks:
-            for channel in chunk.held:
+            for channel in chunk.spans:
                 ends[channel] = ends.get(channel, (chunk, chunk))[0], chunk
         for channel, (first, last) in ends.items():
             for chunk in (first, last):
                 stream.seek(indexes[chunk.offset][channel])
                 exactly(stream, _RECORD.size + 2)
                 times = _index_times(_sized(stream))
-                chunk.held[channel] = Held(0, min(times), max(times))
-            first.held[channel] = replace(first.held[channel], count=counts.get(channel, 0))
+                chunk.spans[channel] = MessageSpan(0, min(times), max(times))
+            first.spans[channel] = replace(first.spans[channel], count=counts.get(channel, 0))
 
     def _walked(self, stream: BinaryIO) -> None:
         """Find chunks and messages outside chunks by going from record to record."""
@@ -150,7 +158,7 @@ class McapFile(ChunkedContainer):
         channel = struct.unpack_from("<H", content)[0]
         times = _index_times(content[6:])
         if times:
-            self.chunks[-1].held[channel] = Held(len(times), min(times), max(times))
+            self.chunks[-1].spans[channel] = MessageSpan(len(times), min(times), max(times))
 
     def _schema(self, content: bytes) -> None:
         number = struct.unpack_from("<H", content)[0]
@@ -193,7 +201,7 @@ def _chunk_index(content: bytes) -> tuple[Chunk, dict[int, int]]:
     """A chunk, and where the index of each of its channels stands."""
     first, last, offset, length, bytes_of_map = struct.unpack_from("<QQQQI", content)
     offsets = dict(struct.iter_unpack("<HQ", content[36 : 36 + bytes_of_map]))
-    return Chunk(offset, length, {channel: Held(0, first, last) for channel in offsets}), offsets
+    return Chunk(offset, length, {channel: MessageSpan(0, first, last) for channel in offsets}), offsets
 
 
 def _sized(stream: BinaryIO) -> bytes:

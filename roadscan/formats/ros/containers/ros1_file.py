@@ -12,7 +12,15 @@ from typing import BinaryIO, Final
 
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.formats.ros.containers.compression import unpacked
-from roadscan.formats.ros.containers.storage import BROKEN, Chunk, ChunkedContainer, Connection, Held, Raw, exactly
+from roadscan.formats.ros.containers.storage import (
+    BROKEN,
+    Chunk,
+    ChunkedContainer,
+    Connection,
+    MessageSpan,
+    Raw,
+    exactly,
+)
 from roadscan.ingest.reading.format import Reject
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
@@ -92,20 +100,20 @@ class Ros1File(ChunkedContainer):
 
     def _sharpen(self, stream: BinaryIO) -> None:
         """Replace the spans of the first and last chunk of each connection, which are those of the whole chunk."""
-        ends = {c: chunk for chunk in reversed(self.chunks) for c in chunk.held}.values()
-        later = {c: chunk for chunk in self.chunks for c in chunk.held}.values()
+        ends = {c: chunk for chunk in reversed(self.chunks) for c in chunk.spans}.values()
+        later = {c: chunk for chunk in self.chunks for c in chunk.spans}.values()
         for chunk in {id(chunk): chunk for chunk in (*ends, *later)}.values():
             stream.seek(chunk.offset)
             if _header(stream)[b"op"][0] != _CHUNK:
                 raise ValueError("the index points to no chunk")
             _skip_data(stream)
-            chunk.held |= self._index_of(stream, len(chunk.held))
+            chunk.spans |= self._index_of(stream, len(chunk.spans))
 
-    def _index_of(self, stream: BinaryIO, most: int | None = None) -> dict[int, Held]:
+    def _index_of(self, stream: BinaryIO, most: int | None = None) -> dict[int, MessageSpan]:
         """What the index records at the stream's place say; the stream stands behind them."""
-        held: dict[int, Held] = {}
+        spans: dict[int, MessageSpan] = {}
         at = stream.tell()
-        while (most is None or len(held) < most) and at < self.size:
+        while (most is None or len(spans) < most) and at < self.size:
             try:
                 fields = _header(stream)
                 if fields[b"op"][0] != _INDEX:
@@ -114,10 +122,10 @@ class Ros1File(ChunkedContainer):
             except BROKEN:
                 break
             if times:
-                held[_LENGTH.unpack(fields[b"conn"])[0]] = Held(len(times), min(times), max(times))
+                spans[_LENGTH.unpack(fields[b"conn"])[0]] = MessageSpan(len(times), min(times), max(times))
             at = stream.tell()
         stream.seek(at)
-        return held
+        return spans
 
     def _walked(self, stream: BinaryIO, at: int) -> None:
         """Find the chunks by going from record to record."""
@@ -193,5 +201,5 @@ def _chunk_info(fields: _Fields, data: bytes) -> Chunk:
     first, last = (
         s * NS_PER_S + ns for s, ns in (_TIME.unpack(fields[b"start_time"]), _TIME.unpack(fields[b"end_time"]))
     )
-    held = {number: Held(count, first, last) for number, count in struct.iter_unpack("<II", data)}
-    return Chunk(struct.unpack("<Q", fields[b"chunk_pos"])[0], 0, held)
+    spans = {number: MessageSpan(count, first, last) for number, count in struct.iter_unpack("<II", data)}
+    return Chunk(struct.unpack("<Q", fields[b"chunk_pos"])[0], 0, spans)

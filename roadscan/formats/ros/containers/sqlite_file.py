@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
-from roadscan.formats.ros.containers.storage import Connection, Container, Held, Raw, RawItem
+from roadscan.formats.ros.containers.storage import Connection, Container, MessageSpan, Raw, RawItem
 from roadscan.ingest.reading.format import Reject
 
 MAGIC: Final = b"SQLite format 3\0"
@@ -89,12 +89,12 @@ class SqliteFile(Container):
         try:
             for number, count, first, last in base.execute(query):
                 if number in self.connections and isinstance(first, int) and isinstance(last, int):
-                    self.connections[number].held = Held(count, first, last)
+                    self.connections[number].span = MessageSpan(count, first, last)
         except sqlite3.Error:
             for item in self.messages(self.connections.keys()):
                 if isinstance(item, Raw) and item.connection in self.connections:
                     connection = self.connections[item.connection]
-                    connection.held = Held(1, item.receive_ns, item.receive_ns).joined(connection.held)
+                    connection.span = MessageSpan(1, item.receive_ns, item.receive_ns).joined(connection.span)
 
 
 def _end(path: Path) -> tuple[int, int, bytes]:

@@ -35,23 +35,25 @@ class Connection:
     """Text of the type's definition; '' where the bag holds none."""
     definition_language: str = "msg"
     """Language of the definition: msg or idl."""
-    held: Held | None = None
+    span: MessageSpan | None = None
     """What the file holds of it; None where it holds no message."""
 
 
 @dataclass(frozen=True)
-class Held:
+class MessageSpan:
     """Number of messages, and their first and last receive stamp (POSIX ns)."""
 
     count: int
     first_ns: int
     last_ns: int
 
-    def joined(self, other: Held | None) -> Held:
+    def joined(self, other: MessageSpan | None) -> MessageSpan:
         """Figures of two parts of one connection together."""
         if other is None:
             return self
-        return Held(self.count + other.count, min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns))
+        return MessageSpan(
+            self.count + other.count, min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns)
+        )
 
 
 class Raw(NamedTuple):
@@ -96,7 +98,7 @@ class Chunk:
     """Byte at which the chunk's record starts."""
     length: int
     """Bytes up to the end of the chunk's record."""
-    held: dict[int, Held] = field(default_factory=dict)
+    spans: dict[int, MessageSpan] = field(default_factory=dict)
     """What it holds of each connection; empty where that is not known."""
 
 
@@ -110,10 +112,10 @@ class ChunkedContainer(Container):
         with path.open("rb") as stream:
             self.open(stream)
         for chunk in self.chunks:
-            for number, held in chunk.held.items():
+            for number, span in chunk.spans.items():
                 connection = self.connections.get(number)
                 if connection is not None:
-                    connection.held = held.joined(connection.held)
+                    connection.span = span.joined(connection.span)
 
     @abstractmethod
     def open(self, stream: BinaryIO) -> None:
@@ -127,7 +129,7 @@ class ChunkedContainer(Container):
         """Yield the messages of some connections, chunk by chunk; a damaged chunk costs its own messages."""
         with self.path.open("rb") as stream:
             for chunk in self.chunks:
-                if chunk.held and not wanted & chunk.held.keys():
+                if chunk.spans and not wanted & chunk.spans.keys():
                     continue
                 found = 0
                 try:
@@ -136,7 +138,7 @@ class ChunkedContainer(Container):
                             found += 1
                             yield item
                 except BROKEN as error:
-                    stated = sum(held.count for number, held in chunk.held.items() if number in wanted)
+                    stated = sum(span.count for number, span in chunk.spans.items() if number in wanted)
                     lost = max(1, stated - found)
                     yield Reject(f"the chunk is damaged: {error}", -1, chunk.offset, lost)
         yield from self.faults
@@ -148,20 +150,20 @@ class ChunkedContainer(Container):
                 if isinstance(item, Connection):
                     self.connections.setdefault(item.id, item)
                 else:
-                    held = Held(1, item.receive_ns, item.receive_ns)
-                    chunk.held[item.connection] = held.joined(chunk.held.get(item.connection))
+                    span = MessageSpan(1, item.receive_ns, item.receive_ns)
+                    chunk.spans[item.connection] = span.joined(chunk.spans.get(item.connection))
         except BROKEN:
-            return bool(chunk.held)
+            return bool(chunk.spans)
         return True
 
     def complete(self, stream: BinaryIO) -> None:
         """Read the chunks whose content is not stated, or that hold connections not yet known."""
         for chunk in self.chunks:
-            if not chunk.held or not chunk.held.keys() <= self.connections.keys():
-                stated = dict(chunk.held)
-                chunk.held.clear()
+            if not chunk.spans or not chunk.spans.keys() <= self.connections.keys():
+                stated = dict(chunk.spans)
+                chunk.spans.clear()
                 self.count(stream, chunk)
-                chunk.held = stated or chunk.held
+                chunk.spans = stated or chunk.spans
 
 
 def exactly(stream: BinaryIO, count: int) -> bytes:

@@ -81,18 +81,10 @@ def test_an_installation_has_few_distributions() -> None:
     assert len({name for name, _ in found}) <= MOST_DISTRIBUTIONS
 
 
-def test_only_numba_has_an_upper_bound() -> None:
-    """Each line with a bound has its reason above it, and a test below that fails when the reason has gone."""
-    bounded = {Requirement(text).name for text in REQUIREMENTS if re.search(r"<|==|~=", text)}
-    assert bounded == {"numba"}
-    lines = (ROOT / "pyproject.toml").read_text().splitlines()
-    (at,) = (number for number, line in enumerate(lines) if line.strip().startswith('"numba'))
-    assert lines[at - 1].strip().startswith("# ")
-
-
-def test_numbas_bound_is_still_needed() -> None:
-    """Fails when no more than one file knows Numba's internals: then take `<` out of numba in pyproject.toml."""
-    assert private_names()["files with private names of Numba"] > 1
+def test_nothing_has_an_upper_bound() -> None:
+    """A newer Numba too: one file knows its internals, and does without those that it does not know."""
+    assert [text for text in REQUIREMENTS if re.search(r"<|==|~=", text)] == []
+    assert private_names()["files with private names of Numba"] == 1
 
 
 def test_the_wheel_installs_roadscan_and_nothing_beside_it() -> None:

@@ -157,7 +157,7 @@ for file in sorted(kernels.rglob("*.py")):
     print(file.relative_to(kernels), _folder_of_source(str(file)))
 """
 CORE = ("__init__.py", "kept.py", "private_folder.py")
-COMPUTE = ("__init__.py", "compiler.py", "kernel_options.py")
+COMPUTE = ("__init__.py", "compiler.py", "kernel_options.py", "numba_internals.py")
 CHAIN = {
     "rooms/first.py": "from roadscan.feature.kernels.rooms import second\n",
     "rooms/second.py": "from .deep.third import doubled\n",
@@ -198,3 +198,26 @@ def test_a_changed_kernel_changes_the_folder_of_all_that_import_it(tmp_path: Pat
     chain = [name for name in CHAIN if name != "rooms/alone.py"]
     stale = {changed} if changed == "rooms/alone.py" else set(chain[: chain.index(changed) + 1])
     assert {name for name in before if before[name] != after[name]} == stale
+
+
+UNKNOWN_NUMBA = """
+import sys
+import numba
+numba.__version__ = "1000.0"
+import pytest
+from roadscan.compute.numba_internals import KNOWN
+assert not KNOWN
+sys.exit(pytest.main(["-q", "-n", "0", "-p", "no:cacheprovider", *sys.argv[1:]]))
+"""
+
+
+@pytest.mark.parametrize(
+    "tests",
+    ["kernels/test_simd.py::test_streaks_are_runs_of_equal_cells", pytest.param("kernels", marks=pytest.mark.nightly)],
+)
+def test_kernels_pass_their_tests_on_a_numba_whose_internals_are_not_known(tests: str, tmp_path: Path) -> None:
+    """Nothing of Numba is changed then; an empty cache, so that all is compiled that way."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", UNKNOWN_NUMBA, str(Path(__file__).parents[1] / tests)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:]

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel, bare
 from roadscan.compute.kernels import vectors
 from roadscan.compute.kernels.vectors import I32, I64, everywhere, instruction
+from roadscan.compute.numba_internals import ir, types
 
 LANES = 16  # Cells that are handled at a time: 32-bit lanes of a 512-bit register.
 LARGEST = np.int32(2**31 - 1)  # Stands for a missing height in sorting.

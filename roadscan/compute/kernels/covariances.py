@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel, bare
 from roadscan.compute.kernels import vectors
 from roadscan.compute.kernels.factorisation import ROW, rows_of
 from roadscan.compute.kernels.vectors import instruction
+from roadscan.compute.numba_internals import cgutils, ir, types
 
 REACH = 12.0
 """Distance from which heights are uncorrelated."""

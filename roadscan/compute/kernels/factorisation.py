@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel, bare
 from roadscan.compute.kernels import vectors
 from roadscan.compute.kernels.vectors import I64
+from roadscan.compute.numba_internals import cgutils, ir, types
 
 LANES = 8  # Matrices that are handled at once: 64-bit lanes of a 512-bit register.
 TOGETHER = 4

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel
 from roadscan.compute.kernels.vectors import I8, I16, I32, everywhere, instruction, load, start, store
+from roadscan.compute.numba_internals import ir, types
 
 VECTOR = 8
 """Number of heights that are stored at once."""

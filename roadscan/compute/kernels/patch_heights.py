@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel
 from roadscan.compute.kernels.column_statistics import generator
 from roadscan.compute.kernels.vectors import I64, everywhere, load, store
+from roadscan.compute.numba_internals import ir, types
 
 CORNER, EDGE, BY_CORNER, BY_EDGE, INNER, CENTRE, POINTS = 0, 3, 9, 12, 15, 18, 19
 """Where the control points of a patch begin in its row, and how many there are; the table stands in

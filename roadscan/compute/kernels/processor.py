@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import llvmlite.binding
 import numba
+
+from roadscan.compute.numba_internals import host_features
 
 
 def compiles_for(*features: str) -> bool:
@@ -11,5 +12,5 @@ def compiles_for(*features: str) -> bool:
     stated = numba.config.CPU_FEATURES
     if numba.config.DISABLE_JIT or (stated is None and numba.config.CPU_NAME is not None):
         return False
-    known = llvmlite.binding.get_host_cpu_features().flatten() if stated is None else stated
+    known = host_features() if stated is None else stated
     return {f"+{feature}" for feature in features} <= set(known.split(","))

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel
@@ -25,6 +23,7 @@ from roadscan.compute.kernels.height_slots import (
 )
 from roadscan.compute.kernels.slot_statistics import heights_of
 from roadscan.compute.kernels.vectors import I16, I32, I64, constant, load, picked, start
+from roadscan.compute.numba_internals import ir, types
 
 _LINE = ir.VectorType(I32, LANES)
 

@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel, bare
@@ -26,6 +24,7 @@ from roadscan.compute.kernels.column_statistics import (
 )
 from roadscan.compute.kernels.processor import compiles_for
 from roadscan.compute.kernels.vectors import I16, I32, constant, everywhere, instruction
+from roadscan.compute.numba_internals import ir, types
 
 SMALLEST, LARGEST = -(1 << 15), (1 << 15) - 1
 """Limits of 16-bit numbers; every height lies nearer to its base (``height_slots.FARTHEST``)."""

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel
 from roadscan.compute.kernels.column_statistics import LANES, generator
 from roadscan.compute.kernels.vectors import I16, I32, I64, constant, everywhere, load, store
+from roadscan.compute.numba_internals import ir, types
 
 _SHORTS, _DOUBLES, _FLOATS = (ir.VectorType(kind, LANES) for kind in (I16, ir.DoubleType(), ir.FloatType()))
 _OUT, _COUNTS, _COLUMN, _ROW, _CELL, _WRITTEN, _PASS, _COLUMNS = range(8)  # Places of the arguments of `store_group`.

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba.core import types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel, bare_inner
 from roadscan.compute.kernels.processor import compiles_for
 from roadscan.compute.kernels.vectors import I8, I16, I32, I64, constant, everywhere, instruction, load, start, store
+from roadscan.compute.numba_internals import ir, types
 
 AT_ONCE = 16  # Streaks that one instruction handles: 32-bit lanes of a 512-bit register.
 

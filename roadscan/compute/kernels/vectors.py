@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from llvmlite import ir
-from numba.core import cgutils
+from roadscan.compute.numba_internals import cgutils, ir
 
 I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))  # LLVM's types of whole numbers.
 

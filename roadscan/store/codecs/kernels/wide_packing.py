@@ -7,13 +7,12 @@ numbers, as many bytes long as a number has bits. They are written one over the 
 from __future__ import annotations
 
 import numpy as np
-from llvmlite import ir
-from numba.core import types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import inner, kernel
 from roadscan.compute.kernels.processor import compiles_for
 from roadscan.compute.kernels.vectors import I32, I64, constant, everywhere, instruction, load, picked, start, store
+from roadscan.compute.numba_internals import ir, types
 from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCK, MINIBLOCKS, widths_of
 
 THERE = compiles_for("avx512f", "avx512bw", "avx512vl")

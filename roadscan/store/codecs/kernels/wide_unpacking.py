@@ -11,8 +11,6 @@ Arithmetic is that of unsigned 16-bit numbers, wrapping, which is enough for val
 from __future__ import annotations
 
 import numpy as np
-from llvmlite import ir
-from numba.core import types
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel, inlined, kernel
@@ -30,6 +28,7 @@ from roadscan.compute.kernels.vectors import (
     start,
     store,
 )
+from roadscan.compute.numba_internals import ir, types
 
 READ_AHEAD_BYTES = 128
 """Bytes after a page that are read; their content does not matter."""

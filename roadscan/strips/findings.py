@@ -14,6 +14,8 @@ from roadscan.core.witness import Finding, Witness
 from roadscan.store.logs import LogRecord, log_of
 from roadscan.store.manifest import Manifest
 from roadscan.strips.lag import Lag
+from roadscan.strips.tilt import Tilt
+from roadscan.strips.tilt_findings import tilt_findings
 from roadscan.strips.whose import Blamed, Difference, End, Suspect, whose
 from roadscan.strips.work import PRODUCT, Pair, SeenBy
 
@@ -88,11 +90,14 @@ class _Names:
     def log(self, run: str, sensor: str) -> str:
         return self._logs.get((run, sensor)) or f"{sensor} of {run}"
 
+    def poses(self, run: str) -> str:
+        return self._poses.get(run, f"poses of run '{run}'")
+
     def suspect(self, one: Suspect) -> str:
         if one.kind == "log":
             return self.log(one.run, one.sensor)
         if one.kind == "run":
-            return self._poses.get(one.run, f"poses of run '{one.run}'")
+            return self.poses(one.run)
         return f"{one.sensor} in all runs"
 
 
@@ -117,6 +122,7 @@ def strip_findings(records: Sequence[LogRecord], manifest: Manifest) -> list[Fin
     repeats = any(lag.repeats for lag in far)
     return [
         *found,
+        *tilt_findings(seen, names.poses, names.log),
         *(
             _finding(ALONG_TRAVEL, one, names, lambda blamed: _shift_words(blamed, speed, repeats=repeats))
             for one in shifts
@@ -125,7 +131,7 @@ def strip_findings(records: Sequence[LogRecord], manifest: Manifest) -> list[Fin
 
 
 def _stretch(figures: Mapping[str, Any]) -> _Stretch:
-    sensors = tuple(SeenBy(**one) for one in figures["sensors"])
+    sensors = tuple(SeenBy(**{**one, "tilts": tuple(Tilt(*t) for t in one["tilts"])}) for one in figures["sensors"])
     return _Stretch(
         figures["run"],
         tuple(figures["sigma_m"]),

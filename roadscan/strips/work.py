@@ -35,6 +35,7 @@ from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.strips.lag import Lag, lag_of
 from roadscan.strips.strip import HALF_WIDTH_M, Strip, Way
+from roadscan.strips.tilt import Sway, Tilt, tilts_of
 from roadscan.tiles.tasks.tile_plan import tiles_of
 
 Float64 = npt.NDArray[np.float64]
@@ -221,6 +222,8 @@ class SeenBy:
     level_share: float
     way: int
     """+1: the run drove along the way, −1: against it."""
+    tilts: tuple[Tilt, ...]
+    """How its readings confirm the angles of the stretch's poses; of the run that drove the stretch alone."""
 
 
 @dataclass(frozen=True)
@@ -244,9 +247,10 @@ def compare_strip(task: StripTask) -> OutputRecord:
     seen: list[tuple[SeenBy, Strip]] = []
     if way is not None:
         placer = Georeferencer(task.store, task.ground, task.slices, recorded=True)
+        sway = _sway(task)
         order = sorted(task.slices, key=lambda one: (one.source.run != task.run, one.source.run, one.source.sensor))
         for _, slices in itertools.groupby(order, lambda one: (one.source.run, one.source.sensor)):
-            seen.append(_seen_by(task, placer, way, list(slices)))
+            seen.append(_seen_by(task, placer, way, sway, list(slices)))
     pairs = [
         _pair(j, k, one[1], other[1])
         for (j, one), (k, other) in itertools.combinations(enumerate(seen), 2)
@@ -262,7 +266,17 @@ def compare_strip(task: StripTask) -> OutputRecord:
     return OutputRecord(PRODUCT, task.unit, task.key, "", 0, "", json.dumps(figures))
 
 
-def _seen_by(task: StripTask, placer: Georeferencer, way: Way, slices: Sequence[RawSlice]) -> tuple[SeenBy, Strip]:
+def _sway(task: StripTask) -> Sway:
+    """Returns how the vehicle swayed on the stretch."""
+    pad = task.first_gps_ns - _PAD_NS, task.last_gps_ns + _PAD_NS
+    recorded = load_recorded(task.store, task.poses, [pad], task.ground.max_gap_s)
+    knots = recorded.epochs_gps_ns
+    return Sway.of(level_poses(recorded, task.ground.map, knots[(knots >= pad[0]) & (knots <= pad[1])]))
+
+
+def _seen_by(
+    task: StripTask, placer: Georeferencer, way: Way, sway: Sway, slices: Sequence[RawSlice]
+) -> tuple[SeenBy, Strip]:
     source = slices[0].source
     given, parts = 0, list[PlacedReadings]()
     for count, part in _placed(task, placer, way, slices):
@@ -278,9 +292,10 @@ def _seen_by(task: StripTask, placer: Georeferencer, way: Way, slices: Sequence[
         with_way = float(((epochs[near] - middle) * (vertex[near] - vertex[near].mean())).sum()) >= 0.0
         direction = 1 if source.run == task.run or with_way else -1
     below = float(strip.below_m) if np.isfinite(strip.below_m) else None
+    tilts = tuple(tilts_of(points, epochs, sway)) if source.run == task.run else ()
     return SeenBy(
         source.run, source.sensor, source.table == "scans", slices[0].file, middle, given, len(found.points_m),
-        int(near.sum()), strip.readings, strip.own_lane, strip.astray, below, strip.level_share, direction,
+        int(near.sum()), strip.readings, strip.own_lane, strip.astray, below, strip.level_share, direction, tilts,
     ), strip  # fmt: skip
 
 

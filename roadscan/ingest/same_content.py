@@ -18,7 +18,7 @@ SAME_CONTENT: Final = Witness(
     input="any log",
     fault="The same log is listed under two names: a copy, or one drive listed as two.",
     asks="the content of the logs of the survey file, byte by byte; of clouds also their number of points, their times "
-    "and their middle",
+    "and their middle; of the logs of one sensor also their number of readings and the times of all row groups",
     does="a copy in the same run and with the same settings counts once; readings that count twice otherwise are used, "
     "and named",
     told=("findings",),
@@ -28,6 +28,8 @@ _Listed: TypeAlias = dict[tuple[str, str, str | None], LogConfig]
 """Logs of the survey file by run, path and sensor."""
 _READINGS: Final = ("scans", "returns", "cloud", "images")
 """Tables of which no two runs share a log. One trajectory may cover several runs."""
+_OF_SENSORS: Final = ("scans", "returns", "images")
+"""Tables of which no sensor has two rows of one time in two logs."""
 _FRAME: Final = ("crs", "height", "geoid", "vertical_crs")
 """Attributes of the coordinates that two clouds must share for their means to be compared."""
 _SAME_MIDDLE_M: Final = 0.005
@@ -40,7 +42,9 @@ _COMPARED_BYTES: Final = 1 << 20
 def same_content_findings(survey: Survey, records: Sequence[LogRecord]) -> list[Finding]:
     """Return findings on copies among the survey file's logs, and on readings that count twice."""
     listed = {(run.id, str(log.path), log.sensor): log for run in survey.config.runs for log in run.logs}
-    return [*_copies(survey, listed, records), *_twice(listed, records), *_same_points(records)]
+    return [
+        *_copies(survey, listed, records), *_twice(listed, records), *_same_points(records), *_same_times(records),
+    ]  # fmt: skip
 
 
 def _copies(survey: Survey, listed: _Listed, records: Sequence[LogRecord]) -> Iterator[Finding]:
@@ -107,6 +111,23 @@ def _same_points(records: Sequence[LogRecord]) -> Iterator[Finding]:
                 f"{text} ({first.run}/{first.sensor}): they count a second time as {later.run}/{later.sensor}; they "
                 "are used",
             )
+
+
+def _same_times(records: Sequence[LogRecord]) -> Iterator[Finding]:
+    """Yield findings on logs of one sensor with the same times and other bytes: one log that was encoded anew."""
+    groups: dict[object, list[LogRecord]] = defaultdict(list)
+    for record in records:
+        for table in _OF_SENSORS:
+            if spans := tuple(file.group_spans for file in record.tables.get(table, ())):
+                groups[record.sensor, table, record.rows, spans].append(record)
+    for group in groups.values():
+        for first, later in itertools.pairwise(sorted(group, key=lambda r: (r.run, r.path))):
+            if first.content != later.content:
+                yield SAME_CONTENT.finds(
+                    later.path,
+                    f"its {later.rows:,} rows have the times of those of {first.path} ({first.run}/{first.sensor}) to "
+                    f"the nanosecond: they count a second time as {later.run}/{later.sensor}; they are used",
+                )
 
 
 def _entry(listed: _Listed, record: LogRecord) -> LogConfig | None:

@@ -164,6 +164,21 @@ def test_one_capture_in_two_runs_is_named(tmp_path: Path) -> None:
     assert "its readings count a second time as two/roof" in said
 
 
+def test_one_drive_that_was_written_anew_for_another_run_is_named(tmp_path: Path) -> None:
+    """The same packets in a capture of other bytes: its header states another snap length."""
+    capture(tmp_path / "l.pcap", heard(600.0, 600.1) + piece(600.2, 600.2))
+    anew = bytearray((tmp_path / "l.pcap").read_bytes())
+    anew[16:20] = (anew[16] ^ 1).to_bytes(1, "little") + bytes(anew[17:20])  # the snap length: no reading depends on it
+    (tmp_path / "again.pcap").write_bytes(anew)
+    text = 'id = "s"\nstore = "store"\n[map]\ncrs = "EPSG:32632"\n[rig.sensors.roof]\nkind = "lidar"\naxes = "flu"\n'
+    for run, name in (("one", "l"), ("two", "again")):
+        text += f'[[runs]]\nid = "{run}"\n[[runs.logs]]\npath = "{name}.pcap"\nsensor = "roof"\n'
+    (tmp_path / "SURVEY.toml").write_text(text)
+    CliRunner().invoke(app, ["ingest", str(tmp_path / "SURVEY.toml")])
+    said = " ".join(CliRunner().invoke(app, ["status", str(tmp_path / "SURVEY.toml")]).output.split())
+    assert "to the nanosecond: they count a second time as two/roof" in said
+
+
 def test_parts_of_a_capture_in_another_order_are_used_and_named(tmp_path: Path) -> None:
     packets = heard(602.0, 602.1) + piece(602.2, 602.2, 700) + heard(600.0, 600.1) + piece(600.2, 600.2, 700)
     capture(tmp_path / "l.pcap", packets)

@@ -117,6 +117,25 @@ def attitude_spike(random: Random, folder: Path) -> str:
     )
 
 
+def attitude_sign(random: Random, folder: Path) -> str:
+    """Roll or pitch of a run has the other sign."""
+    path, poses = _poses(folder, run := _run(random))
+    axis = int(random.integers(2))
+    poses[:, 7 + axis] *= -1.0
+    poses.tofile(path)
+    return f"{_ANGLES[axis]} of {run} has the other sign"
+
+
+def attitude_late(random: Random, folder: Path) -> str:
+    """Roll and pitch of a run are those of another time."""
+    path, poses = _poses(folder, run := _run(random))
+    size_s = _sign(random) * _log_uniform(random, 0.01, 0.5)
+    for axis in (0, 1):
+        poses[:, 7 + axis] = np.interp(poses[:, 0] - size_s, poses[:, 0], poses[:, 7 + axis])
+    poses.tofile(path)
+    return f"roll and pitch of {run} are {size_s:+.4f} s late"
+
+
 def null_pose(random: Random, folder: Path) -> str:
     """A pose at latitude 0, longitude 0, height 0."""
     path, poses = _poses(folder, run := _run(random))
@@ -229,6 +248,14 @@ def profiler_wrong_readings(random: Random, folder: Path) -> str:
     raw[wrong] = random.integers(1, 65_535, int(wrong.sum()), dtype=np.uint16)
     pq.write_table(_with(table, "range", raw), path)
     return f"{share:.2%} of the readings of {head} of {run} are anywhere"
+
+
+def profiles_mirrored(random: Random, folder: Path) -> str:
+    """The readings of each profile of a head run from right to left."""
+    path, table = _scans(folder, run := _run(random), head := _head(random))
+    ranges = _ranges(table)
+    pq.write_table(_with(table, "range", ranges[:, ::-1]), path)
+    return f"profiles of {head} of {run} are mirrored"
 
 
 def profiler_stuck(random: Random, folder: Path) -> str:
@@ -446,16 +473,19 @@ _RIGHT: Final = {
     pose_spike: "pose_leap pose_step",
     pose_step: "pose_step pose_leap tick_clock",
     attitude_spike: "pose_leap pose_step",
+    attitude_sign: "attitude_seen",
+    attitude_late: "attitude_seen",
     null_pose: "pose_leap gnss_no_fix",
-    trajectory_late: "tick_clock along_travel no_pose failed error",
+    trajectory_late: "tick_clock along_travel attitude_seen no_pose failed error",
     trajectory_clock_step: "pose_stamps tick_clock pose_step pose_leap along_travel time_goes_back no_pose",
     pose_gap: "no_pose",
     poses_twice: "time_goes_back rows_twice",
     stated_sigma: "stated_sigma",
-    profiler_late: "tick_clock along_travel no_pose",
+    profiler_late: "tick_clock along_travel attitude_seen no_pose",
     profiler_clock_stands: "one_stamp",
     profiler_scale: "mounting heads_of_a_run readings_agree sees_road",
     profiler_wrong_readings: "readings_agree",
+    profiles_mirrored: "attitude_seen readings_agree heads_of_a_run sees_road",
     profiler_stuck: "repeated_profiles",
     profiler_twice: "time_goes_back rows_twice",
     heads_exchanged: "heads_of_a_run mounting readings_agree sees_road",
@@ -467,7 +497,7 @@ _RIGHT: Final = {
     control_exchanged: "control_point",
     lever_arm: "mounting heads_of_a_run readings_agree sees_road along_travel",
     boresight: "mounting heads_of_a_run readings_agree sees_road along_travel",
-    axes_flipped: "sees_road readings_agree failed error",
+    axes_flipped: "attitude_seen sees_road readings_agree failed error",
     wrong_date: "no_pose lidar_gprmc failed error",
     wrong_system: "no_pose control_place failed error",
     bytes_flipped: _ANYTHING,

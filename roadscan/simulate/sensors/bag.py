@@ -217,7 +217,7 @@ class _Messages:
         steps = np.diff(start.inv().apply(poses.position_ecef_m - poses.position_ecef_m[0]), axis=0, prepend=0.0)
         driven_m = np.cumsum(np.linalg.norm(steps, axis=1))
         flu = Rotation.from_matrix(BODY_FROM_AXES)
-        turned = Rotation.from_euler("z", stated.turn_deg_per_m * driven_m, degrees=True)
+        turned = Rotation.from_rotvec(np.outer(stated.turn_deg_per_m * driven_m, [0.0, 0.0, 1.0]), degrees=True)
         places = np.cumsum((1.0 + stated.scale) * turned.apply(flu.apply(steps)), axis=0)
         quaternions = (turned * flu * start.inv() * poses.ecef_from_body * flu).as_quat()
         zero, unknown = get["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(36)

@@ -24,7 +24,8 @@ DEFINITIONS: Final = {
 }
 """Definitions of the messages, of the driver's public repository."""
 POINT: Final = np.dtype([
-    ("t", "<u4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("tag", "u1"), ("line", "u1"), ("_", "u1")
+    ("t", "<u4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("tag", "u1"), ("line", "u1"),
+    ("_", "u1"),
 ])  # fmt: skip
 """A point as ROS 2 lays it; the last byte, which the last point of a message lacks, is none of ROS 1."""
 _LITTLE_ENDIAN: Final = b"\0\1\0\0"  # begin of a message of ROS 2

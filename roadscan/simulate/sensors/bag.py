@@ -90,7 +90,8 @@ def write_bag(scene: Scene, world: World | None, drive: Drive, bag: Path, hits_f
 
     is_ros1, types = scene.bag.container == "ros1", _types(scene)
     kinds = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    for name, text in livox.DEFINITIONS.items():
+    trees = {_TYPES[MOUNTINGS]: "geometry_msgs/TransformStamped[] transforms\n"} if is_ros1 else {}
+    for name, text in (livox.DEFINITIONS | trees).items():
         kinds.register(get_types_from_msg(text, name))
     messages = _Messages(scene, drive, kinds.types)
     with ExitStack() as stack:

@@ -21,7 +21,7 @@ from tests.formats.log_reading import Log, read_log
 
 STREET = Scene.load("low_cost_rig").changed(
     length_m=1.0, passes=[{"lane": 2, "stops": []}], imu={"on": False}, gnss={"on": False}, bag={"on": False},
-    lidar={"range_max_m": 6.0}, start="2026-07-02T07:59:59.987654Z",
+    lidar={"range_max_m": 5.0}, start="2026-07-02T07:59:59.987654Z",
 ).noiseless()  # fmt: skip
 
 

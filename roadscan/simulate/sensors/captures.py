@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -22,7 +22,7 @@ from roadscan.simulate.sensors.pcap import FILE_HEADER, PcapWriter
 FILE: Final = "lidar.pcap"
 FORMATS: Final = {"velodyne": "velodyne_pcap", "ouster": "ouster_pcap", "hesai": "hesai_pcap"}
 """Format that reads the packets of a maker."""
-_WRITERS: Final = {"ouster": ouster.OusterCapture, "hesai": hesai.HesaiCapture}
+_Writer: TypeAlias = PcapWriter | ouster.OusterCapture | hesai.HesaiCapture
 
 
 def write_capture(scene: Scene, world: World, drive: Drive, folder: Path, hits_file: Path | None) -> Iterator[int]:
@@ -36,13 +36,15 @@ def write_capture(scene: Scene, world: World, drive: Drive, folder: Path, hits_f
         hits = None
         if hits_file is not None:
             hits = stack.enter_context(pq.ParquetWriter(hits_file, lidar.HITS_SCHEMA, use_dictionary=False))
-        writer: PcapWriter | ouster.OusterCapture | hesai.HesaiCapture
+        writer: _Writer
         if maker == "velodyne":
             writer = stack.enter_context(PcapWriter(folder / FILE, scene, drive))
         else:
             stream = stack.enter_context((folder / FILE).open("wb"))
             stream.write(FILE_HEADER)
-            writer = _WRITERS[maker](stream, scene, drive, _clock(scene))
+            clock = _clock(scene)
+            is_ouster = maker == "ouster"
+            writer = ouster.OusterCapture(stream, clock) if is_ouster else hesai.HesaiCapture(stream, clock, scene)
         for block in lidar.measure(scene, world, drive):
             writer.write(block)
             if hits is not None:

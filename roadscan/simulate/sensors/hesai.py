@@ -14,7 +14,6 @@ from typing import BinaryIO, Final
 import numpy as np
 
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.simulate.drive import Drive
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.sensors.clock import SensorClock
@@ -40,7 +39,7 @@ _PACKET: Final = np.dtype([
 class HesaiCapture:
     """Writes the packets of one pass."""
 
-    def __init__(self, stream: BinaryIO, scene: Scene, drive: Drive, clock: SensorClock) -> None:
+    def __init__(self, stream: BinaryIO, clock: SensorClock, scene: Scene) -> None:
         self._stream, self._clock, self._turns_per_s = stream, clock, scene.lidar.turns_per_s
         self._written = 0
 

@@ -209,7 +209,7 @@ def _aim(scene: Scene, start_deg: float, numbers: Int64) -> Aim:
     cycle = numbers[:, None] * figures.cycles + np.arange(figures.cycles)
     share = model.firing_ns / figures.cycle_ns
     if figures.rosette is not None:
-        fired_s = (figures.cycle_ns * cycle[:, :, None] + model.firing_ns) * 1e-9
+        fired_s = 1e-9 * (figures.cycle_ns * cycle[:, :, None] + model.firing_ns).astype(np.float64)
         azimuth_deg, elevation_deg = figures.rosette.aimed(fired_s, start_deg, model.elevation_deg)
         return Aim(np.zeros(cycle.shape, np.uint16), np.mod(azimuth_deg, 360.0), elevation_deg)
     if figures.columns is not None and not scene.bag.on:  # columns begin at their own angles, packets with whole ones

@@ -14,7 +14,6 @@ from typing import Any, BinaryIO, Final
 
 import numpy as np
 
-from roadscan.simulate.drive import Drive
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.sensors.clock import SensorClock
@@ -42,7 +41,7 @@ def _packet(rows: int) -> np.dtype[np.void]:
 class OusterCapture:
     """Writes the packets of one pass."""
 
-    def __init__(self, stream: BinaryIO, scene: Scene, drive: Drive, clock: SensorClock) -> None:
+    def __init__(self, stream: BinaryIO, clock: SensorClock) -> None:
         self._stream, self._clock = stream, clock
         self._turn, self._last = 0, -1
 

@@ -87,7 +87,7 @@ def test_how_good_the_imu_is_is_asked_before_a_log_is_read(tmp_path: Path) -> No
     assert not list(made.folder.glob("store/**/*.parquet"))
 
 
-HANGING = {"model": "Mid-360", "errors": "model", "mount": {"roll_deg": 181.2, "pitch_deg": 5.0}}
+HANGING = {"model": "Mid-360", "mount": {"roll_deg": 181.2, "pitch_deg": 5.0}}
 """A Mid-360 sees from 7° below its level up to 52° above: where it is to see the road, it hangs."""
 
 

@@ -113,6 +113,11 @@ def first_survey(
     for log, companion, setting in found.pairs:
         names = [os.path.relpath(one.path, found.folder) for one in (companion, log)]
         typer.echo(f"paired: {names[0]} with {names[1]}, as its options.{setting}")
+    for log in found.odometries:
+        place = os.path.relpath(log.path, found.folder)
+        typer.echo(
+            f"not listed: {log.stem} of {place}: poses from an origin of their own; IMU and GNSS make the trajectory"
+        )
     for path, words in found.unknown:
         typer.echo(f"not understood: {os.path.relpath(path, found.folder)}: {words}")
     written = " and ".join(str(file) for file in (made.survey_file, made.rig_file) if file is not None)

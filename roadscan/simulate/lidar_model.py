@@ -1,11 +1,11 @@
-"""The models of spinning lidars: when their lasers fire and where they look. A model is a file of `lidars/`."""
+"""The models of lidars: when their lasers fire, where they look and how they err. A model is a file of `lidars/`."""
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,53 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 FOLDER: Final = Path(__file__).parent / "lidars"
+
+
+class ModelErrors(Strict):
+    """How a model errs, for scenes that ask for it (`lidar.errors`); 1 σ."""
+
+    range_m: float = Field(ge=0.0)
+    """Noise of a range."""
+    angle_deg: float = Field(ge=0.0)
+    """How far a beam goes beside its stated direction, on each of two axes."""
+    dropout: float = Field(ge=0.0, le=0.5)
+    """Share of returns that are lost."""
+    clutter: float = Field(ge=0.0, le=0.5)
+    """Share of firings that meet a drop or dust before anything else …"""
+    clutter_m: float = Field(gt=0.0)
+    """… mostly within this distance beyond the shortest range: beyond it lies one in e (m)."""
+    stamp_ns: float = Field(ge=0.0)
+    """Jitter of the stamps of the cycles that are measured together."""
+
+
+class Rosette(Strict):
+    """Two optics in line: a fast one turns beams and fan about the axis, a slow one sweeps the fan up and down.
+
+    The centre of the fan rises and falls by the first two terms of an even sweep: a (cos φ + cos 3φ / 9).
+    """
+
+    turns_per_s: float = Field(gt=0.0)
+    """Turns of the fast optics, clockwise seen from above."""
+    sweeps_per_s: float = Field(gt=0.0)
+    """Sweeps of the slow optics, up and down."""
+    lowest_deg: float
+    """Lowest elevation of the fan's centre."""
+    highest_deg: float
+    """Highest one."""
+    aside: float
+    """Width of the fan where it lies level, as a share of its height where it stands upright."""
+
+    def aimed(self, time_s: Float64, start_deg: float, fan_deg: Float64) -> tuple[Float64, Float64]:
+        """Return azimuth (clockwise) and elevation (…, n) in degrees of n beams at times (…, n) since the start.
+
+        fan_deg : (n,) each beam's place in the fan, upwards where it stands upright.
+        """
+        turned = start_deg + 360.0 * self.turns_per_s * time_s
+        phase = 2.0 * np.pi * self.sweeps_per_s * time_s
+        half = (self.highest_deg - self.lowest_deg) / 2.0
+        centre = self.lowest_deg + half + 0.9 * half * (np.cos(phase) + np.cos(3.0 * phase) / 9.0)
+        aside = self.aside * fan_deg * np.sin(np.radians(turned)) / np.cos(np.radians(centre))
+        return turned - aside, centre + fan_deg * np.cos(np.radians(turned))
 
 
 class Figures(Strict):
@@ -42,6 +89,14 @@ class Figures(Strict):
     """Unit of recorded ranges."""
     divergence_deg: float
     """Full angle of a beam."""
+    rosette: Rosette | None = None
+    """Where the fan of beams goes, whose angles `elevation_deg` are then; none: the head turns evenly."""
+    capture: Literal["velodyne", "ouster", "hesai"] | None = None
+    """Whose packets a capture without a bag has; none: only a bag records it."""
+    columns: int | None = None
+    """Columns of a turn, where the maker counts them: a capture then begins each at its own angle."""
+    errors: ModelErrors
+    """How it errs."""
 
 
 @dataclass(frozen=True)

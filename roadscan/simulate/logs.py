@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from roadscan.core.errors import ConfigError
-from roadscan.core.gpstime import TimeSystem, utc_from_gps_ns
+from roadscan.core.gpstime import TimeSystem
 from roadscan.simulate import trajectory
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.scene import ClockError, Scene
-from roadscan.simulate.sensors import bag, encoder, gnss, imu, lidar, sick
+from roadscan.simulate.sensors import bag, captures, encoder, gnss, imu, sick
 from roadscan.simulate.sensors.camera import write_camera
 from roadscan.simulate.sensors.clock import SensorClock
 from roadscan.simulate.sensors.profiler import Head, heads, write_profiles
@@ -124,25 +122,19 @@ class Pass:
         world = self.world
         if world is None or not self.scene.lidar.on:
             return
-        name = "lidar.pcap"
 
         def write() -> Iterator[int]:
-            return lidar.write_lidar(self.scene, world, self.drive, self.raw / name, self.hits("lidar"))
+            return captures.write_capture(self.scene, world, self.drive, self.raw, self.hits("lidar"))
 
-        clock, first = self.clock("lidar", TimeSystem.UTC_HOUR), lidar.starts_gps_ns(self.drive)
-        hour = None
-        if self.drive.earth.is_local:  # no GNSS receiver is attached that would give the hour
-            shown = int(clock.shown_gps_ns(np.array([first]))[0])
-            hour = f"{{ hour = {utc_from_gps_ns(shown).hour} }}"
-        stated = clock.toml(None, first)
-        yield SimulatedLog(name, write, "returns", "velodyne_pcap", "lidar", stated, options=hour)
+        form, clock, options = captures.stated(self.scene, self.drive)
+        yield SimulatedLog(captures.FILE, write, "returns", form, "lidar", clock, options=options)
 
     def _bag(self) -> Iterator[SimulatedLog]:
         scene, world = self.scene, self.world
         self._need_earth("bag", "its positions are latitude and longitude")
         name = bag.file_name(scene)
         stated = {
-            "ros_points": ("lidar", scene.lidar.on, scene.lidar.clock, None),
+            bag.points_format(scene): ("lidar", scene.lidar.on, scene.lidar.clock, None),
             "ros_imu": ("imu", scene.imu.on, scene.imu.clock, None),
             "ros_gnss": ("gnss", scene.gnss.on, ClockError(), self.drive.earth.geographic_crs),
         }

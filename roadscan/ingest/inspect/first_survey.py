@@ -37,6 +37,9 @@ _MOSTLY: Final = 0.5
 """Least share of common time of companions of one mission; missions one after another have less."""
 _DIGITS: Final = re.compile(r"\d+")
 _NOT_IN_A_NAME: Final = re.compile(r"[^A-Za-z0-9_.-]+")
+_OWN_FRAME_M: Final = 50_000.0
+"""Poses that stay this near their origin are in a frame of their own (m): coordinates of the Earth, and eastings of
+projections for whole countries, are larger."""
 _NAME_LENGTH: Final = 64  # longest sensor name that is proposed (characters)
 
 
@@ -130,6 +133,8 @@ class FoundFolder:
     runs: list[FoundRun] = field(default_factory=list)
     control: list[FoundLog] = field(default_factory=list)
     references: list[FoundLog] = field(default_factory=list)
+    odometries: list[FoundLog] = field(default_factory=list)
+    """Poses in a frame of their own beside what makes a trajectory on the Earth: no logs of a run."""
     lines: list[Path] = field(default_factory=list)
     """Vector layers with lines: perhaps centre lines."""
     settings: list[tuple[Path, FileKind]] = field(default_factory=list)
@@ -182,6 +187,8 @@ def find_logs(folder: Path, progress: Progress = lambda rows, share: None) -> Fo
     logs: list[FoundLog] = []
     for path in _candidates(found.folder):
         _sort_in(path, found, logs, progress)
+    found.odometries = [log for log in logs if _is_odometry(log, logs)]
+    logs = [log for log in logs if log not in found.odometries]
     found.runs = _runs(_pair(logs, found.folder), found.folder)
     for run in found.runs:
         _name_sensors(run)
@@ -327,6 +334,17 @@ def _sort_in_parts(
 
 
 # --- which logs belong together -------------------------------------------------------------------
+
+
+def _is_odometry(log: FoundLog, logs: list[FoundLog]) -> bool:
+    """Return whether poses of a recording begin at an origin of their own, while its IMU and GNSS make a trajectory."""
+    made_of = {table for one in logs if one.path == log.path for table in one.format.yields}
+    if not log.is_trajectory or log.part is None or not {"imu", "gnss"} <= made_of:
+        return False
+    figures = log.report.figures.tables["trajectory"].columns
+    ends = [end for axis in "xyz" for end in (figures[f"{axis}_world_m"].min, figures[f"{axis}_world_m"].max)]
+    is_unstated = any(need.key == "crs" for need in log.needs)
+    return is_unstated and all(end is not None and abs(end) < _OWN_FRAME_M for end in ends)
 
 
 def _runs(logs: list[FoundLog], folder: Path) -> list[FoundRun]:

@@ -274,6 +274,13 @@ def _remarks(found: FoundFolder, folder: Path) -> Iterator[str]:
         for log in found.references:
             yield f"# path = {_path(log.path, folder)}, format = {toml(log.format.name)}"
             yield from _remark("  " + "; ".join(need.reason for need in log.report.opened.needs))
+    if found.odometries:
+        yield ""
+        yield "# Poses that begin at an origin of their own are not listed: IMU and GNSS make the trajectory. One whose"
+        yield "# frame is the map's, by what its program says, may stand in a run in place of them:"
+        for log in found.odometries:
+            topic = "" if log.part is None else f", options.topic = {toml(log.part.name)}"
+            yield f"# path = {_path(log.path, folder)}, format = {toml(log.format.name)}{topic}"
     if found.settings:
         yield ""
         yield "# Settings files that are there already:"

@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field, model_validator
 
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.strict import NAME_PATTERN, Strict, load_toml
+from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.scene.rig import (
     Bag,
     Camera,
@@ -143,8 +144,8 @@ class Scene(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.lidar.on and self.lidar.model != "HDL-32E" and not self.bag.on:
-            raise ValueError(f"lidar.model '{self.lidar.model}' is recorded in a bag: set bag.on = true")
+        if self.lidar.on and not self.bag.on:
+            self._check_capture()
         for one in self.passes:
             if one.route is None and one.lane > self.road.lanes:
                 raise ValueError(f"a pass drives lane {one.lane} of a road with {self.road.lanes}")
@@ -167,6 +168,16 @@ class Scene(Strict):
         for i, target in enumerate(self.road.targets):
             self._refuse_beyond(f"road.targets.{i}.station_m", target.station_m)
         return self
+
+    def _check_capture(self) -> None:
+        """Refuse what no capture records: models whose packets are not written, and turns that columns do not fit."""
+        name, figures = self.lidar.model, lidar_model(self.lidar.model).figures
+        if figures.capture is None:
+            raise ValueError(f"lidar.model '{name}' is recorded in a bag: set bag.on = true")
+        turns_per_s = round(1e9 / (figures.cycle_ns * (figures.columns or 1)), 2)
+        if figures.columns is not None and self.lidar.turns_per_s != turns_per_s:
+            raise ValueError(f"a capture of an {name} has {figures.columns:,} columns a turn: lidar.turns_per_s is "
+                             f"{self.lidar.turns_per_s:g}, expected {turns_per_s:g}")  # fmt: skip
 
     def _refuse_beyond(self, where: str, station_m: float) -> None:
         first, last = self.stations_m
@@ -228,6 +239,7 @@ class Scene(Strict):
             values[name]["mount"]["error"] = {}
         for name in ("lidar", "sick"):
             values[name]["divergence_deg"] = 0.0
+        values["lidar"]["errors"] = "noise"
         values["imu"] |= {"grade": "perfect", "errors": None}
         if self.profilers.head_imus is not None:
             values["profilers"]["head_imus"] = "perfect"

@@ -110,10 +110,11 @@ class Lidar(Strict):
     on: bool = True
     """Whether the rig carries it."""
     model: str = "HDL-32E"
-    """Its model (HDL-32E, OS1-128, VLP-16, XT32): a file of figures with elevations, firing times, unit of ranges and
-    width of the beams. Any other than the HDL-32E needs a bag (`bag.on`)."""
+    """Its model (HDL-32E, Mid-360, OS1-128, VLP-16, XT32): a file of figures with elevations, firing times, unit of
+    ranges, width of the beams and errors. HDL-32E, OS1-128 and XT32 are recorded as captures of their packets, or in a
+    bag (`bag.on`), as the others always are."""
     turns_per_s: float = Field(default=10.0, ge=5.0, le=20.0)
-    """Turns of the head a second."""
+    """Turns of the head a second; frames a second of a Mid-360."""
     range_max_m: float = Field(default=20.0, gt=2.0, le=100.0)
     """Returns farther than this are not measured (m)."""
     on_azimuth_grid: bool = False
@@ -122,6 +123,9 @@ class Lidar(Strict):
     divergence_deg: Annotated[float, Field(ge=0.0, le=0.5)] | Literal["data sheet"] = 0.0
     """Width of a beam (degrees): where two of its edges meet things at different ranges, the range is a mixture.
     "data sheet": that of the model."""
+    errors: Literal["noise", "model"] = "noise"
+    """How it errs: by `noise` alone, or also as its model's file says: noise of ranges and of directions, lost returns,
+    drops of rain before the rest, jitter of stamps."""
     mount: Mount = Mount(lever_arm_body_m=(-1.72, 0.06, -1.36), roll_deg=1.2, pitch_deg=18.0, heading_deg=-2.5)
     """Mounting of the head (axes flu); it leans back, so that the road behind is seen."""
     clock: ClockError = ClockError()
@@ -325,6 +329,21 @@ class Trajectory(Strict):
     """Write the companion SMRMSG (σ of position, velocity, attitude, once a second) and name it in the survey file."""
 
 
+class Odometry(Strict):
+    """The poses of an odometry in a bag: in a frame of its own (`odom`) that begins at the first of them, so that it is
+    no trajectory in the map. Its σ are not stated, as most odometries leave them.
+    """
+
+    on: bool = False
+    """Whether the bag has it."""
+    rate_hz: float = Field(default=20.0, ge=1.0, le=200.0)
+    """Poses a second."""
+    scale: float = Field(default=0.005, ge=-0.1, le=0.1)
+    """Share by which its ways are too long."""
+    turn_deg_per_m: float = Field(default=0.01, ge=-1.0, le=1.0)
+    """How far its heading drifts to the left (degrees per metre driven)."""
+
+
 class Bag(Strict):
     """The recording of a low-cost rig: one ROS bag with the lidar's clouds, the IMU and the receiver's positions."""
 
@@ -332,6 +351,10 @@ class Bag(Strict):
     """Whether lidar, IMU and receiver are recorded in a bag, in place of logs of their own."""
     container: Literal["mcap", "sqlite", "ros1"] = "mcap"
     """A ROS 2 bag of MCAP or SQLite, or a bag of ROS 1."""
+    livox: Literal["CustomMsg", "PointCloud2"] = "CustomMsg"
+    """Messages of a Mid-360: those of Livox's driver, or clouds like the other lidars'."""
+    odometry: Odometry = Odometry()
+    """Poses of an odometry."""
     delay_s: float = Field(default=0.01, ge=0.0)
     """Mean time from when a message is whole to its arrival at the recording computer; single ones vary by half (s)."""
 

@@ -1,8 +1,9 @@
 """Simulates the recording of a low-cost rig: one ROS bag with the lidar's clouds, IMU, GNSS positions and mountings.
 
-Vehicle and sensors have axes x ahead, y left, z up (REP 103). A cloud is a turn of the head; `t` counts nanoseconds
-from the header's stamp (as Ouster's driver writes it). Stamps are Unix UTC of each sensor's own clock; messages arrive
-late by random times, in the order of their arrival.
+Vehicle and sensors have axes x ahead, y left, z up (REP 103). A cloud is a turn of the head (of a Mid-360 a frame, in
+the messages of Livox's driver); `t` counts nanoseconds from the header's stamp (as Ouster's driver writes it). Stamps
+are Unix UTC of each sensor's own clock; messages arrive late by random times, in the order of their arrival. An
+odometry, where the scene has one, is the pose since the start, with an error that grows with the way.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from scipy.spatial.transform import Rotation
 from roadscan.core.gpstime import NS_PER_S, TimeSystem
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive
+from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import ClockError, Mount, Scene
-from roadscan.simulate.sensors import gnss, imu, lidar
+from roadscan.simulate.sensors import gnss, imu, lidar, livox
 from roadscan.simulate.sensors.clock import SensorClock
 from roadscan.simulate.sensors.lidar import BODY_FROM_AXES
 
@@ -33,6 +35,7 @@ CLOUDS: Final = "/lidar/points"
 IMU: Final = "/imu/data"
 POSITIONS: Final = "/gnss/fix"
 MOUNTINGS: Final = "/tf_static"
+ODOMETRY: Final = "/odom"
 _TYPES: Final = {
     CLOUDS: "sensor_msgs/msg/PointCloud2", IMU: "sensor_msgs/msg/Imu", POSITIONS: "sensor_msgs/msg/NavSatFix",
     MOUNTINGS: "tf2_msgs/msg/TFMessage",
@@ -56,6 +59,21 @@ class _Sent(NamedTuple):
     returns: int
 
 
+def points_format(scene: Scene) -> str:
+    """Return the format that reads the lidar's topic."""
+    return "ros_livox" if _is_livox(scene) else "ros_points"
+
+
+def _is_livox(scene: Scene) -> bool:
+    return lidar_model(scene.lidar.model).figures.rosette is not None and scene.bag.livox == "CustomMsg"
+
+
+def _types(scene: Scene) -> dict[str, str]:
+    """Return the type of each topic."""
+    types = _TYPES | ({CLOUDS: livox.MESSAGE} if _is_livox(scene) else {})
+    return types | ({ODOMETRY: "nav_msgs/msg/Odometry"} if scene.bag.odometry.on else {})
+
+
 def file_name(scene: Scene) -> str:
     """Return the name of a pass's bag: a file of ROS 1, a folder of ROS 2."""
     return "rig.bag" if scene.bag.container == "ros1" else "rig"
@@ -68,19 +86,25 @@ def bag_clock(scene: Scene, error: ClockError) -> SensorClock:
 
 def write_bag(scene: Scene, world: World | None, drive: Drive, bag: Path, hits_file: Path | None) -> Iterator[int]:
     """Write the bag of one pass, a message a step; yields the returns of each."""
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    is_ros1 = scene.bag.container == "ros1"
+    is_ros1, types = scene.bag.container == "ros1", _types(scene)
     kinds = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    trees = {_TYPES[MOUNTINGS]: "geometry_msgs/TransformStamped[] transforms\n"} if is_ros1 else {}
+    for name, text in (livox.DEFINITIONS | trees).items():
+        kinds.register(get_types_from_msg(text, name))
     messages = _Messages(scene, drive, kinds.types)
     with ExitStack() as stack:
         writer = stack.enter_context(_writer(scene, bag))
         hits = stack.enter_context(pq.ParquetWriter(hits_file, lidar.HITS_SCHEMA)) if hits_file else None
-        topics = {name: writer.add_connection(name, kind, typestore=kinds) for name, kind in _TYPES.items()}
+        topics = {name: writer.add_connection(name, kind, typestore=kinds) for name, kind in types.items()}
         pack = kinds.serialize_ros1 if is_ros1 else kinds.serialize_cdr
-        streams = [messages.mountings(), messages.rates(), messages.positions(), messages.clouds(world, hits)]
+        streams = [messages.mountings(), messages.rates(), messages.positions(), messages.clouds(world, hits),
+                   messages.odometry()]  # fmt: skip
         for sent in heapq.merge(*streams, key=lambda one: one.arrival_ns):
-            writer.write(topics[sent.topic], sent.arrival_ns, pack(sent.content, _TYPES[sent.topic]))
+            content = sent.content
+            data = content if isinstance(content, bytes) else pack(content, types[sent.topic])
+            writer.write(topics[sent.topic], sent.arrival_ns, data)
             yield sent.returns
 
 
@@ -179,6 +203,34 @@ class _Messages:
             )  # fmt: skip
             yield epoch, fix, 0
 
+    def odometry(self) -> Iterator[_Sent]:
+        """Yield the poses of an odometry."""
+        if self.scene.bag.odometry.on:
+            yield from self._sent(ODOMETRY, self._odometry())
+
+    def _odometry(self) -> Iterator[tuple[int, Any, int]]:
+        """The true pose of the vehicle in its first one, with the stated drift of length and heading."""
+        get, stated = self.types, self.scene.bag.odometry
+        first, last = self.drive.recorded_span_gps_ns
+        epochs = np.arange(first, last + 1, round(NS_PER_S / stated.rate_hz))
+        poses = self.drive.poses(epochs)
+        start = poses.ecef_from_body[0]
+        steps = np.diff(start.inv().apply(poses.position_ecef_m - poses.position_ecef_m[0]), axis=0, prepend=0.0)
+        driven_m = np.cumsum(np.linalg.norm(steps, axis=1))
+        flu = Rotation.from_matrix(BODY_FROM_AXES)
+        turned = Rotation.from_rotvec(np.outer(stated.turn_deg_per_m * driven_m, [0.0, 0.0, 1.0]), degrees=True)
+        places = np.cumsum((1.0 + stated.scale) * turned.apply(flu.apply(steps)), axis=0)
+        quaternions = (turned * flu * start.inv() * poses.ecef_from_body * flu).as_quat()
+        zero, unknown = get["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(36)
+        twist = get["geometry_msgs/msg/TwistWithCovariance"](get["geometry_msgs/msg/Twist"](zero, zero), unknown)
+        for number, (epoch, place, quaternion) in enumerate(zip(epochs.tolist(), places, quaternions, strict=True)):
+            pose = get["geometry_msgs/msg/Pose"](
+                get["geometry_msgs/msg/Point"](*place), get["geometry_msgs/msg/Quaternion"](*quaternion)
+            )
+            uncertain = get["geometry_msgs/msg/PoseWithCovariance"](pose, unknown)
+            header = self._header(self._utc_ns(epoch), "odom", number)
+            yield epoch, get["nav_msgs/msg/Odometry"](header, "base_link", uncertain, twist), 0
+
     def clouds(self, world: World | None, hits: pq.ParquetWriter | None) -> Iterator[_Sent]:
         """Yield the lidar's turns."""
         if world is not None and self.scene.lidar.on:
@@ -188,6 +240,7 @@ class _Messages:
         clock, first = bag_clock(self.scene, self.scene.lidar.clock), lidar.starts_gps_ns(self.drive)
         turn_ns, begun, number = round(NS_PER_S / self.scene.lidar.turns_per_s), first, 0
         pending: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.void]]] = []
+        is_livox, is_ros1 = _is_livox(self.scene), self.scene.bag.container == "ros1"
 
         def cloud(upto: int) -> Iterator[tuple[int, Any, int]]:
             epochs = np.concatenate([one[0] for one in pending])
@@ -196,13 +249,17 @@ class _Messages:
             pending[:] = [(epochs[~now], points[~now])]
             stamp = int(clock.stamps_ns(np.array([begun]))[0])
             own = points[now].copy()
-            own["t"] = clock.stamps_ns(epochs[now]) - stamp
+            own["t"] = np.maximum(clock.stamps_ns(epochs[now]) - stamp, 0)  # jitter may put one before its turn
+            if is_livox:
+                message = livox.serialised(own, stamp, "lidar", number, is_ros1=is_ros1)
+                yield begun + turn_ns, message, int(np.count_nonzero(own["intensity"]))
+                return
             yield begun + turn_ns, self._cloud(stamp, own, number), own.size
 
         for block in lidar.measure(self.scene, world, self.drive):
             if hits is not None:
                 hits.write_batch(lidar.hits_of(block))
-            pending.append(_points(block))
+            pending.append(livox.firings(block) if is_livox else _points(block))
             while block.epoch_gps_ns[-1] >= begun + turn_ns:
                 yield from cloud(begun + turn_ns)
                 begun, number = begun + turn_ns, number + 1
@@ -224,9 +281,9 @@ def _points(block: lidar.Packets) -> tuple[npt.NDArray[np.int64], npt.NDArray[np
     range_m = block.ranges[seen] * block.model.figures.range_step_m
     azimuth = np.radians(block.azimuth_deg[seen])
     laser = np.broadcast_to(np.arange(block.model.lasers), seen.shape)[seen]
-    elevation = np.radians(block.model.elevation_deg)[laser]
+    elevation = np.radians(block.elevation_deg[seen])
     out = np.zeros(range_m.size, _POINT)
     out["x"], out["y"] = range_m * np.cos(elevation) * np.cos(azimuth), -range_m * np.cos(elevation) * np.sin(azimuth)
     out["z"] = range_m * np.sin(elevation) + block.model.rise_m[laser]
     out["intensity"], out["ring"] = block.intensity[seen], laser
-    return block.firing_gps_ns()[seen], out
+    return block.stamped_gps_ns()[seen], out

@@ -1,4 +1,4 @@
-"""Simulates the spinning lidar: firings of a model's lasers while the head turns, and the PCAP log of an HDL-32E.
+"""Simulates the lidar: firings of a model's lasers while the head turns, and the capture of its maker's packets.
 
 When the lasers fire and where they look are the figures of the model's file (:mod:`roadscan.simulate.lidar_model`).
 """
@@ -8,20 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from roadscan.simulate.caster import Hits, Pattern, World, ray_key, steps_within
 from roadscan.simulate.drive import RUN_UP_S, Drive
-from roadscan.simulate.lidar_model import LidarModel, lidar_model
+from roadscan.simulate.lidar_model import LidarModel, ModelErrors, lidar_model
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Scene
-from roadscan.simulate.sensors.pcap import PcapWriter
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -30,13 +27,15 @@ INTERVALS: Final = 4
 """Intervals of a block of cycles (an HDL-32E's packet), within which the sensor moves evenly."""
 GROUP_PACKETS: Final = 8
 """Packets whose firings are neighbours of each other. A pass has whole groups of them."""
-_LONGEST_RAW: Final = 65_535  # largest raw range of an HDL-32E
 BLOCK_PACKETS: Final = 128
 """Packets measured together, whole groups: the noise is drawn by block, so this changes bytes."""
 BODY_FROM_AXES: Final = np.diag([1.0, -1.0, -1.0])
 """Axes flu: x forward, y left, z up."""
 REFLECTIVITY: Final = 0.35
 """Lidar intensity for one digital number of a profiler."""
+_CLUTTER_INTENSITY: Final = 3  # of a drop of rain
+PACKET_COLUMNS: Final = 16
+"""Columns of an Ouster's packet, of which a pass has whole ones."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +48,18 @@ class Packets:
     block_azimuth: npt.NDArray[np.uint16]
     """(p, c) hundredths of a degree at each cycle's first firing, as stated."""
     azimuth_deg: Float64
-    """(p, c, n) true azimuth of each firing, clockwise from the sensor's x, seen from above."""
+    """(p, c, n) azimuth of each firing, clockwise from the sensor's x, seen from above."""
+    elevation_deg: Float64
+    """(p, c, n) and its elevation: both by the model's figures, beside which the beam went by its `errors.angle_deg`.
+    """
     found: Hits
     """(p, c · n) what each firing met, in the order fired."""
-    ranges: npt.NDArray[np.uint16]
+    ranges: npt.NDArray[np.uint32]
     """(p, c, n) in the model's unit, 0: no return."""
     intensity: npt.NDArray[np.uint8]
     """(p, c, n)"""
+    late_ns: Int64
+    """(p,) jitter of the stamps."""
 
     def firing_gps_ns(self) -> Int64:
         """Return the epoch of each firing (p, c, n)."""
@@ -64,18 +68,20 @@ class Packets:
         out: Int64 = self.epoch_gps_ns[:, None, None] + offsets
         return out
 
+    def stamped_gps_ns(self) -> Int64:
+        """Return the same (p, c, n) with the jitter of the stamps."""
+        return self.firing_gps_ns() + self.late_ns[:, None, None]
 
-def write_lidar(scene: Scene, world: World, drive: Drive, file: Path, hits_file: Path | None) -> Iterator[int]:
-    """Write the capture of one pass, a block of packets a step; yields the returns of each."""
-    hits = pq.ParquetWriter(hits_file, HITS_SCHEMA, use_dictionary=False) if hits_file else None
-    with PcapWriter(file, scene, drive) as capture:
-        for block in measure(scene, world, drive):
-            capture.write(block.epoch_gps_ns, block.block_azimuth, block.ranges, block.intensity)
-            if hits is not None:
-                hits.write_batch(hits_of(block))
-            yield int(np.count_nonzero(block.ranges))
-    if hits is not None:
-        hits.close()
+
+class Aim(NamedTuple):
+    """Where the lasers of p packets look, by the model's figures."""
+
+    stated: npt.NDArray[np.uint16]
+    """(p, c) hundredths of a degree at each cycle's first firing."""
+    azimuth_deg: Float64
+    """(p, c, n) clockwise."""
+    elevation_deg: Float64
+    """(n,) or (p, c, n)"""
 
 
 def starts_gps_ns(drive: Drive) -> int:
@@ -94,7 +100,7 @@ def measure(scene: Scene, world: World, drive: Drive) -> Iterator[Packets]:
     key = ray_key(scene, drive, "lidar")
     for block, packet in enumerate(range(0, count, BLOCK_PACKETS)):
         numbers = np.arange(packet, min(packet + BLOCK_PACKETS, count))
-        yield _measure_block(scene, world, drive, first + numbers * packet_ns, _azimuths(scene, start_deg, numbers),
+        yield _measure_block(scene, world, drive, first + numbers * packet_ns, _aim(scene, start_deg, numbers),
                              key + packet * rays, block)  # fmt: skip
 
 
@@ -103,16 +109,19 @@ def _measure_block(
     world: World,
     drive: Drive,
     epochs: Int64,
-    azimuths: tuple[npt.NDArray[np.uint16], Float64],
+    aim: Aim,
     key: int,
     block: int,
 ) -> Packets:
-    stated, azimuth_deg = azimuths
-    model = lidar_model(scene.lidar.model)
-    elevation, azimuth = np.radians(model.elevation_deg), np.radians(azimuth_deg)
+    model, errors = lidar_model(scene.lidar.model), errors_of(scene)
+    elevation, azimuth = np.radians(aim.elevation_deg), np.radians(aim.azimuth_deg)
     flat = np.cos(elevation)
     up = np.broadcast_to(np.sin(elevation), azimuth.shape)
     direction = np.stack([flat * np.cos(azimuth), -flat * np.sin(azimuth), up], axis=-1)
+    if errors.angle_deg > 0.0:
+        aside = stream(scene.seed, drive.number, "lidar angles", block).standard_normal(direction.shape)
+        direction += math.radians(errors.angle_deg) * aside
+        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     intervals = model.block_ns // INTERVALS * (np.arange(GROUP_PACKETS * INTERVALS)[:, None] + np.arange(2))
     groups = world.cast(
         drive,
@@ -124,8 +133,36 @@ def _measure_block(
         key,
     )
     found = groups.of_groups(epochs.size)
+    if errors.clutter > 0.0:
+        _strew(stream(scene.seed, drive.number, "lidar clutter", block), model, errors, found)
     ranges, intensity = _recorded(scene, drive, block, found)
-    return Packets(model, epochs, stated, azimuth_deg, found, ranges, intensity)
+    late_ns = errors.stamp_ns * stream(scene.seed, drive.number, "lidar stamps", block).standard_normal(epochs.size)
+    everywhere = np.broadcast_to(aim.elevation_deg, azimuth.shape)
+    return Packets(
+        model, epochs, aim.stated, aim.azimuth_deg, everywhere, found, ranges, intensity, late_ns.astype(np.int64)
+    )
+
+
+def errors_of(scene: Scene) -> ModelErrors:
+    """Return the lidar's errors: those of the scene's noise, and those of the model where the scene asks for them."""
+    noise = scene.noise
+    none = ModelErrors(
+        range_m=noise.lidar_range_m, angle_deg=0.0, dropout=noise.dropout, clutter=0.0, clutter_m=1.0, stamp_ns=0.0
+    )
+    if scene.lidar.errors == "noise":
+        return none
+    own = lidar_model(scene.lidar.model).figures.errors
+    lost = own.dropout + noise.dropout - own.dropout * noise.dropout
+    return own.model_copy(update={"range_m": math.hypot(own.range_m, noise.lidar_range_m), "dropout": lost})
+
+
+def _strew(rng: np.random.Generator, model: LidarModel, errors: ModelErrors, found: Hits) -> None:
+    """Put drops before what the beams met: they are on no object, and nobody knows where."""
+    met = rng.random(found.range_m.shape) < errors.clutter
+    near = model.figures.range_min_m + rng.exponential(errors.clutter_m, found.range_m.shape)
+    met &= ~(found.range_m <= near)
+    found.range_m[met], found.enh_m[met], found.object_id[met] = near[met], np.nan, -1
+    found.intensity[met], found.is_mixed[met] = _CLUTTER_INTENSITY / REFLECTIVITY, False
 
 
 def _pattern(scene: Scene, model: LidarModel) -> Pattern:
@@ -142,7 +179,7 @@ def _pattern(scene: Scene, model: LidarModel) -> Pattern:
         past_ns % interval_ns / interval_ns,
         wide_deg,
         (figures.range_min_m, scene.lidar.range_max_m),
-        _beside(model, cycles),
+        None if figures.rosette is not None else _beside(model, cycles),
         (steps_within(wide_deg, _degrees_a_cycle(scene, model)), steps_within(wide_deg, model.spacing_deg)),
     )
 
@@ -164,38 +201,45 @@ def _beside(model: LidarModel, cycles: int) -> Int64:
     return beside.reshape(-1, 4)
 
 
-def _azimuths(scene: Scene, start_deg: float, numbers: Int64) -> tuple[npt.NDArray[np.uint16], Float64]:
-    """Return the stated azimuth of each cycle (p, c), hundredths, and that of each firing (p, c, n), degrees."""
+def _aim(scene: Scene, start_deg: float, numbers: Int64) -> Aim:
+    """Return where the lasers of packets look, by their numbers (p,)."""
     model = lidar_model(scene.lidar.model)
     figures = model.figures
     per_cycle = scene.lidar.turns_per_s * 36_000.0 * figures.cycle_ns * 1e-9
     cycle = numbers[:, None] * figures.cycles + np.arange(figures.cycles)
     share = model.firing_ns / figures.cycle_ns
-    if scene.lidar.on_azimuth_grid:
+    if figures.rosette is not None:
+        fired_s = 1e-9 * (figures.cycle_ns * cycle[:, :, None] + model.firing_ns).astype(np.float64)
+        azimuth_deg, elevation_deg = figures.rosette.aimed(fired_s, start_deg, model.elevation_deg)
+        return Aim(np.zeros(cycle.shape, np.uint16), np.mod(azimuth_deg, 360.0), elevation_deg)
+    if figures.columns is not None and not scene.bag.on:  # columns begin at their own angles, packets with whole ones
+        per_cycle = 36_000.0 / figures.columns
+        start_deg = PACKET_COLUMNS * 360.0 / figures.columns * (int(start_deg) % (figures.columns // PACKET_COLUMNS))
+    elif scene.lidar.on_azimuth_grid:
         per_cycle = float(round(per_cycle))
         start_deg = round(start_deg * 100.0) / 100.0
     begins = start_deg * 100.0 + per_cycle * cycle
     hundredths = begins[:, :, None] + per_cycle * share + 100.0 * model.azimuth_deg
     stated = np.mod(np.rint(begins).astype(np.int64), 36_000).astype(np.uint16)
-    return stated, np.mod(hundredths, 36_000.0) / 100.0
+    return Aim(stated, np.mod(hundredths, 36_000.0) / 100.0, model.elevation_deg)
 
 
 def _recorded(
     scene: Scene, drive: Drive, block: int, found: Hits
-) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8]]:
+) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint8]]:
     """Return ranges and intensities (p, c, n) with noise, as integers."""
     model = lidar_model(scene.lidar.model)
     rng = stream(scene.seed, drive.number, "lidar", block)
-    noise = scene.noise
+    wrong = errors_of(scene)
     exact = found.range_m.reshape(-1, model.figures.cycles, model.lasers)
     seen = np.isfinite(exact)
-    if noise.dropout > 0.0:
-        seen &= rng.random(seen.shape, dtype=np.float32) >= noise.dropout
+    if wrong.dropout > 0.0:
+        seen &= rng.random(seen.shape, dtype=np.float32) >= wrong.dropout
     errors = rng.standard_normal((2, np.count_nonzero(seen)), dtype=np.float32)
-    ranges, intensity = np.zeros(seen.shape, np.uint16), np.zeros(seen.shape, np.uint8)
-    units = np.rint((exact[seen] + noise.lidar_range_m * errors[0]) / model.figures.range_step_m)
-    ranges[seen] = np.clip(units, 1, _LONGEST_RAW)
-    value = REFLECTIVITY * (found.intensity.reshape(seen.shape)[seen] + noise.intensity * errors[1])
+    ranges, intensity = np.zeros(seen.shape, np.uint32), np.zeros(seen.shape, np.uint8)
+    units = np.rint((exact[seen] + wrong.range_m * errors[0]) / model.figures.range_step_m)
+    ranges[seen] = np.maximum(units, 1)
+    value = REFLECTIVITY * (found.intensity.reshape(seen.shape)[seen] + scene.noise.intensity * errors[1])
     intensity[seen] = np.clip(np.rint(value), 1, 100)
     return ranges, intensity
 

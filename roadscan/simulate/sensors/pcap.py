@@ -15,6 +15,7 @@ from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, TimeSystem, leap_s
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.sensors.clock import SensorClock
+from roadscan.simulate.sensors.lidar import Packets
 
 Int64 = npt.NDArray[np.int64]
 
@@ -32,6 +33,8 @@ _CAPTURE_DELAY_NS: Final = 600_000
 """Time from a packet's first firing to its arrival at the computer (ns)."""
 _SENSOR_ADDRESS: Final = bytes([192, 168, 3, 43])  # IP address of the sensor
 _BROADCAST_ADDRESS: Final = bytes([255, 255, 255, 255])  # IP address of a broadcast
+FILE_HEADER: Final = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 262_144, 1)
+"""Begin of a capture of Ethernet frames with stamps of microseconds."""
 _ETHERNET: Final = bytes.fromhex("ffffffffffff6076880000000800")
 _FIRING: Final = np.dtype([("range", "<u2"), ("intensity", "u1")])
 _BLOCK: Final = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("firings", _FIRING, 32)])  # block of a data packet
@@ -60,7 +63,7 @@ class PcapWriter:
         self._drive = drive
         self._clock = SensorClock.of(scene, scene.lidar.clock, TimeSystem.UTC_HOUR)
         self._stream = file.open("wb")
-        self._stream.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 262_144, 1))
+        self._stream.write(FILE_HEADER)
         self._next_position_gps_ns: int | None = None
 
     def __enter__(self) -> Self:
@@ -71,20 +74,11 @@ class PcapWriter:
     ) -> None:
         self._stream.close()
 
-    def write(
-        self,
-        epoch_gps_ns: Int64,
-        azimuth: npt.NDArray[np.uint16],
-        ranges: npt.NDArray[np.uint16],
-        intensity: npt.NDArray[np.uint8],
-    ) -> None:
-        """Append data packets.
-
-        epoch_gps_ns : (p,) first firing; azimuth : (p, 12) hundredths of a degree; ranges : (p, 12, 32) units of 2 mm;
-        intensity : (p, 12, 32).
-        """
+    def write(self, block: Packets) -> None:
+        """Append data packets."""
+        epoch_gps_ns = block.epoch_gps_ns
         shown = self._clock.shown_gps_ns(epoch_gps_ns)
-        records = _data_packets(epoch_gps_ns, shown, azimuth, ranges, intensity)
+        records = _data_packets(block, shown)
         done = 0
         while not self._drive.earth.is_local and self._position_due(shown[-1], int(shown[0])):
             due = self._next_position_gps_ns or 0
@@ -106,13 +100,13 @@ class PcapWriter:
 
         shown_gps_ns : what the sensor's clock shows at the true epoch.
         """
-        utc = int(_utc_ns(np.array([shown_gps_ns]))[0])
+        utc = int(posix_ns(np.array([shown_gps_ns]))[0])
         sentence = self._gprmc(epoch_gps_ns, utc // NS_PER_S)
         payload = bytearray(POSITION_BYTES)
         struct.pack_into("<IB", payload, 198, utc % HOUR_NS // 1_000, 2)
         payload[206 : 206 + len(sentence)] = sentence
-        frame = _headers(POSITION_BYTES, POSITION_PORT) + bytes(payload)
-        captured = int(_utc_ns(np.array([epoch_gps_ns]))[0]) + _CAPTURE_DELAY_NS
+        frame = udp_headers(POSITION_BYTES, POSITION_PORT) + bytes(payload)
+        captured = int(posix_ns(np.array([epoch_gps_ns]))[0]) + _CAPTURE_DELAY_NS
         seconds, rest = divmod(captured, NS_PER_S)
         return struct.pack("<IIII", seconds, rest // 1_000, len(frame), len(frame)) + frame
 
@@ -133,35 +127,44 @@ class PcapWriter:
         return f"${body}*{check:02X}\r\n".encode()
 
 
-def _data_packets(
-    epoch_gps_ns: Int64,
-    shown_gps_ns: Int64,
-    azimuth: npt.NDArray[np.uint16],
-    ranges: npt.NDArray[np.uint16],
-    intensity: npt.NDArray[np.uint8],
-) -> npt.NDArray[np.void]:
-    captured = _utc_ns(epoch_gps_ns) + _CAPTURE_DELAY_NS
+def _data_packets(block: Packets, shown_gps_ns: Int64) -> npt.NDArray[np.void]:
+    epoch_gps_ns = block.epoch_gps_ns
+    captured = posix_ns(epoch_gps_ns) + _CAPTURE_DELAY_NS
     records = np.zeros(epoch_gps_ns.size, dtype=_RECORD)
     records["captured_s"], records["captured_us"] = captured // NS_PER_S, captured % NS_PER_S // 1_000
     records["stored"] = records["sent"] = 42 + DATA_BYTES
-    records["headers"] = np.frombuffer(_headers(DATA_BYTES, DATA_PORT), dtype="V42")
+    records["headers"] = np.frombuffer(udp_headers(DATA_BYTES, DATA_PORT), dtype="V42")
     records["blocks"]["flag"] = UPPER_BLOCK
-    records["blocks"]["azimuth"] = azimuth
-    records["blocks"]["firings"]["range"] = ranges
-    records["blocks"]["firings"]["intensity"] = intensity
-    records["hour_us"] = (_utc_ns(shown_gps_ns) + 500) // 1_000 % (HOUR_NS // 1_000)
+    records["blocks"]["azimuth"] = block.block_azimuth
+    records["blocks"]["firings"]["range"] = block.ranges
+    records["blocks"]["firings"]["intensity"] = block.intensity
+    records["hour_us"] = (posix_ns(shown_gps_ns + block.late_ns) + 500) // 1_000 % (HOUR_NS // 1_000)
     records["mode"], records["product"] = STRONGEST_RETURN, HDL_32E
     return records
 
 
-def _utc_ns(epoch_gps_ns: Int64) -> Int64:
+def framed(payloads: npt.NDArray[np.void], whole_gps_ns: Int64, port: int) -> bytes:
+    """Return the records of data packets (p,) that were whole at epochs (p,) and sent to a port."""
+    size = payloads.dtype.itemsize
+    headers = udp_headers(size, port)
+    fields = [("captured_s", "<u4"), ("captured_us", "<u4"), ("stored", "<u4"), ("sent", "<u4")]
+    records = np.zeros(payloads.size, [*fields, ("headers", f"V{len(headers)}"), ("payload", payloads.dtype)])
+    captured = posix_ns(whole_gps_ns) + _CAPTURE_DELAY_NS
+    records["captured_s"], records["captured_us"] = captured // NS_PER_S, captured % NS_PER_S // 1_000
+    records["stored"] = records["sent"] = len(headers) + size
+    records["headers"] = np.frombuffer(headers, records.dtype["headers"])
+    records["payload"] = payloads
+    return records.tobytes()
+
+
+def posix_ns(epoch_gps_ns: Int64) -> Int64:
     """Return POSIX nanoseconds of GPS epochs."""
     leap = leap_seconds_at_gps(epoch_gps_ns // NS_PER_S)
     out: Int64 = epoch_gps_ns + (GPS_EPOCH_UNIX_S - leap) * NS_PER_S
     return out
 
 
-def _headers(payload_bytes: int, port: int) -> bytes:
+def udp_headers(payload_bytes: int, port: int) -> bytes:
     """Return Ethernet, IPv4 and UDP headers (42 bytes) of a broadcast of `payload_bytes` to `port`."""
     udp = struct.pack(">HHHH", 443 if port == DATA_PORT else port, port, 8 + payload_bytes, 0)
     ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(udp) + payload_bytes, 0, 0, 64, 17, 0)

@@ -235,32 +235,6 @@ def test_recordings_against_the_sweeps_of_another_program(
     assert (np.minimum(azimuth, 360 - azimuth)[strays] < 0.2).all()
 
 
-def test_walls_are_flatter_with_the_turn_of_the_head(recordings: Path) -> None:
-    """Neighbouring channels of a Pandar40P fire up to 50 µs apart: without the turn meanwhile, walls are rougher."""
-    folder = recordings / "lidars" / "hesai_40p"
-    clouds = [
-        read("hesai_scans", folder / "bag", {"angles": folder / "Pandar40P.csv", "azimuth": azimuth}, clock=FREE)
-        for azimuth in ("driver", "firing")
-    ]
-    x, y, z = clouds[0].xyz_sensor_m.T
-    level = np.hypot(x, y)
-    near = np.flatnonzero((level > 3) & (np.abs(z) < 3))
-    cells = np.stack([np.arctan2(-y, x) / np.radians(3), z / 2, np.log(level) / 0.05])[:, near]
-    _, cell, count = np.unique(np.floor(cells), axis=1, return_inverse=True, return_counts=True)
-    rough = np.zeros(2)
-    walls = 0
-    for one in np.flatnonzero(count > 150):
-        rows = near[cell.ravel() == one]
-        spread = [np.linalg.eigh(np.cov(cloud.xyz_sensor_m[rows].T)) for cloud in clouds]
-        normal, middle = spread[0][1][:, 0], clouds[0].xyz_sensor_m[rows].mean(axis=0)
-        slant = abs(normal @ middle) / np.linalg.norm(middle)
-        if spread[0][0][0] < 0.03**2 and spread[0][0][1] > 0.05**2 and abs(normal[2]) < 0.3 and 0.2 < slant < 0.9:
-            walls += 1
-            rough += [rows.size * values[0] for values, _ in spread]
-    assert walls >= 8
-    assert np.sqrt(rough[1] / rough[0]) < 0.985
-
-
 def test_a_sensor_that_nothing_set_is_told_by_the_drivers_stamps(recordings: Path) -> None:
     """The Pandar40P of the recording shows 2017, its driver 2023."""
     folder = recordings / "lidars" / "hesai_40p"

@@ -8,6 +8,10 @@ return mode both returns are kept, and one that is written twice is kept once. A
 or those of the unit's calibration file. Where the sensor leaves out azimuths, one packet a turn lies across the gap:
 its later blocks wait for the head to turn on.
 
+**Azimuths.** A head turns on between a block's azimuth and a laser's firing: by rate × time, as the manuals say. ROS
+drivers count a VLP-32C's lasers as fired one by one, which doubles it. In a recording of a standing VLP-32C, walls are
+flattest with 0.6 ± 0.3 times the manual's turn (tests/formats/test_head_turn.py): the doubled one is excluded.
+
 **Which hour** it is the data packets do not say. It comes from a valid GPRMC in the capture, or from
 `options.hour` with the clock's date; from the capture's own clock only when `options.hour = "capture"`.
 See :mod:`roadscan.formats.lidars.velodyne_hours`.

@@ -16,10 +16,9 @@ firing sequence (the second: within 2.2 µs); where its packet starts is taken f
 QT128's first block is taken to start 111.11 µs before its second. One packet a turn lies across the gap of a limited
 view: its earlier blocks were fired before the head turned on over the gap.
 
-**Azimuths.** Between a block's azimuth and a channel's firing the head turns on. Which share of this turn has to be added
-was measured in recordings of standing rigs, by how flat and plumb it makes walls (tests/formats/test_head_turn.py):
-0.84 ± 0.13 for a Pandar40P, 3.1 ± 0.2 for a PandarXT-32 whose angle file may be of another unit. Manuals say 1, drivers
-0. The turn counts, unless `options.azimuth = "driver"`.
+**Azimuths.** Between a block's azimuth and a channel's firing the head turns on. Which share of this turn has to be
+added was measured in recordings of standing rigs, by how flat and plumb it makes walls (tests/formats/test_head_turn.py): 0.84 ± 0.13 for a Pandar40P, 3.1 ± 0.2 for a PandarXT-32 whose angle file may be of another unit. Manuals say 1 and
+drivers 0. The turn counts, unless `options.azimuth = "driver"`.
 
 **Time.** Packets have date and time to the microsecond. They are UTC where a GPS receiver sets the sensor. Under PTP
 they are whatever the master sends (UTC or TAI), and unset they count from a date in the past; the packets do not say

@@ -34,6 +34,7 @@ from roadscan.formats.scanners.sick_telegrams import encode_scans
 from roadscan.ingest.reading.text_table import LINE_BYTES_MAX
 from tests.formats import (
     hesai_files,
+    robosense_files,
     ros_files,
     test_argoverse,
     test_carmen,
@@ -693,6 +694,14 @@ def _packets() -> Iterator[Sample]:
         size = 16 + 42 + len(hesai_files.turning(model, 1)[0])
         spans = every(size, 24) if model in ("QT128", "PandarXT-16") else None
         yield Sample("hesai_pcap", model.lower(), hesai(model), options, {}, fields=_PCAP_FIELDS, spans=spans)
+    for model in ("RS-LiDAR-16", "Helios", "Ruby"):
+        sent, info = robosense_files.turning(model, RECORDS), robosense_files.difop(model)
+        named = {"model": model} if model == "Ruby" else {}
+        robosense = functools.partial(robosense_files.log_of, payloads=sent, info=info)
+        yield Sample("robosense_pcap", model.lower(), robosense, named, {}, fields=_PCAP_FIELDS)
+    yield Sample("robosense_pcap", "m1", robosense_files.frames, {}, {}, fields=_PCAP_FIELDS)
+    for kind, log in (("ros1", "bag.bag"), ("mcap", "bag/*.mcap")):
+        yield Sample("robosense_scans", kind, functools.partial(robosense_files.bag, kind=kind), {}, {}, (log,))
     velodyne = [content[42:] for _, content in test_velodyne_models.drive(test_velodyne_models.VLP_32C, RECORDS)]
     xt = hesai_files.turning("PandarXT-16", RECORDS)
     for kind, log in (("ros1", "bag.bag"), ("mcap", "bag/*.mcap"), ("sqlite", "bag/*.db3")):

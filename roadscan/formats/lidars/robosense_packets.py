@@ -7,7 +7,7 @@ one distance and intensity a channel, all big-endian; and DIFOP packets, also of
     sensor                        header begins            blocks    unit    stamp
     ============================  =======================  ========  ======  =====================
     RS-LiDAR-16, -32, Bpearl      55AA050A5AA550A0, 42 B   12 × 32   5 mm    date, ms, µs
-    Helios, Helios-16P            55AA055A, 42 bytes       12 × 32   2.5 mm  seconds since 1970, µs
+    Helios                        55AA055A, 42 bytes       12 × 32   2.5 mm  seconds since 1970, µs
     Ruby, Ruby Plus               55AA055A, 80 bytes       3 × 128   5 mm    seconds since 1970, µs
     M1 (MEMS, 1,210 bytes)        55AA5AA5, 32 bytes       25 × 5    5 mm    seconds since 1970, µs
     ============================  =======================  ========  ======  =====================
@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -55,6 +55,7 @@ _SLACK_CENTIDEG: Final = 10  # tolerance of azimuth steps (0.01°)
 _MILLION: Final = 1_000_000  # microseconds of a second
 _EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)  # scales 255 to 65,535
 _YAW_ZERO: Final = 32_768  # yaw and pitch 0 of an M1
+_BPEARL_V4: Final = b"\x03\x04"  # bytes 31 and 32 of the header of one with other figures, which is not read
 _OLD_TYPES: Final = {1: "RS-LiDAR-16", 2: "RS-LiDAR-32", 3: "Bpearl"}
 """Sensors by byte 30 of the older header."""
 
@@ -107,12 +108,17 @@ class Model:
 
 
 def _packet(
-    block: np.dtype[np.void], blocks: int, first: int, size: int, stamp: int, more: dict[str, tuple[str, int]] | None = None
-) -> np.dtype[np.void]:  # fmt: skip
-    fields: dict[str, tuple[object, int]] = {"block": ((block, (blocks,)), first), "stamp": (("u1", (10,)), stamp)}
+    block: np.dtype[np.void],
+    blocks: int,
+    first: int,
+    size: int,
+    stamp: int,
+    more: dict[str, tuple[str, int]] | None = None,
+) -> np.dtype[np.void]:
+    fields: dict[str, tuple[Any, int]] = {"block": ((block, (blocks,)), first), "stamp": (("u1", (10,)), stamp)}
     fields |= more or {}
     return np.dtype({"names": list(fields), "formats": [f for f, _ in fields.values()],
-                     "offsets": [at for _, at in fields.values()], "itemsize": size})  # type: ignore[call-overload,no-any-return]  # fmt: skip
+                     "offsets": [at for _, at in fields.values()], "itemsize": size})  # fmt: skip
 
 
 _RS_32_US: Final = (*_evenly(2.88, 15), 44.64, *_evenly(2.88, 15, 1.44), 46.08)
@@ -135,7 +141,6 @@ MODELS: Final = (
         55.52, radius_m=0.01473, height_m=0.09427, dated=True,
     ),
     Model("Helios", _NEW_ID, _HELIOS_US, 55.56, unit_m=0.0025, radius_m=0.03498),
-    Model("Helios-16P", _NEW_ID, _evenly(1.73, 16), 27.78, 16, unit_m=0.0025, radius_m=0.03498),
     Model("Ruby", _NEW_ID, tuple(3.236 * (k // 4 % 16) for k in range(128)), 55.55, 128, radius_m=0.03615),
     Model("Ruby Plus", _NEW_ID, tuple(t for t in _RUBY_PLUS_US for _ in range(4)), 55.56, 128, radius_m=0.02892),
     Model("M1", _M1_ID, lasers=5),
@@ -149,12 +154,13 @@ def models_of(payload: bytes) -> list[Model]:
         return [MODELS[-1]]
     if len(payload) != 1248:
         return []
-    if payload.startswith(_OLD_ID):
+    if payload.startswith(_OLD_ID) and payload[31:33] != _BPEARL_V4:
         found = [one for one in MODELS if one.head == _OLD_ID]
         return [one for one in found if one.name == _OLD_TYPES.get(payload[30])] or found
     if payload.startswith(_NEW_ID):
-        many = payload[80] == 0xFE and payload[42:44] != b"\xff\xee"
-        return [one for one in MODELS if one.head == _NEW_ID and (one.lasers == 128) is many]
+        many = all(payload[at] == 0xFE for at in (80, 468, 856))
+        if many or payload[42:44] == b"\xff\xee":
+            return [one for one in MODELS if one.head == _NEW_ID and (one.lasers == 128) is many]
     return []
 
 
@@ -177,7 +183,7 @@ class Angles:
             angle = np.dtype([("sign", "u1"), ("value", ">u2")])
             found = np.frombuffer(payload, angle, 2 * slots, _ANGLES_AT).reshape(2, slots)[:, : model.lasers]
             table = np.where(found["sign"] == 0, 1.0, -1.0) * found["value"] * model.angle_deg
-            blank = bool((found["sign"] == _UNSET).any()) or not found["value"][0].any()
+            blank = bool((found["sign"] == _UNSET).any()) or len(np.unique(table[0])) < model.lasers // 2
         return None if blank or (np.abs(table) > _LARGEST_DEG).any() else cls(*np.radians(table))
 
     @classmethod
@@ -219,12 +225,12 @@ def posix_us(raw: Raw, model: Model) -> Int64:
 
 def faults(raw: Raw, model: Model, gap: Gap | None) -> list[tuple[Bool, str]]:
     """Return masks (n,) of damaged packets, each with its reason."""
-    masks = [(posix_us(raw, model) < 0, "date or time are impossible")]
+    masks: list[tuple[Bool, str]] = [(np.asarray(posix_us(raw, model) < 0), "date or time are impossible")]
     if "azimuth" in (raw.dtype["block"].base.names or ()):
         azimuth, mark = raw["block"]["azimuth"], 0xFE if model.lasers == 128 else 0xFFEE
         masks += [
-            ((raw["block"]["mark"] != mark).any(axis=1), f"a block does not begin with 0x{mark:X}"),
-            ((azimuth >= TURN).any(axis=1), "an azimuth is 360° or more"),
+            (np.any(np.asarray(raw["block"]["mark"]) != mark, axis=1), f"a block does not begin with 0x{mark:X}"),
+            (np.any(azimuth >= TURN, axis=1), "an azimuth is 360° or more"),
             (jumps(azimuth, odd_steps(azimuth, model), gap), "the azimuth jumps inside the packet"),
         ]
     return masks
@@ -236,9 +242,9 @@ def odd_steps(azimuth: npt.NDArray[np.uint16], model: Model) -> Bool:
     return np.asarray(np.abs(steps(azimuth)) > most)
 
 
-def firings(azimuth: npt.NDArray[np.uint16]) -> Int64:
+def firings(azimuth: Int64) -> Int64:
     """Return the firing (n, blocks) of each block: both returns of one have its azimuth."""
-    return np.cumsum(np.pad(np.diff(azimuth.astype(np.int64), axis=1) != 0, ((0, 0), (1, 0))), axis=1)
+    return np.cumsum(np.pad(np.diff(azimuth, axis=1) != 0, ((0, 0), (1, 0))), axis=1)
 
 
 def decode(
@@ -272,9 +278,9 @@ def decode(
             wanted[:, :, 16:] &= (distance[:, :, 16:] != distance[:, :, :16]) | (bright[:, :, 16:] != bright[:, :, :16])
     else:
         fired_us, block_us = np.array(model.fired_us), firings(azimuth) * model.block_us
-        again = azimuth[:, 1:] == azimuth[:, :-1]
-        alike = (distance[:, 1:] == distance[:, :-1]) & (bright[:, 1:] == bright[:, :-1])
-        wanted[:, 1:] &= ~(again[:, :, None] & alike)
+        row, far_row, bright_row = azimuth.reshape(-1), distance.reshape(-1, slots), bright.reshape(-1, slots)
+        alike = (far_row[1:] == far_row[:-1]) & (bright_row[1:] == bright_row[:-1])
+        wanted.reshape(-1, slots)[1:] &= ~((row[1:] == row[:-1])[:, None] & alike)
     rows = np.flatnonzero(wanted)
     late_ns = np.rint((block_us[:, :, None] + fired_us) * 1e3).astype(np.int64) + waits[:, :, None]
     lasers = np.arange(slots) % model.lasers

@@ -89,6 +89,7 @@ Source: TypeAlias = Callable[[Wanted], Iterator[Datagram | Reject]]
 
 _VIEWED_PACKETS: Final = 5_000  # packets in which a gap of the view is looked for: more than ten turns
 _AZIMUTHS: Final = "<" + "xxH96x" * BLOCKS  # azimuths of a packet's blocks
+_DATAGRAM: Final = (DATA_BYTES + 8).to_bytes(2, "big")  # length of its UDP datagram, four bytes before it
 _FIRST_FLAG: Final = FLAGS[0].to_bytes(2, "little")  # bytes with which a data packet begins
 _MANY_LASERS: Final = MODELS[-1]  # the one whose blocks have four flags
 
@@ -493,7 +494,7 @@ def _wanted(options: VelodyneOptions, sender: str | None) -> Wanted:
 def _has_data_packet(start: bytes) -> bool:
     at = start.find(_FIRST_FLAG)
     while 0 <= at < len(start) - DATA_BYTES:
-        if _is_flagged(start[at : at + DATA_BYTES]):
+        if start[at - 4 : at - 2] == _DATAGRAM and _is_flagged(start[at : at + DATA_BYTES]):
             return True
         at = start.find(_FIRST_FLAG, at + 1)
     return False

@@ -148,9 +148,14 @@ def _two() -> np.ndarray:
 
 
 def test_high_resolution_halves_the_cycle(tmp_path: Path) -> None:
-    """Pandar128E3X manual, appendix: block 1 starts 27.778 µs before block 2, not 55.556."""
+    """Pandar128E3X manual, appendix: block 1 starts 27.778 µs before block 2, and its channels fire inside that time.
+
+    Channels 1, 26, 29, 36 fire after 4.436, 10.381, 14.951 and 24.091 µs (azimuth state 0).
+    """
     log = read_log(tmp_path, "Pandar128", turning("Pandar128", 3, flag=0))
     assert log.epochs[128] - log.epochs[0] == pytest.approx(27_778, abs=1)
+    late = log.epochs[[25, 28, 35]] - log.epochs[0]
+    np.testing.assert_allclose(late, [10_381 - 4_436, 14_951 - 4_436, 24_091 - 4_436], atol=800)
 
 
 @pytest.mark.parametrize(("model", "front_m", "side_m"), [("PandarXT-32", 0.0315, 0.013), ("OT128", 0.04, 0.012)])

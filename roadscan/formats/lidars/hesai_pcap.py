@@ -11,7 +11,7 @@ of 0, which is also what blocked azimuths have, is no return. Gaps in the packet
 of the XT family can be read with `options.angles = "design"`, which its units meet to some 0.1°.
 
 **Figures.** Firing times are those of the manuals and of the maker's firing-time files. Those of a Pandar128 hold for
-far returns in standard mode (others: within 1.3 µs; in high resolution: within 28 µs), those of an OT128 for its first
+far returns in standard mode (others, and those in high resolution: within 1.3 µs), those of an OT128 for its first
 firing sequence (the second: within 2.2 µs); where its packet starts is taken from the manual of the Pandar128. A
 QT128's first block is taken to start 111.11 µs before its second. One packet a turn lies across the gap of a limited
 view: its earlier blocks were fired before the head turned on over the gap.

@@ -1,4 +1,4 @@
-"""Velodyne HDL-32E, VLP-16, VLP-32C and VLS-128: network captures (PCAP) of the sensor's UDP packets.
+"""Velodyne HDL-32E, VLP-16 (and Hi-Res), VLP-32C and VLS-128: network captures (PCAP) of the sensor's UDP packets.
 
 One data packet is one record: :mod:`roadscan.formats.lidars.velodyne_packets` says how it is decoded, and a
 damaged one is rejected whole. Position packets of 512 bytes hold the lidar's stamp and a GPRMC sentence.
@@ -81,7 +81,7 @@ _FASTEST_DRIFT: Final = 6e-4
 _LEAST_DRIFT_S: Final = 0.05  # smaller gains of the capture's clock are ignored
 _NAMES_IN_RIG_FILES: Final = ("HDL32", "VLP16", "HDL64", "VLP32", "VLS128", "PUCKHIRES")
 # Product codes of models that are not read.
-_OTHER_PRODUCTS: Final = {0x23: "VLP-32A/B", 0x24: "Puck Hi-Res", 0x31: "Velarray"}
+_OTHER_PRODUCTS: Final = {0x23: "VLP-32A/B", 0x31: "Velarray"}
 
 Source: TypeAlias = Callable[[Wanted], Iterator[Datagram | Reject]]
 """Gives the wanted packets of a log in file order."""
@@ -127,7 +127,7 @@ class VelodyneOptions(Strict):
     hour: Literal["capture"] | int | None = None
     """UTC hour (0–23) of the first data packet, on the clock's date, where the capture holds no valid GPRMC;
     "capture" takes it from the recording computer's clock, and the date too where the clock states none."""
-    model: Literal["HDL-32E", "VLP-16", "VLP-32C", "VLS-128"] | None = None
+    model: Literal["HDL-32E", "VLP-16", "VLP-16 Hi-Res", "VLP-32C", "VLS-128"] | None = None
     """Sensor, where its firmware is too old to write it into the packets."""
     calibration: Path | None = None
     """Calibration file of the unit (YAML with angles and offsets by laser, as velodyne_pointcloud and VeloView's
@@ -151,7 +151,9 @@ class VelodynePcap(LogFormat):
     """Captures of Velodyne packets."""
 
     name: ClassVar[str] = "velodyne_pcap"
-    title: ClassVar[str] = "Velodyne HDL-32E, VLP-16, VLP-32C or VLS-128 packets in a PCAP capture, a stamp per return"
+    title: ClassVar[str] = (
+        "Velodyne HDL-32E, VLP-16, Hi-Res, VLP-32C or VLS-128 packets in a PCAP capture, a stamp per return"
+    )
     yields: ClassVar[tuple[str, ...]] = ("returns",)
     version: ClassVar[int] = 3
     suffixes: ClassVar[tuple[str, ...]] = (
@@ -593,6 +595,7 @@ def _model(source: LogSource, options: VelodyneOptions, known: _Known) -> Model:
     said = "".join(c for c in (source.sensor.model if source.sensor else "").upper() if c.isalnum())
     own = model.name.replace("-", "")[:5]
     other = [n for n in _NAMES_IN_RIG_FILES if n in said and not n.startswith(own)]
+    other = [n for n in other if n != "PUCKHIRES" or model.name != "VLP-16 Hi-Res"]
     if other and own not in said:
         raise ConfigError(
             f"the rig's sensor is '{source.sensor.model if source.sensor else ''}', the packets are {model.name}",

@@ -12,8 +12,6 @@ from roadscan.ingest.reading.format import log_formats
 from tests.answers import roadscan
 
 CAPTURED = b"\xd4\xc3\xb2\xa1" + bytes(28) + b"\xe0\4\0\0" * 2 + bytes(42)  # up to the payload
-    b"\xd4\xc3\xb2\xa1" + bytes(20) + bytes(8) + (1248).to_bytes(4, "little") * 2 + bytes(42)
-)  # up to the payload
 # First bytes as their makers publish them
 FIRST_BYTES = {
     "a.sbf": (b"$@\x1c\x35\xa7\x0f\x60\x00" + bytes(90), "Septentrio", "RINEX"),

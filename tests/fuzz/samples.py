@@ -41,6 +41,7 @@ from tests.formats import (
     test_control_lines,
     test_control_vector,
     test_encoder_csv,
+    test_gnss_csv,
     test_gpx,
     test_hesai,
     test_images,
@@ -573,6 +574,7 @@ def _poses() -> Iterator[Sample]:
     yield Sample("pospac", "plain", file("a.csv", pospac), axes, ms, **lines)
     sat = {"crs": "EPSG:4979"}
     offices = {"inertial_explorer": (test_office_text.explorer, sat), "qinertia": (test_office_text.qinertia, sat)}
+    yield Sample("grafnav", "plain", file("a.txt", lambda: test_office_text.grafnav().encode()), {}, sat, text=True)
     of_2018 = {"clock": Clock(TimeSystem.GPS_WEEK, week=2013), "crs": "EPSG:4979"}
     offices["pospac_text"] = (test_office_text.pospac, of_2018)
     for name, (write, known) in offices.items():
@@ -599,6 +601,10 @@ def _poses() -> Iterator[Sample]:
     yield Sample("ppk", "ubx", _with_rtklib(test_ppk.sample_ubx), **ppk)
     gpx = {"height": "ellipsoidal"}
     yield Sample("gpx", "plain", file("a.gpx", test_gpx.track(RECORDS).encode()), {"quality": "single"}, gpx, text=True)
+    names = "time,latitude_deg,longitude_deg,height_m,quality,satellites,sigma_north_m"
+    row = "2025-05-04T09:00:0{i}Z,{lat},{lon},{h},fix,12,0.01"
+    positions = functools.partial(test_gnss_csv.table, names=names, row=row)
+    yield Sample("gnss_csv", "plain", positions, {}, {"height": "ellipsoidal", "crs": "EPSG:4979"}, text=True)
     yield Sample("ubx", "plain", file("a.ubx", test_ubx.sample), {}, sat, spans=every(100))
     for untimed in ("before", "after"):
         yield Sample("nmea", untimed, file("a.nmea", nmea), {"untimed": untimed}, sat, text=True, inside=nmea_inside)

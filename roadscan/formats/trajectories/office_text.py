@@ -146,7 +146,7 @@ class OfficeTrajectory(LogFormat):
     """A text of one program; its subclasses find the columns."""
 
     yields = ("trajectory",)
-    options = OfficeOptions
+    options: ClassVar[type[Strict]] = OfficeOptions
     vocabulary: ClassVar[Mapping[str, str]]
     """Quantity by the program's name of its column, lower case. Quantities: `week`, `week_s`, `date`, `utc_date`,
     `utc_time`; the keys of `_DIMENSIONS`."""

@@ -36,6 +36,7 @@ from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, steps
 
 Bool: TypeAlias = npt.NDArray[np.bool_]
+Float32: TypeAlias = npt.NDArray[np.float32]
 Float64: TypeAlias = npt.NDArray[np.float64]
 Int32: TypeAlias = npt.NDArray[np.int32]
 Int64: TypeAlias = npt.NDArray[np.int64]
@@ -282,23 +283,39 @@ def decode(
         alike = (far_row[1:] == far_row[:-1]) & (bright_row[1:] == bright_row[:-1])
         wanted.reshape(-1, slots)[1:] &= ~((row[1:] == row[:-1])[:, None] & alike)
     rows = np.flatnonzero(wanted)
-    late_ns = np.rint((block_us[:, :, None] + fired_us) * 1e3).astype(np.int64) + waits[:, :, None]
-    lasers = np.arange(slots) % model.lasers
-    head = (np.radians(azimuth * 0.01)[:, :, None] + np.radians(rate * 0.01) * 1e3 * fired_us).reshape(-1)[rows]
-    laser = np.broadcast_to(lasers, distance.shape).reshape(-1)[rows]
-    far = distance.reshape(-1)[rows] * np.float64(model.unit_m)
-    level, own = far * np.cos(angles.elevation)[laser], head + angles.azimuth[laser]
+    late_ns = np.rint((block_us[:, :, None] + fired_us) * 1e3).astype(np.int64)
+    late_ns += waits[:, :, None]
+    lasers = (np.arange(slots) % model.lasers).astype(np.uint8)
+    x, y, z = _positions(distance, azimuth, np.radians(rate * 0.01) * 1e3 * fired_us, model, angles, lasers)
     return returns_batch(
-        np.add(epochs[:, None, None], late_ns).reshape(-1)[rows],
-        [
-            (level * np.cos(own) + model.radius_m * np.cos(head)).astype(np.float32),
-            (-level * np.sin(own) - model.radius_m * np.sin(head)).astype(np.float32),
-            (far * np.sin(angles.elevation)[laser] + model.height_m).astype(np.float32),
-        ],
+        np.add(late_ns, epochs[:, None, None], out=late_ns).reshape(-1)[rows],
+        [one.reshape(-1)[rows] for one in (x, y, z)],
         bright.reshape(-1)[rows] * _EIGHT_TO_SIXTEEN_BITS,
-        laser.astype(np.uint8),
+        np.broadcast_to(lasers, distance.shape).reshape(-1)[rows],
         np.broadcast_to(sweeps[:, :, None], distance.shape).reshape(-1)[rows],
     )
+
+
+def _positions(
+    distance: Float32, azimuth: Int64, turned: Float64, model: Model, angles: Angles, lasers: npt.NDArray[np.uint8]
+) -> tuple[Float32, Float32, Float32]:
+    """Return x, y, z (n, blocks, channels) in m.
+
+    Parameters
+    ----------
+    turned : (channels,) by which the head turns on until the firing (rad).
+    """
+    elevation, own = angles.elevation[lasers], angles.azimuth[lasers] + turned
+    range_m = distance * np.float32(model.unit_m)
+    # In axes that turn with the head: forward along the block's azimuth, and to the right of it.
+    forward = range_m * (np.cos(elevation) * np.cos(own)).astype(np.float32)
+    forward += (model.radius_m * np.cos(turned)).astype(np.float32)
+    right = range_m * (np.cos(elevation) * np.sin(own)).astype(np.float32)
+    right += (model.radius_m * np.sin(turned)).astype(np.float32)
+    head = np.radians(azimuth * 0.01)[:, :, None]
+    sine, cosine = np.sin(head).astype(np.float32), np.cos(head).astype(np.float32)
+    z = range_m * np.sin(elevation).astype(np.float32) + np.float32(model.height_m)
+    return forward * cosine - right * sine, -(forward * sine + right * cosine), z
 
 
 def decode_m1(raw: Raw, epochs: Int64, sweeps: Int32) -> pa.RecordBatch:

@@ -132,7 +132,7 @@ def word_of(name: str) -> str:
 
 def likeness(quantities: Iterable[Quantity], names: Sequence[str]) -> Likeness:
     """Return how well columns of these `names` match the `quantities`; the clock gives a missing unit of time."""
-    plain = {_BRACKETS.sub("", name.lower()).strip(" _"): name for name in names}
+    plain = {word_of(_BRACKETS.sub("", name)).strip("_"): name for name in names}
     bracketed = {name: bracket[0].strip("()[]<>{} ") for name in names if (bracket := _BRACKETS.search(name.lower()))}
     found, unitless, absent = 0, {}, []
     for quantity in quantities:

@@ -125,7 +125,7 @@ def test_the_turn_flattens_walls_of_a_pandar40p(recordings: Path) -> None:
 
 
 def test_walls_before_an_xt32_are_not_plumb_without_the_turn(recordings: Path) -> None:
-    """3.1 ± 0.2: more than the manual says, as if the angle file's azimuths were another unit's; 0 is far off."""
+    """3.1 ± 0.2: neither the manual's 1 nor the drivers' 0, as if the angle file were another unit's: no evidence."""
     share, sigma = plumbness(recordings, "hesai_xt32")
     assert share > 1 > 4 * sigma
 

@@ -10,7 +10,8 @@ its later blocks wait for the head to turn on.
 
 **Azimuths.** A head turns on between a block's azimuth and a laser's firing: by rate × time, as the manuals say. ROS
 drivers count a VLP-32C's lasers as fired one by one, which doubles it. In a recording of a standing VLP-32C, walls are
-flattest with 0.6 ± 0.3 times the manual's turn (tests/formats/test_head_turn.py): the doubled one is excluded.
+flattest with 0.6 ± 0.3 times the manual's turn (tests/formats/test_head_turn.py), and by other choices of walls and
+edges with −0.3 to 0.6 ± 0.5: the doubled one is excluded, the manual's and none are not told apart.
 
 **Which hour** it is the data packets do not say. It comes from a valid GPRMC in the capture, or from
 `options.hour` with the clock's date; from the capture's own clock only when `options.hour = "capture"`.

@@ -17,10 +17,10 @@ QT128's first block is taken to start 111.11 µs before its second. One packet a
 view: its earlier blocks were fired before the head turned on over the gap.
 
 **Azimuths.** Between a block's azimuth and a channel's firing the head turns on. Which share of this turn has to be
-added was measured in recordings of standing rigs, by how flat and plumb it makes walls
-(tests/formats/test_head_turn.py): manuals say 1, drivers 0. A Pandar40P gives 0.84 ± 0.13 (0.6 to 1.1 by other choices of walls). A PandarXT-32 decides
-nothing: plumb walls give 3.1 ± 0.2, which is neither, and the twist of long walls 0.5 to 1.5 ± 0.9; its angle file may
-be of another unit. The turn counts, unless `options.azimuth = "driver"`.
+added was measured in recordings of standing rigs, by how flat and plumb it makes walls; manuals say 1, drivers 0. A
+Pandar40P gives 0.84 ± 0.13 (0.6 to 1.1 by other choices of walls; tests/formats/test_head_turn.py). A PandarXT-32
+decides nothing: plumb walls give 3.1 ± 0.2, which is neither, and the twist of long walls 0.5 to 1.5 ± 0.9; its angle
+file may be of another unit. The turn counts, unless `options.azimuth = "driver"`.
 
 **Time.** Packets have date and time to the microsecond. They are UTC where a GPS receiver sets the sensor. Under PTP
 they are whatever the master sends (UTC or TAI), and unset they count from a date in the past; the packets do not say

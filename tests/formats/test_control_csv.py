@@ -247,3 +247,49 @@ def _cells(row: str) -> list[str]:
     head, height = rest.rsplit(",", 1)
     latitude, longitude = head.rsplit(",", 1)
     return [name, latitude, longitude, height]
+
+
+POINTS = [("P1", 571_600.123, 5_539_000.456, 312.789), ("P2", 571_610.5, 5_539_001.5, 313.5)]
+
+
+@pytest.mark.parametrize(
+    ("names", "row", "how"),
+    [
+        ("ID,E [m],N [m],H [m]", "{p},{e},{n},{h}", {}),
+        (
+            '"Point ID","Grid Northing (m)","Grid Easting (m)","Elevation (m)","Code"',
+            '"{p}","{n}","{e}","{h}","MH"',
+            {},
+        ),
+        ("Punkt;Ostwert;Nordwert;Höhe", "{p};{e};{n};{h}", {"comma": True, "encoding": "utf-16", "end": "\r\n"}),
+        ("Punto\tEste\tNorte\tCota", "{p}\t{e}\t{n}\t{h}", {"end": "\r"}),
+        ("# control of job 7\n; surveyor: x\n\nname,EASTING,NORTHING,HEIGHT\n", "{p},{e},{n},{h}\n", {}),
+        ("Point Name;North;East;Elev;Desc", "{p};{n};{e};{h};nail, in kerb", {}),
+        ("Point,Northing (usft),Easting (usft),Elevation (usft)", "{p},{n},{e},{h}", {"unit": 3937 / 1200}),
+    ],
+)
+def test_names_and_units_as_programs_write_them(tmp_path: Path, names: str, row: str, how: dict[str, Any]) -> None:
+    """A unit in brackets is the column's; US survey feet have their own: a foot is 3 m off at 5,500 km."""
+    scale = how.get("unit", 1.0)
+    rows = [row.format(p=p, e=f"{e * scale:.4f}", n=f"{n * scale:.4f}", h=f"{h * scale:.4f}") for p, e, n, h in POINTS]
+    rows = [one.replace(".", ",") for one in rows] if how.get("comma") else rows
+    path = tmp_path / "control.csv"
+    path.write_bytes(how.get("end", "\n").join([names, *rows, ""]).encode(how.get("encoding", "utf-8")))
+    assert format_of(path).name == "control_csv"
+    options = {"role": "gcp"} if "(" in names or "[" in names else {"role": "gcp", "height_unit": "m"}
+    log = read_log("control_csv", path, options, crs="EPSG:25832", map=UTM32)
+    assert log.rejects == []
+    assert log.column("name").tolist() == ["P1", "P2"]
+    found = np.stack([log.column(k) for k in ("easting_m", "northing_m", "height_m")], axis=1)
+    np.testing.assert_allclose(found, [p[1:] for p in POINTS], atol=1e-3)
+
+
+def test_feet_without_their_kind_are_asked_for(tmp_path: Path) -> None:
+    """Which foot "(ft)" is, no one knows: it is not read without options.columns."""
+    path = write(
+        tmp_path / "a.csv", "Point,Northing (ft),Easting (ft),Elevation (ft)", "P1,18172900.0,1875328.0,1026.0"
+    )
+    with pytest.raises(FormatError):
+        format_of(path)
+    with pytest.raises(FormatError, match="no column holds the easting"):
+        read_log("control_csv", path, {"role": "gcp"}, crs="EPSG:25832", map=UTM32)

@@ -186,3 +186,40 @@ def test_damage_costs_its_line(tmp_path: Path) -> None:
     log = read(tmp_path, "inertial_explorer", "".join(lines) + "\nFooter lines of the export\n")
     assert log.epochs.size == 10
     assert {r.reason.split(" is ")[0] for r in log.rejects if r.record < 12} >= {"Latitude"}
+
+
+# --- positions without attitude -----------------------------------------------------------------------
+
+GRAFNAV = """Project:     drive
+Program:     GrafNav Version 8.90.2124
+Source:      GNSS Epochs(Smoothed)
+Datum:       ETRS89
+SD Scaling Settings:
+  Position: 2.0000
+
+     Date      GPSTime       Latitude        Longitude        H-Ell   SDNorth  SDEast SDHeight Q
+    (MDY)        (sec)          (deg)            (deg)          (m)       (m)     (m)      (m)
+"""
+
+
+def grafnav(count: int = 12) -> str:
+    rows = (f" 5/04/2025 {32_418 + k}.00 50.1{k:02d}0000 7.3{k:02d}0000 160.{k:03d} 0.010 0.012 0.020 {1 + k % 2}\n"
+            for k in range(count))  # fmt: skip
+    return GRAFNAV + "".join(rows)
+
+
+def test_grafnav_positions_without_attitude_are_a_log_of_gnss(tmp_path: Path) -> None:
+    path = tmp_path / "grafnav.txt"
+    path.write_text(grafnav(4))
+    assert format_of(path).name == "grafnav"
+    log = read_log("grafnav", path, crs="EPSG:4937")
+    places = np.array([[7.3 + 1e-3 * k, 50.1 + 1e-3 * k, 160 + 1e-3 * k] for k in range(4)])
+    ecef = pyproj.Transformer.from_crs(4979, 4978, always_xy=True).transform(*places.T)
+    np.testing.assert_allclose(log.positions, np.stack(ecef, axis=1), atol=1e-3)
+    assert log.epochs[0] == 1_430_384_418 * S  # 2025-05-04, a Sunday: 32,418 s into the week
+    assert log.column("quality").tolist() == ["fixed", "float"] * 2
+    np.testing.assert_allclose(log.column("sigma_east_m"), 0.006)  # the preamble says 2 σ
+    path.write_text(grafnav(4).replace(" Q\n", "\n").replace(" 1\n", "\n").replace(" 2\n", "\n"))
+    with pytest.raises(ConfigError, match="kind of solution"):
+        read_log("grafnav", path, crs="EPSG:4937")
+    assert set(read_log("grafnav", path, {"quality": "fixed"}, crs="EPSG:4937").column("quality")) == {"fixed"}

@@ -361,7 +361,7 @@ def test_points_of_livox(kind: str, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", kind, {"/livox": ("livox_ros_driver2/msg/CustomMsg", messages)})
     rows = read("ros_livox", bag, clock=UTC, sensor=LIDAR)
     np.testing.assert_array_equal(rows.xyz_sensor_m.astype(np.float32), np.tile(places, (3, 1)))
-    np.testing.assert_array_equal(rows["intensity"][:300], np.arange(300) % 256)
+    np.testing.assert_array_equal(rows["intensity"][:300], np.arange(300) % 256 * 257)
     np.testing.assert_array_equal(rows["laser"][:300], np.arange(300) % 4)
     np.testing.assert_array_equal(np.diff(rows.epochs[:300]), 1_000)
 

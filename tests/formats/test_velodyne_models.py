@@ -251,3 +251,14 @@ def test_a_bag_without_an_hour_asks_for_it(recordings: Path) -> None:
     log = read("velodyne_scans", recordings / "lidars" / "velodyne_vlp32" / "bag", {"hour": 2}, clock=clock)
     capture_time = read("velodyne_scans", recordings / "lidars" / "velodyne_vlp32" / "bag", {"hour": "capture"})
     np.testing.assert_array_equal(log.epochs, capture_time.epochs)
+
+
+def test_a_hi_res_has_its_own_angles(tmp_path: Path) -> None:
+    """Elevations of velodyne-decoder's file; beams rise from where those of a VLP-16 cross the axis, within 1 mm."""
+    packets = [(ns, content[:-1] + b"\x24") for ns, content in drive(VLP_32C, 2)]
+    log = read_drive(tmp_path, packets)
+    assert log.attributes["model"] == "VLP-16 Hi-Res"
+    calibration = yaml.safe_load(velodyne_decoder.get_bundled_calibration("Puck Hi-Res.yml").to_string())
+    elevation = np.array([laser["vert_correction"] for laser in calibration["lasers"]])[log["laser"]]
+    x, y, z = log.xyz_sensor_m.T
+    np.testing.assert_allclose(z - np.hypot(x, y) * np.tan(elevation), -0.0418 * np.tan(elevation), atol=1e-3)

@@ -433,8 +433,8 @@ def test_another_sensor_than_stated_is_refused(tmp_path: Path) -> None:
 
 
 def test_unknown_products_are_named(tmp_path: Path) -> None:
-    path = capture(tmp_path / "a.pcap", [(0, frame(data_packet(5, turning(0), product=0x24)))])
-    with pytest.raises(FormatError, match="the packets are Puck Hi-Res"):
+    path = capture(tmp_path / "a.pcap", [(0, frame(data_packet(5, turning(0), product=0x23)))])
+    with pytest.raises(FormatError, match="the packets are VLP-32A/B"):
         read("velodyne_pcap", path, {"hour": 9}, clock=CLOCK)
 
 

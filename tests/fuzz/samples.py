@@ -34,12 +34,14 @@ from roadscan.formats.scanners.sick_telegrams import encode_scans
 from roadscan.ingest.reading.text_table import LINE_BYTES_MAX
 from tests.formats import (
     hesai_files,
+    robosense_files,
     ros_files,
     test_argoverse,
     test_carmen,
     test_control_lines,
     test_control_vector,
     test_encoder_csv,
+    test_gnss_csv,
     test_gpx,
     test_hesai,
     test_images,
@@ -572,6 +574,7 @@ def _poses() -> Iterator[Sample]:
     yield Sample("pospac", "plain", file("a.csv", pospac), axes, ms, **lines)
     sat = {"crs": "EPSG:4979"}
     offices = {"inertial_explorer": (test_office_text.explorer, sat), "qinertia": (test_office_text.qinertia, sat)}
+    yield Sample("grafnav", "plain", file("a.txt", lambda: test_office_text.grafnav().encode()), {}, sat, text=True)
     of_2018 = {"clock": Clock(TimeSystem.GPS_WEEK, week=2013), "crs": "EPSG:4979"}
     offices["pospac_text"] = (test_office_text.pospac, of_2018)
     for name, (write, known) in offices.items():
@@ -598,6 +601,10 @@ def _poses() -> Iterator[Sample]:
     yield Sample("ppk", "ubx", _with_rtklib(test_ppk.sample_ubx), **ppk)
     gpx = {"height": "ellipsoidal"}
     yield Sample("gpx", "plain", file("a.gpx", test_gpx.track(RECORDS).encode()), {"quality": "single"}, gpx, text=True)
+    names = "time,latitude_deg,longitude_deg,height_m,quality,satellites,sigma_north_m"
+    row = "2025-05-04T09:00:0{i}Z,{lat},{lon},{h},fix,12,0.01"
+    positions = functools.partial(test_gnss_csv.table, names=names, row=row)
+    yield Sample("gnss_csv", "plain", positions, {}, {"height": "ellipsoidal", "crs": "EPSG:4979"}, text=True)
     yield Sample("ubx", "plain", file("a.ubx", test_ubx.sample), {}, sat, spans=every(100))
     for untimed in ("before", "after"):
         yield Sample("nmea", untimed, file("a.nmea", nmea), {"untimed": untimed}, sat, text=True, inside=nmea_inside)
@@ -693,6 +700,14 @@ def _packets() -> Iterator[Sample]:
         size = 16 + 42 + len(hesai_files.turning(model, 1)[0])
         spans = every(size, 24) if model in ("QT128", "PandarXT-16") else None
         yield Sample("hesai_pcap", model.lower(), hesai(model), options, {}, fields=_PCAP_FIELDS, spans=spans)
+    for model in ("RS-LiDAR-16", "Helios", "Ruby"):
+        sent, info = robosense_files.turning(model, RECORDS), robosense_files.difop(model)
+        named = {"model": model} if model == "Ruby" else {}
+        robosense = functools.partial(robosense_files.log_of, payloads=sent, info=info)
+        yield Sample("robosense_pcap", model.lower(), robosense, named, {}, fields=_PCAP_FIELDS)
+    yield Sample("robosense_pcap", "m1", robosense_files.frames, {}, {}, fields=_PCAP_FIELDS)
+    for kind, log in (("ros1", "bag.bag"), ("mcap", "bag/*.mcap")):
+        yield Sample("robosense_scans", kind, functools.partial(robosense_files.bag, kind=kind), {}, {}, (log,))
     velodyne = [content[42:] for _, content in test_velodyne_models.drive(test_velodyne_models.VLP_32C, RECORDS)]
     xt = hesai_files.turning("PandarXT-16", RECORDS)
     for kind, log in (("ros1", "bag.bag"), ("mcap", "bag/*.mcap"), ("sqlite", "bag/*.db3")):

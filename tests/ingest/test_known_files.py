@@ -11,6 +11,7 @@ from roadscan.ingest.inspect.known_files import known_file, known_files
 from roadscan.ingest.reading.format import log_formats
 from tests.answers import roadscan
 
+CAPTURED = b"\xd4\xc3\xb2\xa1" + bytes(28) + b"\xe0\4\0\0" * 2 + bytes(42)  # up to the payload
 # First bytes as their makers publish them
 FIRST_BYTES = {
     "a.sbf": (b"$@\x1c\x35\xa7\x0f\x60\x00" + bytes(90), "Septentrio", "RINEX"),
@@ -18,6 +19,11 @@ FIRST_BYTES = {
     "pos.000": (b"$GRP\x01\x00" + bytes(200), "Applanix", "SBET"),
     "cloud.bin": (b"CCB2" + bytes(90), "CloudCompare", "E57"),
     "a.osf": (b"\x2c\0\0\0\x14\0\0\0OSF!" + bytes(90), "Ouster", "pcap"),
+    "at128.pcap": (CAPTURED + bytes.fromhex("eeff0403000080020004") + bytes(900), "Hesai AT128", "ROS bag"),
+    "jt128.pcap": (CAPTURED + bytes.fromhex("eeff0108000080020004") + bytes(900), "Hesai JT", "ROS bag"),
+    "hdl64.pcap": (CAPTURED + (b"\xff\xee" + bytes(98) + b"\xff\xdd" + bytes(98)) * 6, "HDL-64E", "velodyne-decoder"),
+    "bpearl.pcap": (CAPTURED + bytes.fromhex("55aa050a5aa550a0") + bytes(23) + b"\3\4" + bytes(900), "V4", "ROS bag"),
+    "rs80.pcap": (CAPTURED + bytes.fromhex("55aa055a") + bytes(76) + (b"\xfe\1" + bytes(242)) * 4, "80", "ROS bag"),
 }
 # Others by the endings of their names
 ENDINGS = {

@@ -17,8 +17,8 @@ and the head turns on meanwhile at its mean rate. A return's position, in axes `
     x = d cos ω cos α,  y = −d cos ω sin α,  z = d sin ω + v
 
 with the azimuth α and the laser's own part of it, its elevation ω and its vertical offset v (HDL-32E: drawing
-86-0106; VLP-16: manual, table 9-1; VLP-32C and VLS-128: the maker's calibration files, as VeloView has them, and
-beams whose lenses are 42.4 mm and 58.63 mm from the axis, which they cross at v).
+86-0106; VLP-16: manual, table 9-1; VLP-16 Hi-Res, VLP-32C and VLS-128: the maker's calibration files, as VeloView has
+them, and beams whose lenses are 41.8 mm, 42.4 mm and 58.63 mm from the axis, which they cross at v).
 
 Decoding is done here and checked in the tests against ``velodyne-decoder``. That library emits whole
 turns, rounds every azimuth to 0.01° (4 mm at 50 m) and gives float32 seconds relative to the turn; here
@@ -176,6 +176,9 @@ class Model:
         )
 
 
+_HI_RES_DEG: Final = (
+    -10.0, 0.667, -8.667, 2.0, -7.333, 3.333, -6.0, 4.667, -4.667, 6.0, -3.333, 7.333, -2.0, 8.667, -0.667, 10.0,
+)  # fmt: skip
 _VLP_32C_DEG: Final = (
     -25.0, -1.0, -1.667, -15.639, -11.31, 0.0, -0.667, -8.843, -7.254, 0.333, -0.333, -6.148, -5.333, 1.333,
     0.667, -4.0, -4.667, 1.667, 1.0, -3.667, -3.333, 3.333, 2.333, -2.667, -3.0, 7.0, 4.667, -2.333, -2.0, 15.0,
@@ -216,6 +219,11 @@ MODELS: Final = (
         "VLP-16", 0x22, 16, 55_296, 2_304,
         (-15.0, 1.0, -13.0, 3.0, -11.0, 5.0, -9.0, 7.0, -7.0, 9.0, -5.0, 11.0, -3.0, 13.0, -1.0, 15.0),
         (11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2),
+    ),
+    Model(
+        "VLP-16 Hi-Res", 0x24, 16, 55_296, 2_304,
+        _HI_RES_DEG,
+        _rises(41.8, _HI_RES_DEG),
     ),
     Model(
         "VLP-32C", 0x28, 32, 55_296, 2_304,

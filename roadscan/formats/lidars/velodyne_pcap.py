@@ -1,4 +1,4 @@
-"""Velodyne HDL-32E, VLP-16, VLP-32C and VLS-128: network captures (PCAP) of the sensor's UDP packets.
+"""Velodyne HDL-32E, VLP-16 (and Hi-Res), VLP-32C and VLS-128: network captures (PCAP) of the sensor's UDP packets.
 
 One data packet is one record: :mod:`roadscan.formats.lidars.velodyne_packets` says how it is decoded, and a
 damaged one is rejected whole. Position packets of 512 bytes hold the lidar's stamp and a GPRMC sentence.
@@ -7,6 +7,11 @@ reflectivity is scaled to 16 bits (255 becomes 65,535); a sweep ends where the a
 return mode both returns are kept, and one that is written twice is kept once. Angles are the maker's design values,
 or those of the unit's calibration file. Where the sensor leaves out azimuths, one packet a turn lies across the gap:
 its later blocks wait for the head to turn on.
+
+**Azimuths.** A head turns on between a block's azimuth and a laser's firing: by rate × time, as the manuals say. ROS
+drivers count a VLP-32C's lasers as fired one by one, which doubles it. In a recording of a standing VLP-32C, walls are
+flattest with 0.6 ± 0.3 times the manual's turn (tests/formats/test_head_turn.py), and by other choices of walls and
+edges with −0.3 to 0.6 ± 0.5: the doubled one is excluded, the manual's and none are not told apart.
 
 **Which hour** it is the data packets do not say. It comes from a valid GPRMC in the capture, or from
 `options.hour` with the clock's date; from the capture's own clock only when `options.hour = "capture"`.
@@ -77,7 +82,7 @@ _FASTEST_DRIFT: Final = 6e-4
 _LEAST_DRIFT_S: Final = 0.05  # smaller gains of the capture's clock are ignored
 _NAMES_IN_RIG_FILES: Final = ("HDL32", "VLP16", "HDL64", "VLP32", "VLS128", "PUCKHIRES")
 # Product codes of models that are not read.
-_OTHER_PRODUCTS: Final = {0x23: "VLP-32A/B", 0x24: "Puck Hi-Res", 0x31: "Velarray"}
+_OTHER_PRODUCTS: Final = {0x23: "VLP-32A/B", 0x31: "Velarray"}
 
 Source: TypeAlias = Callable[[Wanted], Iterator[Datagram | Reject]]
 """Gives the wanted packets of a log in file order."""
@@ -85,6 +90,7 @@ Source: TypeAlias = Callable[[Wanted], Iterator[Datagram | Reject]]
 
 _VIEWED_PACKETS: Final = 5_000  # packets in which a gap of the view is looked for: more than ten turns
 _AZIMUTHS: Final = "<" + "xxH96x" * BLOCKS  # azimuths of a packet's blocks
+_DATAGRAM: Final = (DATA_BYTES + 8).to_bytes(2, "big")  # length of its UDP datagram, four bytes before it
 _FIRST_FLAG: Final = FLAGS[0].to_bytes(2, "little")  # bytes with which a data packet begins
 _MANY_LASERS: Final = MODELS[-1]  # the one whose blocks have four flags
 
@@ -122,7 +128,7 @@ class VelodyneOptions(Strict):
     hour: Literal["capture"] | int | None = None
     """UTC hour (0–23) of the first data packet, on the clock's date, where the capture holds no valid GPRMC;
     "capture" takes it from the recording computer's clock, and the date too where the clock states none."""
-    model: Literal["HDL-32E", "VLP-16", "VLP-32C", "VLS-128"] | None = None
+    model: Literal["HDL-32E", "VLP-16", "VLP-16 Hi-Res", "VLP-32C", "VLS-128"] | None = None
     """Sensor, where its firmware is too old to write it into the packets."""
     calibration: Path | None = None
     """Calibration file of the unit (YAML with angles and offsets by laser, as velodyne_pointcloud and VeloView's
@@ -146,7 +152,9 @@ class VelodynePcap(LogFormat):
     """Captures of Velodyne packets."""
 
     name: ClassVar[str] = "velodyne_pcap"
-    title: ClassVar[str] = "Velodyne HDL-32E, VLP-16, VLP-32C or VLS-128 packets in a PCAP capture, a stamp per return"
+    title: ClassVar[str] = (
+        "Velodyne HDL-32E, VLP-16, Hi-Res, VLP-32C or VLS-128 packets in a PCAP capture, a stamp per return"
+    )
     yields: ClassVar[tuple[str, ...]] = ("returns",)
     version: ClassVar[int] = 3
     suffixes: ClassVar[tuple[str, ...]] = (
@@ -489,7 +497,7 @@ def _wanted(options: VelodyneOptions, sender: str | None) -> Wanted:
 def _has_data_packet(start: bytes) -> bool:
     at = start.find(_FIRST_FLAG)
     while 0 <= at < len(start) - DATA_BYTES:
-        if _is_flagged(start[at : at + DATA_BYTES]):
+        if start[at - 4 : at - 2] == _DATAGRAM and _is_flagged(start[at : at + DATA_BYTES]):
             return True
         at = start.find(_FIRST_FLAG, at + 1)
     return False
@@ -588,6 +596,7 @@ def _model(source: LogSource, options: VelodyneOptions, known: _Known) -> Model:
     said = "".join(c for c in (source.sensor.model if source.sensor else "").upper() if c.isalnum())
     own = model.name.replace("-", "")[:5]
     other = [n for n in _NAMES_IN_RIG_FILES if n in said and not n.startswith(own)]
+    other = [n for n in other if n != "PUCKHIRES" or model.name != "VLP-16 Hi-Res"]
     if other and own not in said:
         raise ConfigError(
             f"the rig's sensor is '{source.sensor.model if source.sensor else ''}', the packets are {model.name}",

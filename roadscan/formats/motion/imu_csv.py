@@ -47,9 +47,23 @@ def _on_axes(stem: str, dimension: Dimension, *also: str) -> tuple[Quantity, ...
     return tuple(Quantity(f"{stem}_{a}", dimension, tuple(f"{name}{a}" for name in also)) for a in _AXES)
 
 
-RATES: Final = _on_axes("angular_rate", "rate", "gyro_", "gyr_", "omega_", "w", "w_")
+RATES: Final = _on_axes(
+    "angular_rate", "rate", "gyro_", "gyr_", "g", "omega_", "w", "w_", "w_rs_s_", "angular_velocity_"
+)
 ANGLES: Final = _on_axes("delta_angle", "angle", "delta_theta_", "dtheta_", "dangle_")
-FORCES: Final = _on_axes("specific_force", "acceleration", "acceleration_", "accel_", "acc_", "a", "a_", "f", "f_")
+FORCES: Final = _on_axes(
+    "specific_force",
+    "acceleration",
+    "acceleration_",
+    "accel_",
+    "acc_",
+    "a",
+    "a_",
+    "f",
+    "f_",
+    "a_rs_s_",
+    "linear_acceleration_",
+)
 VELOCITIES: Final = _on_axes("delta_velocity", "speed", "delta_v_", "dvel_", "dv_")
 TEMPERATURE: Final = Quantity("temperature", "temperature", ("temp",), optional=True)
 

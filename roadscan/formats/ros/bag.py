@@ -293,6 +293,9 @@ def _payloads(content: Any, receive_ns: int) -> Iterator[tuple[bytes, int]]:
     if hasattr(content, "buf"):
         yield content.buf.tobytes(), receive_ns
         return
+    if hasattr(content, "data"):
+        yield content.data.tobytes(), stamp_ns(content.header.stamp) or receive_ns
+        return
     for packet in content.packets:
         own_ns = stamp_ns(packet.stamp) if hasattr(packet, "stamp") else 0
         size = int(packet.size) if hasattr(packet, "size") else None

@@ -20,6 +20,7 @@ _POINT: Final = (
     ("offset_ns", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"),
 )  # fmt: skip
 """CustomPoint of livox_ros_driver and livox_ros_driver2."""
+_EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)  # scales 255 to 65,535, as for all sensors of 8 bits
 _ROS1_BYTES: Final = 19  # bytes of a point in ROS 1, where fields follow one another
 _CDR_BYTES: Final = 20  # bytes from one point to the next in ROS 2, where the first field lies at a multiple of four
 _BEHIND_HEADER: Final = 16  # bytes of timebase, number of points, lidar and three reserved ones, before the points
@@ -27,7 +28,7 @@ _CDR_HEAD: Final = 4  # bytes before a message of ROS 2: how it is serialised
 
 
 class RosLivox(TopicFormat):
-    """A message a frame: points with x, y, z (m), reflectivity (0–255, as recorded), line, time after the stamp.
+    """A message a frame: points with x, y, z (m), reflectivity (255 becomes 65,535), line, time after the stamp.
 
     A point of 0, 0, 0 is no return. The tag (kind of the return, and the driver's opinion of noise) is not kept. The
     stamp is that of the header, which the driver takes from the lidar's own clock: with PTP or GPS that is its time,
@@ -36,6 +37,7 @@ class RosLivox(TopicFormat):
 
     name = "ros_livox"
     title = "Livox lidar in a ROS bag (CustomMsg)"
+    version = 2
     yields = ("returns",)
     types = tuple(
         f"{package}/msg/CustomMsg" for package in ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
@@ -64,7 +66,7 @@ class RosLivox(TopicFormat):
                 points = item.content.points
                 yield from rows.items(
                     item.message, item.stamp_ns, [points[axis] for axis in "xyz"], points["offset_ns"].astype(np.int64),
-                    points["reflectivity"], points["line"],
+                    points["reflectivity"] * _EIGHT_TO_SIXTEEN_BITS, points["line"],
                 )  # fmt: skip
 
 

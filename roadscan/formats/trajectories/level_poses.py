@@ -20,17 +20,17 @@ Int64 = npt.NDArray[np.int64]
 GEODETIC: Final = (
     Quantity("longitude", "angle", ("lon", "lng")),
     Quantity("latitude", "angle", ("lat",)),
-    Quantity("height", "length", ("altitude",)),
+    Quantity("height", "length", ("altitude", "alt", "elevation", "h-ell", "ellipsoidal_height")),
 )
 GRID: Final = (
     Quantity("easting", "length"),
     Quantity("northing", "length"),
-    Quantity("height", "length", ("altitude",)),
+    Quantity("height", "length", ("altitude", "alt", "elevation", "h-ell", "ellipsoidal_height")),
 )
 LOCAL: Final = (
     Quantity("easting", "length", ("x",)),
     Quantity("northing", "length", ("y",)),
-    Quantity("height", "length", ("z", "altitude")),
+    Quantity("height", "length", ("z", "altitude", "alt")),
 )
 ATTITUDE: Final = (Quantity("roll", "angle"), Quantity("pitch", "angle"), Quantity("heading", "angle"))
 SIGMAS: Final = (

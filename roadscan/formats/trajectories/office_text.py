@@ -130,7 +130,7 @@ class _Column:
 
 
 @dataclass(frozen=True)
-class _Plan:
+class Plan:
     """How a file is read."""
 
     layout: TextLayout
@@ -146,10 +146,12 @@ class OfficeTrajectory(LogFormat):
     """A text of one program; its subclasses find the columns."""
 
     yields = ("trajectory",)
-    options = OfficeOptions
+    options: ClassVar[type[Strict]] = OfficeOptions
     vocabulary: ClassVar[Mapping[str, str]]
     """Quantity by the program's name of its column, lower case. Quantities: `week`, `week_s`, `date`, `utc_date`,
     `utc_time`; the keys of `_DIMENSIONS`."""
+    attitude: ClassVar[tuple[str, ...]] = ("roll", "pitch", "heading")
+    """Quantities that a file needs beside time and position."""
 
     @abstractmethod
     def preamble(self, lines: Sequence[str]) -> Preamble | None:
@@ -159,18 +161,22 @@ class OfficeTrajectory(LogFormat):
         """True if the preamble is this program's and names attitudes."""
         found = self.preamble(_lines_of(path)[0]) if path.is_file() else None
         named = set() if found is None else {self.vocabulary.get(cell.name.lower()) for cell in found.cells}
-        return set(_ATTITUDE) <= named
+        return found is not None and set(self.attitude) <= named
+
+    def north(self, source: LogSource) -> North | None:
+        """Return the north that headings are counted from, as stated."""
+        return options_of(source, OfficeOptions).heading
 
     def header(self, source: LogSource) -> LogHeader:
         """Check columns, clock, CRS, heights and the heading's north."""
-        plan = self._plan(source)
+        plan = self.plan(source)
         columns = {quantity: column.name for quantity, column in plan.columns.items()}
         said = dict(plan.preamble.said)
         return LogHeader({"world_frame": plan.placement.world, "columns": columns} | ({"says": said} if said else {}))
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream poses; a line that cannot be read is rejected."""
-        plan = self._plan(source)
+        plan = self.plan(source)
         reader = PoseReader(source, plan.clock, plan.placement)
         for block in text_blocks(source.path, plan.layout, plan.kinds):
             if isinstance(block, Reject):
@@ -179,19 +185,20 @@ class OfficeTrajectory(LogFormat):
             sieve = Sieve(block.records.size)
             yield from reader.items(_poses(block, plan, sieve), sieve)
 
-    def _plan(self, source: LogSource) -> _Plan:
+    def plan(self, source: LogSource) -> Plan:
+        """Return how a file is read; raises as :meth:`header`."""
         lines, coding, offsets = _lines_of(source.path)
         preamble = self.preamble(lines)
         if preamble is None:
             raise FormatError(f"the preamble is not {self.title.split(':')[0]}", expected=self.title, file=source.path)
-        names, columns = _columns(preamble, self.vocabulary, source.path)
+        names, columns = _columns(preamble, self.vocabulary, self.attitude, source.path)
         layout = TextLayout(names, preamble.delimiter, "", offsets[preamble.lines], coding=coding)
         _need_words(layout, lines[preamble.lines :], source.path)
-        placement, position = _placement(source, columns)
+        placement, position = _placement(source, columns, self.north(source))
         texts = {w for q in ("date", "utc_date", "utc_time") if q in columns for w in columns[q].words}
         wanted = [word for column in columns.values() for word in column.words]
         kinds: dict[str, Kind] = {word: "text" if word in texts else "number" for word in wanted}
-        return _Plan(layout, columns, kinds, _clock(source, columns, preamble, layout), placement, position, preamble)
+        return Plan(layout, columns, kinds, _clock(source, columns, preamble, layout), placement, position, preamble)
 
 
 # --- preambles ---------------------------------------------------------------------------------------
@@ -220,7 +227,7 @@ def _lines_of(path: Path) -> tuple[list[str], TextCoding, list[int]]:
 
 
 def _columns(
-    preamble: Preamble, vocabulary: Mapping[str, str], file: Path
+    preamble: Preamble, vocabulary: Mapping[str, str], attitude: Sequence[str], file: Path
 ) -> tuple[tuple[str, ...], dict[str, _Column]]:
     """Return a name for each word of a line, and the words of each quantity; the first column of a quantity counts."""
     names: list[str] = []
@@ -235,7 +242,7 @@ def _columns(
         quantity = vocabulary.get(cell.name.lower())
         if quantity is not None and quantity not in found:
             found[quantity] = _Column(tuple(words), _scale(quantity, cell, len(words), file), cell.name, cell.unit)
-    absent = [name for name in _ATTITUDE if name not in found]
+    absent = [name for name in attitude if name not in found]
     if absent:
         raise FormatError(f"no column holds the {absent[0]}", expected="roll, pitch and heading", file=file)
     return tuple(names), found
@@ -316,7 +323,7 @@ def _has_utc(columns: Mapping[str, _Column]) -> bool:
     return {"utc_date", "utc_time"} <= columns.keys() and columns["utc_time"].unit.lower() not in _SECONDS
 
 
-def _stamps(block: TextBlock, plan: _Plan, sieve: Sieve) -> npt.NDArray[np.generic]:
+def stamps_of(block: TextBlock, plan: Plan, sieve: Sieve) -> npt.NDArray[np.generic]:
     """Return stamps (n,) of a block for the plan's clock."""
     columns = plan.columns
     is_dated = "week" in columns or "date" in columns
@@ -369,7 +376,9 @@ def _iso_date(word: str, order: str) -> str:
         return ""
 
 
-def _placement(source: LogSource, columns: Mapping[str, _Column]) -> tuple[Placement, tuple[str, str, str]]:
+def _placement(
+    source: LogSource, columns: Mapping[str, _Column], north: North | None
+) -> tuple[Placement, tuple[str, str, str]]:
     """Return the placement of the poses, and the three quantities of their position."""
     crs = source.need_crs()
     is_grid = crs != "local" and crs_from_text(crs).is_projected
@@ -387,27 +396,32 @@ def _placement(source: LogSource, columns: Mapping[str, _Column]) -> tuple[Place
         raise FormatError("no column holds the height", expected="such as H-Ell or H-MSL", file=source.path)
     kind = next((kind for kind in kinds if kind == source.any_height), kinds[0])
     height = source.need_height(kind, f"the column '{columns[f'height_{kind}'].name}'")
-    heading = options_of(source, OfficeOptions).heading
-    return level_placement(replace(source, height=height), heading), (first, second, f"height_{kind}")
+    return level_placement(replace(source, height=height), north), (first, second, f"height_{kind}")
 
 
-def _poses(block: TextBlock, plan: _Plan, sieve: Sieve) -> RawPoses:
+def _poses(block: TextBlock, plan: Plan, sieve: Sieve) -> RawPoses:
     def quantity(name: str) -> Float64:
         return _values(block, plan.columns[name], sieve)
 
-    stamps = _stamps(block, plan, sieve)
+    stamps = stamps_of(block, plan, sieve)
     roll, pitch, heading = (quantity(name) for name in _ATTITUDE)
     check_rph(roll, pitch, heading, sieve)
     with np.errstate(invalid="ignore"):  # infinities of damaged records, dropped above
         attitude = ned_from_rph(roll, pitch, heading)
+    position, sigmas = position_of(block, plan, sieve)
+    velocity = _velocity({name: quantity(name) for name in plan.columns if name.startswith("velocity_")})
+    return RawPoses(block.records, block.offsets, stamps, position, attitude, sigmas, velocity)
+
+
+def position_of(block: TextBlock, plan: Plan, sieve: Sieve) -> tuple[Float64, dict[str, Float64]]:
+    """Return positions (3, n) in the units of the plan's placement, and σ (n,) by column of the trajectory table."""
     sigmas = {}
     for name, column in _SIGMAS.items():
         if name in plan.columns:
-            sigma = quantity(name) / plan.preamble.sigma_scale.get(_DIMENSIONS[name], 1.0)
+            sigma = _values(block, plan.columns[name], sieve)
+            sigma = sigma / plan.preamble.sigma_scale.get(_DIMENSIONS[name], 1.0)
             sigmas[column] = np.degrees(sigma) if column.endswith("_deg") else sigma
-    position = np.stack([quantity(name) for name in plan.position])
-    velocity = _velocity({name: quantity(name) for name in plan.columns if name.startswith("velocity_")})
-    return RawPoses(block.records, block.offsets, stamps, position, attitude, sigmas, velocity)
+    return np.stack([_values(block, plan.columns[name], sieve) for name in plan.position]), sigmas
 
 
 def _velocity(parts: Mapping[str, Float64]) -> Float64 | None:

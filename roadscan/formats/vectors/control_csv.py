@@ -32,19 +32,30 @@ from roadscan.ingest.reading.text_table import (
 
 Float64 = npt.NDArray[np.float64]
 
-NAME: Final = Quantity("name", "text", ("point", "id", "point_id", "punkt", "punktnummer"))
-WORDS: Final = (
-    Quantity("code", "text", ("description", "desc"), optional=True), Quantity("role", "text", optional=True),
+NAME: Final = Quantity(
+    "name", "text",
+    ("point", "id", "point_id", "punkt", "punktnummer", "point_name", "point_no", "pt", "pkt", "nr", "punto",
+     "matricule"),
 )  # fmt: skip
-_EASTING: Final = Quantity("easting", "length", ("rechtswert",))
-_NORTHING: Final = Quantity("northing", "length", ("hochwert",))
+WORDS: Final = (
+    Quantity("code", "text", ("description", "desc", "bemerkung"), optional=True),
+    Quantity("role", "text", optional=True),
+)  # fmt: skip
+_EASTING: Final = Quantity("easting", "length", ("rechtswert", "ostwert", "east", "este", "est", "e", "grid_easting"))
+_NORTHING: Final = Quantity(
+    "northing", "length", ("hochwert", "nordwert", "north", "norte", "nord", "n", "grid_northing")
+)
 GEODETIC: Final = (Quantity("longitude", "angle", ("lon", "lng")), Quantity("latitude", "angle", ("lat",)))
 GRID: Final = (_EASTING, _NORTHING)
 LOCAL: Final = (
     Quantity("easting", "length", ("x", *_EASTING.also)), Quantity("northing", "length", ("y", *_NORTHING.also)),
 )  # fmt: skip
-HEIGHT: Final = Quantity("height", "length", ("altitude", "elevation", "höhe", "hoehe"))
-LOCAL_HEIGHT: Final = Quantity("height", "length", ("z", *HEIGHT.also))
+HEIGHT: Final = Quantity(
+    "height",
+    "length",
+    ("altitude", "elevation", "höhe", "hoehe", "elev", "alt", "cota", "z", "h"),
+)
+LOCAL_HEIGHT: Final = HEIGHT
 SIGMAS: Final = (
     Quantity("sigma_horizontal", "length", optional=True),
     Quantity("sigma_height", "length", ("sigma_vertical",), optional=True),

@@ -23,6 +23,18 @@ Dimension: TypeAlias = Literal[
 
 _BRACKETS: Final = re.compile(r"[(\[<{].*")
 """How many programs add a unit to a name: `Latitude (deg)`."""
+_BRACKET_UNITS: Final = {
+    **{u: u for u in ("m", "mm", "cm", "km", "deg", "rad", "arcmin", "arcsec", "s", "ms", "us", "ns", "g", "mg")},
+    "dps": "dps",
+    "meter": "m", "meters": "m", "metre": "m", "metres": "m", "usft": "ft_us", "us ft": "ft_us", "ftus": "ft_us",
+    "us survey foot": "ft_us", "sft": "ft_us", "ift": "ft", "°": "deg", "degree": "deg", "degrees": "deg",
+    "radian": "rad", "radians": "rad", "sec": "s", "seconds": "s", "µs": "us", "°/s": "deg_per_s",
+    "deg/s": "deg_per_s", "deg s^-1": "deg_per_s", "°/h": "deg_per_h", "deg/h": "deg_per_h", "rad/s": "rad_per_s",
+    "rad s^-1": "rad_per_s", "m/s": "m_per_s", "m s^-1": "m_per_s", "km/h": "km_per_h", "m/s²": "m_per_s2",
+    "m/s^2": "m_per_s2", "m/s2": "m_per_s2", "m s^-2": "m_per_s2", "°c": "deg_c",
+}  # fmt: skip
+"""Units as programs write them in brackets. Not "ft": which foot it is, it does not say."""
+_BRACKETED: Final = re.compile(r"\s*[(\[<{]([^)\]>}]*)[)\]>}]\s*$")
 
 STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
 """Size of the unit g (CGPM 1901)."""
@@ -83,8 +95,8 @@ class Quantity:
 
     @property
     def usual_unit(self) -> str:
-        """First of its units, "" where it has none."""
-        return next(iter(UNITS[self.dimension]))
+        """The unit that most programs write, "" where it has none."""
+        return "deg" if self.dimension == "angle" else next(iter(UNITS[self.dimension]))
 
 
 @dataclass(frozen=True)
@@ -110,14 +122,22 @@ class Likeness:
         return there >= max(2, len(self.absent))
 
 
+def word_of(name: str) -> str:
+    """Return a column's name in lower case with blanks as `_` and a unit in brackets at its end: `latitude_deg`."""
+    found = _BRACKETED.search(name)
+    unit = None if found is None else _BRACKET_UNITS.get(found[1].strip().lower().replace("μ", "µ"))
+    stem = name if found is None or unit is None else f"{name[: found.start()]}_{unit}"
+    return re.sub(r"[\s.]+", "_", stem.strip().lower())
+
+
 def likeness(quantities: Iterable[Quantity], names: Sequence[str]) -> Likeness:
     """Return how well columns of these `names` match the `quantities`; the clock gives a missing unit of time."""
-    plain = {_BRACKETS.sub("", name.lower()).strip(" _"): name for name in names}
+    plain = {word_of(_BRACKETS.sub("", name)).strip("_"): name for name in names}
     bracketed = {name: bracket[0].strip("()[]<>{} ") for name in names if (bracket := _BRACKETS.search(name.lower()))}
     found, unitless, absent = 0, {}, []
     for quantity in quantities:
         named = next((plain[stem] for stem in (quantity.name, *quantity.also) if stem in plain), None)
-        if any(name.lower() in _spellings(quantity) for name in plain.values()):
+        if any(word_of(name) in _spellings(quantity) for name in plain.values()):
             found += 1
         elif named is None:
             absent.append(quantity)
@@ -183,7 +203,7 @@ def find_columns(
 
 def fits(quantities: Iterable[Quantity], names: Iterable[str], plain: Iterable[str] = ()) -> bool:
     """Return True if every required quantity has a column whose name has its unit (or is in `plain`)."""
-    lower = [n.lower() for n in names]
+    lower = [word_of(n) for n in names]
     return all(
         q.optional or any(n in _spellings(q) for n in lower) or (q.name in plain and _plain(q, lower))
         for q in quantities
@@ -204,7 +224,7 @@ def need_stamp_unit(column: Found, clock: Clock, file: Path) -> None:
 
 def unit_in_name(name: str, dimension: Dimension) -> str:
     """Return the unit at the end of a column's name (``timestamp_ns`` → ``ns``), "" for none."""
-    ends = [unit for unit in UNITS[dimension] if unit and name.lower().endswith("_" + unit)]
+    ends = [unit for unit in UNITS[dimension] if unit and word_of(name).endswith("_" + unit)]
     return max(ends, key=len, default="")
 
 
@@ -220,13 +240,13 @@ def _plain(quantity: Quantity, lower: list[str]) -> list[str]:
 
 def _by_name(quantity: Quantity, names: tuple[str, ...], file: Path, plain_units: Mapping[str, float]) -> Found | None:
     spellings = _spellings(quantity)
-    fitting = [n for n in names if n.lower() in spellings]
+    fitting = [n for n in names if word_of(n) in spellings]
     if len(fitting) > 1:
         raise _twice(quantity, fitting, file)
     if fitting:
-        unit = spellings[fitting[0].lower()]
+        unit = spellings[word_of(fitting[0])]
         return Found(fitting[0], UNITS[quantity.dimension][unit], unit)
-    plain = [n for n in names if n.lower() in (quantity.name, *quantity.also)]
+    plain = [n for n in names if word_of(n) in (quantity.name, *quantity.also)]
     if plain[1:] and quantity.name in plain_units:
         raise _twice(quantity, plain, file)
     if plain and quantity.name in plain_units:
@@ -266,10 +286,10 @@ def _by_option(quantity: Quantity, option: ColumnOption, names: tuple[str, ...],
 
 
 def _missing(quantity: Quantity, names: tuple[str, ...], file: Path) -> FormatError:
-    plain = [n for n in names if n.lower() in (quantity.name, *quantity.also)]
+    plain = [n for n in names if word_of(n) in (quantity.name, *quantity.also)]
     arrived = f"column '{plain[0]}' says no unit" if plain else f"no column holds the {quantity.name}"
     example = plain[0] if plain else names[0] if names else "…"
-    unit = next(u for u in (*UNITS[quantity.dimension], "…"))
+    unit = quantity.usual_unit or "…"
     return FormatError(
         arrived,
         expected="a column called " + " or ".join(f"'{s}'" for s in list(_spellings(quantity))[:4]),

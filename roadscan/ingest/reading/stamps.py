@@ -29,10 +29,12 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 TIME: Final = Quantity(
-    "time", "time", ("timestamp", "stamp", "datetime", "date_time", "gps_time", "utc_time", "unix_time", "gpst_unix")
-)
+    "time", "time",
+    ("timestamp", "stamp", "datetime", "date_time", "gps_time", "utc_time", "unix_time", "gpst_unix", "utctime", "zeit",
+     "gps_seconds", "gps_sow", "sow", "tow", "seconds_of_week"),
+)  # fmt: skip
 """Column of time stamps by its common names."""
-DATES: Final = ("date", "date_utc", "utc_date")
+DATES: Final = ("date", "date_utc", "utc_date", "utcdate")
 """Names of a column with the date, where the column of stamps only has the time of day."""
 _TIME_OF_DAY: Final = re.compile(r"T?\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d*)?)?(?:Z|[+-]\d{2}:?\d{2})?")
 _OTHER_TIMES: Final = (
@@ -115,7 +117,7 @@ class StampColumn:
         if date is not None:
             word = f"{_first_word(file, layout, date)}T{word}"
         zoned = parse_calendar([word], zoned=True) is not None
-        named_utc = any("utc" in name.lower().split("_") for name in (found.column, date or ""))
+        named_utc = any("utc" in name.lower() for name in (found.column, date or ""))
         is_utc = zoned or (named_utc and clock is None)
         stated = source.clock if zoned else clock
         own = calendar_clock(stated, word, file, zoned=zoned, is_utc=is_utc)

@@ -48,6 +48,8 @@ Kind: TypeAlias = Literal["number", "integer", "text"]
 """Type of a column: float64, int64 or text. An empty number is NaN, an empty whole number is a fault."""
 
 _ARROW_TYPES: Final[dict[Kind, pa.DataType]] = {"number": pa.float64(), "integer": pa.int64(), "text": pa.string()}
+_REMARKS: Final = (b"//", b"; ", b"% ", b"! ")
+"""Other starts of remarks that programs write above the line of names."""
 _LETTERS: Final = frozenset(b"abcdfghijklmopqrstuvwxyzABCDFGHIJKLMOPQRSTUVWXYZ_")
 """Letters of names that occur in no number (1e5, nan)."""
 _DELIMITERS: Final = (",", ";", "\t", "|")
@@ -286,7 +288,7 @@ def _start_of(path: Path, options: TextOptions) -> _Start:
         if b"\x00" in raw:
             raise _no_text(head, path)
         line = raw.strip()
-        comment = bool(options.comment) and line.startswith(options.comment.encode())
+        comment = bool(options.comment) and line.startswith((options.comment.encode(), *_REMARKS))
         if skip <= 0 and line and not comment:
             behind = offset + len(raw)
             if behind >= HEAD_BYTES and not raw.endswith((b"\n", b"\r")):

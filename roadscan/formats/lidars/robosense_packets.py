@@ -122,6 +122,7 @@ def _packet(
                      "offsets": [at for _, at in fields.values()], "itemsize": size})  # fmt: skip
 
 
+# Times (µs) of the channels of a block from its stamp on.
 _RS_32_US: Final = (*_evenly(2.88, 15), 44.64, *_evenly(2.88, 15, 1.44), 46.08)
 _HELIOS_US: Final = (
     0.0, 1.57, 3.15, 4.72, 6.3, 7.87, 9.45, 11.36, 13.26, 15.17, 17.08, 18.99, 20.56, 22.14, 23.71, 25.29, 26.53, 29.01,

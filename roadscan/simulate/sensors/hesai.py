@@ -27,9 +27,9 @@ _HEAD: Final = bytes([0xEE, 0xFF, 6, 1, 0, 0, 32, 8, 0, 4, 1, 1])
 """Protocol 6.1, 32 lasers, 8 blocks, 4 mm, one return, with numbers."""
 _BEFORE_FIRST_NS: Final = 5_632 + 368
 """From the packet's time to the first firing of its last block, and from a block's azimuth to that of its first one."""
-_STRONGEST: Final = 0x37
+_STRONGEST: Final = 0x37  # return mode of the strongest return
 _CHANNEL: Final = np.dtype([("distance", "<u2"), ("reflectivity", "u1"), ("_", "u1")])
-_BLOCK: Final = np.dtype([("azimuth", "<u2"), ("channels", _CHANNEL, 32)])
+_BLOCK: Final = np.dtype([("azimuth", "<u2"), ("channels", _CHANNEL, 32)])  # azimuth in 0.01°
 _PACKET: Final = np.dtype([
     ("head", "V12"), ("blocks", _BLOCK, 8), ("reserved", "V10"), ("mode", "u1"), ("speed", "<u2"), ("date", "u1", 6),
     ("stamp_us", "<u4"), ("factory", "u1"), ("number", "<u4"),

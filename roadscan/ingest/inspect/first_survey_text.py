@@ -149,6 +149,19 @@ def _map(found: FoundFolder) -> Iterator[str]:
         yield from _utm_line(guessed, "EPSG:4979", is_known=False)
     elif any(extent.frame == LOCAL_WORLD for log in stated for extent in _extents(log.report)):
         yield 'local = { name = "local" }  # the poses are in a local frame'
+    elif (lidar := found.only_lidar) is not None and not found.control:
+        yield _question('local = { name = "local, no position on Earth" }')
+        yield from _remark(
+            "no log has positions. Is there no other log that has? Then the lidar's sweeps can be matched with one another: "
+            "that makes a local map, without a position on Earth, whose errors grow with the way. If there is one, add it "
+            "to the folder and run `roadscan init` again."
+        )
+        yield ""
+        yield "[navigation.odometry]"
+        yield _question(f"lidar = {toml(lidar)}")
+        yield "# the sensor whose sweeps make the poses; roadscan[odometry] brings what does it"
+        yield ""
+        return
     else:
         yield _question('crs = "????"')
         yield '# The map of the products: a projected CRS ("EPSG:25832"), or, for poses that are not tied to the Earth,'

@@ -281,7 +281,7 @@ class NavigationConfig(Strict):
     smoother: SmootherConfig = SmootherConfig()
     """How it is computed."""
     odometry: OdometryConfig | None = None
-    """Poses from a lidar's sweeps, for runs with neither a trajectory nor GNSS: they lie in the local frame of the map."""
+    """Poses from a lidar's sweeps, for runs with neither a trajectory nor GNSS: a local map."""
     ppk: PpkSettings | None = None
     """Base station and settings of logs of raw GNSS observations (format = "ppk"); their options go before it."""
     spline: SplineConfig = SplineConfig()

@@ -45,8 +45,8 @@ from roadscan.ingest.place_checks import without_fix
 from roadscan.ingest.planned_logs import CONTROL_RUN, log_options, log_source, plan_logs
 from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
 from roadscan.ingest.sources import listed_name, remembered_formats
-from roadscan.navigation.tasks.clocks import check_clocks
 from roadscan.navigation.odometry.registration import LIBRARY, WHAT
+from roadscan.navigation.tasks.clocks import check_clocks
 from roadscan.navigation.tasks.navigation_logs import unknown_imu
 from roadscan.navigation.tasks.odometry_trajectory import LOCAL_MAP
 from roadscan.run.selection import Selection

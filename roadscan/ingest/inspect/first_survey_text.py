@@ -152,15 +152,14 @@ def _map(found: FoundFolder) -> Iterator[str]:
     elif (lidar := found.only_lidar) is not None and not found.control:
         yield _question('local = { name = "local, no position on Earth" }')
         yield from _remark(
-            "no log has positions. Is there no other log that has? Then the lidar's sweeps can be matched with one another: "
-            "that makes a local map, without a position on Earth, whose errors grow with the way. If there is one, add it "
-            "to the folder and run `roadscan init` again."
+            "No log has positions. If there is one that has, add it to the folder, and run `roadscan init` again. If "
+            "not, the lidar's sweeps are matched with one another, which makes a local map: it has no position on "
+            "Earth, and its errors grow with the way."
         )
         yield ""
         yield "[navigation.odometry]"
         yield _question(f"lidar = {toml(lidar)}")
-        yield "# the sensor whose sweeps make the poses; roadscan[odometry] brings what does it"
-        yield ""
+        yield '# the sensor whose sweeps make the poses; pip install "roadscan[odometry]" brings what does it'
         return
     else:
         yield _question('crs = "????"')

@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
+from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.core.settings.odometry import OdometryConfig
 from roadscan.core.witness import Finding, Witness
-from roadscan.navigation.odometry.registration import FEWEST_POINTS, Matched
+from roadscan.navigation.odometry.registration import FEWEST_POINTS, LEAST_HELD, Matched
 from roadscan.navigation.odometry.rig_motion import GRAVITY_M_PER_S2, WINDOW_S, Way, Windows
 
 Int64 = npt.NDArray[np.int64]
@@ -21,16 +21,14 @@ Flags = npt.NDArray[np.bool_]
 LIDAR_ODOMETRY: Final = Witness(
     "lidar_odometry",
     input="lidar",
-    fault="Sweeps were matched wrongly, or could not be matched: too few points, nothing that holds them along the road, "
-    "a leap.",
-    asks="the number of points of each sweep, the directions of the surfaces around, the speed that the poses need, and "
-    "turns and gravity by the IMU, where there is one",
-    does="a sweep with too few points gets no pose; all else is kept, and named with its time",
-    told=("findings",),
+    fault="Sweeps were matched wrongly, or could not be matched: too few points, nothing that holds them along the "
+    "road, a leap.",
+    asks="the number of points of each sweep, the directions of the surfaces around, the speed that the poses need, "
+    "and turns and gravity by the IMU, where there is one",
+    does="a sweep with too few points gets no pose; all else is kept, and named with its time; where most sweeps are "
+    "not held along the road, no trajectory is made",
+    told=("findings", "error"),
 )
-LEAST_HELD: Final = 0.01
-"""Surfaces that hold a sweep less along a direction (mean square of their normals) leave it to the guess there: 1/3 where
-they face all ways alike."""
 _LEAP_M, _LEAP_M_PER_S2 = 0.5, 1.5 * GRAVITY_M_PER_S2
 """A pose lies off a steady motion by at most this, and by what brakes and kerbs do."""
 _TURN_RAD: Final = np.radians(1.5)  # turn within a window that gyroscope and sweeps may differ by
@@ -57,12 +55,13 @@ def findings(
     yield from told(
         matched.held < LEAST_HELD, matched.judged_gps_ns, -matched.held,
         "{count} of {of} sweeps that were judged see surfaces that hold them along two directions only, worst at {at}: "
-        "the way along the third one is guessed there.",
+        "the way along the third one is guessed there, and σ says so.",
     )  # fmt: skip
     step_s, step_m = np.diff(way.seconds), np.linalg.norm(np.diff(way.position_m, axis=0), axis=1)
     yield from told(
         step_m > config.speed_max_m_per_s * step_s, way.epochs_gps_ns[1:], step_m / step_s,
-        f"{{count}} poses can be reached only faster than {config.speed_max_m_per_s:g} m/s, worst {{size:.0f}} m/s at {{at}}.",
+        f"{{count}} poses can be reached only faster than {config.speed_max_m_per_s:g} m/s, worst {{size:.0f}} m/s at "
+        "{at}.",
     )  # fmt: skip
     speed = np.diff(way.position_m, axis=0) / step_s[:, None]
     leap_m = np.linalg.norm(np.diff(speed, axis=0), axis=1) * step_s[1:]
@@ -79,14 +78,14 @@ def findings(
         turn = windows.turn_rad - np.median(windows.turn_rad) * (windows.turn_rad.size > 4)  # less the gyroscope's bias
         yield from told(
             np.abs(turn) > _TURN_RAD, windows.epochs_gps_ns[:-1], np.degrees(np.abs(turn)),
-            f"{{count}} of {{of}} times the IMU turns otherwise than the poses within {WINDOW_S:g} s, worst {{size:.1f}}° "
-            "from {at}.",
+            f"{{count}} of {{of}} times the IMU turns otherwise than the poses within {WINDOW_S:g} s, worst by "
+            "{size:.1f}° from {at}.",
         )  # fmt: skip
         mean, up = windows.up_world.mean(axis=0), windows.up_world
         cosine = up @ mean / np.linalg.norm(up, axis=1) / np.linalg.norm(mean)
         tilt = np.arccos(np.clip(cosine, -1.0, 1.0))
         yield from told(
             tilt > _TILT_RAD, windows.epochs_gps_ns[:-1], np.degrees(tilt),
-            "{count} of {of} times gravity points elsewhere than on average, worst by {size:.1f}° from {at}: the map "
-            "bends there, or the accelerometers err.",
+            "{count} of {of} times gravity points elsewhere than on average, worst by {size:.1f}° from {at}: matching "
+            "bends the way, or the accelerometers err; the way was turned to gravity.",
         )  # fmt: skip

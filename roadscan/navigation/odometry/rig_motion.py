@@ -22,6 +22,7 @@ WINDOW_S: Final = 5.0
 """Length of the pieces over which accelerations are averaged and turns compared (s): shorter than a turn of a road."""
 _FLOOR_M, _FLOOR_DEG = 0.02, 0.1
 """1 σ of a pose beside its neighbours: centimetres by the noise of ranges and the cubes of the map."""
+_SPEED_SIGMA_M_PER_S: Final = 0.1  # of the way at the ends of a window: centimetres between two sweeps
 STANDING_SIGMA_DEG: Final = 2.0
 """1 σ of roll and pitch where no accelerometer says where up is: cross slope and grade of a road, springs."""
 
@@ -40,12 +41,15 @@ class Way:
     @property
     def seconds(self) -> Float64:
         """Time since the first pose (n,)."""
-        return (self.epochs_gps_ns - self.epochs_gps_ns[0]) / NS_PER_S
+        seconds: Float64 = (self.epochs_gps_ns - self.epochs_gps_ns[0]) / NS_PER_S
+        return seconds
 
     @property
     def path_m(self) -> Float64:
         """Way since the first pose (n,)."""
-        return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.position_m, axis=0), axis=1)))
+        steps = np.linalg.norm(np.diff(self.position_m, axis=0), axis=1)
+        path: Float64 = np.append(0.0, np.cumsum(steps))
+        return path
 
     def turned(self, rotation: Float64) -> Way:
         """Return the way in axes turned by a rotation (3, 3)."""
@@ -105,20 +109,56 @@ def windows_of(
     return Windows(limits, np.stack(means[:3], axis=-1) - np.diff(at_limits, axis=0) / WINDOW_S, difference)
 
 
-def levelled(way: Way, windows: Windows, errors: ImuErrors) -> tuple[Way, float]:
-    """Return the way turned so that the mean of all specific forces points up, and 1 σ (rad) of its tilt."""
-    up = windows.up_world.mean(axis=0)
-    axis = np.array([up[1], -up[0], 0.0])  # up × z
-    angle = np.arctan2(np.hypot(up[0], up[1]), up[2])
-    turn = Rotation.from_rotvec(axis / max(float(np.linalg.norm(axis)), 1e-12) * angle).as_matrix()
-    scatter = (windows.up_world - up)[:, :2].std(axis=0).max() / GRAVITY_M_PER_S2 / np.sqrt(len(windows.up_world))
-    return way.turned(turn), float(np.hypot(1e-3 * errors.accel_bias_mg, scatter))
+def levelled(way: Way, windows: Windows) -> Way:
+    """Return the way turned so that the mean of all specific forces points up."""
+    (turn,) = _to_up(windows.up_world.mean(axis=0, keepdims=True))
+    return way.turned(Rotation.from_rotvec(turn).as_matrix())
 
 
-def sigmas(way: Way, config: OdometryConfig, tilt_rad: float) -> tuple[Float64, Float64]:
-    """Return 1 σ of positions (n, 3; north, east, down; m) and of roll, pitch, heading (n, 3; rad)."""
+def unbent(way: Way, windows: Windows, is_held: npt.NDArray[np.bool_]) -> Way:
+    """Return the way turned so that specific forces point up all along it: its roll and pitch drift no more.
+
+    Each step between two poses is turned like the poses; what the lidar measured of it stays as it is. Pieces in which
+    surfaces do not hold a pose (n,) do not count: the speed is guessed there, and with it what is left of the forces.
+    """
+    guessed = np.searchsorted(windows.epochs_gps_ns, way.epochs_gps_ns[~is_held], side="right") - 1
+    counts = ~np.isin(np.arange(len(windows.up_world)), guessed)
+    if not counts.any():
+        return way
+    middles = ((windows.epochs_gps_ns[1:] + windows.epochs_gps_ns[:-1]) / 2 - way.epochs_gps_ns[0])[counts]
+    turns = _to_up(windows.up_world[counts])
+    turn = np.stack([np.interp(way.seconds, middles / NS_PER_S, turns[:, i]) for i in range(3)], axis=-1)
+    steps = Rotation.from_rotvec((turn[1:] + turn[:-1]) / 2).apply(np.diff(way.position_m, axis=0))
+    position = np.concatenate([way.position_m[:1], way.position_m[0] + np.cumsum(steps, axis=0)])
+    return Way(way.epochs_gps_ns, position, Rotation.from_rotvec(turn).as_matrix() @ way.world_from_body)
+
+
+def _to_up(up: Float64) -> Float64:
+    """Return rotation vectors (n, 3) that turn directions (n, 3) to z."""
+    axis = np.column_stack([up[:, 1], -up[:, 0], np.zeros(len(up))])  # up × z
+    level = np.linalg.norm(axis, axis=1)
+    turn: Float64 = axis * (np.arctan2(level, up[:, 2]) / np.maximum(level, 1e-12))[:, None]
+    return turn
+
+
+def tilt_sigma_rad(errors: ImuErrors) -> float:
+    """Return 1 σ of roll and pitch of a way that was unbent."""
+    return float(np.hypot(1e-3 * errors.accel_bias_mg, np.sqrt(2) * _SPEED_SIGMA_M_PER_S / WINDOW_S / GRAVITY_M_PER_S2))
+
+
+def sigmas(
+    way: Way, is_held: npt.NDArray[np.bool_], config: OdometryConfig, tilt_rad: float, *, is_unbent: bool
+) -> tuple[Float64, Float64]:
+    """Return 1 σ of positions (n, 3; north, east, down; m) and of roll, pitch, heading (n, 3; rad).
+
+    Where the surfaces around do not hold a pose (n,), matching pulls it back by any part of the way: there σ grows by
+    the greatest speed that the rig had elsewhere.
+    """
     path, away = way.path_m, np.linalg.norm(way.position_m[:, :2], axis=1)
-    level = np.hypot(_FLOOR_M, config.drift_share * path)
+    step_s = np.diff(way.seconds)
+    fastest = np.max(np.diff(path) / step_s, where=is_held[1:], initial=0.0)
+    guessed = np.append(0.0, np.cumsum(np.where(is_held[1:], 0.0, fastest * step_s)))
+    level = np.hypot(np.hypot(_FLOOR_M, config.drift_share * path), guessed)
     angle = np.radians(np.hypot(_FLOOR_DEG, config.drift_deg_per_100m * path / 100.0))
-    tilt = np.hypot(angle, tilt_rad)
+    tilt = np.hypot(np.radians(_FLOOR_DEG) if is_unbent else angle, tilt_rad) + np.zeros_like(angle)
     return np.column_stack([level, level, np.hypot(level, tilt_rad * away)]), np.column_stack([tilt, tilt, angle])

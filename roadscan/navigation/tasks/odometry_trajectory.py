@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import ConfigError, NavigationError
@@ -17,6 +18,7 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.ids import of_run
 from roadscan.core.imu import IMU_GRADES
 from roadscan.core.rig import Sensor
+from roadscan.core.settings.odometry import OdometryConfig
 from roadscan.core.survey import Survey
 from roadscan.ingest.clocks.correction import ClockCorrection
 from roadscan.navigation.inertial.readings import ImuReadings
@@ -28,16 +30,18 @@ from roadscan.navigation.odometry.rig_motion import (
     Windows,
     levelled,
     sigmas,
+    tilt_sigma_rad,
+    unbent,
     way_of,
     windows_of,
 )
 from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.navigation.tasks.computed_trajectory import Computed, sigma_figures, trajectory_rows
-from roadscan.navigation.tasks.navigation_logs import NO_SENSOR, imu_readings
+from roadscan.navigation.tasks.navigation_logs import imu_readings
 from roadscan.navigation.tasks.solve_trajectory import on_time
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.store.logs import LogRecord
+from roadscan.store.logs import NAVIGATION, LogRecord
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
@@ -45,6 +49,7 @@ ODOMETRY: Final = "odometry"
 """Format of the records of these trajectories."""
 LOCAL_MAP: Final = "local map: it has no position on Earth, and its errors grow with the way"
 _LONGEST_SWEEP_S: Final = 1.0  # of a head that turns once a second
+_LEAST_SHARE: Final = 0.5  # of poses that surfaces hold along all directions; with fewer, the map would be a guess
 _COLUMNS: Final = ["pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m", "sweep"]
 
 
@@ -54,6 +59,7 @@ class PlannedOdometry:
 
     survey: Survey
     store: Store
+    config: OdometryConfig
     lidar: tuple[LogRecord, ...]
     imu: tuple[LogRecord, ...]
     clocks: tuple[tuple[str, ClockCorrection], ...]
@@ -74,9 +80,9 @@ class PlannedOdometry:
         RoadscanError
             where the library is not installed, or the log has no sweeps to match.
         """
-        config, sensor = self.survey.config.navigation.odometry, _sensor(self.survey, self.lidar)
-        assert config is not None  # noqa: S101
-        matched = match(sweeps_of(self._pieces()), config, sensor.range_min_m, min(config.range_max_m, sensor.range_max_m))
+        config, sensor = self.config, _sensor(self.survey, self.lidar)
+        far_m = min(config.range_max_m, sensor.range_max_m)
+        matched = match(sweeps_of(self._pieces()), config, sensor.range_min_m, far_m)
         if matched.epochs_gps_ns.size < 3:
             raise NavigationError(
                 f"fewer than three sweeps of the lidar '{self.lidar[0].sensor}' could be matched",
@@ -84,14 +90,21 @@ class PlannedOdometry:
                 change="check the range limits of the sensor, and voxel_m of [navigation.odometry]",
                 file=self.lidar[0].path,
             )
+        if matched.is_held.mean() < _LEAST_SHARE:
+            raise NavigationError(
+                f"what the lidar '{self.lidar[0].sensor}' sees tells nothing of the way along the road, for "
+                f"{1 - matched.is_held.mean():.0%} of the sweeps",
+                expected="houses, trees, poles or cars around: odometry of a lidar cannot do without them",
+                change="add a log of GNSS, or a trajectory, to the run",
+                file=self.lidar[0].path,
+            )
         way = way_of(matched.epochs_gps_ns, matched.first_from_lidar, *sensor.mounting().arrays())
-        way, windows, tilt_rad = self._level(way)
+        way, windows, tilt_rad = self._level(way, matched.is_held)
         subject = f"trajectory of run '{self.run}'"
         found = list(findings(subject, way, matched, windows, config, self.survey.config.navigation.max_gap_s))
         for one in found:
             report(f"doubtful: {one.line}")
-        report(f"note: run '{self.run}': {LOCAL_MAP} (1 σ: {config.drift_share:.1%} of it, tilt {np.degrees(tilt_rad):.2f}°)")
-        sigma_m, sigma_rad = sigmas(way, config, tilt_rad)
+        sigma_m, sigma_rad = sigmas(way, matched.is_held, config, tilt_rad, is_unbent=windows is not None)
         rows = trajectory_rows(
             way.epochs_gps_ns, way.position_m, quaternion_from_rotation(way.world_from_body), sigma_m, sigma_rad
         )
@@ -107,22 +120,25 @@ class PlannedOdometry:
         }
         return Computed(rows, attributes)
 
-    def _level(self, way: Way) -> tuple[Way, Windows | None, float]:
+    def _level(self, way: Way, is_held: npt.NDArray[np.bool_]) -> tuple[Way, Windows | None, float]:
         """Return the way with z upwards, what the IMU measured along it, and 1 σ (rad) of its tilt."""
         standing = np.radians(STANDING_SIGMA_DEG)
         if not self.imu:
             return way, None, standing
-        readings: ImuReadings = on_time(
-            imu_readings(self.store, self.imu), dict(self.clocks).get(self.imu[0].sensor)
-        )
+        readings: ImuReadings = on_time(imu_readings(self.store, self.imu), dict(self.clocks).get(self.imu[0].sensor))
         sensor = _sensor(self.survey, self.imu)
         turn, _ = sensor.mounting().arrays()
-        samples = readings.epochs_gps_ns, readings.specific_force_m_per_s2 @ turn.T, readings.angular_rate_rad_per_s @ turn.T
-        first = windows_of(way, *samples)
-        if first is None:
+        samples = (
+            readings.epochs_gps_ns,
+            readings.specific_force_m_per_s2 @ turn.T,
+            readings.angular_rate_rad_per_s @ turn.T,
+        )
+        windows = windows_of(way, *samples)
+        if windows is None:
             return way, None, standing
-        way, tilt_rad = levelled(way, first, sensor.imu_errors() or IMU_GRADES["mems"])
-        return way, windows_of(way, *samples), tilt_rad
+        way = levelled(way, windows)
+        windows = windows_of(way, *samples) or windows
+        return unbent(way, windows, is_held), windows, tilt_sigma_rad(sensor.imu_errors() or IMU_GRADES["mems"])
 
     def _pieces(self) -> Iterator[tuple[tuple[str, int], Sweep]]:
         """Yield pieces of sweeps in order of time, a row group at a time."""
@@ -134,7 +150,7 @@ class PlannedOdometry:
                     rows = read_groups(self.store, file.path, [group], _COLUMNS)
                     epochs, *xyz, numbers = (rows.column(name).to_numpy() for name in _COLUMNS)
                     epochs = epochs if clock is None else clock.applied(epochs)
-                    points = np.stack(xyz, axis=-1).astype(np.float64)
+                    points = np.stack(xyz, axis=-1)
                     for number in np.unique(numbers).tolist():
                         own = numbers == number
                         _check_length(begun.setdefault(number, int(epochs[own].min())), int(epochs[own].max()), record)
@@ -167,7 +183,7 @@ def plan_odometry(
     clocks, code = load_clocks(store), code_digest(name_of(PlannedOdometry))
     found: list[PlannedOdometry] = []
     for run in runs:
-        if any(r.run == run and r.tables.get("trajectory") for r in records):
+        if any(r.run == run and r.tables.get("trajectory") and r.sensor != NAVIGATION for r in records):
             continue
         lidar = _of_one(records, run, "returns", config.lidar, "lidar")
         imu = _of_one(records, run, "imu", config.imu, "imu")
@@ -181,7 +197,7 @@ def plan_odometry(
             ODOMETRY, code, version, run, [r.key for r in (*lidar, *imu)], rig, own,
             config.model_dump(mode="json"), survey.config.navigation.max_gap_s,
         )  # fmt: skip
-        found.append(PlannedOdometry(survey, store, lidar, imu, own, key))
+        found.append(PlannedOdometry(survey, store, config, lidar, imu, own, key))
     return found
 
 
@@ -191,7 +207,7 @@ def _of_one(
     """Return logs of one sensor of a run with rows in `table`: the stated sensor's, or those of the only one."""
     own = [r for r in records if r.run == run and r.tables.get(table) and stated in (None, r.sensor)]
     names = sorted({r.sensor for r in own})
-    if len(names) > 1 and stated != NO_SENSOR:
+    if len(names) > 1:
         raise ConfigError(
             f"run '{run}' has logs of {len(names)} sensors in the table {table}: {', '.join(names)}",
             expected="to know whose poses are made",

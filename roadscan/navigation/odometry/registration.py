@@ -161,8 +161,7 @@ class _Matcher:
     def _begin(self, begin: int, end: int) -> None:
         if end > begin:
             self._epochs.append(begin)
-            back: Float64 = np.linalg.inv(_step(self.motion, (end - begin) / NS_PER_S))
-            self._poses.append(back)
+            self._poses.append(np.asarray(np.linalg.inv(_step(self.motion, (end - begin) / NS_PER_S)), np.float64))
 
     def matched(self) -> Matched:
         """Return what was matched so far."""

@@ -22,7 +22,8 @@ WINDOW_S: Final = 5.0
 """Length of the pieces over which accelerations are averaged and turns compared (s): shorter than a turn of a road."""
 _FLOOR_M, _FLOOR_DEG = 0.02, 0.1
 """1 σ of a pose beside its neighbours: centimetres by the noise of ranges and the cubes of the map."""
-_SPEED_SIGMA_M_PER_S: Final = 0.1  # of the way at the ends of a window: centimetres between two sweeps
+_AROUND_S: Final = 0.25
+_SPEED_SIGMA_M_PER_S: Final = 0.1  # of the way at the ends of a window: centimetres in half a second, and its change
 STANDING_SIGMA_DEG: Final = 2.0
 """1 σ of roll and pitch where no accelerometer says where up is: cross slope and grade of a road, springs."""
 
@@ -94,8 +95,6 @@ def windows_of(
     turned = Slerp(way.seconds, Rotation.from_matrix(way.world_from_body))
     attitude = turned(seconds)
     force, rate = attitude.apply(force_body_m_per_s2[own]), attitude.apply(rate_body_rad_per_s[own])
-    velocity = np.gradient(way.position_m, way.seconds, axis=0)
-    at_limits = np.stack([np.interp(limits_s, way.seconds, velocity[:, i]) for i in range(3)], axis=-1)
     piece = np.searchsorted(limits_s, seconds, side="right") - 1
     inside = (piece >= 0) & (piece < limits.size - 1)
     count = np.bincount(piece[inside], minlength=limits.size - 1)
@@ -106,7 +105,19 @@ def windows_of(
     by_way = relative.as_euler("ZYX")[:, 0]
     by_gyros = means[3] * WINDOW_S
     difference = np.angle(np.exp(1j * (by_gyros - by_way)))
-    return Windows(limits, np.stack(means[:3], axis=-1) - np.diff(at_limits, axis=0) / WINDOW_S, difference)
+    return Windows(
+        limits, np.stack(means[:3], axis=-1) - np.diff(_velocity(way, limits_s), axis=0) / WINDOW_S, difference
+    )
+
+
+def _velocity(way: Way, seconds: Float64) -> Float64:
+    """Return velocities (n, 3) at times (n,) since the first pose, means over half a second around them."""
+    from_s, to_s = np.maximum(seconds - _AROUND_S, 0.0), np.minimum(seconds + _AROUND_S, way.seconds[-1])
+    before, after = (
+        np.stack([np.interp(at, way.seconds, way.position_m[:, i]) for i in range(3)], axis=-1) for at in (from_s, to_s)
+    )
+    velocity: Float64 = (after - before) / (to_s - from_s)[:, None]
+    return velocity
 
 
 def levelled(way: Way, windows: Windows) -> Way:

@@ -20,6 +20,7 @@ EXTRAS: Final = {
     "bokeh": ("bokeh", "dashboard"),
     "cv2": ("opencv-python-headless", "opencv"),
     "geopandas": ("geopandas", "frames"),
+    "kiss_icp.kiss_icp": ("kiss-icp", "odometry"),
     "matplotlib": ("matplotlib", "pictures"),
     "onnxruntime": ("onnxruntime", "onnx"),
     "psycopg": ("psycopg", "postgis"),

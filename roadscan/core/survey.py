@@ -17,6 +17,7 @@ from roadscan.core.ids import LanePass, PassId, RunId
 from roadscan.core.plugins import found_kinds
 from roadscan.core.rig import Rig, Sensor
 from roadscan.core.settings.calibration import CalibrationEvidence, CalibrationSettings
+from roadscan.core.settings.odometry import OdometryConfig
 from roadscan.core.settings.ppk import PpkSettings
 from roadscan.core.settings.segmentation import RoadSegmentation
 from roadscan.core.settings.smoothing import SmootherConfig, SplineConfig
@@ -279,6 +280,8 @@ class NavigationConfig(Strict):
     """Runs whose trajectory is computed from GNSS and IMU: those without a trajectory log, all that have both, none."""
     smoother: SmootherConfig = SmootherConfig()
     """How it is computed."""
+    odometry: OdometryConfig | None = None
+    """Poses from a lidar's sweeps, for runs with neither a trajectory nor GNSS: a local map."""
     ppk: PpkSettings | None = None
     """Base station and settings of logs of raw GNSS observations (format = "ppk"); their options go before it."""
     spline: SplineConfig = SplineConfig()

@@ -45,8 +45,10 @@ from roadscan.ingest.place_checks import without_fix
 from roadscan.ingest.planned_logs import CONTROL_RUN, log_options, log_source, plan_logs
 from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
 from roadscan.ingest.sources import listed_name, remembered_formats
+from roadscan.navigation.odometry.registration import LIBRARY, WHAT
 from roadscan.navigation.tasks.clocks import check_clocks
 from roadscan.navigation.tasks.navigation_logs import unknown_imu
+from roadscan.navigation.tasks.odometry_trajectory import LOCAL_MAP
 from roadscan.run.selection import Selection
 from roadscan.run.stage import stages
 from roadscan.store.logs import has_log, read_log_records
@@ -169,6 +171,20 @@ class Asked:
     def yields(self, run: str) -> set[str]:
         """Return the tables that the logs of a run fill."""
         return {table for log in self.logs if log.run == run for table in log.yields}
+
+    def is_solved(self, run: str) -> bool:
+        """Return whether a run has poses, or GNSS and IMU from which they are computed."""
+        yields = self.yields(run)
+        solve = self.survey.config.navigation.solve
+        return "trajectory" in yields or (solve != "never" and {"gnss", "imu"} <= yields)
+
+    @property
+    def by_lidar(self) -> list[str]:
+        """Runs whose poses come from their lidar's sweeps."""
+        if self.survey.config.navigation.odometry is None:
+            return []
+        runs = [run.id for run in self.survey.config.runs]
+        return [run for run in runs if "returns" in self.yields(run) and not self.is_solved(run)]
 
 
 Check: TypeAlias = Callable[[Asked], Iterator[RoadscanError]]
@@ -363,17 +379,26 @@ def check_imu(asked: Asked) -> Iterator[RoadscanError]:
 
 def check_poses(asked: Asked) -> Iterator[RoadscanError]:
     """Check that each run with readings has poses, or data from which they are computed."""
-    solve = asked.survey.config.navigation.solve
     for run in asked.survey.config.runs:
         yields = asked.yields(run.id)
         unknown = any(log.format is None for log in asked.logs if log.run == run.id)
-        poses = "trajectory" in yields or (solve != "never" and {"gnss", "imu"} <= yields)
+        poses = asked.is_solved(run.id) or run.id in asked.by_lidar
         if not unknown and not poses and yields & set(_PLACED):
             yield ConfigError(
                 f"run '{run.id}' has readings ({', '.join(sorted(yields & set(_PLACED)))}) and no trajectory",
                 expected="one trajectory log, or several in one datum; or logs of GNSS and IMU with navigation.solve",
-                change=f"add its trajectory to the logs of run '{run.id}'",
+                change=f"add its trajectory to the logs of run '{run.id}'"
+                + ("; or state [navigation.odometry] for a local map" if "returns" in yields else ""),
             )
+
+
+def check_odometry(asked: Asked) -> Iterator[RoadscanError]:
+    """Check that what makes poses from sweeps is installed, and that the map takes poses of a local frame."""
+    frame = asked.frame
+    if asked.by_lidar:
+        yield from _faults(lambda: need(LIBRARY, WHAT))
+        if frame is not None:
+            yield from _faults(lambda: frame.check_world(LOCAL_WORLD))
 
 
 def check_segmentation(asked: Asked) -> Iterator[RoadscanError]:
@@ -495,6 +520,7 @@ CHECKS: Final[tuple[tuple[str, Check], ...]] = (
     ("ingest", check_times),
     ("navigate", check_motion_clocks),
     ("navigate", check_imu),
+    ("navigate", check_odometry),
     ("footprints", check_poses),
     ("footprints", check_segmentation),
     ("footprints", check_centre_lines),
@@ -559,6 +585,8 @@ def _grouped(found: Sequence[RoadscanError]) -> Iterator[RoadscanError]:
 def _notes(asked: Asked) -> Iterator[str]:
     if not can_draw():
         yield f"pictures of figures are not drawn: {missing('matplotlib', 'drawing').change}"
+    for run in asked.by_lidar:
+        yield f"run '{run}' has no positions, its poses come from its lidar: {LOCAL_MAP}"
     found, settings = _tables_of_sensors(asked), asked.survey.config.segmentation
     if settings is not None and (segmented := _segmented(asked)) and (rest := sorted(found.keys() - segmented)):
         yield (

@@ -14,6 +14,10 @@ from typer.testing import CliRunner
 
 from roadscan.cli import app
 from roadscan.core.survey import Survey
+from roadscan.report.blocks import Paragraph
+from roadscan.report.section import Material
+from roadscan.report.sections.navigation import Navigation
+from roadscan.run.session import Session
 from roadscan.simulate import simulate
 from roadscan.simulate.sensors.gnss import Solutions, write_pos
 from roadscan.simulate.sensors.imu import COLUMNS
@@ -119,6 +123,13 @@ def test_status_waits_for_a_trajectory(driven: tuple[Path, Path], tmp_path: Path
     assert place.do("ingest", "--workers", "0") == 0
     assert place.do("status") == 1
     assert "trajectory of run 'run-1': waiting" in place.said
+
+
+def test_the_report_tells_of_the_trajectory(alone: Place) -> None:
+    """It is handed the trajectory's own record among those of the logs, which must not seem to be a trajectory log."""
+    material = Material(Session(Survey.load(alone.file), alone.store))
+    lines = [block.text for block in Navigation().blocks(material) if isinstance(block, Paragraph)]
+    assert any("poses by the smoother" in line for line in lines)
 
 
 def test_status_tells_of_the_trajectory(alone: Place) -> None:

@@ -148,6 +148,14 @@ class FoundFolder:
         return [log for run in self.runs for log in run.logs]
 
     @property
+    def only_lidar(self) -> str | None:
+        """Return the first lidar with sweeps of logs without any positions; None where a log has some."""
+        tables = {table for log in self.logs for table in log.format.yields}
+        if tables & {"trajectory", "gnss", "cloud"}:
+            return None
+        return next((log.sensor for log in self.logs if "returns" in log.format.yields and log.sensor), None)
+
+    @property
     def pairs(self) -> list[tuple[FoundLog, FoundLog, str]]:
         """Return logs that belong to another one: the other, the log, and the setting of the other that names it."""
         return [(log, one, setting) for log in self.logs for setting, one in log.companions.items()]

@@ -149,6 +149,18 @@ def _map(found: FoundFolder) -> Iterator[str]:
         yield from _utm_line(guessed, "EPSG:4979", is_known=False)
     elif any(extent.frame == LOCAL_WORLD for log in stated for extent in _extents(log.report)):
         yield 'local = { name = "local" }  # the poses are in a local frame'
+    elif (lidar := found.only_lidar) is not None and not found.control:
+        yield _question('local = { name = "local, no position on Earth" }')
+        yield from _remark(
+            "No log has positions. If there is one that has, add it to the folder, and run `roadscan init` again. If "
+            "not, the lidar's sweeps are matched with one another, which makes a local map: it has no position on "
+            "Earth, and its errors grow with the way."
+        )
+        yield ""
+        yield "[navigation.odometry]"
+        yield _question(f"lidar = {toml(lidar)}")
+        yield '# the sensor whose sweeps make the poses; pip install "roadscan[odometry]" brings what does it'
+        return
     else:
         yield _question('crs = "????"')
         yield '# The map of the products: a projected CRS ("EPSG:25832"), or, for poses that are not tied to the Earth,'

@@ -38,7 +38,7 @@ class PlannedTrajectory(Protocol):
 
     @property
     def format(self) -> str:
-        """Name of the method: `smoother` or `spline`."""
+        """Name of the method: `smoother`, `spline` or `odometry`."""
 
     @property
     def key(self) -> str:

@@ -14,6 +14,7 @@ from roadscan.ingest.ingest import ingested_of, survey_records
 from roadscan.ingest.planned_logs import Logs, plan_logs
 from roadscan.navigation.tasks.computed_trajectory import PlannedTrajectory
 from roadscan.navigation.tasks.navigation_pictures import draw_trajectories
+from roadscan.navigation.tasks.odometry_trajectory import plan_odometry
 from roadscan.navigation.tasks.solve_trajectory import plan_solutions
 from roadscan.navigation.tasks.spline_trajectory import plan_splines
 from roadscan.run.session import Session, found_once
@@ -33,7 +34,7 @@ def plan_trajectories(survey: Survey, store: Store, records: Sequence[LogRecord]
     solutions = plan_solutions(survey, store, records)
     solved = {s.run for s in solutions}
     rest = [run.id for run in survey.config.runs if run.id not in solved]
-    return [*solutions, *plan_splines(survey, store, records, rest)]
+    return [*solutions, *plan_splines(survey, store, records, rest), *plan_odometry(survey, store, records, rest)]
 
 
 def navigate(

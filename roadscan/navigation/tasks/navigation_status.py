@@ -15,6 +15,7 @@ from roadscan.navigation.tasks.clock_tables import clock_picture_path, clock_uni
 from roadscan.navigation.tasks.computed_trajectory import PlannedTrajectory
 from roadscan.navigation.tasks.navigate import plan_trajectories
 from roadscan.navigation.tasks.navigation_pictures import picture_path
+from roadscan.navigation.tasks.odometry_trajectory import LOCAL_MAP, ODOMETRY
 from roadscan.store.logs import NAVIGATION, LogRecord, has_log
 from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store
@@ -72,7 +73,7 @@ def trajectory_findings(records: Iterable[LogRecord]) -> list[Finding]:
         for r in records
         if r.sensor == NAVIGATION
         for doubt in r.attributes.get("doubts", ())
-    ]
+    ] + [Finding.of(one) for r in records if r.sensor == NAVIGATION for one in r.attributes.get("findings", ())]
 
 
 def navigation_status(
@@ -119,7 +120,7 @@ def _trajectory(store: Store, planned: PlannedTrajectory, record: LogRecord | No
         **{name: attributes[name] for name in names if name in attributes},
         "outlier_share": attributes["outliers"] / updates if updates else None,
         "measured_noise": attributes.get("measured_noise", {}),
-        "doubts": list(attributes.get("doubts", ())),
+        "doubts": [*attributes.get("doubts", ()), *(one["text"] for one in attributes.get("findings", ()))],
         "picture": picture if store.exists(picture) else "",
     }
 
@@ -135,6 +136,8 @@ def _trajectory_words(one: dict[str, Any]) -> str:
         )
     if one["outlier_share"] is not None:
         parts.append(f"{one['outlier_share']:.1%} of the updates are outliers")
+    if one["format"] == ODOMETRY:
+        parts.append(LOCAL_MAP)
     parts.append("doubtful" if one["doubts"] else "not doubted")
     return "; ".join(parts) + _shown(one)
 

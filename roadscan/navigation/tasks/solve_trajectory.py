@@ -28,7 +28,7 @@ from roadscan.navigation.tasks.navigation_logs import (
 )
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.store.logs import LogRecord
+from roadscan.store.logs import NAVIGATION, LogRecord
 from roadscan.store.store import Store
 
 SMOOTHER: Final = "smoother"
@@ -107,7 +107,8 @@ def plan_solutions(survey: Survey, store: Store, records: Sequence[LogRecord]) -
     clocks, code = load_clocks(store), code_digest(name_of(PlannedSolution))
     found: list[PlannedSolution] = []
     for run in (r.id for r in survey.config.runs):
-        if settings.solve == "missing" and any(r.run == run and r.tables.get("trajectory") for r in records):
+        given = (r for r in records if r.run == run and r.tables.get("trajectory") and r.sensor != NAVIGATION)
+        if settings.solve == "missing" and any(given):
             continue
         if not all(any(r.run == run and r.tables.get(table) for r in records) for table in ("imu", "gnss")):
             continue

@@ -1,0 +1,229 @@
+"""Makes the trajectory of a run from the sweeps of its lidar: load, match, level, check, yield rows."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.crs import LOCAL_WORLD
+from roadscan.core.errors import ConfigError, NavigationError
+from roadscan.core.extras import is_installed
+from roadscan.core.frames import quaternion_from_rotation
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.ids import of_run
+from roadscan.core.imu import IMU_GRADES
+from roadscan.core.rig import Sensor
+from roadscan.core.settings.odometry import OdometryConfig
+from roadscan.core.survey import Survey
+from roadscan.ingest.clocks.correction import ClockCorrection
+from roadscan.navigation.inertial.readings import ImuReadings
+from roadscan.navigation.odometry.checks import findings
+from roadscan.navigation.odometry.registration import LIBRARY, Sweep, match, sweeps_of
+from roadscan.navigation.odometry.rig_motion import (
+    STANDING_SIGMA_DEG,
+    Way,
+    Windows,
+    levelled,
+    sigmas,
+    tilt_sigma_rad,
+    unbent,
+    way_of,
+    windows_of,
+)
+from roadscan.navigation.tasks.clock_tables import load_clocks
+from roadscan.navigation.tasks.computed_trajectory import Computed, sigma_figures, trajectory_rows
+from roadscan.navigation.tasks.navigation_logs import imu_readings
+from roadscan.navigation.tasks.solve_trajectory import on_time
+from roadscan.run.code_reach import code_digest, name_of
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.logs import NAVIGATION, LogRecord
+from roadscan.store.readings.row_groups import read_groups
+from roadscan.store.store import Store
+
+ODOMETRY: Final = "odometry"
+"""Format of the records of these trajectories."""
+LOCAL_MAP: Final = "local map: it has no position on Earth, and its errors grow with the way"
+_LONGEST_SWEEP_S: Final = 1.0  # of a head that turns once a second
+_LEAST_SHARE: Final = 0.5  # of poses that surfaces hold along all directions; with fewer, the map would be a guess
+_COLUMNS: Final = ["pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m", "sweep"]
+
+
+@dataclass(frozen=True)
+class PlannedOdometry:
+    """A trajectory to make from a lidar's sweeps."""
+
+    survey: Survey
+    store: Store
+    config: OdometryConfig
+    lidar: tuple[LogRecord, ...]
+    imu: tuple[LogRecord, ...]
+    clocks: tuple[tuple[str, ClockCorrection], ...]
+    """Estimated corrections of the sensors' clocks."""
+    key: str
+    format: str = ODOMETRY
+
+    @property
+    def run(self) -> str:
+        """Run it belongs to."""
+        return self.lidar[0].run
+
+    def compute(self, report: Callable[[str], None]) -> Computed:
+        """Match the sweeps.
+
+        Raises
+        ------
+        RoadscanError
+            where the library is not installed, or the log has no sweeps to match.
+        """
+        config, sensor = self.config, _sensor(self.survey, self.lidar)
+        far_m = min(config.range_max_m, sensor.range_max_m)
+        matched = match(sweeps_of(self._pieces()), config, sensor.range_min_m, far_m)
+        if matched.epochs_gps_ns.size < 3:
+            raise NavigationError(
+                f"fewer than three sweeps of the lidar '{self.lidar[0].sensor}' could be matched",
+                expected="sweeps of a moving rig, numbered by the log, each with points all around",
+                change="check the range limits of the sensor, and voxel_m of [navigation.odometry]",
+                file=self.lidar[0].path,
+            )
+        if matched.is_held.mean() < _LEAST_SHARE:
+            raise NavigationError(
+                f"what the lidar '{self.lidar[0].sensor}' sees tells nothing of the way along the road, for "
+                f"{1 - matched.is_held.mean():.0%} of the sweeps",
+                expected="houses, trees, poles or cars around: odometry of a lidar cannot do without them",
+                change="add a log of GNSS, or a trajectory, to the run",
+                file=self.lidar[0].path,
+            )
+        way = way_of(matched.epochs_gps_ns, matched.first_from_lidar, *sensor.mounting().arrays())
+        way, windows, tilt_rad = self._level(way, matched.is_held)
+        subject = f"trajectory of run '{self.run}'"
+        found = list(findings(subject, way, matched, windows, config, self.survey.config.navigation.max_gap_s))
+        for one in found:
+            report(f"doubtful: {one.line}")
+        sigma_m, sigma_rad = sigmas(way, matched.is_held, config, tilt_rad, is_unbent=windows is not None)
+        rows = trajectory_rows(
+            way.epochs_gps_ns, way.position_m, quaternion_from_rotation(way.world_from_body), sigma_m, sigma_rad
+        )
+        attributes = {
+            "world_frame": LOCAL_WORLD,
+            "logs": [r.key for r in (*self.lidar, *self.imu)],
+            "path_m": float(way.path_m[-1]),
+            "sigma_tilt_deg": float(np.degrees(tilt_rad)),
+            "sweeps_left_out": int(matched.thin_gps_ns.size),
+            "least_held": float(matched.held.min(initial=1.0)),
+            "findings": [asdict(one) for one in found],
+            **sigma_figures(sigma_m),
+        }
+        return Computed(rows, attributes)
+
+    def _level(self, way: Way, is_held: npt.NDArray[np.bool_]) -> tuple[Way, Windows | None, float]:
+        """Return the way with z upwards, what the IMU measured along it, and 1 σ (rad) of its tilt."""
+        standing = np.radians(STANDING_SIGMA_DEG)
+        if not self.imu:
+            return way, None, standing
+        readings: ImuReadings = on_time(imu_readings(self.store, self.imu), dict(self.clocks).get(self.imu[0].sensor))
+        sensor = _sensor(self.survey, self.imu)
+        turn, _ = sensor.mounting().arrays()
+        samples = (
+            readings.epochs_gps_ns,
+            readings.specific_force_m_per_s2 @ turn.T,
+            readings.angular_rate_rad_per_s @ turn.T,
+        )
+        windows = windows_of(way, *samples)
+        if windows is None:
+            return way, None, standing
+        way = levelled(way, windows)
+        windows = windows_of(way, *samples) or windows
+        return unbent(way, windows, is_held), windows, tilt_sigma_rad(sensor.imu_errors() or IMU_GRADES["mems"])
+
+    def _pieces(self) -> Iterator[tuple[tuple[str, int], Sweep]]:
+        """Yield pieces of sweeps in order of time, a row group at a time."""
+        clock = dict(self.clocks).get(self.lidar[0].sensor)
+        for record in sorted(self.lidar, key=lambda r: r.span("returns") or (0, 0)):
+            begun: dict[int, int] = {}
+            for file in sorted(record.tables["returns"], key=lambda f: f.span or (0, 0)):
+                for group in range(len(file.group_rows)):
+                    rows = read_groups(self.store, file.path, [group], _COLUMNS)
+                    epochs, *xyz, numbers = (rows.column(name).to_numpy() for name in _COLUMNS)
+                    epochs = epochs if clock is None else clock.applied(epochs)
+                    points = np.stack(xyz, axis=-1)
+                    for number in np.unique(numbers).tolist():
+                        own = numbers == number
+                        _check_length(begun.setdefault(number, int(epochs[own].min())), int(epochs[own].max()), record)
+                        yield (record.key, number), Sweep(points[own], epochs[own])
+
+
+def _check_length(first: int, last: int, record: LogRecord) -> None:
+    if last - first > _LONGEST_SWEEP_S * NS_PER_S:
+        raise NavigationError(
+            f"a sweep of the lidar '{record.sensor}' lasts longer than {_LONGEST_SWEEP_S:g} s",
+            expected="a log that numbers the turns of its head",
+            change="a trajectory cannot be made from this log: add one to the run",
+            file=record.path,
+        )
+
+
+def plan_odometry(
+    survey: Survey, store: Store, records: Sequence[LogRecord], runs: Sequence[str]
+) -> list[PlannedOdometry]:
+    """Return trajectories of those of `runs` that have none and sweeps of a lidar, where the survey file asks for them.
+
+    Raises
+    ------
+    ConfigError
+        where it is not clear which sensors are meant.
+    """
+    config = survey.config.navigation.odometry
+    if config is None:
+        return []
+    clocks, code = load_clocks(store), code_digest(name_of(PlannedOdometry))
+    found: list[PlannedOdometry] = []
+    for run in runs:
+        if any(r.run == run and r.tables.get("trajectory") and r.sensor != NAVIGATION for r in records):
+            continue
+        lidar = _of_one(records, run, "returns", config.lidar, "lidar")
+        imu = _of_one(records, run, "imu", config.imu, "imu")
+        if not lidar:
+            continue
+        sensors = sorted({r.sensor for r in (*lidar, *imu)})
+        own = tuple((s, c) for s in sensors if (c := of_run(clocks, run, s)) is not None)
+        rig = {s: survey.rig.sensors[s].model_dump(mode="json") for s in sensors if s in survey.rig.sensors}
+        version = importlib.metadata.version("kiss-icp") if is_installed(LIBRARY) else ""
+        key = key_of(
+            ODOMETRY, code, version, run, [r.key for r in (*lidar, *imu)], rig, own,
+            config.model_dump(mode="json"), survey.config.navigation.max_gap_s,
+        )  # fmt: skip
+        found.append(PlannedOdometry(survey, store, config, lidar, imu, own, key))
+    return found
+
+
+def _of_one(
+    records: Sequence[LogRecord], run: str, table: str, stated: str | None, setting: str
+) -> tuple[LogRecord, ...]:
+    """Return logs of one sensor of a run with rows in `table`: the stated sensor's, or those of the only one."""
+    own = [r for r in records if r.run == run and r.tables.get(table) and stated in (None, r.sensor)]
+    names = sorted({r.sensor for r in own})
+    if len(names) > 1:
+        raise ConfigError(
+            f"run '{run}' has logs of {len(names)} sensors in the table {table}: {', '.join(names)}",
+            expected="to know whose poses are made",
+            change=f'state [navigation.odometry] {setting} = "{names[0]}" (or another)',
+        )
+    return tuple(own)
+
+
+def _sensor(survey: Survey, logs: Sequence[LogRecord]) -> Sensor:
+    """Return the sensor of logs with the mounting that they state, where the rig file states none."""
+    sensor: Any = survey.rig.sensors.get(logs[0].sensor)
+    if sensor is None:
+        raise ConfigError(
+            f"log '{logs[0].path}' of run '{logs[0].run}' names no sensor of the rig (it is '{logs[0].sensor}')",
+            expected="a sensor with axes and lever arm: poses are those of the rig's reference point",
+            change='add it to the rig file and sensor = "…" to the log',
+        )
+    mounted: Sensor = sensor.mounted_as(logs[0].attributes.get("mounting", {}))
+    return mounted

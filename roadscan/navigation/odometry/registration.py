@@ -37,8 +37,8 @@ land."""
 _PRIMING: Final = 30
 """Sweeps that are matched forwards, backwards and forwards again: where a log begins on the way, the first ones seem to
 stand still, since the circles of returns on the ground move with the rig; from what follows its speed is learnt."""
-_JUDGED_EVERY_S: Final = 0.5
-_NEIGHBOURS: Final = 8
+_JUDGED_EVERY_S: Final = 0.5  # time between sweeps whose surfaces are judged (s): sweeps in between see the same
+_NEIGHBOURS: Final = 8  # points of which a normal is made: fewer follow the noise of ranges
 _FLATNESS: Final = 0.1
 """Points are on a surface where their neighbours scatter along its normal with less than this share of the variance
 of the next axis."""

@@ -17,12 +17,12 @@ from roadscan.core.settings.odometry import OdometryConfig
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-GRAVITY_M_PER_S2: Final = 9.80665
+GRAVITY_M_PER_S2: Final = 9.80665  # standard gravity (CGPM 1901)
 WINDOW_S: Final = 5.0
 """Length of the pieces over which accelerations are averaged and turns compared (s): shorter than a turn of a road."""
 _FLOOR_M, _FLOOR_DEG = 0.02, 0.1
 """1 σ of a pose beside its neighbours: centimetres by the noise of ranges and the cubes of the map."""
-_AROUND_S: Final = 0.25
+_AROUND_S: Final = 0.25  # time before and after an end of a window over which its speed is taken (s)
 _SPEED_SIGMA_M_PER_S: Final = 0.1  # of the way at the ends of a window: centimetres in half a second, and its change
 STANDING_SIGMA_DEG: Final = 2.0
 """1 σ of roll and pitch where no accelerometer says where up is: cross slope and grade of a road, springs."""

@@ -375,7 +375,7 @@ def _classified(street: Street) -> Iterator[tuple[Float64, Float64, Float64, npt
     for path in street.session.store.files("products/classified_points", ".laz"):
         with laspy.open(street.session.store.path(path)) as reader:
             las = reader.read()
-        x, y, z = (np.asarray(v) * u for v, u in ((las.x, street.unit_m), (las.y, street.unit_m), (las.z, 1.0)))
+        x, y, z = (np.asarray(v) * u for v, u in zip((las.x, las.y, las.z), street.units_m, strict=True))
         yield x, y, z, np.asarray(las.classification)
 
 
@@ -511,9 +511,9 @@ def ground_figures(street: Street) -> Iterator[Figure]:
     off: dict[str, list[Float64]] = {"on the road": [], "beside it": [], "under plants": []}
     for path in street.session.store.files("products/bare_earth", ".tif"):
         with rasterio.open(street.session.store.path(path)) as raster:
-            seen = raster.read(1)
+            seen = raster.read(1) * street.units_m[2]
             rows, columns = np.nonzero(np.isfinite(seen))
-            x, y = (np.asarray(v) * street.unit_m for v in rasterio.transform.xy(raster.transform, rows, columns))
+            x, y = (np.asarray(v) * street.units_m[0] for v in rasterio.transform.xy(raster.transform, rows, columns))
         if not x.size:
             continue
         station, offset = street.along(x, y)

@@ -10,7 +10,6 @@ import geopandas
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
-import pyproj
 import shapely
 
 from roadscan.run.session import Session
@@ -93,8 +92,8 @@ class Street:
     """What stands there, as the truth states it; stations and offsets are those of its foot."""
     ends_m: tuple[float, float]
     """Stations between which it is judged."""
-    unit_m: float
-    """Length of the unit of the map's coordinates (m); tables are in metres here."""
+    units_m: Float64
+    """(3,) lengths of the map's units of easting, northing and height (m); tables are in metres here."""
 
     def along(self, easting_m: Any, northing_m: Any) -> tuple[Float64, Float64]:
         """Station and offset of places (n,)."""
@@ -144,12 +143,10 @@ def street_in(folder: Path, session: Session, *, end_m: float = 4.0) -> Street:
         for kind, file in files.items()
         if session.store.exists(file)
     }
-    unit_m = float(pyproj.CRS(known.scene.map.crs).axis_info[0].unit_conversion_factor)
-    if unit_m != 1.0:
-        for table in tables.values():
-            table.geometry = shapely.transform(
-                table.geometry.to_numpy(), lambda xyz: xyz * [unit_m, unit_m, 1.0], include_z=True
-            )
+    frame = session.survey.frame()
+    units_m = np.array([frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m])
+    for table in tables.values():
+        table.geometry = shapely.transform(table.geometry.to_numpy(), lambda xyz: xyz * units_m, include_z=True)
     things = objects_table(known.scene, known.surface).to_pandas()
     ends_m = (end_m, known.scene.length_m - end_m)
-    return Street(known.scene, known.surface, session, tables, things, ends_m, unit_m)
+    return Street(known.scene, known.surface, session, tables, things, ends_m, units_m)

@@ -122,7 +122,9 @@ def test_an_outage_that_the_logs_state_costs_the_good_drives_nothing(outage: Run
 
 
 def test_its_sigma_is_that_of_the_dense_estimate(outage: Run) -> None:
-    """The best linear unbiased estimate from the covariance of the poses' errors at the observations themselves."""
+    """The best linear unbiased estimate from the covariance of the errors of poses, surveys and mountings at the
+    observations themselves.
+    """
     evidence, solution = outage.evidence, outage.solution
     gcp = np.array([one.point.role == "gcp" for one in evidence.sightings for _ in range(one.observed)])
     every = Observations.joined([evidence.ties.observations, solution.control.chosen(gcp)])
@@ -136,6 +138,7 @@ def test_its_sigma_is_that_of_the_dense_estimate(outage: Run) -> None:
     direction = used.partials[:, 0, :3]
     survey = np.where(shared, used.survey_sigma_m[:, None] * used.survey_sigma_m * (direction @ direction.T), 0.0)
     own = _covariance(outage, ends, ends) + survey + np.diag(used.sigma_m**2 / counts[counts > 0.0])
+    own += _of_mountings(outage, used)
     for number, run in enumerate(evidence.runs):
         found = solution.corrections[run]
         knots = found.epochs_gps_ns[::12]
@@ -178,6 +181,24 @@ def _covariance(
         own *= sum(np.outer(a[:, c], b[:, c]) for a, b in zip(*parts, strict=True))
         np.add.at(total, (row[:, None], column), own * np.outer(slope[0][:, c], slope[1][:, c]))
     return total
+
+
+def _of_mountings(outage: Run, used: Observations) -> np.ndarray:
+    """Covariance (n, n) by the mountings that were estimated; an error of height that all have in common is none."""
+    assert outage.solution.mountings is not None
+    is_estimated = outage.solution.mountings.error.any(axis=1)
+    sigma = np.array([one.sigma for one in outage.evidence.mounted.priors]) * is_estimated[:, None]
+    slope = np.zeros((used.size, *sigma.shape))
+    for end in (0, 1):
+        seen = np.flatnonzero(used.sensor[:, end] >= 0)
+        np.add.at(slope, (seen, used.sensor[seen, end]), used.mount_partials[seen, end])
+    each = (slope * sigma).reshape(used.size, sigma.size)
+    covariance = np.eye(sigma.size)
+    if is_estimated.all():
+        common = np.zeros(sigma.shape)
+        common[:, 2] = 1.0 / sigma[:, 2]
+        covariance -= np.outer(common, common) / (common**2).sum()
+    return np.asarray(each @ covariance @ each.T)
 
 
 def _usual_and_extra(outage: Run, run: np.ndarray, epochs_gps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

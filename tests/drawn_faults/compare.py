@@ -54,7 +54,7 @@ class Products:
 
 def differences(clean: Products, other: Products) -> Iterator[str]:
     """What differs by more than σ allows, in words."""
-    both = clean.cells.join(other.cells, how="inner", lsuffix="_clean")
+    both = clean.cells.add_suffix("_clean").join(other.cells, how="inner")
     lost = 1.0 - len(both) / len(clean.cells)
     new = 1.0 - len(both) / len(other.cells)
     if lost > MOST_SHARE:

@@ -71,6 +71,10 @@ def test_what_is_no_line_or_not_said_is_refused(tmp_path: Path) -> None:
     read_log("control_lines", bare, {"kind": "kerb"}, crs="EPSG:25832", map=UTM32)
     with pytest.raises(CrsError, match="states 'EPSG:25833'"):
         read_log("control_lines", bare, {"kind": "kerb"}, crs="EPSG:25833", map=UTM32)
+    table = tmp_path / "table.csv"
+    table.write_text("line,kind,easting_m,\0ght_m\n1,kerb,571600.0,312.0\n")
+    with pytest.raises(FormatError, match="layer 'table' has no geometry"):
+        read_log("control_lines", table, crs="EPSG:25832", map=UTM32)
     empty = tmp_path / "empty.csv"
     empty.write_text(TEXT.splitlines()[0] + "\n")
     with pytest.raises((FormatError, ConfigError)):

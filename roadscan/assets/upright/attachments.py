@@ -143,7 +143,10 @@ def arms(near: About, shaft: Shaft) -> Arms | None:
 
 
 def _reach(along: Float64, above: Float64) -> tuple[float, float]:
-    """Returns how far returns extend outwards without a gap of more than 0.6 m, and the height of the end."""
+    """Returns how far returns extend outwards without a gap of more than 0.6 m, and the height of the end.
+
+    The end are the returns from 0.4 m before it to 0.1 m beyond it, or the nearest one where a gap lies there.
+    """
     order = np.argsort(along, kind="stable")
     out = along[order][along[order] > 0.0]
     if out.size < 5:
@@ -154,8 +157,8 @@ def _reach(along: Float64, above: Float64) -> tuple[float, float]:
     if out.size < 5:
         return 0.0, 0.0
     reach = float(np.quantile(out, 0.98))
-    end = (along > reach - 0.4) & (along <= reach + 0.1)
-    return reach, float(np.median(above[end]))
+    away = np.abs(along - (reach - 0.15))
+    return reach, float(np.median(above[away <= max(0.25, away.min())]))
 
 
 def signal_head(scene: Scene, near: About, out: Arms | None) -> tuple[float, float] | None:

@@ -99,7 +99,7 @@ def _fan(scene: Scene, rows: Int64, normal: Float64) -> _Fan | None:
         sensor = np.column_stack([returns.sensor_x_m[rows], returns.sensor_y_m[rows], returns.sensor_height_m[rows]])
         way = np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]]) - sensor
         length = np.sqrt((way**2).sum(axis=1))
-        return sensor, way / length[:, None], length
+        return sensor, way / np.where(length > 0.0, length, np.nan)[:, None], length  # a null return has no direction
 
     rows = rows[np.abs(beam(rows)[1] @ normal) > _LEAST_COSINE]
     epoch, laser = returns.epoch_gps_ns[rows], returns.laser[rows].astype(np.int64)

@@ -130,8 +130,6 @@ def _plan(source: LogSource) -> _Plan:
         layers = layer_names(source.path)
         layer = chosen_layer(layers, options.layer, source.path)
         info = layer_info(source.path, layer)
-    if info["geometry_type"] is None:
-        raise FormatError(f"layer '{layer}' has no geometry", expected="points", file=source.path)
     check_crs(info["crs"], frame, source.path)
     attributes = tuple(str(field) for field in info["fields"])
     for wanted in (options.name, options.height):

@@ -73,10 +73,19 @@ def layer_names(path: Path) -> list[str]:
 
 
 def layer_info(path: Path, layer: str | None = None) -> dict[str, Any]:
-    """Return GDAL's information on a layer (by default the first); call it inside :func:`gdal_faults`."""
+    """Return GDAL's information on a layer (by default the first); call it inside :func:`gdal_faults`.
+
+    Raises
+    ------
+    FormatError
+        if the layer is a table without geometry.
+    """
     import pyogrio  # slow to import
 
-    return dict(pyogrio.read_info(gdal_name(path), layer=layer))
+    info = dict(pyogrio.read_info(gdal_name(path), layer=layer))
+    if info["geometry_type"] is None:
+        raise FormatError(f"layer '{info['layer_name']}' has no geometry", expected="a layer of features", file=path)
+    return info
 
 
 def chosen_layer(layers: list[str], stated: str | None, file: Path) -> str:

@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from roadscan.compute.robust import scatter_about
 from roadscan.core.witness import Finding, Witness
+from roadscan.ingest.kernels.laser_ranges import by_firing, residuals
 from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.store.readings.returns import sensor_xyz_m
@@ -43,40 +44,6 @@ _MOST_LASERS: Final = 4  # if more lasers are off, none is left out
 _EVERY: Final = 8  # one chunk in this many is examined
 _MOST_CHUNKS: Final = 40
 """Most chunks that are examined: some ten million returns of a long capture."""
-_MOST_RES_M: Final = 1.0  # larger differences to the neighbours (m) are not of one surface
-_NEAREST_M: Final = 1.0  # nearer returns (m) are not compared
-_EVEN: Final = 0.7
-"""Least ratio of the two neighbours' ranges: below it, they do not measure one surface."""
-_SIDE: Final = float(np.sin(np.radians(2.0)))  # sine of the largest difference of azimuth to the neighbours
-
-
-@dataclass(frozen=True)
-class _Heads:
-    """What each laser measured in each firing, (lasers, firings); NaN where it measured nothing."""
-
-    ranges_m: Float64
-    up: Float64
-    """Sine of the elevation."""
-    ahead: Float64
-    left: Float64
-    """Cosine and sine of the azimuth."""
-
-    @classmethod
-    def of(cls, laser: Int64, firing: Int64, xyz_m: Float64) -> _Heads:
-        """Return the returns (n,) of lasers in their firings, with positions (3, n)."""
-        x, y, z = xyz_m
-        shape = int(laser.max()) + 1, int(firing[-1]) + 1
-        place = laser * shape[1] + firing
-        with np.errstate(invalid="ignore", divide="ignore"):
-            level = x * x + y * y
-            own, level = np.sqrt(level + z * z), np.sqrt(level)
-            own[~(own > 0)] = np.nan
-            grids = []
-            for values in (own, z / own, x / level, y / level):
-                grid = np.full(shape, np.nan)
-                grid.reshape(-1)[place] = values
-                grids.append(grid)
-        return cls(*grids)
 
 
 @dataclass
@@ -103,10 +70,10 @@ class LaserRanges(LogCheck):
         firing = np.cumsum(np.diff(laser, prepend=-1) <= 0)
         if laser.size < _LEAST or laser.max() > 255 or laser.size < 4 * (firing[-1] + 1):
             return
-        heads = _Heads.of(laser, firing, np.array(sensor_xyz_m(batch)))
-        known = np.flatnonzero(np.isfinite(heads.ranges_m).sum(axis=1) >= _LEAST)
-        rises = heads.up[known]
-        level = np.array([float(np.arcsin(_median(one[np.isfinite(one)]))) for one in rises])
+        heads = np.full((4, int(laser.max()) + 1, int(firing[-1]) + 1), np.nan)
+        by_firing(laser, firing, np.array(sensor_xyz_m(batch)), heads)
+        known = np.flatnonzero(np.isfinite(heads[0]).sum(axis=1) >= _LEAST)
+        level = np.array([float(np.arcsin(_median(one[np.isfinite(one)]))) for one in heads[1, known]])
         known, level = known[np.argsort(level)], np.sort(level)
         last = known.size - 1
         for mid in range(known.size if last >= 2 else 0):  # the lowest and the highest have two on one side
@@ -114,29 +81,20 @@ class LaserRanges(LogCheck):
             three = [mid, one, other]
             self._compare(heads, known[three].tolist(), level[three])
 
-    def _compare(self, heads: _Heads, lasers: Sequence[int], level: Float64) -> None:
+    def _compare(self, heads: Float64, lasers: Sequence[int], level: Float64) -> None:
         """Add one laser's residuals against two others, by firing; `level` (3,) holds their elevations (rad)."""
-        mid, one, other = (heads.ranges_m[k] for k in lasers)
+        mid, one, other = lasers
         span = float(np.sin(level[2] - level[1]))
         if span <= 0:
             return
         share = float(np.sin(level[2] - level[0])) / span, float(np.sin(level[0] - level[1])) / span
-        with np.errstate(invalid="ignore", divide="ignore"):
-            should = 1.0 / (share[0] / one + share[1] / other)
-            off = mid - should
-            good = (np.abs(off) < _MOST_RES_M) & (np.minimum(one, other) > _EVEN * np.maximum(one, other))
-            good &= one > _NEAREST_M
-            good = np.flatnonzero(good)
-        ahead, left = heads.ahead[lasers[0]][good], heads.left[lasers[0]][good]
-        near = np.ones(good.size, dtype=bool)
-        for k in lasers[1:]:
-            near &= np.abs(ahead * heads.left[k][good] - left * heads.ahead[k][good]) < _SIDE
-        good, ahead, left = good[near], ahead[near], left[near]
-        if not good.size or self._beside.setdefault(lasers[0], (lasers[1], lasers[2])) != (lasers[1], lasers[2]):
+        firings = heads.shape[2]
+        off_m, quarter, pulls = np.empty(firings), np.empty(firings, np.int64), np.empty((2, firings))
+        count = residuals(heads, mid, one, other, *share, off_m, quarter, pulls)
+        if not count or self._beside.setdefault(mid, (one, other)) != (one, other):
             return
-        quarter = np.where(left < 0, np.where(ahead < 0, 0, 1), np.where(ahead < 0, 3, 2))
-        pulls = [-_median(w * (should[good] / r[good]) ** 2) for w, r in zip(share, (one, other), strict=True)]
-        self._found.setdefault(lasers[0], []).append((off[good], quarter, *pulls))
+        pull, other_pull = (_median(one[:count]) for one in pulls)
+        self._found.setdefault(mid, []).append((off_m[:count], quarter[:count], pull, other_pull))
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
         """Leave the returns of lasers with wrong ranges out of the finished table."""

@@ -19,15 +19,33 @@ Int64 = npt.NDArray[np.int64]
 
 def sorted_rows(schema: TableSchema, rows: pa.Table) -> pa.Table:
     """Return rows in the schema's order; equal keys keep their input order."""
-    batches, is_new = [], False
+    pieces, is_new = list[pa.RecordBatch](), False
     for stretch in _stretches(rows, schema.sort[0]):
-        keys = [stretch.column(name).to_numpy() for name in schema.sort]
-        if in_order(keys):
-            batches += stretch.to_batches()
+        if in_order(_keys(schema, stretch)):
+            pieces += stretch.to_batches()
         else:
-            batches.append(_sorted(stretch, schema.sort, keys))
+            pieces.append(sorted_batch(schema, stretch.combine_chunks().to_batches()[0]))
             is_new = True
-    return pa.Table.from_batches(batches, rows.schema) if is_new else rows
+    return pa.Table.from_batches(pieces, rows.schema) if is_new else rows
+
+
+def sorted_batch(schema: TableSchema, rows: pa.RecordBatch) -> pa.RecordBatch:
+    """Return the same of a batch. Columns that share their memory share it again."""
+    keys = _keys(schema, rows)
+    if in_order(keys):
+        return rows
+    order, found = ordered(keys)
+    done = {_place(rows.column(name)): values for name, values in zip(schema.sort, found, strict=True)}
+    indices, columns = pa.array(order), []
+    for column in rows.columns:
+        place = _place(column)
+        if not pa.types.is_primitive(column.type) or column.null_count:
+            columns.append(column.take(indices))
+            continue
+        if place not in done:
+            done[place] = _in(order, column.to_numpy(zero_copy_only=False))
+        columns.append(pa.array(done[place], column.type))
+    return pa.RecordBatch.from_arrays(columns, schema=rows.schema)
 
 
 def ordered(keys: Sequence[Array]) -> tuple[Int64, list[Array]]:
@@ -66,13 +84,19 @@ def _low_bits(count: int) -> np.uint64:
 
 def in_order(keys: Sequence[Array]) -> bool:
     """Return True if rows are in order of these keys, the first foremost; names are compared only where they lead."""
-    tied = np.ones(max(keys[0].size - 1, 0), dtype=bool)
+    if keys[0].size < 2:
+        return True
+    tied: npt.NDArray[np.bool_] | None = None  # rows that equal the row before them so far
     for key in keys:
         if key.dtype.kind == "O" and len(keys) > 1:
-            return not tied.any()
-        if (tied & ~(key[1:] >= key[:-1])).any():  # also where one is no number
+            return tied is not None and not tied.any()
+        rises = key[1:] >= key[:-1]  # false also where one is no number
+        if not (rises.all() if tied is None else (rises | ~tied).all()):
             return False
-        tied &= key[1:] == key[:-1]
+        same = key[1:] == key[:-1]
+        tied = same if tied is None else tied & same
+        if not tied.any():
+            return True
     return True
 
 
@@ -96,21 +120,8 @@ def _stretches(rows: pa.Table, leading: str) -> Iterator[pa.Table]:
         yield pa.Table.from_batches(held)
 
 
-def _sorted(rows: pa.Table, names: Sequence[str], keys: Sequence[Array]) -> pa.RecordBatch:
-    """Return rows of one chunk a column in the order of their keys; columns that share their memory share it again."""
-    order, found = ordered(keys)
-    batch = rows.combine_chunks().to_batches()[0]
-    done = {_place(batch.column(name)): pa.array(values) for name, values in zip(names, found, strict=True)}
-    indices, columns = pa.array(order), []
-    for column in batch.columns:
-        if pa.types.is_primitive(column.type) and not column.null_count:
-            place = _place(column)
-            if place not in done:
-                done[place] = _in(order, column)
-            columns.append(done[place])
-        else:
-            columns.append(column.take(indices))
-    return pa.RecordBatch.from_arrays(columns, schema=batch.schema)
+def _keys(schema: TableSchema, rows: pa.Table | pa.RecordBatch) -> list[Array]:
+    return [np.asarray(rows.column(name)) for name in schema.sort]
 
 
 def _place(column: pa.Array) -> tuple[object, ...]:
@@ -118,9 +129,8 @@ def _place(column: pa.Array) -> tuple[object, ...]:
     return column.type, column.offset, *(buffer and buffer.address for buffer in column.buffers())
 
 
-def _in(order: Int64, column: pa.Array) -> pa.Array:
-    """Return numbers in an order: the same array where all of them are one whole number."""
-    values = column.to_numpy(zero_copy_only=False)
+def _in(order: Int64, values: Array) -> Array:
+    """Return numbers (n,) in an order: the same array where all of them are one whole number."""
     if values.dtype.kind in "iu" and values[0] == values[-1] and (values == values[0]).all():
-        return column
-    return pa.array(values[order], column.type)
+        return values
+    return np.asarray(values[order])

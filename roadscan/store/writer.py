@@ -22,7 +22,7 @@ from roadscan.store.codecs.parquet.number_table import is_number_table, write_nu
 from roadscan.store.derived import with_derived
 from roadscan.store.logs import DataFile, log_folder
 from roadscan.store.merge import merged
-from roadscan.store.row_order import sorted_rows
+from roadscan.store.row_order import sorted_batch, sorted_rows
 from roadscan.store.schema import TableSchema, table_schema
 from roadscan.store.store import Store, file_digest
 
@@ -80,8 +80,7 @@ class LogWriter:
         rows = with_derived(schema, rows)
         for start, part in _by_bin(schema, rows):
             held = self._bins[(table, start)]
-            part = sorted_rows(schema, pa.Table.from_batches([part])).to_batches()[0]
-            held.batches.append(part)
+            held.batches.append(sorted_batch(schema, part))  # while it is in the processor's cache
             held.bytes += part.nbytes
             held.row_bytes = max(held.row_bytes, part.nbytes / part.num_rows)
             self._held += part.nbytes

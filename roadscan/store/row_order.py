@@ -62,19 +62,20 @@ def ordered(keys: Sequence[Array]) -> tuple[Int64, list[Array]]:
     if sum(widths) + row_bits > _WORD_BITS:
         order = np.lexsort(keys[::-1])
         return order, [key[order] for key in keys]
-    packed = np.zeros(rows, np.uint64)
-    for key, low, width in zip(keys, lows, widths, strict=True):
+    # Differences fit as numbers without a sign, those of the widest integers too.
+    above = [(key - key.dtype.type(low)).view(f"u{key.itemsize}") for key, low in zip(keys, lows, strict=True)]
+    packed = above[0].astype(np.uint64)
+    for values, width in zip([*above[1:], np.arange(rows)], [*widths[1:], row_bits], strict=True):
         packed <<= np.uint64(width)
-        packed |= (key - key.dtype.type(low)).view(f"u{key.itemsize}")  # differences fit, as numbers without a sign
-    packed <<= np.uint64(row_bits)
-    packed |= np.arange(rows, dtype=np.uint64)
+        packed |= values.astype(np.uint64, copy=False)
     packed.sort()
     order = (packed & _low_bits(row_bits)).view(np.int64)
     packed >>= np.uint64(row_bits)
     found: list[Array] = []
-    for key, low, width in zip(keys[::-1], lows[::-1], widths[::-1], strict=True):
+    for key, low, width in zip(keys[:0:-1], lows[:0:-1], widths[:0:-1], strict=True):
         found.append((packed & _low_bits(width)).astype(key.dtype) + key.dtype.type(low))
         packed >>= np.uint64(width)
+    found.append(packed.astype(keys[0].dtype) + keys[0].dtype.type(lows[0]))
     return order, found[::-1]
 
 

@@ -39,8 +39,14 @@ def is_number_table(schema: pa.Schema) -> bool:
 def write_number_table(path: Path, rows: pa.Table, group_rows: int) -> None:
     """Write rows in row groups of `group_rows`; equal rows give equal bytes. The table satisfies `is_number_table`."""
     parts = (rows.slice(first, group_rows) for first in range(0, rows.num_rows, group_rows))
-    groups = ({name: part.column(name).to_numpy() for name in rows.column_names} for part in parts)
+    groups = ({name: _values(part.column(name)) for name in rows.column_names} for part in parts)
     write_number_groups(path, rows.schema, groups)
+
+
+def _values(column: pa.ChunkedArray) -> Array:
+    """Return non-null numbers as one array, without a copy where they already are one."""
+    chunks = [chunk.to_numpy() for chunk in column.chunks]
+    return chunks[0] if len(chunks) == 1 else np.concatenate(chunks)
 
 
 def write_number_groups(

@@ -102,23 +102,20 @@ def in_order(keys: Sequence[Array]) -> bool:
 
 
 def _stretches(rows: pa.Table, leading: str) -> Iterator[pa.Table]:
-    """Yield rows batch by batch, those that overlap in the leading column together."""
+    """Yield rows batch by batch in the order of the leading column, those that overlap in it together."""
     if rows.schema.field(leading).type != pa.int64() or rows.column(leading).null_count:
         yield rows
         return
-    held: list[pa.RecordBatch] = []
-    top = 0
+    found: list[tuple[list[pa.RecordBatch], int]] = []  # batches of each stretch, and its last epoch
     for batch in filter(len, rows.to_batches()):
         keys = batch.column(leading).to_numpy()
-        if held and keys.min() <= top:  # at one epoch, the next key decides
-            top = max(top, keys.max())
-        else:
-            if held:
-                yield pa.Table.from_batches(held)
-            held, top = [], keys.max()
-        held.append(batch)
-    if held:
-        yield pa.Table.from_batches(held)
+        own, first, last = [batch], keys.min(), keys.max()
+        while found and first <= found[-1][1]:  # at one epoch, the next key decides
+            before, end = found.pop()
+            before += own
+            own, last = before, max(last, end)
+        found.append((own, last))
+    yield from (pa.Table.from_batches(own) for own, _ in found)
 
 
 def _keys(schema: TableSchema, rows: pa.Table | pa.RecordBatch) -> list[Array]:

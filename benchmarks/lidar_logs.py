@@ -110,7 +110,7 @@ def ouster_capture(folder: Path, turns: int = 80) -> LidarLog:
         return turn
 
     path = _capture(folder / "a.pcap", turned, turns, 7502)
-    return LidarLog(path, returns * turns, {"metadata": "a.json"}, {"system": "free"})
+    return LidarLog(path, returns * turns, {"metadata": "a.json"}, {"system": "free", "offset_s": 1_400_000_000})
 
 
 def hesai_capture(folder: Path, turns: int = 120) -> LidarLog:
@@ -175,18 +175,18 @@ def livox_file(folder: Path, seconds: int = 40) -> LidarLog:
         made.append([(0, 0, test_livox_lvx.stamp(ns), 1, content) for ns in stamps])
     path = folder / "a.lvx2"
     path.write_bytes(test_livox_lvx.lvx(made))
-    return LidarLog(path, frames * packages * 96, {}, {"system": "free"})
+    return LidarLog(path, frames * packages * 96, {}, {"system": "free", "offset_s": 1_400_000_000})
 
 
-MAKERS: Final[dict[str, tuple[str, str, Callable[[Path], LidarLog]]]] = {
-    "ros_points": ("ros_points", "firing by firing, returns", points_bag),
-    "ros_points rings": ("ros_points", "ring by ring, returns", lambda folder: points_bag(folder, 60, by_ring=True)),
-    "ouster_pcap": ("ouster_pcap", "OS1-128, returns", ouster_capture),
-    "hesai_pcap": ("hesai_pcap", "PandarXT-32, returns", hesai_capture),
-    "velodyne_pcap VLP-32C": ("velodyne_pcap", "VLP-32C, returns", vlp32_capture),
-    "livox_lvx": ("livox_lvx", "LVX2, returns", livox_file),
+LIDAR_LOGS: Final[dict[str, tuple[str, str, Callable[[Path], LidarLog], float]]] = {
+    "ros_points": ("ros_points", "firing by firing, returns", points_bag, 8.0),
+    "ros_points rings": ("ros_points", "ring by ring, returns", lambda at: points_bag(at, 60, by_ring=True), 8.0),
+    "ouster_pcap": ("ouster_pcap", "OS1-128, returns", ouster_capture, 10.0),
+    "hesai_pcap": ("hesai_pcap", "PandarXT-32, returns", hesai_capture, 10.0),
+    "velodyne_pcap VLP-32C": ("velodyne_pcap", "VLP-32C, returns", vlp32_capture, 10.0),
+    "livox_lvx": ("livox_lvx", "LVX2, returns", livox_file, 10.0),
 }
-"""By name: the format, what its log holds, and the log's maker."""
+"""By name: the format, what its log holds, its maker, and the bar of ingest (million returns a second of a core)."""
 
 
 def _stacked(packets: list[bytes]) -> Bytes:

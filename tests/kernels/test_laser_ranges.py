@@ -36,7 +36,7 @@ def test_the_middle_laser_of_a_plane_is_told_by_the_two_beside_it() -> None:
     heads[0, 1] += 0.2  # the laser is off
     heads[0, 0, 5] = np.nan
     heads[0, 2, 6] = 0.5 * heads[0, 0, 6]  # not of one surface
-    heads[2:, 2, 7] *= -1  # to the other side
+    heads[2:, 2, 7] = -heads[3, 2, 7], heads[2, 2, 7]  # to another side
     heads[0, :, 8] = 0.1  # too near
     heads[0, 1, 9] += 1.0
     span = np.sin(ELEVATIONS[2] - ELEVATIONS[0])

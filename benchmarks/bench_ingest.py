@@ -30,6 +30,7 @@ import pyarrow.feather
 import pyarrow.parquet as pq
 import shapely
 
+from benchmarks.lidar_logs import LIDAR_LOGS
 from benchmarks.line_rate_ingest import line_rate_figures
 from benchmarks.timing import Figure, best_seconds
 from roadscan.core.crs import MapFrame
@@ -72,6 +73,10 @@ class Log:
     against: str = ""
     bar: float | None = None
     """Million records a second."""
+    survey: str = ""
+    """Its other lines in a survey file, where it is brought to Parquet too."""
+    ingest_bar: float | None = None
+    """Million records a second of a core's time, from the log to Parquet."""
 
 
 def figures(folder: Path) -> Iterator[Figure]:
@@ -96,9 +101,9 @@ def format_figures(folder: Path) -> Iterator[Figure]:
         log = make(place)
         took = seconds(log)
         yield read_figure(log, took)
-        if log.format == "velodyne_pcap":
+        if name == "velodyne_pcap":
             yield Figure(f"velodyne_pcap HDL-32E: times real time (bar: {HDL_32E_BAR:g})", HDL_32E_S / took, "x")
-        if log.format in {"sbet", "velodyne_pcap", "scans"}:
+        if log.survey:
             yield from ingest_figures(log, place)
 
 
@@ -136,32 +141,28 @@ def seconds(log: Log) -> float:
 
 # --- ingest -----------------------------------------------------------------------------------------
 
-_SURVEYS = {
-    "sbet": 'crs = "EPSG:4979"\nclock = { system = "gps_week_seconds", week = 2405 }',
-    "velodyne_pcap": 'sensor = "lidar"\nclock = { system = "utc_hour", date = 2026-05-04 }\noptions = { hour = 9 }',
-    "scans": 'sensor = "head"',
-}
-
 
 def ingest_figures(log: Log, folder: Path) -> Iterator[Figure]:
     """From the raw log to tables: fingerprint, reading, partitions, Parquet."""
     lines = [
         'id = "bench"', 'store = "store"', "[map]", 'crs = "EPSG:25832"', "[rig.sensors.lidar]", 'kind = "lidar"',
         "[rig.sensors.head]", 'kind = "profiler"', "[[runs]]", 'id = "run"', "[[runs.logs]]",
-        f'path = "{log.path.name}"', f'format = "{log.format}"', _SURVEYS[log.format],
+        f'path = "{log.path.name}"', f'format = "{log.format}"', log.survey,
     ]  # fmt: skip
     (folder / "SURVEY.toml").write_text("\n".join(lines))
     survey = Survey.load(folder / "SURVEY.toml")
-    times = []
+    times, cores = [], []
     for name in ("once", "again"):  # the first loads what a process loads once
-        started = time.perf_counter()
+        started, worked = time.perf_counter(), time.process_time()
         (result,) = ingest(survey, Store(str(folder / name), "bench"))
         times.append(time.perf_counter() - started)
-    took = min(times)
-    size = log.path.stat().st_size / 1e6
-    rows = log.records or result.record.rows
-    yield Figure(f"{log.format} → Parquet: {size:,.0f} MB at {size / took:,.0f} MB/s", rows / took / 1e6, "M/s")
-    if log.format == "velodyne_pcap":
+        cores.append(time.process_time() - worked)
+    took, rows = min(times), log.records or result.record.rows
+    size = sum(f.stat().st_size for f in format_named(log.format).files(log.path)) / 1e6
+    what, bar = f"{log.format} {log.what}".strip(), f" (bar: {log.ingest_bar:g})" if log.ingest_bar else ""
+    yield Figure(f"{what} → Parquet: {size:,.0f} MB at {size / took:,.0f} MB/s", rows / took / 1e6, "M/s")
+    yield Figure(f"{what} → Parquet, by a core's time{bar}", rows / min(cores) / 1e6, "M/s")
+    if log.format == "velodyne_pcap" and log.what.startswith("HDL-32E"):
         yield Figure("velodyne_pcap HDL-32E → Parquet: times real time", HDL_32E_S / took, "x")
 
 
@@ -181,13 +182,14 @@ def makers() -> dict[str, Callable[[Path], Log]]:
         "scans": scans, "psi": psi, "psi zip": functools.partial(psi, codec="zip"),
         "las": functools.partial(las, name="a.las"), "las laz": functools.partial(las, name="a.laz"), "e57": e57,
         "ply": ply, "ply ascii": functools.partial(ply, text=True), "opencrg": opencrg, "images": images,
+        **{name: functools.partial(lidar_log, name=name) for name in LIDAR_LOGS},
     }  # fmt: skip
 
 
 UNTIMED = frozenset({
-    "gpx", "hesai_pcap", "hesai_scans", "inertial_explorer", "livox_lvx", "novatel_bestpos", "novatel_ins",
-    "odm_gcp", "opensfm_gcp", "ouster_bag", "ouster_bag_imu", "ouster_imu", "ouster_pcap", "pcd", "pcd_cloud",
-    "pospac_text", "ppk", "qinertia", "ros_gnss", "ros_imu", "ros_livox", "ros_nmea", "ros_points", "ros_poses",
+    "gpx", "hesai_scans", "inertial_explorer", "novatel_bestpos", "novatel_ins",
+    "odm_gcp", "opensfm_gcp", "ouster_bag", "ouster_bag_imu", "ouster_imu", "pcd", "pcd_cloud",
+    "pospac_text", "ppk", "qinertia", "ros_gnss", "ros_imu", "ros_livox", "ros_nmea", "ros_poses",
     "velodyne_scans",
 })  # fmt: skip
 """Formats that have no maker of logs here yet."""
@@ -220,7 +222,17 @@ def sbet(folder: Path) -> Log:
     rows.astype("<f8").tofile(path)
     other = lambda: len(np.fromfile(path, "<f8").reshape(-1, 17).T.copy().T)  # noqa: E731
     stated = {"clock": WEEK, "crs": "EPSG:4979"}
-    return Log("sbet", "", path, {}, stated, other=other, against="numpy.fromfile, turned", bar=SBET_BAR)
+    return Log(
+        "sbet",
+        "",
+        path,
+        {},
+        stated,
+        other=other,
+        against="numpy.fromfile, turned",
+        bar=SBET_BAR,
+        survey='crs = "EPSG:4979"\nclock = { system = "gps_week_seconds", week = 2405 }',
+    )
 
 
 def smrmsg(folder: Path) -> Log:
@@ -306,7 +318,16 @@ def pose_parquet(folder: Path) -> Log:
     path, other = columns_parquet(folder / "a.parquet", quaternions(1_000_000))
     stated = {"clock": GPS, "crs": "local"}
     against = "pyarrow.parquet.read_table"
-    return Log("pose_quaternions", "Parquet", path, {"axes": "flu"}, stated, other=other, against=against)
+    return Log(
+        "pose_quaternions",
+        "Parquet",
+        path,
+        {"axes": "flu"},
+        stated,
+        other=other,
+        against=against,
+        survey='sensor = "head"',
+    )
 
 
 def pospac(folder: Path) -> Log:
@@ -498,7 +519,24 @@ def velodyne_pcap(folder: Path) -> Log:
 
     date = pd.Timestamp("2026-05-04").date()
     stated = {"clock": Clock(TimeSystem.UTC_HOUR, date=date)}
-    return Log("velodyne_pcap", "HDL-32E, returns", path, {"hour": 9}, stated, other=other, against="velodyne_decoder")
+    return Log(
+        "velodyne_pcap", "HDL-32E, returns", path, {"hour": 9}, stated, other=other, against="velodyne_decoder",
+        survey='sensor = "lidar"\nclock = { system = "utc_hour", date = 2026-05-04 }\noptions = { hour = 9 }',
+    )  # fmt: skip
+
+
+def lidar_log(folder: Path, name: str) -> Log:
+    """A log of :mod:`benchmarks.lidar_logs`."""
+    kind, what, make, bar = LIDAR_LOGS[name]
+    made = make(folder)
+    values = ", ".join(f"{k} = {json.dumps(v) if isinstance(v, str | int) else v}" for k, v in made.options.items())
+    clock = ", ".join(f"{k} = {json.dumps(v) if isinstance(v, str | int) else v}" for k, v in made.clock.items())
+    stated = {
+        "clock": Clock(**made.clock | {"system": TimeSystem(made.clock["system"])}),
+        "sensor": Sensor(kind="lidar"),
+    }
+    survey = f'sensor = "lidar"\nclock = {{ {clock} }}\noptions = {{ {values} }}'
+    return Log(kind, what, made.path, made.options, stated, survey=survey, ingest_bar=bar)
 
 
 _UDP = bytes.fromhex("ffffffffffff6076880000000800450004d20001000040110000c0a801c9ffffffff01bb094004be0000")
@@ -580,7 +618,7 @@ def scans(folder: Path) -> Log:
     pq.write_table(table, path, row_group_size=1000, use_dictionary=False)
     other = lambda: pq.read_table(path).num_rows * readings  # noqa: E731
     against = "pyarrow.parquet.read_table"
-    return Log("scans", "readings", path, records=n * readings, other=other, against=against)
+    return Log("scans", "readings", path, records=n * readings, other=other, against=against, survey='sensor = "head"')
 
 
 def psi(folder: Path, codec: Any = "raw") -> Log:

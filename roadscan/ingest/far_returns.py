@@ -41,6 +41,10 @@ class FarReturns(LogCheck):
         """Take the next rows of the table `returns`."""
         if rows.table != "returns" or not rows.batch.num_rows:
             return
+        columns = [rows.batch.column(f"{axis}_sensor_m").to_numpy(zero_copy_only=False) for axis in "xyz"]
+        if np.hypot.reduce([max(float(one.max()), -float(one.min())) for one in columns]) <= FARTHEST_M:
+            self._count += rows.batch.num_rows
+            return
         distance_m = np.nan_to_num(distances_m(rows.batch), nan=0.0, posinf=0.0)
         self._count += distance_m.size
         self._far += int((distance_m > FARTHEST_M).sum())

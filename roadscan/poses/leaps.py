@@ -426,12 +426,13 @@ def _slower(steps: Float64, elapsed_s: Float64) -> Float64:
 
 def _block_medians(values: Float64) -> Float64:
     """Return the medians (b, c) of values (k, c) for each block of links."""
-    count = len(values)
-    starts = np.arange(0, count, _NOISE_LINKS)
-    medians = np.array([np.median(values[s : s + _NOISE_LINKS], axis=0) for s in starts])
-    if len(medians) > 1 and count - starts[-1] < _NOISE_LINKS // 2:
-        medians[-1] = medians[-2]  # a burst would be half of so few links
-    return medians
+    whole, rest = divmod(len(values), _NOISE_LINKS)
+    medians: Float64 = np.median(values[: len(values) - rest].reshape(whole, _NOISE_LINKS, values.shape[1]), axis=1)
+    if not rest:
+        return medians
+    # A burst would be half of few links.
+    last = medians[-1] if whole and rest < _NOISE_LINKS // 2 else np.median(values[-rest:], axis=0)
+    return np.concatenate([medians, last[None]])
 
 
 def _medians(values: Float64) -> Float64:

@@ -22,6 +22,7 @@ from roadscan.store.codecs.parquet.number_table import is_number_table, write_nu
 from roadscan.store.derived import with_derived
 from roadscan.store.logs import DataFile, log_folder
 from roadscan.store.merge import merged
+from roadscan.store.row_order import sorted_batch, sorted_rows
 from roadscan.store.schema import TableSchema, table_schema
 from roadscan.store.store import Store, file_digest
 
@@ -79,7 +80,7 @@ class LogWriter:
         rows = with_derived(schema, rows)
         for start, part in _by_bin(schema, rows):
             held = self._bins[(table, start)]
-            held.batches.append(part)
+            held.batches.append(sorted_batch(schema, part))  # while it is in the processor's cache
             held.bytes += part.nbytes
             held.row_bytes = max(held.row_bytes, part.nbytes / part.num_rows)
             self._held += part.nbytes
@@ -239,36 +240,16 @@ def _write_by_arrow(to: Path | pa.NativeFile, rows: pa.Table, schema: TableSchem
     )
 
 
-def sorted_rows(schema: TableSchema, rows: pa.Table) -> pa.Table:
-    """Return rows in the schema's order; equal keys keep their input order."""
-    keys = [rows.column(name).to_numpy() for name in schema.sort]
-    if _in_order(keys):
-        return rows
-    order = np.lexsort(keys[::-1])
-    return rows if np.array_equal(order, np.arange(order.size)) else rows.take(pa.array(order))
-
-
-def _in_order(keys: list[npt.NDArray[Any]]) -> bool:
-    """Return True if rows are in order of these keys, the first foremost; names are compared only where they lead."""
-    tied = np.ones(max(keys[0].size - 1, 0), dtype=bool)
-    for key in keys:
-        if key.dtype.kind == "O" and len(keys) > 1:
-            return not tied.any()
-        if (tied & ~(key[1:] >= key[:-1])).any():  # also where one is no number
-            return False
-        tied &= key[1:] == key[:-1]
-    return True
-
-
 def _by_bin(schema: TableSchema, rows: pa.RecordBatch) -> list[tuple[int, pa.RecordBatch]]:
     if rows.num_rows == 0:
         return []
     if schema.partition_s is None:
         return [(0, rows)]
-    seconds = rows.column("epoch_gps_ns").to_numpy() // NS_PER_S
-    starts = seconds // schema.partition_s * schema.partition_s
-    if starts[0] == starts[-1] and (starts == starts[0]).all():
-        return [(int(starts[0]), rows)]
+    epochs = rows.column("epoch_gps_ns").to_numpy()
+    bin_ns = schema.partition_s * NS_PER_S
+    if (first := int(epochs.min()) // bin_ns) == int(epochs.max()) // bin_ns:
+        return [(first * schema.partition_s, rows)]
+    starts = epochs // bin_ns * schema.partition_s
     return [(int(s), rows.filter(pa.array(starts == s))) for s in np.unique(starts)]
 
 

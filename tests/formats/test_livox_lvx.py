@@ -31,7 +31,7 @@ def stamp(ns: int) -> bytes:
 
 def lvx(packages: list[list[Package]], version: tuple[int, int] = (2, 0), devices: int = 1) -> bytes:
     """A file with frames of packages."""
-    out = b"livox_tech".ljust(16, b"\0") + bytes([*version, 0, 0]) + struct.pack("<I", MAGIC)
+    out = bytearray(b"livox_tech".ljust(16, b"\0") + bytes([*version, 0, 0]) + struct.pack("<I", MAGIC))
     out += struct.pack("<B", devices) if version == (1, 0) else struct.pack("<IB", 50, devices)
     for k in range(devices):
         names = f"SN{k}".encode().ljust(16, b"\0") + bytes(16)

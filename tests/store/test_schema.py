@@ -145,3 +145,18 @@ def test_faults(columns: dict[str, pa.Array], expected: list[tuple[list[int], st
 
 def test_no_rows_have_no_faults() -> None:
     assert TABLE.faults(TABLE.conform(batch().slice(0, 0), list_size=2)) == []
+
+
+def test_columns_that_are_sound_by_their_extremes_are_so_value_by_value() -> None:
+    schema, random = table_schema("returns"), np.random.default_rng(0)
+    for k in range(60):
+        values = {
+            c.name: random.integers(0, 256, 50).astype(c.arrow_type(None).to_pandas_dtype()) for c in schema.columns
+        }
+        odd = random.choice([np.nan, np.inf, -np.inf, 1e4, -1e4, 10_001.0, -10_001.0, 0.0])
+        values["y_sensor_m"][random.integers(50)] = odd
+        values["epoch_gps_ns"][random.integers(50)] = random.integers(-1, 2)
+        rows = schema.conform(pa.RecordBatch.from_pydict(values))
+        found = {row for bad, _ in schema.faults(rows) for row in bad.tolist()}
+        y, epochs = values["y_sensor_m"], values["epoch_gps_ns"]
+        assert found == set(np.flatnonzero(~(np.abs(y) <= 1e4) | (epochs < 0)).tolist()), (k, odd)

@@ -55,8 +55,10 @@ class PointTimes:
         """Return times (n,) relative to a stamp (ns), rounded to ns; values that are not finite give 0."""
         scale = UNIT_NS[self.unit]
         if values.dtype.kind in "iu":
-            whole = values.astype(np.int64)
-            return np.asarray(whole * scale - (stamp_ns if self.origin == "epoch" else 0))
+            whole: npt.NDArray[np.int64] = values.astype(np.int64)
+            if scale != 1:
+                whole *= scale
+            return whole - stamp_ns if self.origin == "epoch" else whole
         numbers = values.astype(np.float64)
         if self.origin == "epoch":
             # Whole units first: a double holds the difference of two near times better than either of them in ns.

@@ -148,6 +148,7 @@ def _plan(source: LogSource, bag: Bag, topic: Topic) -> _Plan:
             file=source.path,
         )
     names = cloud.dtype.names or ()
+    first = [one for one in first if one[1].dtype.names == names]  # others are rejected when they are read
     if missing := [axis for axis in AXES if axis not in names]:
         raise FormatError(f"the clouds have no field '{missing[0]}'", expected="x, y, z in metres", file=source.path)
     brightness = field_named(options.intensity_field, "intensity_field", INTENSITIES, names, source.path)

@@ -71,9 +71,10 @@ class ReturnRows:
             farthest = np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(z))  # NaN where one of them is
             returned = farthest > 0.0  # neither 0, 0, 0 nor NaN
         kept: npt.NDArray[np.int64] | slice = slice(None) if returned.all() else np.flatnonzero(returned)
-        records = first + np.arange(x.size)[kept]
+        records = first + (np.arange(x.size) if isinstance(kept, slice) else kept)
         sieve = Sieve(records.size)
-        sieve.drop(farthest[kept] > _FARTHEST_M, "the position is beyond 10 km")
+        if not farthest.max(initial=0.0) <= _FARTHEST_M:  # also where one is no number
+            sieve.drop(farthest[kept] > _FARTHEST_M, "the position is beyond 10 km")
         late = None if offsets is None else offsets[kept]
         if late is not None and late.size and (late.min() < -_LATEST_NS or late.max() > _LATEST_NS):
             sieve.drop(np.abs(late) > _LATEST_NS, "its time is more than 10 s from its message's")
@@ -123,5 +124,7 @@ def _bright(intensity: Numbers | None, kept: npt.NDArray[np.int64] | slice) -> N
     if values.dtype.kind == "u" and values.dtype.itemsize <= 2:
         return values.astype(np.uint16)
     if values.dtype.kind == "f":
+        if values.size and values.min() >= 0 and values.max() <= INTENSITY_MAX:
+            return np.rint(values).astype(np.uint16)
         values = np.nan_to_num(values)
     return np.asarray(np.rint(np.clip(values, 0, INTENSITY_MAX)), dtype=np.uint16)

@@ -98,6 +98,15 @@ def test_the_store_writes_returns_so(tmp_path: Path) -> None:
     assert one == (tmp_path / "b.parquet").read_bytes()
 
 
+@pytest.mark.parametrize("name", TABLES)
+def test_equal_rows_give_equal_bytes_in_any_chunks(name: str, tmp_path: Path) -> None:
+    rows = TABLES[name]
+    parts = pa.concat_tables([rows.slice(k, 37) for k in range(0, rows.num_rows, 37)])
+    for file, own in (("a", rows), ("b", parts)):
+        write_number_table(tmp_path / file, own, GROUP)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
 def test_files_of_arrow_are_read(tmp_path: Path) -> None:
     rows = TABLES["epochs of sweeps"]
     store = put(tmp_path, rows, lambda path, t, size: pq.write_table(t, path, row_group_size=size))

@@ -178,13 +178,14 @@ class Writer:
         path = (field.name, "list", "element")
         return chunk(KINDS[field.type.value_type], path, pages.DELTA_BINARY_PACKED, count, Page(at, size), {})
 
-    def compressed(
-        self, field: pa.Field, encoding: int, content: npt.NDArray[np.uint8], count: int, more: dict[int, Value]
-    ) -> Value:
-        """Write a column of non-null numbers as a page under LZ4; return its part of the footer."""
-        packed = np.frombuffer(self._codec.compress(content), np.uint8)
-        at, size = self.page(b"", packed, count, encoding, content.size)
-        raw = size - packed.size + content.size
+    def pack(self, content: npt.NDArray[np.uint8]) -> Packed:
+        """Return the content of a page under LZ4."""
+        return Packed(np.frombuffer(self._codec.compress(content), np.uint8), content.size)
+
+    def compressed(self, field: pa.Field, encoding: int, packed: Packed, count: int, more: dict[int, Value]) -> Value:
+        """Write a column of non-null numbers as a page that was packed; return its part of the footer."""
+        at, size = self.page(b"", packed.content, count, encoding, packed.raw)
+        raw = size - packed.content.size + packed.raw
         return chunk(KINDS[field.type], (field.name,), encoding, count, Page(at, size, raw), more)
 
     def page(self, levels: bytes, values: Any, count: int, encoding: int, raw: int | None = None) -> tuple[int, int]:
@@ -206,6 +207,14 @@ def _valid(field: pa.Field, column: pa.Array) -> pages.Bools | None:
 def _whole(column: pa.ChunkedArray) -> pa.Array:
     """Return the column as one array, without a copy where it already is one."""
     return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
+
+
+class Packed(NamedTuple):
+    """The content of a page under LZ4."""
+
+    content: npt.NDArray[np.uint8]
+    raw: int
+    """Its bytes before compression."""
 
 
 class Page(NamedTuple):

@@ -21,7 +21,7 @@ from roadscan.store.codecs.kernels.byte_planes import split, split_rounded
 from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCKS
 from roadscan.store.codecs.kernels.delta_packing_int64 import TOO_FAR, encode_long, room_words
 from roadscan.store.codecs.parquet import pages
-from roadscan.store.codecs.parquet.list_table import KINDS, Writer
+from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Writer
 from roadscan.store.codecs.parquet.thrift import Value, binary, i64, struct, varint, zigzag
 
 _SCRATCH: Final = 2048  # values of the scratch line that the kernels need
@@ -38,12 +38,15 @@ def is_number_table(schema: pa.Schema) -> bool:
 
 def write_number_table(path: Path, rows: pa.Table, group_rows: int) -> None:
     """Write rows in row groups of `group_rows`; equal rows give equal bytes. The table satisfies `is_number_table`."""
-    columns = {name: rows.column(name).to_numpy() for name in rows.column_names}
-    groups = (
-        {name: values[first : first + group_rows] for name, values in columns.items()}
-        for first in range(0, rows.num_rows, group_rows)
-    )
+    parts = (rows.slice(first, group_rows) for first in range(0, rows.num_rows, group_rows))
+    groups = ({name: _values(part.column(name)) for name in rows.column_names} for part in parts)
     write_number_groups(path, rows.schema, groups)
+
+
+def _values(column: pa.ChunkedArray) -> Array:
+    """Return non-null numbers as one array, without a copy where they already are one."""
+    chunks = [chunk.to_numpy() for chunk in column.chunks]
+    return chunks[0] if len(chunks) == 1 else np.concatenate(chunks)
 
 
 def write_number_groups(
@@ -88,15 +91,21 @@ class _Numbers(Writer):
         super().__init__(stream)
         self._planes = np.empty(0, np.uint8)
         self._room = np.empty(0, np.uint64)
+        self._epochs: tuple[Array, int, Packed] | None = None
+        """The 64-bit numbers that were packed last: a return's pose is of its own epoch mostly."""
 
     def column(self, field: pa.Field, values: Array, step: float | None, stated: bool) -> Value:
         """Write a column chunk; return its part of the footer."""
-        if values.dtype == np.int64:
-            encoding, content = self._differences(values)
+        if values.dtype != np.int64:
+            encoding, packed = pages.BYTE_STREAM_SPLIT, self.pack(self._split(field, values, step))
+        elif self._epochs is not None and np.array_equal(values, self._epochs[0]):
+            _, encoding, packed = self._epochs
         else:
-            encoding, content = pages.BYTE_STREAM_SPLIT, self._split(field, values, step)
+            encoding, content = self._differences(values)
+            packed = self.pack(content)
+            self._epochs = values, encoding, packed
         more = {12: struct(_statistics(values, KINDS[field.type].stored))} if stated and values.size else {}
-        return self.compressed(field, encoding, content, values.size, more)
+        return self.compressed(field, encoding, packed, values.size, more)
 
     def _differences(self, values: Array) -> tuple[int, Bytes]:
         if self._room.size < room_words(values.size):

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from roadscan.store.schema import TableSchema
 
-_WORD_BITS: Final = 64
+_WORD_BITS: Final = 64  # bits of the number that rows are sorted by: key and row number
 
 Array = npt.NDArray[Any]
 Int64 = npt.NDArray[np.int64]

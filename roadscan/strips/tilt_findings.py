@@ -132,8 +132,9 @@ def _small_words(angle: Angle, who: str, one: _Seen, alone: bool) -> str:
 def _late_words(angle: Angle, who: str, one: _Seen, alone: bool) -> str:
     why = "the clock of the sensor is off" if alone else "the angles are filtered, or the clock of either is off"
     return (
-        f"the {angle} of the poses is {1e3 * one.late_s:+.0f} ms (σ {1e3 * one.sigma_late_s:.0f} ms) late against the "
-        f"tilt of the road that {who} saw (sway {one.sway_deg:.2f}°): {why}; all readings are placed by it"
+        f"the {angle} of the poses is {1e3 * abs(one.late_s):.0f} ms (σ {1e3 * one.sigma_late_s:.0f} ms) "
+        f"{'late' if one.late_s > 0.0 else 'early'} against the tilt of the road that {who} saw (sway "
+        f"{one.sway_deg:.2f}°): {why}; all readings are placed by it"
     )
 
 

@@ -91,4 +91,5 @@ def test_half_a_roll_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("late_s", [LATE_S, -LATE_S])
 def test_a_late_roll_is_named_with_the_time(tmp_path: Path, late_s: float) -> None:
     (line,) = told(tmp_path, lambda at: roll_deg(at - late_s))
-    assert float(line.split("poses is ")[1].split(" ms")[0]) == pytest.approx(1e3 * late_s, abs=8.0)
+    assert float(line.split("poses is ")[1].split(" ms")[0]) == pytest.approx(1e3 * abs(late_s), abs=8.0)
+    assert (" late against " in line) == (late_s > 0.0)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from roadscan.calibrate.tasks.calibrate import outdated_calibrations
+from roadscan.calibrate.tasks.calibrate import outdated_calibrations, renew_reports
+from roadscan.calibrate.tasks.mounting_status import mounting_lines
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import (
@@ -16,7 +17,7 @@ from roadscan.footprints.footprints import (
 )
 from roadscan.georeference.plan.plan import empty_passes, plan_of
 from roadscan.georeference.tick_clocks import check_tick_clocks, tick_findings, tick_state
-from roadscan.run.session import Session
+from roadscan.run.session import Session, manifest_of
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
@@ -40,6 +41,8 @@ class Footprints(Stage):
 
     def run(self, session: Session) -> None:
         """Index the data files whose footprints are missing or stale."""
+        renew_reports(session.store, session.reporter.line)
+        session.forget(manifest_of)  # pictures were recorded meanwhile
         plan, manifest = plan_of(session), session.manifest
         session.failed(self.name, [*(fault.told for fault in plan.apart), *empty_passes(plan)])
         for note in outdated_calibrations(plan):
@@ -54,6 +57,7 @@ class Footprints(Stage):
         asked = plan_of(session), session.manifest, session.compute.workers
         state = footprint_state(*asked)
         state.notes = outdated_calibrations(plan_of(session))
+        state.lines = mounting_lines(session.store)
         state.faults = faults_of_plan(session)
         if not session.manifest.of(PRODUCT):
             state.hides_rest = True

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from roadscan.calibrate.tasks.calibrate import renew_reports
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.ingest.ingest import survey_records
@@ -45,13 +44,12 @@ class Navigate(Stage):
             draw_post_processed(survey, store, survey_records(survey, store, logs_of(session)), say)
             navigate(survey, store, say, logs_of(session))
             estimate_clocks(survey, store, say, logs=logs_of(session))
-            renew_reports(store, say)
         finally:
             session.forget(records_of)
             session.forget(manifest_of)  # pictures were recorded meanwhile
 
     def state(self, session: Session) -> StageState:
-        """Computed trajectories, estimated clocks, calibrated mountings."""
+        """Computed trajectories, estimated clocks."""
         held = {r.key: r for r in read_log_records(session.store, damaged=[])}
         own = [held[log.key] for log in logs_of(session)[0] if log.key in held]
         found = navigation_status(session.survey, session.store, own, held)

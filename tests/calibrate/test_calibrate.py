@@ -116,10 +116,10 @@ def test_a_report_that_is_gone_or_damaged_is_seen_and_written_again(calibrated: 
     store.write_bytes(TEXT, before[TEXT][::-1])
     faults = verify_store(store)
     assert [any(path in fault for fault in faults) for path in (PICTURE, TEXT)] == [True, True]
-    run_stages(Session(survey, store, Inline()), [s for s in stages() if s.name == "navigate"])
+    run_stages(Session(survey, store, Inline()), [s for s in stages() if s.name == "footprints"])
     assert {path: store.read_bytes(path) for path in (PICTURE, TEXT)} == before
     assert verify_store(store) == []
-    lines = survey_status(Session(survey, store)).of("navigate").lines
+    lines = survey_status(Session(survey, store)).of("footprints").lines
     (line,) = [one for one in lines if one.startswith("mounting of profiler_left ")]
     assert ", not determined: " in line and "vertical lever arm" in line and line.endswith(PICTURE)
 

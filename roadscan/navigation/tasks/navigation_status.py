@@ -1,12 +1,12 @@
-"""Status of computed trajectories, estimated clocks and calibrated mountings, for `roadscan status`."""
+"""Status of computed trajectories and estimated clocks, for `roadscan status`."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from roadscan.calibrate.tasks.calibrate import PICTURE as CALIBRATION_PICTURE
 from roadscan.core.errors import ConfigError, DamagedError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.survey import Survey
@@ -17,21 +17,18 @@ from roadscan.navigation.tasks.navigate import plan_trajectories
 from roadscan.navigation.tasks.navigation_pictures import picture_path
 from roadscan.navigation.tasks.odometry_trajectory import LOCAL_MAP, ODOMETRY
 from roadscan.store.logs import NAVIGATION, LogRecord, has_log
-from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store
 
 
 @dataclass
 class NavigationStatus:
-    """Status of computed trajectories, clocks and mountings; damaged tables are left out."""
+    """Status of computed trajectories and clocks; damaged tables are left out."""
 
     trajectories: list[dict[str, Any]] = field(default_factory=list)
     """A computed trajectory of each run that has or awaits one: run, state, poses, epochs, σ, outliers, doubts,
     picture."""
     clocks: list[dict[str, Any]] = field(default_factory=list)
     """Estimated clocks."""
-    mountings: list[dict[str, Any]] = field(default_factory=list)
-    """Calibrated mountings."""
 
     @property
     def is_complete(self) -> bool:
@@ -46,13 +43,6 @@ class NavigationStatus:
             yield (
                 f"clock of {one['run']}/{one['sensor']}: {one['offset_s']:+.6f} s ± {one['sigma_ms']:.2g} ms, drift "
                 f"{one['drift_ppm']:+.3f} ± {one['sigma_drift_ppm']:.2g} ppm, from {one['method']}{_shown(one)}"
-            )
-        for one in self.mountings:
-            lever, angle = one["sigma_lever_m"], one["sigma_angle_deg"]
-            held = f", not determined: {one['not_determined']}" if one["not_determined"] else ""
-            yield (
-                f"mounting of {one['sensor']} (runs {one['run']}): calibrated {one['estimated_at']} from "
-                f"{one['method']}, σ at most {1e3 * lever:.1f} mm and {angle:.3f}°{held}{_shown(one)}"
             )
 
 
@@ -92,11 +82,8 @@ def navigation_status(
         found.trajectories = [_trajectory(store, one, records.get(one.key)) for one in planned]
     except ConfigError:
         pass  # the run reports it
-    try:
+    with contextlib.suppress(DamagedError):  # `roadscan verify` reports it
         found.clocks = list(_clocks(store))
-        found.mountings = list(_mountings(store))
-    except DamagedError:
-        pass  # `roadscan verify` reports it
     return found
 
 
@@ -158,22 +145,4 @@ def _clocks(store: Store) -> Iterator[dict[str, Any]]:
             "drift_ppm": 1e6 * one.correction.drift,
             "sigma_drift_ppm": 1e6 * one.correction.sigma_drift,
             "picture": picture if store.exists(picture) else "",
-        }
-
-
-def _mountings(store: Store) -> Iterator[dict[str, Any]]:
-    table = read_small(store, "mountings")
-    picture = CALIBRATION_PICTURE if store.exists(CALIBRATION_PICTURE) else ""
-    for row in [] if table is None else table.to_pylist():
-        lever = [row[f"sigma_lever_{a}_m"] for a in ("forward", "right", "down")]
-        angles = [row[f"sigma_{a}_deg"] for a in ("roll", "pitch", "heading")]
-        yield {
-            "run": row["run"],
-            "sensor": row["sensor"],
-            "method": row["method"] or "",
-            "estimated_at": row["estimated_at"] or "",
-            "sigma_lever_m": max((v for v in lever if v is not None), default=float("nan")),
-            "sigma_angle_deg": max((v for v in angles if v is not None), default=float("nan")),
-            "not_determined": row["not_determined"] or "",
-            "picture": picture if row["calibration"] else "",
         }

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from roadscan.calibrate.tasks.calibrate import PICTURE
+from roadscan.calibrate.tasks.mounting_status import mounting_lines
 from roadscan.navigation.tasks.navigation_status import NavigationStatus, navigation_status, trajectory_findings
 from roadscan.report.blocks import Block, Paragraph, Picture
 from roadscan.report.section import Material, Section
@@ -22,9 +24,9 @@ class Navigation(Section):
         found = navigation_status(material.session.survey, store, material.logs, material.records)
         for one in trajectory_findings(material.logs):
             yield Paragraph(one.line, is_warning=True)
-        for line in found.lines():
+        for line in (*found.lines(), *mounting_lines(store)):
             yield Paragraph(line)
-        for path, caption in _pictures(found).items():
+        for path, caption in (_pictures(found) | {PICTURE: "Calibration of the mountings"}).items():
             if store.exists(path):
                 yield Picture(store.read_bytes(path), caption)
 
@@ -32,5 +34,4 @@ class Navigation(Section):
 def _pictures(found: NavigationStatus) -> dict[str, str]:
     """Return captions by path: one picture may show several estimates."""
     shown = {one["picture"]: f"Trajectory of run '{one['run']}'" for one in found.trajectories if one["picture"]}
-    shown |= {one["picture"]: f"Clock of {one['run']}/{one['sensor']}" for one in found.clocks if one["picture"]}
-    return shown | {one["picture"]: "Calibration of the mountings" for one in found.mountings if one["picture"]}
+    return shown | {one["picture"]: f"Clock of {one['run']}/{one['sensor']}" for one in found.clocks if one["picture"]}

@@ -98,6 +98,12 @@ class Stage(ABC):
         """All that is wrong with the survey file as far as it concerns this stage; called before a run reads a log."""
         return []
 
+    def check_ahead(self, session: Session, *, files: bool) -> None:  # noqa: B027 — most stages ask nothing ahead
+        """Raise where it could not do its work once it is its turn; stages before it ask, when the survey is planned.
+
+        files : whether the files that it needs are looked at too, which takes longer.
+        """
+
     def state(self, session: Session) -> StageState:
         """What there is and what is to do; reads no readings.
 
@@ -129,6 +135,12 @@ class Stage(ABC):
     def word(self) -> str:
         """Its name on the command line."""
         return self.command or self.name
+
+
+def check_stages_ahead(session: Session, *, files: bool) -> None:
+    """Raise where a stage could not do its work once it is its turn, see :meth:`Stage.check_ahead`."""
+    for one in stages():
+        one.check_ahead(session, files=files)
 
 
 def findings_of(

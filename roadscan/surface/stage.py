@@ -12,7 +12,7 @@ from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.found_regions import find_due_regions
 from roadscan.surface.tasks.surface_colours import check_colours, colour_notes
 from roadscan.surface.tasks.surface_plan import SURFACE, files_without_surface
-from roadscan.surface.tasks.surface_work import plan_surface_work
+from roadscan.surface.tasks.surface_work import check_surface_ahead, plan_surface_work
 from roadscan.surface.tasks.surfaces import compute_surfaces
 from roadscan.tiles.product import SurfaceProduct
 from roadscan.tiles.tasks.tiles import run_tasks
@@ -28,6 +28,10 @@ class Surfaces(Stage):
     units = "tiles"
     reads = ("cells", "scans", "returns", "cloud", "trajectory", "corrections", "footprints", "images")
     writes = ("regions", SurfaceProduct)
+
+    def check_ahead(self, session: Session, *, files: bool) -> None:
+        """Raise where the surface that the survey asks for cannot be made: its settings, regions or pictures."""
+        check_surface_ahead(plan_of(session), files=files)
 
     def run(self, session: Session) -> None:
         """Reconstruct what is missing or stale."""

@@ -10,14 +10,12 @@ from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.footprints.stage import faults_of_plan
-from roadscan.georeference.plan.plan import plan_of
 from roadscan.georeference.reading_counts import counts_by_log, fate_words, lost_findings, of_all
 from roadscan.run.engine.compute import LazyTasks
 from roadscan.run.session import Session
-from roadscan.run.stage import Stage, StageState
+from roadscan.run.stage import Stage, StageState, check_stages_ahead
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
-from roadscan.surface.tasks.surface_colours import check_colours
 from roadscan.tiles.product import TileProduct
 from roadscan.tiles.tasks.passes_apart import apart_findings
 from roadscan.tiles.tasks.tile_files import tile_file_names
@@ -42,9 +40,10 @@ class Tiles(Stage):
 
     def run(self, session: Session) -> None:
         """Compute the tiles that are missing or stale, or those that are chosen."""
+        check_stages_ahead(session, files=False)
         manifest, work = session.manifest, plan_tile_work(session)
         if work.chosen:
-            check_colours(plan_of(session), folders=True)  # before tiles are computed for them
+            check_stages_ahead(session, files=True)  # before tiles are computed for them
         manifest.remove(work.gone)
 
         def counted(task: TileTask) -> TileTask:
@@ -85,6 +84,7 @@ class Tiles(Stage):
 
     def state(self, session: Session) -> StageState:
         """Tiles, tasks and memory."""
+        check_stages_ahead(session, files=False)
         work = plan_tile_work(session)
         tasks = list(work.planned.tasks(work.chosen, session.compute.workers))
         stale = {str(tile) for t in tasks for tile in t.block.tiles}

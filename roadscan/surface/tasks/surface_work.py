@@ -81,9 +81,12 @@ def _waiting_note(waiting: int, found: FoundRegions) -> str:
     return f"surfaces of {waiting:,} tiles wait for cells that are missing or out of date: run `roadscan tiles`"
 
 
-def check_surface_ahead(plan: SurveyPlan) -> None:
-    """Raise where the surface that a survey asks for cannot be made: its settings, its regions, its pictures."""
+def check_surface_ahead(plan: SurveyPlan, *, files: bool) -> None:
+    """Raise where the surface that a survey asks for cannot be made: its settings, its regions, its pictures.
+
+    files : whether the files of the pictures are looked at.
+    """
     if (config := SurfaceConfig.stated(plan.survey)) is not None:
         checked_surface(plan.survey, config)
         searched_sources(plan)
-        check_colours(plan)
+        check_colours(plan, folders=files)

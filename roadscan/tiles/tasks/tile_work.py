@@ -11,7 +11,6 @@ from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.memory import BYTES_PER_READING, WORKER_BASE_BYTES
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
-from roadscan.surface.tasks.surface_work import check_surface_ahead
 from roadscan.tiles.accumulator import MOST_BYTES
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import tile_file_names
@@ -36,7 +35,6 @@ def plan_tile_work(session: Session) -> TileWork:
     """Compare existing tiles with required ones."""
     plan, manifest, survey = plan_of(session), session.manifest, session.survey
     context = product_context(plan)
-    check_surface_ahead(plan)  # before tiles are computed for it
     wanted = tuple(wanted_tile_products(survey, context))
     tiles, footprints = tiles_of(session), footprints_of(session)
     why = {} if session.selection is not None else stale_tiles(tiles, wanted, manifest)

@@ -297,6 +297,73 @@ def test_times_that_may_mean_two_things_are_asked_for(tmp_path: Path) -> None:
     assert [one.key for group in caught.value.missing for one in group] == ["options.time_unit", "options.time_from"]
 
 
+def sweeps(count: int, kind: str = "<f8", off_s: float = 0.0) -> list[tuple[int, dict[str, Any]]]:
+    """Messages of 0.1 s with times of points from 1970 on, which are off against the headers."""
+    made = []
+    for sweep in range(count):
+        ns = T0 + sweep * NS // 10
+        points = spinning([("timestamp", kind)])
+        points["timestamp"] = ns / NS + off_s + np.linspace(0, 0.099, points.size)
+        made.append((ns + 120_000_000, cloud(points, ns)))
+    return made
+
+
+@pytest.mark.witness("clouds_of_a_bag")
+def test_times_of_points_that_are_off_the_headers_are_named(tmp_path: Path) -> None:
+    rows = read("ros_points", clouds(tmp_path / "off", "mcap", sweeps(4, off_s=1.5)), clock=UTC, sensor=LIDAR)
+    (one,) = rows.findings
+    assert "the points' own times lie +1.5" in one.text
+    rows = read("ros_points", clouds(tmp_path / "right", "mcap", sweeps(4)), clock=UTC, sensor=LIDAR)
+    assert rows.findings == []
+
+
+@pytest.mark.parametrize(("ahead_s", "words"), [(18.0, "as GPS time is ahead"), (37.0, "as TAI is ahead")])
+def test_points_on_another_scale_than_their_headers_are_asked_for(ahead_s: float, words: str, tmp_path: Path) -> None:
+    bag = clouds(tmp_path / "bag", "mcap", sweeps(4, off_s=ahead_s))
+    with pytest.raises(TimeSystemError, match=words):
+        read("ros_points", bag, clock=UTC, sensor=LIDAR)
+    rows = read("ros_points", bag, {"time_ahead_s": ahead_s}, clock=UTC, sensor=LIDAR)
+    first_ns = int(rows.epochs.min()) + 315_964_800 * NS - 18 * NS
+    assert first_ns == pytest.approx(T0, abs=1_000)
+
+
+def test_points_without_a_time_are_rejected(tmp_path: Path) -> None:
+    messages = []
+    for sweep in range(4):
+        ns = T0 + sweep * NS // 10
+        points = spinning([("timestamp", "<f8")])
+        points["timestamp"] = ns / NS + np.linspace(0, 0.099, points.size)
+        points["timestamp"][7] = np.nan
+        messages.append((ns, cloud(points, ns)))
+    rows = read("ros_points", clouds(tmp_path / "bag", "mcap", messages), clock=UTC, sensor=LIDAR)
+    assert (rows.rejected, rows.epochs.size) == (4, 4 * 999)
+
+
+def test_times_whose_numbers_have_no_steps_fine_enough_are_refused(tmp_path: Path) -> None:
+    bag = clouds(tmp_path / "bag", "mcap", sweeps(4, kind="<f4"))
+    stated = {"time_unit": "s", "time_from": "epoch"}
+    with pytest.raises(TimeSystemError, match="states times to 128 s only"):
+        read("ros_points", bag, stated, clock=UTC, sensor=LIDAR)
+
+
+def test_fractions_that_come_after_whole_numbers_are_named(tmp_path: Path) -> None:
+    messages = []
+    for sweep in range(10):
+        ns = T0 + sweep * NS // 10
+        points = spinning([("intensity", "<f4")])
+        points["intensity"] = 0.0 if sweep < 8 else 0.25
+        messages.append((ns, cloud(points, ns)))
+    rows = read("ros_points", clouds(tmp_path / "bag", "mcap", messages), {"untimed": "stamp"}, clock=UTC, sensor=LIDAR)
+    (one,) = rows.findings
+    assert "2,000 intensities are fractions" in one.text
+
+
+def test_whole_numbers_as_positions_are_refused(tmp_path: Path) -> None:
+    points = spinning([]).astype([("x", "<i4"), ("y", "<i4"), ("z", "<i4")])
+    with pytest.raises(FormatError, match="of a unit that no message states"):
+        read("ros_points", clouds(tmp_path / "bag", "mcap", [(T0, cloud(points, T0))]), clock=UTC, sensor=LIDAR)
+
+
 def test_clouds_without_times_are_asked_for(tmp_path: Path) -> None:
     bag = clouds(tmp_path / "bag", "ros1", [(T0, cloud(spinning([]), T0))])
     with pytest.raises(ConfigError, match="no time of each point"):

@@ -24,10 +24,14 @@ FIELDS: Final = ("t", "time", "timestamp", "time_stamp", "offset_time", "timesta
 """Names by which a field with times of points is known."""
 Origin = Literal["header", "epoch"]
 
+UNKNOWN_NS: Final = np.int64(1 << 62)
+"""Offset (ns) of a point without a time."""
 _NEAR_NS: Final = 2 * NS_PER_S  # times from 1970 lie so near to the header's stamp (ns), if one clock wrote both
 _SWEEP_NS: Final = (5_000_000, 2 * NS_PER_S)
 """Range of a sweep's duration (ns) where the rate of the messages is not known: 200 Hz to 0.5 Hz."""
 _SHARE: Final = (0.2, 1.6)  # span of a sweep's times to the interval of messages; part of a turn may be empty
+_MOST_AHEAD_S: Final = 9.5
+"""Points that are farther from their header (s) would all be rejected: it is asked how far the clocks are apart."""
 _OUR_TIME_S: Final = (4.75e8, 2.524e9)  # seconds from 1970 or 1980 of dates from 1985 to 2060
 
 
@@ -50,29 +54,39 @@ class PointTimes:
     """s, ms, us or ns."""
     origin: Origin
     """What they count from: the message's stamp, or the origin of the clock."""
+    ahead_ns: int = 0
+    """How far the clock of the points is ahead of that of the stamps, where they count from its origin."""
 
     def offsets_ns(self, values: npt.NDArray[np.generic], stamp_ns: int) -> npt.NDArray[np.int64]:
-        """Return times (n,) relative to a stamp (ns), rounded to ns; values that are not finite give 0."""
+        """Return times (n,) relative to a stamp (ns), rounded to ns; `UNKNOWN_NS` for what is no number."""
         scale = UNIT_NS[self.unit]
+        stamp_ns += self.ahead_ns
         if values.dtype.kind in "iu":
             whole: npt.NDArray[np.int64] = values.astype(np.int64)
             if scale != 1:
                 whole *= scale
             return whole - stamp_ns if self.origin == "epoch" else whole
         numbers = values.astype(np.float64)
+        if not (known := np.isfinite(numbers)).all():
+            found = np.full(numbers.size, UNKNOWN_NS)
+            found[known] = self.offsets_ns(numbers[known], stamp_ns - self.ahead_ns)
+            return found
         if self.origin == "epoch":
             # Whole units first: a double holds the difference of two near times better than either of them in ns.
             units, rest_ns = divmod(stamp_ns, scale)
-            return np.rint(np.nan_to_num((numbers - units) * scale)).astype(np.int64) - rest_ns
-        return np.rint(np.nan_to_num(numbers * scale)).astype(np.int64)
+            return np.rint((numbers - units) * scale).astype(np.int64) - rest_ns
+        return np.rint(numbers * scale).astype(np.int64)
 
 
-def found(field: str, samples: Sequence[Sample], unit: str | None, origin: Origin | None, file: Path) -> PointTimes:
+def found(
+    field: str, samples: Sequence[Sample], unit: str | None, origin: Origin | None, ahead_s: float, file: Path
+) -> PointTimes:
     """Return how the times of a field are written: as stated, else as the numbers alone can mean it.
 
     Parameters
     ----------
     samples : of the first messages, in their order.
+    ahead_s : how far the clock of the points is ahead of that of the headers.
 
     Raises
     ------
@@ -86,7 +100,11 @@ def found(field: str, samples: Sequence[Sample], unit: str | None, origin: Origi
         if unit in {None, u} and origin in {None, o} and (_fits(samples, UNIT_NS[u], o) or (unit and origin))
     ]
     if len(fitting) == 1:
-        return PointTimes(field, fitting[0][0], "epoch" if fitting[0][1] == "epoch" else "header")
+        times = PointTimes(
+            field, fitting[0][0], "epoch" if fitting[0][1] == "epoch" else "header", round(ahead_s * NS_PER_S)
+        )
+        _check_ahead(times, samples, file)
+        return times
     least, most = min(s.least for s in samples), max(s.most for s in samples)
     means = " and ".join(f"{u} from the {'header' if o == 'header' else 'origin of the clock'}" for u, o in fitting)
     questions = {"options.time_unit": tuple(UNIT_NS), "options.time_from": ("header", "epoch")}
@@ -96,6 +114,25 @@ def found(field: str, samples: Sequence[Sample], unit: str | None, origin: Origi
         expected="options.time_unit (s, ms, us, ns) and options.time_from (header, epoch), by the driver's manual",
         file=file,
         missing=[asked],
+    )
+
+
+def _check_ahead(times: PointTimes, samples: Sequence[Sample], file: Path) -> None:
+    """Refuse times from the origin of a clock that is seconds off that of the headers."""
+    if times.origin != "epoch":
+        return
+    scale = UNIT_NS[times.unit]
+    ahead_s = float(np.median([0.5 * (s.least + s.most) * scale - s.header_ns for s in samples])) / NS_PER_S
+    left_s = ahead_s - times.ahead_ns / NS_PER_S
+    if abs(left_s) < _MOST_AHEAD_S:
+        return
+    scales = {18: "as GPS time is ahead of UTC", 37: "as TAI is ahead of UTC", 19: "as TAI is ahead of GPS time"}
+    why = scales.get(round(abs(ahead_s)), "which is no difference of two time scales")
+    raise TimeSystemError(
+        f"the points' own times ('{times.field}') are {ahead_s:+.1f} s ahead of the headers' stamps, {why}",
+        expected="options.time_ahead_s, which is taken off the points' times",
+        file=file,
+        missing=Missing("options.time_ahead_s", float(round(ahead_s))),
     )
 
 

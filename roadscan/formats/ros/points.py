@@ -10,9 +10,11 @@ from typing import Any, ClassVar, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.errors import ConfigError, FormatError, Missing
+from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
+from roadscan.core.gpstime import NS_PER_S, UNIT_NS
 from roadscan.core.strict import Strict
 from roadscan.formats.ros.bag import Bag, Topic, stamp_ns
+from roadscan.formats.ros.cloud_watch import CloudWatch
 from roadscan.formats.ros.point_times import FIELDS, Origin, PointTimes, Sample, found
 from roadscan.formats.ros.return_rows import INTENSITY_MAX, ReturnRows
 from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions
@@ -22,6 +24,8 @@ from roadscan.ingest.reading.records import options_of
 
 _TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Number types of sensor_msgs/PointField by its constants."""
+_COARSEST_NS: Final = 1_000_000
+"""Coarsest step of the points' times (ns): 0.02 m at 72 km/h."""
 _LOOKED_AT: Final = 8  # messages from which units are found
 _MAP_FRAMES: Final = ("map", "odom", "world", "earth", "utm")
 """Frames that are not of a sensor: a cloud in one of them was placed by another program already (REP 105)."""
@@ -38,6 +42,9 @@ class RosPointsOptions(TopicOptions):
     time_from: Origin | None = None
     """What that field counts from: the message's own stamp (`header`), or the origin of the clock (`epoch`); needed
     where the numbers leave it open."""
+    time_ahead_s: float = 0.0
+    """Seconds by which the points' own times are ahead of the headers' stamps, where both count from the origin of a
+    clock: 18 (since 2017) where the points are on GPS time and the headers on UTC, 37 where they are on TAI."""
     untimed: Literal["stamp"] | None = None
     """For clouds without a time of each point: "stamp" gives every point that of its message. It is right where the
     cloud was compensated for motion to that instant, and smears it otherwise. Has to be stated."""
@@ -82,7 +89,7 @@ class RosPoints(TopicFormat):
         options = options_of(source, RosPointsOptions)
         with Bag.open(source.path) as bag:
             plan = _plan(source, bag, self.topic(bag, source))
-            rows = ReturnRows(source, compensated=options.compensated)
+            rows, watch = ReturnRows(source, compensated=options.compensated), CloudWatch()
             for item in self.timed(source, bag):
                 if not isinstance(item, Timed):
                     yield item
@@ -98,10 +105,15 @@ class RosPoints(TopicFormat):
                 if plan.times is not None:
                     own_ns = item.stamp_ns if options.stamps == "header" else stamp_ns(item.content.header.stamp)
                     offsets_ns = plan.times.offsets_ns(cloud[plan.times.field], own_ns)
+                    if plan.times.origin == "epoch":
+                        watch.times(offsets_ns)
+                if plan.brightness is not None and plan.intensity_full is None:
+                    watch.intensity(cloud[plan.brightness])
                 yield from rows.items(
                     message, item.stamp_ns, [cloud[axis] for axis in AXES], offsets_ns,
                     plan.intensity(cloud), None if plan.laser is None else cloud[plan.laser],
                 )  # fmt: skip
+            yield from watch.findings()
 
 
 @dataclass(frozen=True)
@@ -151,6 +163,13 @@ def _plan(source: LogSource, bag: Bag, topic: Topic) -> _Plan:
     first = [one for one in first if one[1].dtype.names == names]  # others are rejected when they are read
     if missing := [axis for axis in AXES if axis not in names]:
         raise FormatError(f"the clouds have no field '{missing[0]}'", expected="x, y, z in metres", file=source.path)
+    if whole := [axis for axis in AXES if cloud.dtype[axis].kind in "iu"]:
+        raise FormatError(
+            f"the field '{whole[0]}' holds whole numbers ({cloud.dtype[whole[0]]}) of a unit that no message states",
+            expected="x, y, z in metres, as floating-point numbers (REP 103)",
+            change="let the driver publish metres",
+            file=source.path,
+        )
     brightness = field_named(options.intensity_field, "intensity_field", INTENSITIES, names, source.path)
     full = options.intensity_full
     if brightness is not None and full is None:
@@ -201,7 +220,18 @@ def _times(
             samples.append(Sample(stamp_ns(content.header.stamp), float(values.min()), float(values.max())))
     if not samples:
         raise FormatError(f"the field '{name}' holds no number", file=source.path)
-    return found(name, samples, options.time_unit, options.time_from, source.path)
+    times = found(name, samples, options.time_unit, options.time_from, options.time_ahead_s, source.path)
+    kind = first[0][1].dtype[name]
+    step_ns = float(np.spacing(kind.type(abs(samples[0].most)))) * UNIT_NS[times.unit] if kind.kind == "f" else 0.0
+    if step_ns > _COARSEST_NS:
+        raise TimeSystemError(
+            f"the field '{name}' ({kind.name}) states times to {step_ns / NS_PER_S:.3g} s only: so large a number has "
+            "no finer steps",
+            expected='options.untimed = "stamp", or clouds whose driver counts from the header\'s stamp',
+            file=source.path,
+            missing=Missing("options.untimed", "stamp"),
+        )
+    return times
 
 
 def _full(values: npt.NDArray[np.float64], name: str, source: LogSource) -> float | None:

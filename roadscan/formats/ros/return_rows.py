@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.formats.ros.bag import Message
+from roadscan.formats.ros.point_times import UNKNOWN_NS
 from roadscan.formats.ros.topics import message_clock
 from roadscan.ingest.reading.format import Item, LogSource, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve
@@ -77,6 +78,7 @@ class ReturnRows:
             sieve.drop(farthest[kept] > _FARTHEST_M, "the position is beyond 10 km")
         late = None if offsets is None else offsets[kept]
         if late is not None and late.size and (late.min() < -_LATEST_NS or late.max() > _LATEST_NS):
+            sieve.drop(late == UNKNOWN_NS, "its time is no number")
             sieve.drop(np.abs(late) > _LATEST_NS, "its time is more than 10 s from its message's")
         ring = None if laser is None else laser[kept]
         if ring is not None and ring.size and not 0 <= ring.min() <= ring.max() <= _LASERS:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from roadscan.core.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
+from roadscan.core.errors import ConfigError, CrsError, FormatError, RoadscanError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
 from roadscan.ingest.reading.format import format_of
@@ -217,6 +217,15 @@ def test_poses_of_a_bag_are_those_of_a_table(kind: str, tmp_path: Path) -> None:
     same(rows, direct, ("epoch_gps_ns", *(f"{a}_world_m" for a in "xyz"), "qw", "qx", "qy", "qz"))
     np.testing.assert_allclose([rows[f"sigma_{a}_m"][0] for a in ("east", "north", "down")], [0.1, 0.2, 0.3], rtol=1e-6)
     assert rows.attributes["child_frame_id"] == "base_link"
+
+
+def test_poses_about_the_origin_of_utm_are_of_a_local_frame(tmp_path: Path) -> None:
+    """As an odometry writes them; by UTM they would lie on the equator, in the sea."""
+    pose = {"position": {"x": 3.0, "y": -2.0, "z": 0.5}, "orientation": {"w": 1.0}}
+    messages = [(T0 + i * NS, {"header": header(T0 + i * NS), "pose": pose}) for i in range(3)]
+    bag = write_bag(tmp_path / "bag", "mcap", {"/pose": ("geometry_msgs/msg/PoseStamped", messages)})
+    with pytest.raises(CrsError, match="coordinates of a local frame"):
+        read("ros_poses", bag, {"axes": "flu"}, clock=UTC, crs="EPSG:32632", height="ellipsoidal")
 
 
 def test_poses_in_utm_look_where_the_grid_says(tmp_path: Path) -> None:

@@ -58,6 +58,8 @@ SIGMA_MAX_DEG: Final = 360.0
 """An angle with a σ above a whole turn is damage."""
 GRID_MAX_M: Final = 2.1e7
 """Eastings and northings beyond half the Earth's girth are damage."""
+_LOCAL_M: Final = 20_000.0
+"""A drive that stays so near (m) to the origin of a grid, far from where the grid is used, has local coordinates."""
 
 
 # --- quaternions -----------------------------------------------------------------------------------
@@ -214,11 +216,26 @@ class GridPlacement(Placement):
         if not np.all(np.isfinite(world)):
             raise CrsError(f"a position lies outside the projection '{self._crs}'", expected="easting, northing in m")
         degrees = geodetic_from_world(self.world, world)
+        self._refuse_local(position, degrees)
         if self._north == "grid":
             turn = quaternion_about("z", grid_convergence_rad(self._crs, degrees))
             attitude = quaternion_product(turn, attitude)
         longitude, latitude = np.radians(degrees[:, :2].T)
         return self._ecef.place_ellipsoidal(longitude, latitude, degrees[:, 2], attitude)
+
+    def _refuse_local(self, position: Float64, degrees: Float64) -> None:
+        """Raise where positions lie about the origin of the grid, outside the area that the CRS is made for."""
+        area = pyproj.CRS.from_user_input(self._crs).area_of_use
+        if area is None or np.abs(position[:2]).max(initial=0.0) > _LOCAL_M:
+            return
+        west, south, east, north = area.bounds
+        longitude, latitude = degrees[:, 0], degrees[:, 1]
+        if not ((longitude > west) & (longitude < east) & (latitude > south) & (latitude < north)).any():
+            raise CrsError(
+                f"the positions lie within {_LOCAL_M / 1e3:g} km of easting 0, northing 0 of '{self._crs}', outside "
+                "the area that it is made for: they are coordinates of a local frame",
+                change='state crs = "local"',
+            )
 
 
 class LevelPlacement(Placement):

@@ -56,7 +56,12 @@ def _cut_off(folder: Path) -> None:
     file.write_bytes(file.read_bytes()[:-4_096])
 
 
-@pytest.mark.parametrize("harm", [_counts_more, _names_a_missing_file, _cut_off])
+def _begins_with_an_empty_file(folder: Path) -> None:
+    next(folder.glob("*.db3")).rename(folder / "bag_1.db3")
+    (folder / "bag_0.db3").touch()
+
+
+@pytest.mark.parametrize("harm", [_counts_more, _names_a_missing_file, _cut_off, _begins_with_an_empty_file])
 def test_a_fault_of_a_bag_leaves_frames_and_mountings(harm: Any, tmp_path: Path) -> None:
     folder = _bag(tmp_path / "bag", [_transform("base_link", "imu", 1.5)], ("imu",))
     harm(folder)

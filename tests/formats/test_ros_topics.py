@@ -397,8 +397,36 @@ def test_organised_big_endian_clouds_with_gaps(tmp_path: Path) -> None:
     assert rows.rejected == 1  # infinite, which is beyond 10 km
 
 
-def test_a_cloud_that_was_placed_already_is_refused(tmp_path: Path) -> None:
-    bag = clouds(tmp_path / "bag", "mcap", [(T0, cloud(spinning([("t", "<u4")]), T0, frame="map"))])
+def test_rows_of_no_stated_length_and_padding_are_read(tmp_path: Path) -> None:
+    points = spinning([("t", "<u4"), ("p", "u1"), ("q", "u1")])
+    points["t"] = np.linspace(0, 99_000_000, points.size)
+    for number, row_step in enumerate((0, points.nbytes)):
+        messages = []
+        for k in range(4):
+            fields = cloud(points, T0 + k * NS // 10, height=4) | {"row_step": row_step}
+            for one in fields["fields"]:
+                one["name"] = {"p": "_", "q": "_"}.get(one["name"], one["name"])
+            messages.append((T0 + k * NS // 10, fields))
+        rows = read("ros_points", clouds(tmp_path / f"{number}", "mcap", messages), clock=UTC, sensor=LIDAR)
+        np.testing.assert_array_equal(rows["x_sensor_m"][: points.size], points["x"])
+        assert (len(rows["x_sensor_m"]), rows.rejected) == (4 * points.size, 0)
+
+
+def test_a_topic_of_refused_clouds_says_why(tmp_path: Path) -> None:
+    for name, change, why in (
+        ("short", {"width": 5_000}, "the cloud holds fewer bytes than its points need"),
+        ("narrow", {"point_step": 9}, "a field reaches beyond its point"),
+    ):
+        bag = clouds(tmp_path / name, "mcap", [(T0, cloud(spinning([("t", "<u4")]), T0) | change)])
+        with pytest.raises(FormatError, match=why):
+            read("ros_points", bag, clock=UTC, sensor=LIDAR)
+
+
+@pytest.mark.parametrize(
+    "frame", ["map", "/camera_init", "odom_combined", "local_enu", "local_origin", "world", "ENU", "utm_32n", "car/map"]
+)
+def test_a_cloud_that_was_placed_already_is_refused(frame: str, tmp_path: Path) -> None:
+    bag = clouds(tmp_path / "bag", "mcap", [(T0, cloud(spinning([("t", "<u4")]), T0, frame=frame))])
     with pytest.raises(FormatError, match="placed them already"):
         read("ros_points", bag, clock=UTC, sensor=LIDAR)
 

@@ -99,6 +99,8 @@ def test_a_bag_of_which_nothing_is_read_is_listed_all_the_same(tmp_path: Path) -
     file = tmp_path / "cut.mcap"
     file.write_bytes(b"\x89MCAP0\r\n" + bytes(3))
     assert roadscan("inspect", file).exit_code == 2
+    file.write_bytes(b"\x89MCAP0\r\n")
+    assert "the MCAP file ends after its first 8 bytes" in " ".join(roadscan("inspect", file).stdout.split())
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])

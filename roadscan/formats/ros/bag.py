@@ -100,6 +100,8 @@ class Bag:
     topics: dict[str, Topic] = field(default_factory=dict)
     faults: list[Reject] = field(default_factory=list)
     """What is damaged of the bag as a whole, such as an end that is missing."""
+    _unread: list[FormatError] = field(default_factory=list)
+    """Why files of the folder are left out."""
     _scratch: tempfile.TemporaryDirectory[str] | None = None
 
     @classmethod
@@ -115,6 +117,8 @@ class Bag:
         try:
             for file in bag_files(path):
                 bag._take(file, file.name if path.is_dir() else "")
+            if not bag.files and bag._unread:
+                raise bag._unread[0]
             bag._find_missing()
         except OSError as error:
             bag.close()
@@ -205,7 +209,14 @@ class Bag:
             if fault:
                 self.faults.append(Reject(fault, file=name))
             file = plain
-        container = _container(file)
+        try:
+            container = _container(file)
+        except FormatError as error:
+            if not name:
+                raise
+            self._unread.append(error)
+            self.faults.append(Reject(f"nothing of {name} is read: {error.arrived}", file=name))
+            return
         self.files.append((name, container))
         for connection in container.connections.values():
             self._join(connection)
@@ -246,7 +257,7 @@ class Bag:
 def is_bag(path: Path) -> bool:
     """Whether a file or folder is a bag, by its content."""
     if path.is_dir():
-        return any(_is_part(file) for file in bag_files(path)[:1])
+        return any(_is_part(file) for file in bag_files(path))
     return _is_part(path)
 
 

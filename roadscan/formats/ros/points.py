@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Literal
@@ -27,8 +28,12 @@ _TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 
 _COARSEST_NS: Final = 1_000_000
 """Coarsest step of the points' times (ns): 0.02 m at 72 km/h."""
 _LOOKED_AT: Final = 8  # messages from which units are found
-_MAP_FRAMES: Final = ("map", "odom", "world", "earth", "utm")
-"""Frames that are not of a sensor: a cloud in one of them was placed by another program already (REP 105)."""
+_REASONS: Final = 4  # why messages are refused that an error names at most
+_MAP_FRAMES: Final = re.compile(
+    r"(map|odom|world|earth|utm|enu|ned|ecef)([_\d].*)?|local_(enu|ned|origin|map)|camera_init|global", re.IGNORECASE
+)
+"""Frames that are not of a sensor: a cloud in one of them was placed by another program already. REP 105, and the names
+of LOAM and its heirs (camera_init), robot_pose_ekf (odom_combined), Autoware and MAVROS (map_ned, local_origin)."""
 
 
 class RosPointsOptions(TopicOptions):
@@ -147,12 +152,14 @@ class _Plan:
 def _plan(source: LogSource, bag: Bag, topic: Topic) -> _Plan:
     """Find fields and units in the first messages with points."""
     options = options_of(source, RosPointsOptions)
-    first = list(itertools.islice(_first_clouds(bag, topic), _LOOKED_AT))
+    refused: list[str] = []
+    first = list(itertools.islice(_first_clouds(bag, topic, refused), _LOOKED_AT))
     if not first:
-        raise FormatError(f"the topic {topic.name} holds no cloud with points", file=source.path)
+        why = f": {'; '.join(refused)}" if refused else ""
+        raise FormatError(f"the topic {topic.name} holds no cloud with points{why}", file=source.path)
     content, cloud = first[0]
     frame = str(content.header.frame_id).strip("/").split("/")[-1]
-    if frame in _MAP_FRAMES:
+    if _MAP_FRAMES.fullmatch(frame):
         raise FormatError(
             f"the clouds of {topic.name} are in the frame '{frame}': another program has placed them already",
             expected="clouds in the frame of the sensor",
@@ -183,13 +190,16 @@ def _plan(source: LogSource, bag: Bag, topic: Topic) -> _Plan:
     )
 
 
-def _first_clouds(bag: Bag, topic: Topic) -> Iterator[tuple[Any, npt.NDArray[np.void]]]:
+def _first_clouds(bag: Bag, topic: Topic, refused: list[str]) -> Iterator[tuple[Any, npt.NDArray[np.void]]]:
+    """Yield the first messages with points; `refused` takes why others before them cannot be read."""
     for item in bag.decoded(topic.name):
-        if isinstance(item, Reject):
-            continue
         try:
+            if isinstance(item, Reject):
+                raise ValueError(item.reason)
             cloud = _cloud(item[1])
-        except ValueError:
+        except ValueError as error:
+            if str(error) not in refused and len(refused) < _REASONS:
+                refused.append(str(error))
             continue
         if cloud.size:
             yield item[1], cloud
@@ -259,20 +269,23 @@ def _cloud(content: Any) -> npt.NDArray[np.void]:
         where the message contradicts itself.
     """
     width, height, step = int(content.width), int(content.height), int(content.point_step)
-    known = [f for f in content.fields if f.datatype in _TYPES and f.count <= 1]
+    known = [f for f in content.fields if f.datatype in _TYPES and f.count <= 1 and f.name.strip("_ ")]  # _ is padding
     order = ">" if content.is_bigendian else "<"
     names = [str(f.name) for f in known]
     places = [int(f.offset) for f in known]
     kinds = [np.dtype(order + _TYPES[f.datatype]) for f in known]
     if len(set(names)) < len(names):
-        raise ValueError("two fields of the cloud have one name")
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"two fields of the cloud have the name '{twice}'")
     if any(place + kind.itemsize > step for place, kind in zip(places, kinds, strict=True)):
         raise ValueError("a field reaches beyond its point")
     if not width * height:
         return np.empty(0, np.dtype([("x", "f4")]))
     points = np.dtype({"names": names, "formats": kinds, "offsets": places, "itemsize": step})
-    row = int(content.row_step) if height > 1 else width * step
     data = content.data
+    row = int(content.row_step) if height > 1 else width * step
+    if row in {0, data.size} and data.size == height * width * step:  # drivers that state no row, or all of them as one
+        row = width * step
     if row < width * step or data.size < (height - 1) * row + width * step:
         raise ValueError("the cloud holds fewer bytes than its points need")
     if row == width * step:

@@ -366,6 +366,8 @@ def _mounting(kind: str, log: FoundLog) -> Iterator[str]:
     if log.part is not None and log.part.mounting:
         yield from _stated_by_container(log.part, kind)
         return
+    if log.part is not None and log.part.unmounted:
+        yield from _remark(f"The recording states no mounting of the frame {log.part.frame}: {log.part.unmounted}.")
     known = {} if log.is_assumed else log.report.header.get("mounting", {})
     for key, value in known.items():
         yield f"{key} = {toml(value)}  # as the log says"

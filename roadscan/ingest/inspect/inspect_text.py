@@ -75,6 +75,8 @@ def _parts(contents: Contents) -> Iterator[Line]:
         yield "holds", f"{part.name}: {part.words}{frame} → {part.format or 'not read'}", "" if part.format else "dim"
         if part.mounting:
             yield "holds", f"  {part.frame} as it stands on {part.parent}: {mounting_words(part)}", ""
+        elif part.unmounted:
+            yield "holds", f"  no mounting of {part.frame}: {part.unmounted}", "yellow"
     first = next((part for part in contents.parts if part.format), None)
     if first is not None:
         settings = " ".join(f"--option {name}={value}" for name, value in first.options.items())

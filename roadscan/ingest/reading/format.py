@@ -318,6 +318,8 @@ class Part:
     """Frame from which the container counts that frame's mounting; "" where it says nothing of it."""
     mounting: Mapping[str, Any] = field(default_factory=dict)
     """Mounting of the frame by keys of :class:`roadscan.core.rig.Sensor`, if the parent is x ahead, y left, z up."""
+    unmounted: str = ""
+    """Why no mounting follows from what the container states of that frame; "" where it states nothing."""
 
 
 @dataclass(frozen=True)

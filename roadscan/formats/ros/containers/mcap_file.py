@@ -51,6 +51,8 @@ class McapFile(ChunkedContainer):
         self._schemas: dict[int, tuple[str, str, str]] = {}
         if stream.read(len(MAGIC)) != MAGIC:
             raise self.damaged("the file is no MCAP")
+        if self.size == len(MAGIC):
+            raise self.damaged("the MCAP file ends after its first 8 bytes: it holds no message")
         if self._summarised(stream):
             return
         self.connections.clear()
@@ -81,6 +83,8 @@ class McapFile(ChunkedContainer):
     def _summarised(self, stream: BinaryIO) -> bool:
         """Take what the summary says; False where there is none, or it does not list all messages."""
         footer = _RECORD.size + 20  # two offsets and a CRC
+        if self.size < len(MAGIC) + footer + len(MAGIC):
+            return False
         try:
             stream.seek(self.size - len(MAGIC) - footer)
             kind, _ = _RECORD.unpack(exactly(stream, _RECORD.size))

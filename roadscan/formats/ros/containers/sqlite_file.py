@@ -40,13 +40,17 @@ class SqliteFile(Container):
     def messages(self, wanted: Set[int]) -> Iterator[RawItem]:
         """Yield the messages of some topics in the order in which they were written."""
         yield from self.faults
-        last, skip = -1, 0
+        last, skip, limit = -1, 0, -1
         marks = ",".join("?" * len(wanted))
-        query = f"SELECT id, topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) AND id > ? ORDER BY id"
+        query = (
+            "SELECT id, topic_id, timestamp, data FROM messages "
+            f"WHERE topic_id IN ({marks}) AND id > ? ORDER BY id LIMIT ?"
+        )
         with closing(self._connect()) as base:
             while skip <= _MOST_SKIPS:
                 try:
-                    for number, topic, stamp, data in base.execute(query, (*sorted(wanted), last)):
+                    begun = last
+                    for number, topic, stamp, data in base.execute(query, (*sorted(wanted), last, limit)):
                         last, skip = number, 0
                         if self._cut_page and isinstance(data, bytes) and self._reaches_beyond(data):
                             yield Reject("the file ends inside this message")
@@ -54,8 +58,14 @@ class SqliteFile(Container):
                             yield Raw(topic, -1, stamp, data)
                         else:
                             yield Reject("the row is no message")
-                    return
+                    if limit < 0 or last == begun:
+                        return
+                    limit = -1
                 except sqlite3.Error as error:
+                    if limit < 0:  # Python's sqlite3 seeks the next row before it gives one: ask for that one alone
+                        limit = 1
+                        continue
+                    limit = -1
                     if not skip:
                         yield Reject(f"the database is damaged after message {last}: {error}")
                     last, skip = last + (1 << skip), skip + 1

@@ -14,6 +14,7 @@ from tests.formats.log_reading import Log, read_log
 
 FLAGS_AT = 6 + 21
 VALID_AT = 6 + 11
+FLAGS3_AT = 6 + 78
 
 
 @pytest.fixture
@@ -80,6 +81,7 @@ def test_damaged_and_undated_solutions_are_rejected(tmp_path: Path, recording: b
     for content, reason in (
         (changed(recording, 40, 7, checksum=False), "checksum"),
         (changed(recording, VALID_AT, 0b001), "date and time"),
+        (changed(recording, FLAGS3_AT, 1), "invalidLlh"),
     ):
         log = read(tmp_path, content)
         assert len(log.epochs) == 1

@@ -103,3 +103,18 @@ def test_frames_are_found_across_blocks(
     for size in (1, 99, 100, 101, 517):
         monkeypatch.setattr("roadscan.formats.motion.ubx._BLOCK_BYTES", size)
         assert read(tmp_path, recording).table.equals(whole.table)
+
+
+@pytest.mark.parametrize(
+    ("sentence", "name"),
+    [
+        (b"$GNGGA,,,,,,0,00,99.99,,,,,,*56\r\n", "ubx"),  # a receiver that writes NMEA without a fix
+        (b"$GPGGA,092750.000,5321.6802,N,00630.3372,W,1,8,1.03,61.7,M,55.2,M,,*76\r\n", "nmea"),
+    ],
+)
+def test_sentences_without_a_position_leave_the_log_to_ubx(tmp_path: Path, sentence: bytes, name: str) -> None:
+    frames = sample()
+    size = SOLUTION.itemsize
+    path = tmp_path / "mixed.ubx"
+    path.write_bytes(b"".join(frames[k : k + size] + sentence for k in range(0, len(frames), size)))
+    assert format_of(path).name == name

@@ -55,8 +55,8 @@ class Ubx(LogFormat):
 
     NAV-PVT gives UTC, position with its ellipsoidal height, velocity, σ of both, kind of the solution and satellites.
     Other messages are passed over, and so is NMEA: NAV-PVT states the same with more decimals. Raw measurements
-    (RXM-RAWX) are named: `roadscan ppk` computes positions of them. A log whose beginning
-    holds sentences of NMEA that can be used is read as `nmea` unless format = "ubx" is stated. A record is a NAV-PVT.
+    (RXM-RAWX) are named: `roadscan ppk` computes positions of them. A log whose beginning holds sentences of NMEA
+    that state positions is read as `nmea` unless format = "ubx" is stated. A record is a NAV-PVT.
     σ of the plane is divided between north and east. The datum is the receiver's or its corrections': state it as crs.
     """
 

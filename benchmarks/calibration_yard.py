@@ -236,7 +236,7 @@ def _some_packets(scene: Scene, world: World, drive: Drive) -> Iterator[lidar.Pa
         numbers = block * lidar.BLOCK_PACKETS + np.arange(lidar.BLOCK_PACKETS)
         epochs = lidar.starts_gps_ns(drive) + numbers * HDL32E.block_ns
         key = ray_key(scene, drive, "lidar") + int(numbers[0]) * HDL32E.figures.cycles * HDL32E.lasers
-        yield lidar._measure_block(scene, world, drive, epochs, lidar._azimuths(scene, 0.0, numbers), key, block)
+        yield lidar._measure_block(scene, world, drive, epochs, lidar._aim(scene, 0.0, numbers), key, block)
 
 
 def _local_frame(scene: Scene, surface: Surface, earth: Earth) -> tuple[Float64, Rotation]:

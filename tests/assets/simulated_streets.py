@@ -112,9 +112,9 @@ def _seen(
         stations = drive.station_m(epochs[[0, -1]])
         if max(stations) < span_m[0] or min(stations) > span_m[1]:
             continue
-        azimuths = lidar._azimuths(scene, start_deg, numbers)
+        aims = lidar._aim(scene, start_deg, numbers)
         found = lidar._measure_block(
-            scene, world, drive, epochs, azimuths, key + packet * HDL32E.figures.cycles * HDL32E.lasers, block
+            scene, world, drive, epochs, aims, key + packet * HDL32E.figures.cycles * HDL32E.lasers, block
         )
         parts.append(_columns(scene, drive, found, window, corner))
     return {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}

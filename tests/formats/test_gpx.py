@@ -79,3 +79,26 @@ def test_nothing_is_guessed(tmp_path: Path) -> None:
         read(tmp_path, track(), height="orthometric")
     with pytest.raises(TimeSystemError, match="UTC"):
         read(tmp_path, track(), clock=Clock(TimeSystem.GPS))
+
+
+def test_points_in_comments_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = read(tmp_path, track())
+    lines = track().splitlines()
+    away = lines[4].replace("45.27", "49.27")
+    for start, end in (("<!-- ", " -->"), ("<desc><![CDATA[", "]]></desc>")):
+        text = "\n".join([*lines[:2], f"{start}{away}\n{away}{end}", *lines[2:5], f"{start}{away}{end}", *lines[5:]])
+        for size in (7, 60, 1 << 20):
+            monkeypatch.setattr("roadscan.ingest.reading.text_table.BLOCK_BYTES", size)
+            log = read(tmp_path, text)
+            assert log.table.equals(plain.table) and not log.rejects
+    log = read(tmp_path, "\n".join([*lines[:6], "<!--", *lines[6:]]))
+    assert (log.table.num_rows, log.rejects[0].reason) == (4, "the file ends inside a comment or CDATA section")
+
+
+def test_names_with_a_prefix(tmp_path: Path) -> None:
+    """Only elements of GPX's own namespace count: an extension may have a time of its own."""
+    text = track().replace("xmlns=", "xmlns:g=").replace("<ele>", "<e:time>1999-01-01T00:00:00Z</e:time><ele>")
+    for name in ("gpx", "trk", "trkseg", "trkpt", "ele", "time", "fix", "sat"):
+        text = text.replace(f"<{name} ", f"<g:{name} ").replace(f"<{name}>", f"<g:{name}>")
+        text = text.replace(f"</{name}>", f"</g:{name}>")
+    assert read(tmp_path, text).table.equals(read(tmp_path, track()).table)

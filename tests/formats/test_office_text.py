@@ -127,6 +127,24 @@ def test_inertial_explorer_by_date(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_years_of_two_digits(tmp_path: Path) -> None:
+    """GPS time began in 1980: 26 is 2026. Where the order is not stated, 05/04/26 may be three dates, and is none."""
+    names = "Date,GPSTime,Latitude,Longitude,H-Ell,Roll,Pitch,Heading\n"
+    pose = "{date},122418.000,48.0,11.0,500.0,0.1,0.2,90.0\n"
+    for unit, dates, sound in (
+        ("(MDY)", ("05/04/2026", "05/04/26", "05/04/0026", "05/04/6"), 2),
+        ("(YMD)", ("2026/05/04", "26/05/04", "026/05/04"), 2),
+        ("", ("2026/05/04", "26/05/04", "05/04/26"), 1),
+    ):
+        units = f"{unit},(sec),(deg),(deg),(m),(deg),(deg),(deg)\n"
+        lines = "".join(pose.format(date=date) for date in dates)
+        log = read(
+            tmp_path, "inertial_explorer", "Program:     Inertial Explorer Version 8.90\n\n" + names + units + lines
+        )
+        assert log.epochs.tolist() == [2417 * WEEK_NS + 122_418 * S] * sound  # 4 May 2026 is the Monday of week 2417
+        assert {one.reason for one in log.rejects} == {"the date is none"}
+
+
 def test_pospac_by_degrees_and_by_grid(tmp_path: Path) -> None:
     clock = Clock(TimeSystem.GPS_WEEK, week=2013)
     log = read(tmp_path, "pospac_text", pospac(), clock=clock)

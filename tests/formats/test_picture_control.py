@@ -60,6 +60,28 @@ def test_gcp_list(tmp_path: Path) -> None:
     assert places(log)["gcp_1"] == pytest.approx((*place, 5.1), abs=1e-4)
 
 
+def test_heights_of_a_gcp_list_in_feet(tmp_path: Path) -> None:
+    """EPSG:2263 counts in US survey feet (1200/3937 m); nothing in the file says the unit of z."""
+    path = tmp_path / "gcp_list.txt"
+    path.write_text("EPSG:2263\n987654.32 201234.56 33.5 100 200 a.jpg P1\n")
+    stated: dict[str, Any] = {"map": MapFrame(crs="EPSG:26918"), "height": "ellipsoidal"}
+    with pytest.raises(ConfigError, match="unit of heights") as error:
+        read_log("odm_gcp", path, {"role": "gcp"}, **stated)
+    assert next(iter(error.value.asks_for("options.height_unit"))).choices == ("m", "ft", "ft_us")
+    for unit, height_m in (("m", 33.5), ("ft", 33.5 * 0.3048), ("ft_us", 33.5 * 1200 / 3937)):
+        log = read_log("odm_gcp", path, {"role": "gcp", "height_unit": unit}, **stated)
+        assert places(log)["P1"][2] == pytest.approx(height_m, abs=1e-4)
+
+
+def test_a_height_of_nan_costs_its_point(tmp_path: Path) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text("WGS84 UTM 32N\n691000.1 5319000.2 NaN 100 200 a.jpg P1\n691010.1 5319000.2 500.0 1 2 a.jpg P2\n")
+    assert format_of(path).name == "odm_gcp"
+    log = read_log("odm_gcp", path, {"role": "gcp"}, **UTM32)
+    assert list(places(log)) == ["P2"]
+    assert [(r.record, r.reason) for r in log.rejects] == [(0, "the height of the point is not stated (NaN)")]
+
+
 def test_the_control_of_berlin(recordings: Path) -> None:
     path = recordings / "pictures" / "berlin" / "ground_control_points.json"
     assert format_of(path).name == "opensfm_gcp"

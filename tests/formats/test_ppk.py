@@ -289,6 +289,14 @@ def test_antenna_heights_that_are_not_stated(driven: Path, tmp_path: Path) -> No
     assert np.abs(off_enu_m(log)).max() < 0.06
 
 
+@pytest.mark.witness("ppk_antenna_height")
+def test_heights_of_zero_in_the_files_are_named_as_perhaps_unknown(driven: Path) -> None:
+    log = read_log("ppk", driven / "rover.obs", sample_options(antenna_height_m=1.5) | {"antenna_height_m": 1.2})
+    base, rover = (one.text for one in log.findings if one.text.startswith("The height of the"))
+    assert "base's antenna is stated as 1.5000 m, its file says 0.0000 m" in base and "do not know it" in base
+    assert "rover's antenna is stated as 1.2000 m" in rover
+
+
 # --- what is never guessed -------------------------------------------------------------------------
 
 

@@ -470,6 +470,40 @@ def test_points_of_livox(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.diff(rows.epochs[:300]), 1_000)
 
 
+@pytest.mark.witness("livox_timebase")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("timebase", "header_late_ns", "late_ns", "says"),
+    [
+        (T0, lambda k: 0, 0, ""),
+        (T0, lambda k: 100_000_000, 0, "+0.100000 s to +0.100000 s from the timebase"),  # stamped when it was sent
+        (7 * NS, lambda k: 0, 0, ""),  # since power-on
+        (7 * NS, lambda k: 3_000_000 * k, 3_000_000, "the header counts"),  # since power-on, and sent late
+        (0, lambda k: 3_000_000 * k, 3_000_000, ""),  # not stated
+    ],
+)
+def test_points_of_livox_count_from_the_timebase(
+    kind: str, timebase: int, header_late_ns: Any, late_ns: int, says: str, tmp_path: Path
+) -> None:
+    """A message's first point is measured at T0 and 0.1 s later; `late_ns` is how late the second message is read."""
+    point = {"x": 9.0, "y": 1.0, "z": 0.0, "reflectivity": 9, "tag": 16, "line": 0}
+    points = [point | {"offset_time": 1_000 * i} for i in range(3)]
+    messages = []
+    for k in range(2):
+        own = k * 100_000_000
+        stamps = {
+            "header": header(T0 + own + header_late_ns(k), "livox"),
+            "timebase": timebase + own if timebase else 0,
+        }
+        messages.append((T0 + own + 110_000_000, stamps | {"point_num": 3, "points": points}))
+    bag = write_bag(tmp_path / "bag", kind, {"/livox": ("livox_ros_driver2/msg/CustomMsg", messages)})
+    log = read("ros_livox", bag, clock=UTC, sensor=LIDAR)
+    expected = np.array([0, 1_000, 2_000, *(100_000_000 + late_ns + np.array([0, 1_000, 2_000]))])
+    first_ns = T0 - 315_964_800 * NS + 18 * NS  # GPS time runs 18 s ahead of UTC
+    np.testing.assert_array_equal(log.epochs - first_ns, expected)
+    assert [says in one.text for one in log.findings] == ([True] if says else [])
+
+
 # --- IMU, GNSS and sentences ------------------------------------------------------------------------
 
 

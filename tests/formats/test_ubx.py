@@ -14,6 +14,7 @@ from tests.formats.log_reading import Log, read_log
 
 FLAGS_AT = 6 + 21
 VALID_AT = 6 + 11
+FLAGS3_AT = 6 + 78
 
 
 @pytest.fixture
@@ -80,6 +81,7 @@ def test_damaged_and_undated_solutions_are_rejected(tmp_path: Path, recording: b
     for content, reason in (
         (changed(recording, 40, 7, checksum=False), "checksum"),
         (changed(recording, VALID_AT, 0b001), "date and time"),
+        (changed(recording, FLAGS3_AT, 1), "invalidLlh"),
     ):
         log = read(tmp_path, content)
         assert len(log.epochs) == 1
@@ -101,3 +103,18 @@ def test_frames_are_found_across_blocks(
     for size in (1, 99, 100, 101, 517):
         monkeypatch.setattr("roadscan.formats.motion.ubx._BLOCK_BYTES", size)
         assert read(tmp_path, recording).table.equals(whole.table)
+
+
+@pytest.mark.parametrize(
+    ("sentence", "name"),
+    [
+        (b"$GNGGA,,,,,,0,00,99.99,,,,,,*56\r\n", "ubx"),  # a receiver that writes NMEA without a fix
+        (b"$GPGGA,092750.000,5321.6802,N,00630.3372,W,1,8,1.03,61.7,M,55.2,M,,*76\r\n", "nmea"),
+    ],
+)
+def test_sentences_without_a_position_leave_the_log_to_ubx(tmp_path: Path, sentence: bytes, name: str) -> None:
+    frames = sample()
+    size = SOLUTION.itemsize
+    path = tmp_path / "mixed.ubx"
+    path.write_bytes(b"".join(frames[k : k + size] + sentence for k in range(0, len(frames), size)))
+    assert format_of(path).name == name

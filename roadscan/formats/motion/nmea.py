@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,6 +61,8 @@ _EPOCH_DAY: Final = dt.date(1970, 1, 1)  # origin of day counts
 _UNKNOWN: Final = np.iinfo(np.int64).min
 
 
+_UBX_SOLUTION: Final = b"\xb5\x62\x01\x07\x5c\x00"  # how a NAV-PVT of UBX begins
+_PLACED: Final = re.compile(rb"GGA,[^,\r\n]*,\d")  # a GGA with a latitude
 _BAGS: Final = (b"#ROS", b"\x89MCA", b"SQLi")  # first bytes of ROS bags
 
 
@@ -104,7 +107,10 @@ class Nmea(LogFormat):
     options = NmeaOptions
 
     def sniff(self, path: Path) -> bool:
-        """True if the first sentences are known, with right checksums for the most part; several in binary data."""
+        """True if the first sentences are known, with right checksums for the most part; several in binary data.
+
+        Where they state no position, and solutions of UBX stand between them, the log is one of UBX.
+        """
         head = head_of(path, SNIFF_BYTES) if path.is_file() else b""
         if b"$" not in head or head[:4] in {*MAGICS, PCAPNG, *_BAGS}:  # they may hold the sentences of a receiver
             return False
@@ -113,6 +119,8 @@ class Nmea(LogFormat):
         known = int((kinds_of(whole, found.starts, found.ends) >= 0).sum())
         if b"\x00" not in head and known and found.starts.size >= len(found.faulty):
             return True
+        if _UBX_SOLUTION in head and not _PLACED.search(head):
+            return False
         damaged = sum(is_address(whole, dollar) for dollar, _ in found.faulty)
         return known >= MIXED_SENTENCES and found.starts.size >= damaged
 

@@ -163,11 +163,13 @@ def antenna_findings(settings: PpkSettings, rover: RinexHeader, base: RinexHeade
         )
     for name, used, header in (("base", stated, base), ("rover", settings.antenna_height_m, rover)):
         said = header.antenna_height_m
-        if used is not None and said and abs(used - said) > _HEIGHT_OFF_M:
-            yield ANTENNA_HEIGHT.finds(
-                "", f"The height of the {name}'s antenna is stated as {used:.4f} m, its file says {said:.4f} m. "
-                "The stated one is used.",
-            )  # fmt: skip
+        if used is None or said is None or abs(used - said) <= _HEIGHT_OFF_M:
+            continue
+        unsure = "" if said else " Many programs write zero where they do not know it: look at the record of the site."
+        yield ANTENNA_HEIGHT.finds(
+            "", f"The height of the {name}'s antenna is stated as {used:.4f} m, its file says {said:.4f} m. "
+            f"The stated one is used.{unsure}",
+        )  # fmt: skip
 
 
 def _said(header: RinexHeader) -> str:

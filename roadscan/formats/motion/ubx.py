@@ -30,13 +30,14 @@ SOLUTION: Final = np.dtype(
         ("flags", "u1"), ("flags2", "u1"), ("satellites", "u1"), ("longitude", "<i4"), ("latitude", "<i4"),
         ("height_mm", "<i4"), ("above_sea_mm", "<i4"), ("sigma_horizontal_mm", "<u4"), ("sigma_vertical_mm", "<u4"),
         ("velocity_mm_per_s", "<i4", 3), ("speed_mm_per_s", "<i4"), ("course", "<i4"), ("sigma_speed_mm_per_s", "<u4"),
-        ("rest", "V20"), ("checksum", "u1", 2),
+        ("sigma_course", "<u4"), ("pdop", "<u2"), ("flags3", "<u2"), ("rest", "V12"), ("checksum", "u1", 2),
     ]
 )  # fmt: skip
 """NAV-PVT in u-blox's interface description (UBX-18010854, 5.14.19), with the checksum of its frame."""
 _DATED: Final = 0b011
 """Bits of `valid`: date and time of day are known."""
 _FIXED_OK: Final = 1  # bit of `flags`: the fix is valid
+_INVALID_PLACE: Final = 1  # bit of `flags3` (invalidLlh): longitude, latitude and height are not valid
 _FIX_KINDS: Final = {1: "dead_reckoning", 2: "none", 3: "single", 4: "single", 0: "none", 5: "none"}
 """Quality by `fix`: a 2D fix has no height, and a time-only fix no position."""
 _CARRIER: Final = {1: "float", 2: "fixed"}  # quality by the carrier solution in `flags`
@@ -54,13 +55,14 @@ class Ubx(LogFormat):
 
     NAV-PVT gives UTC, position with its ellipsoidal height, velocity, σ of both, kind of the solution and satellites.
     Other messages are passed over, and so is NMEA: NAV-PVT states the same with more decimals. Raw measurements
-    (RXM-RAWX) are named: `roadscan ppk` computes positions of them. A log whose beginning
-    holds sentences of NMEA that can be used is read as `nmea` unless format = "ubx" is stated. A record is a NAV-PVT.
+    (RXM-RAWX) are named: `roadscan ppk` computes positions of them. A log whose beginning holds sentences of NMEA
+    that state positions is read as `nmea` unless format = "ubx" is stated. A record is a NAV-PVT.
     σ of the plane is divided between north and east. The datum is the receiver's or its corrections': state it as crs.
     """
 
     name = "ubx"
     title = "u-blox recording (UBX): navigation solutions of NAV-PVT"
+    version = 2
     yields = ("gnss",)
     time = "UTC by its nature, with its date"
 
@@ -85,7 +87,7 @@ class Ubx(LogFormat):
         return LogHeader(attributes)
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
-        """Stream solutions; a damaged one, and one without date and time, is rejected."""
+        """Stream solutions; one that is damaged, has no date and time or an invalid position is rejected."""
         reader, epochs = GnssReader(source, _placement(source)), EpochReader(_clock(source), source.path)
         number = 0
         for offsets, frames in _blocks(source.path):
@@ -94,9 +96,12 @@ class Ubx(LogFormat):
             sieve = Sieve(frames.size)
             sieve.drop(~_sound(frames), "the checksum of the NAV-PVT is wrong")
             sieve.drop((frames["valid"] & _DATED) != _DATED, "the receiver did not know date and time yet")
+            quality = _quality(frames)
+            is_void = (quality != NO_POSITION) & ((frames["flags3"] & _INVALID_PLACE) > 0)
+            sieve.drop(is_void, "the receiver says that its position is not valid (flags3, invalidLlh)")
             unix_ns = _unix_ns(frames, sieve)
             raw = RawSolutions(
-                records, offsets, epochs.epochs(unix_ns, sieve, records), _position(frames), _quality(frames),
+                records, offsets, epochs.epochs(unix_ns, sieve, records), _position(frames), quality,
                 _columns(frames),
             )  # fmt: skip
             yield from reader.items(raw, sieve)

@@ -80,6 +80,7 @@ _DIMENSIONS: Final = (
 _WEEKDAYS_FROM: Final = np.datetime64("1980-01-06", "D")
 """The day of GPS week 0 that is a Sunday, where seconds of the week begin."""
 _DAY_S: Final = 86_400  # seconds in a day
+_GPS_SINCE: Final = 1980  # first year of GPS time
 _WIDEST: Final = 512
 """More columns than this are none."""
 
@@ -359,17 +360,28 @@ def _ns(seconds: Float64, sieve: Sieve) -> Int64:
 def _iso_dates(block: TextBlock, column: _Column) -> list[str]:
     """Return dates as ISO 8601, "" where one is none; their order is that of the unit (MDY, DMY), else year first."""
     order = "".join(letter for letter in "".join(dict.fromkeys(column.unit.upper())) if letter in "YMD")
-    order = order if sorted(order) == ["D", "M", "Y"] else "YMD"
+    is_stated = sorted(order) == ["D", "M", "Y"]
     words = block.text(column.words[0])
-    known = {word: _iso_date(word, order) for word in set(words)}
+    known = {word: _iso_date(word, order if is_stated else "YMD", is_stated=is_stated) for word in set(words)}
     return [known[word] for word in words]
 
 
-def _iso_date(word: str, order: str) -> str:
+def _iso_date(word: str, order: str, *, is_stated: bool) -> str:
+    """Return a date as ISO 8601, "" for none. A year has four digits, or two where the order is stated.
+
+    GPS time begins in 1980, so that two digits stand for one year of 1980 to 2079.
+    """
     parts = re.split(r"[/.-]", word)
     if len(parts) != 3 or not all(part.isascii() and part.isdigit() and len(part) <= 4 for part in parts):
         return ""
     year, month, day = (int(parts[order.index(letter)]) for letter in "YMD")
+    digits = len(parts[order.index("Y")])
+    if digits == 2 and is_stated:
+        year += 2000 if year < _GPS_SINCE % 100 else 1900
+    elif digits != 4:
+        return ""
+    if year < _GPS_SINCE:
+        return ""
     try:
         return dt.date(year, month, day).isoformat()
     except ValueError:

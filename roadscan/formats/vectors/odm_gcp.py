@@ -6,28 +6,35 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 import pyproj
 from pyproj.exceptions import CRSError as ProjCrsError
 
-from roadscan.core.errors import CrsError, FormatError, Missing
+from roadscan.core.crs import crs_from_text
+from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.formats.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
+from roadscan.ingest.reading.columns import UNITS
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.records import options_of
 from roadscan.ingest.reading.text_table import head_of, is_number, line_blocks
 
 _UTM: Final = re.compile(r"WGS84 UTM (\d{1,2})([NS])", re.IGNORECASE)
 _FEWEST: Final = 6  # words of a line: easting, northing, height, x and y in the picture, and the picture
+_NO_NUMBER: Final = "nan"  # a height that is not stated, in lower case
 
 
 class OdmGcpOptions(Strict):
     """Settings of `odm_gcp`."""
 
+    later: ClassVar[frozenset[str]] = frozenset({"height_unit"})
+
     role: Role | None = None
     """Role of all points: "gcp" or "check". Has to be stated."""
+    height_unit: Literal["m", "ft", "ft_us"] | None = None
+    """Unit of heights (ft_us: US survey foot). Has to be stated where eastings are in feet; else it is the metre."""
 
 
 class OdmGcp(LogFormat):
@@ -35,11 +42,13 @@ class OdmGcp(LogFormat):
 
     The CRS is an EPSG code, a PROJ string or ``WGS84 UTM 32N``, as OpenDroneMap has it; x is easting or longitude. A
     point without a name is called by its number among the points of other coordinates. Its places in pictures are not
-    read. The file does not say whether heights are ellipsoidal: state it.
+    read. A point whose height is NaN is rejected. The file does not say whether heights are ellipsoidal, nor their unit
+    where the CRS counts in feet: state both.
     """
 
     name = "odm_gcp"
     title = "OpenDroneMap ground control (gcp_list.txt): a CRS, then a line for each picture of a point"
+    version = 2
     yields = ("control_points",)
     time = "holds no time"
     options = OdmGcpOptions
@@ -55,12 +64,13 @@ class OdmGcp(LogFormat):
     def header(self, source: LogSource) -> LogHeader:
         """Check CRS, heights and roles."""
         frame = _frame(source)
+        _height_unit_m(source, frame)
         return LogHeader({"crs": frame.crs, "height": frame.height})
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream points; a line that is none is rejected."""
         frame, role = _frame(source), options_of(source, OdmGcpOptions).role
-        reader = ControlReader(frame)
+        reader, unit_m = ControlReader(frame), _height_unit_m(source, frame)
         known: dict[tuple[float, ...], str] = {}
         points: dict[str, tuple[int, int, tuple[float, ...]]] = {}
         for record, line in enumerate(_lines(source.path)):
@@ -68,6 +78,9 @@ class OdmGcp(LogFormat):
                 yield replace(line, record=record)
                 continue
             offset, words = line
+            if words[2:3] and words[2].lower() == _NO_NUMBER and _is_row(words):
+                yield Reject("the height of the point is not stated (NaN)", record, offset)
+                continue
             if not _is_row(words):
                 yield Reject("the line is not x, y, z, column, row and picture of a point", record, offset)
                 continue
@@ -77,7 +90,7 @@ class OdmGcp(LogFormat):
             if points.setdefault(name, (record, offset, place))[2] != place:
                 yield Reject("a point of this name has other coordinates above", record, offset)
         if points:
-            yield from reader.items(_raw(points, frame, role or ""))
+            yield from reader.items(_raw(points, (frame.horizontal_scale, frame.horizontal_scale, unit_m), role or ""))
         yield from reader.findings()
 
 
@@ -96,7 +109,10 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]] | Reject]:
             is_first = is_first and not words
 
 
-def _raw(points: Mapping[str, tuple[int, int, tuple[float, ...]]], frame: ControlFrame, role: str) -> RawControl:
+def _raw(
+    points: Mapping[str, tuple[int, int, tuple[float, ...]]], units: tuple[float, float, float], role: str
+) -> RawControl:
+    """Return the points; units : sizes of those of x, y, z (degrees or metres)."""
     records, offsets, places = zip(*points.values(), strict=True)
     missing = np.full(len(points), np.nan)
     return RawControl(
@@ -105,14 +121,16 @@ def _raw(points: Mapping[str, tuple[int, int, tuple[float, ...]]], frame: Contro
         names=list(points),
         roles=[role] * len(points),
         codes=[None] * len(points),
-        coordinates=np.array(places).T * np.array([[frame.horizontal_scale], [frame.horizontal_scale], [1.0]]),
+        coordinates=np.array(places).T * np.array(units)[:, None],
         sigma_horizontal_m=missing,
         sigma_height_m=missing,
     )
 
 
 def _is_row(words: Sequence[str]) -> bool:
-    return len(words) >= _FEWEST and all(is_number(word) for word in words[:5]) and not is_number(words[5])
+    """Return whether the words are those of a point; its height may be NaN."""
+    numbers = [word for k, word in enumerate(words[:5]) if k != 2 or word.lower() != _NO_NUMBER]
+    return len(words) >= _FEWEST and all(map(is_number, numbers)) and not is_number(words[5])
 
 
 def _crs(text: str) -> str | None:
@@ -127,6 +145,35 @@ def _crs(text: str) -> str | None:
     except ProjCrsError:
         return None
     return text
+
+
+def _height_unit_m(source: LogSource, frame: ControlFrame) -> float:
+    """Return the size of the heights' unit (m): the CRS's, the stated one, or the metre where eastings are in metres.
+
+    Raises
+    ------
+    ConfigError
+        where nothing says it, or two say different ones.
+    """
+    stated, axes = options_of(source, OdmGcpOptions).height_unit, crs_from_text(frame.crs).axis_info
+    unit_m = None if stated is None else UNITS["length"][stated]
+    if len(axes) == 3:
+        own_m = float(axes[2].unit_conversion_factor)
+        if unit_m not in (None, own_m):
+            raise ConfigError(
+                f"options.height_unit = \"{stated}\", and the CRS '{frame.crs}' says another unit of heights",
+                expected="one unit",
+                change="leave options.height_unit out",
+                file=source.path,
+            )
+        return own_m
+    if unit_m is None and frame.kind == "projected" and frame.horizontal_scale != 1.0:
+        raise ConfigError(
+            f"the CRS '{frame.crs}' counts in {axes[0].unit_name}, and nothing says the unit of heights",
+            file=source.path,
+            missing=Missing("options.height_unit", choices=("m", "ft", "ft_us")),
+        )
+    return 1.0 if unit_m is None else unit_m
 
 
 def _frame(source: LogSource) -> ControlFrame:

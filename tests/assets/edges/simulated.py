@@ -48,10 +48,8 @@ def town_street(length_m: float = 30.0, every: int = 1, seed: int = 3302) -> Sim
         count = int((drive.duration_s + 1.0) * 1e9) // HDL32E.block_ns // lidar.BLOCK_PACKETS
         for number in range(0, count, every):
             packets = number * lidar.BLOCK_PACKETS + np.arange(lidar.BLOCK_PACKETS)
-            azimuths = lidar._azimuths(scene, 0.0, packets)
-            block = lidar._measure_block(
-                scene, world, drive, start + packets * HDL32E.block_ns, azimuths, number, number
-            )
+            aims = lidar._aim(scene, 0.0, packets)
+            block = lidar._measure_block(scene, world, drive, start + packets * HDL32E.block_ns, aims, number, number)
             epoch = block.firing_gps_ns().reshape(len(packets), -1)
             position, _ = drive.poses(block.epoch_gps_ns).sensor(scene.lidar.mount, lidar.BODY_FROM_AXES)
             sensor = drive.earth.map_from_ecef(position) - corner

@@ -25,7 +25,7 @@ import pyarrow as pa
 
 from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.toml_text import toml
-from roadscan.formats.lidars.returns_batch import returns_batch
+from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS, returns_batch
 from roadscan.ingest.reading.arrow_batches import unlisted_batches, unlisted_reason
 from roadscan.ingest.reading.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve
@@ -35,7 +35,6 @@ _CHUNK_RETURNS: Final = 1 << 18  # returns of a chunk
 _FARTHEST_M: Final = 10_000.0  # farther positions count as damage
 _LONGEST_OFFSET_NS: Final = 1_000_000_000  # larger offsets count as damage
 _SWEEP: Final = re.compile(r"^\d{10,19}\.feather$")
-_EIGHT_TO_SIXTEEN_BITS: Final = 257  # scales 255 to 65,535
 _CLOCK: Final = {"system": "unix_gps", "unit": "ns"}
 _UNREADABLE: Final = (pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError, MemoryError)
 """Errors that Arrow raises on damaged bytes."""
@@ -188,7 +187,7 @@ def _chunk(batch: pa.RecordBatch, stamp_gps_ns: int, number: int, name: str, fir
     rows = returns_batch(
         stamp_gps_ns + offset,
         list(xyz[:, good]),
-        intensity[good].astype(np.uint16) * np.uint16(_EIGHT_TO_SIXTEEN_BITS),
+        intensity[good].astype(np.uint16) * EIGHT_TO_SIXTEEN_BITS,
         laser[good].astype(np.uint8),
         np.full(offset.size, number, dtype=np.int32),
         np.full(offset.size, stamp_gps_ns, dtype=np.int64),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 from roadscan.core.errors import Missing, TimeSystemError
@@ -22,6 +23,18 @@ OTHER_CLOCK: Final = Witness(
     does="a log whose clock the survey file does not state is refused; the message proposes one",
     told=("error",),
 )
+
+
+TIME: Final = (
+    "date and time in UTC where GPS sets the sensor, and whatever the master sends under PTP; a log without a stated "
+    "clock is UTC where the recording computer's clock agrees"
+)
+"""`LogFormat.time` of such lidars."""
+
+
+def clock_of(source: LogSource, system: str) -> Clock:
+    """Return the clock by which rows are read, in microseconds, of the system that :func:`dated_clock` found."""
+    return replace(source.any_clock or Clock(TimeSystem.UNIX_UTC), system=TimeSystem(system), unit="us")
 
 
 def dated_clock(source: LogSource, stamp_s: float, ahead_s: float) -> Clock:

@@ -37,7 +37,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.core.errors import ConfigError
-from roadscan.formats.lidars.returns_batch import returns_batch
+from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS, returns_batch
 from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, steps, waits_ns
 
 Bool: TypeAlias = npt.NDArray[np.bool_]
@@ -52,7 +52,6 @@ RETURNS: Final = {
 }  # fmt: skip
 """Returns of a firing by the return mode's byte; each is in a block of its own."""
 
-_EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)  # scales 255 to 65,535
 _FASTEST_HZ: Final = 30.0  # fastest turn that is accepted
 _SLACK_CENTIDEG: Final = 10  # tolerance of azimuth steps (0.01°)
 _LATEST_US: Final = 1_000_000  # microseconds of a second
@@ -504,7 +503,7 @@ def decode(
     return returns_batch(
         epoch,
         [one.reshape(-1)[rows] for one in (x, y, z)],
-        reflectivity.reshape(-1)[rows] * _EIGHT_TO_SIXTEEN_BITS,
+        reflectivity.reshape(-1)[rows] * EIGHT_TO_SIXTEEN_BITS,
         np.broadcast_to(np.arange(model.channels, dtype=np.uint8), distance.shape).reshape(-1)[rows],
         np.broadcast_to(sweeps[:, :, None], distance.shape).reshape(-1)[rows],
     )

@@ -30,7 +30,6 @@ an error otherwise.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -43,10 +42,9 @@ import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.core.errors import ConfigError, FormatError, Missing
-from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
-from roadscan.formats.lidars.dated_clock import dated_clock
+from roadscan.formats.lidars.dated_clock import TIME, clock_of, dated_clock
 from roadscan.formats.lidars.hesai_packets import (
     MODELS,
     RETURNS,
@@ -61,8 +59,8 @@ from roadscan.formats.lidars.hesai_packets import (
     odd_steps,
     posix_us,
 )
-from roadscan.formats.lidars.pcap import MAGICS, PCAPNG, Datagram, Wanted, batches, datagrams
-from roadscan.formats.lidars.view_gaps import TURN, Gap, gap_of, mean_rate
+from roadscan.formats.lidars.pcap import Datagram, Wanted, batches, capture_start, datagrams, need_one_sender
+from roadscan.formats.lidars.view_gaps import Gap, Turns, gap_of, mean_rate
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 
@@ -74,7 +72,6 @@ Source: TypeAlias = Callable[[int | None, str | None], Iterator[Datagram | Rejec
 _CHUNK_SLOTS: Final = 240_000  # slots that are decoded at once
 _FIRST_LOOK: Final = 5_000  # packets of the first look: some turns
 _NO_PORT: Final = -1  # a port that no packet is sent to
-_SNIFFED: Final = 1 << 20  # bytes of a file's start that are searched
 _LARGEST_LOSS: Final = 1_000_000  # larger gaps in the packets' numbers mean that the sensor started anew
 _RECENT_PACKETS: Final = 64  # packets within which a copy from a mirrored port arrives
 
@@ -125,22 +122,12 @@ class HesaiPcap(LogFormat):
     suffixes: ClassVar[tuple[str, ...]] = (".pcap", ".pcapng")
     axes_on_sensor: ClassVar[str] = "x points along azimuth 0° (the maker's y), y along azimuth 270°, z out of the top"
     usual_axes: ClassVar[Mapping[str, str]] = {"flu": "it stands upright and azimuth 0° lies ahead"}
-    time: ClassVar[str] = (
-        "date and time in UTC where GPS sets the sensor, and whatever the master sends under PTP; a log without a "
-        "stated clock is UTC where the recording computer's clock agrees"
-    )
+    time = TIME
     options: ClassVar[type[Strict]] = HesaiOptions
 
     def sniff(self, path: Path) -> bool:
         """True for a capture (PCAP or PCAPNG) that begins with a Hesai data packet."""
-        try:
-            if not path.is_file():
-                return False
-            with path.open("rb") as stream:
-                start = stream.read(_SNIFFED)
-        except OSError:
-            return False
-        return start[:4] in {*MAGICS, PCAPNG} and _has_data_packet(start)
+        return _has_data_packet(capture_start(path))
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
         """Return the angle file, where one is stated."""
@@ -182,10 +169,7 @@ class HesaiPcap(LogFormat):
         geometry = Geometry(
             model, _angles(source, options, model), layout.unit_mm, options.azimuth == "firing", options.optical_centre
         )
-        clock = dataclasses.replace(
-            source.any_clock or Clock(TimeSystem.UNIX_UTC), system=TimeSystem(at["clock"]), unit="us"
-        )
-        epochs = EpochReader(clock, source.path)
+        epochs = EpochReader(clock_of(source, at["clock"]), source.path)
         decoder = _Decoder(layout, geometry, epochs, known.first, known.checksum, known.gap)
         chunk = max(1, _CHUNK_SLOTS // (layout.blocks * model.channels))
         for packets in batches(self.packets(source)(layout.packet.itemsize, at["sender"]), chunk):
@@ -206,8 +190,7 @@ class _Decoder:
     """Rule of the checksum; '' where packets have none, or none that is known."""
     gap: Gap | None
     """Gap of the sensor's view."""
-    _sweep: int = 0
-    _azimuth: int = -1
+    _turns: Turns = field(default_factory=Turns)
     _rate: float = 0.0
     _sequence: int | None = None
     _recent: set[bytes] = field(default_factory=set)
@@ -233,7 +216,7 @@ class _Decoder:
             raw, epochs, numbers = raw[order], epochs[order], numbers[order]
         self._count_lost(raw)
         azimuth = raw["block"]["azimuth"]
-        sweeps = self._sweeps(azimuth)
+        sweeps = self._turns.of(azimuth)
         self._rate = mean_rate(azimuth, epochs) or self._rate
         returns = np.array([RETURNS.get(mode, 0) for mode in range(256)])[raw["mode"]]
         state = raw["state"] if "state" in (raw.dtype.names or ()) else np.full(raw.size, 1, dtype=np.uint8)
@@ -288,14 +271,6 @@ class _Decoder:
         gaps = np.diff(numbers, prepend=numbers[0] - 1 if self._sequence is None else self._sequence) % (1 << 32) - 1
         self._lost += int(gaps[(gaps > 0) & (gaps < _LARGEST_LOSS)].sum())
         self._sequence = int(numbers[-1])
-
-    def _sweeps(self, azimuth: npt.NDArray[np.uint16]) -> npt.NDArray[np.int32]:
-        """Return (n, blocks) sweep of each block: incremented wherever the azimuth passes 360°, either way."""
-        flat = azimuth.reshape(-1).astype(np.int32)
-        before = flat[0] if self._azimuth < 0 else self._azimuth
-        sweeps = self._sweep + np.cumsum(np.abs(np.diff(flat, prepend=before)) > TURN // 2)
-        self._sweep, self._azimuth = int(sweeps[-1]), int(flat[-1])
-        return np.asarray(sweeps.reshape(azimuth.shape), dtype=np.int32)
 
 
 @dataclass(frozen=True)
@@ -357,14 +332,8 @@ def _survey(path: Path, options: HesaiOptions, packets_of: Source) -> _Known:
             missing=Missing("options.port"),
         )
     senders = sorted({p.sender for p, _ in seen})
-    if options.sender is None and len(senders) > 1:
-        raise FormatError(
-            f"{len(senders)} sensors sent to port {options.port}: {', '.join(senders)}",
-            expected="one sensor a log",
-            change="list the capture once a sensor, each with its address as options.sender",
-            file=path,
-            missing=Missing("options.sender", choices=tuple(senders)),
-        )
+    if options.sender is None:
+        need_one_sender(senders, options.port, path)
     layout = Counter(found for _, found in seen).most_common(1)[0][0]
     alike = [p for p, found in seen if found == layout]
     raw = np.frombuffer(b"".join(p.payload for p in alike), dtype=layout.packet)

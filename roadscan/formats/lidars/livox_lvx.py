@@ -20,7 +20,7 @@ from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem
 from roadscan.core.strict import Strict
 from roadscan.core.toml_text import UNKNOWN
-from roadscan.formats.lidars.returns_batch import returns_batch
+from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS, returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
 
@@ -31,7 +31,6 @@ _MOST_FRAME_BYTES: Final = 64 << 20  # larger frames are damage: 50 ms of ten se
 _CHUNK_POINTS: Final = 1 << 17  # points of a chunk, about: 4.6 MB as rows
 _LOOKED_AT: Final = 2_000  # packages of the first look: about a second
 _SEARCH_BYTES: Final = 1 << 20  # bytes that are searched at once for the next frame
-_FULL_BYTE: Final = 257  # scales 255 to 65,535
 _FARTHEST_M: Final = 10_000.0  # farther positions count as damage
 _MOST_SPREAD_NS: Final = 20_000_000  # a package lasts 2 ms at most
 _MM, _CM, _M = 0.001, 0.01, 1.0  # units of coordinates (m)
@@ -471,7 +470,7 @@ def _rows(packages: list[_Package], epoch: npt.NDArray[np.int64], points: _Point
     batch = returns_batch(
         when[kept[0]],
         [values[kept] for values in xyz],
-        bright[kept].astype(np.uint16) * np.uint16(_FULL_BYTE),
+        bright[kept].astype(np.uint16) * EIGHT_TO_SIXTEEN_BITS,
         np.zeros(own.size, np.uint8),
         np.array([p.sweep for p in packages], dtype=np.int32)[own],
     )

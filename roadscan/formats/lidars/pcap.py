@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, TypeAlias
 
-from roadscan.core.errors import FormatError
+from roadscan.core.errors import FormatError, Missing
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.ingest.reading.format import Reject
 
@@ -55,6 +55,34 @@ class Datagram(NamedTuple):
     port: int
     """Port to which it was sent."""
     payload: bytes
+
+
+_SNIFFED: Final = 1 << 20  # bytes of a file's start that are searched
+
+
+def capture_start(path: Path) -> bytes:
+    """Return the first bytes of a capture (PCAP or PCAPNG); none of any other file."""
+    try:
+        if not path.is_file():
+            return b""
+        with path.open("rb") as stream:
+            start = stream.read(_SNIFFED)
+    except OSError:
+        return b""
+    return start if start[:4] in {*MAGICS, PCAPNG} else b""
+
+
+def need_one_sender(senders: Collection[str], port: int, file: Path) -> None:
+    """Raise FormatError where several sensors sent to a port."""
+    if len(senders) > 1:
+        names = sorted(senders)
+        raise FormatError(
+            f"{len(names)} sensors sent to port {port}: {', '.join(names)}",
+            expected="one sensor a log",
+            change="list the capture once a sensor, each with its address as options.sender",
+            file=file,
+            missing=Missing("options.sender", choices=tuple(names)),
+        )
 
 
 def batches(items: Iterable[Datagram | Reject], size: int) -> Iterator[list[Datagram] | Reject]:

@@ -32,7 +32,7 @@ from roadscan.ingest.reading.point_fields import AXES, INTENSITIES, LASERS, fiel
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
 
 _FARTHEST_M: Final = 10_000.0  # farther positions count as damage
-_MOSTLASERS: Final = 255  # greatest number of a laser
+_MOST_LASERS: Final = 255  # greatest number of a laser
 _LATEST_NS: Final = 10_000_000_000  # points measured longer before or after a sweep's stamp count as damage
 _MOST_COMMON: Final = 0.5  # share of a sweep's time that the next one may have in common
 _LOOKED_AT: Final = 2  # files whose times are compared
@@ -247,7 +247,7 @@ def _items(part: Points, plan: _Plan, stamp_ns: int, sweep: int, epochs: EpochRe
     sieve.drop(~(farthest[returned] <= _FARTHEST_M), "the position is beyond 10 km")
     with np.errstate(invalid="ignore"):
         laser = np.zeros(returned.size) if plan.laser is None else own[plan.laser].astype(np.float64)
-    sieve.drop(~((laser >= 0) & (laser <= _MOSTLASERS)), "the laser's number is outside 0 to 255")
+    sieve.drop(~((laser >= 0) & (laser <= _MOST_LASERS)), "the laser's number is outside 0 to 255")
     stamps = plan.counted(own[plan.time], stamp_ns, sieve)
     epoch = epochs.epochs(stamps, sieve, records) if sieve.good.any() else np.zeros(returned.size, np.int64)
     yield from few_rejects(list(sieve.rejects(records, offsets)))

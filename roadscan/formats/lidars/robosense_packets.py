@@ -32,7 +32,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.core.errors import ConfigError
-from roadscan.formats.lidars.returns_batch import returns_batch
+from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS, returns_batch
 from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, steps
 
 Bool: TypeAlias = npt.NDArray[np.bool_]
@@ -54,7 +54,6 @@ _LARGEST_DEG: Final = 90.0  # larger angles are damage
 _FASTEST_HZ: Final = 25.0  # fastest turn that is accepted
 _SLACK_CENTIDEG: Final = 10  # tolerance of azimuth steps (0.01°)
 _MILLION: Final = 1_000_000  # microseconds of a second
-_EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)  # scales 255 to 65,535
 _YAW_ZERO: Final = 32_768  # yaw and pitch 0 of an M1
 _BPEARL_V4: Final = b"\x03\x04"  # bytes 31 and 32 of the header of one with other figures, which is not read
 _OLD_TYPES: Final = {1: "RS-LiDAR-16", 2: "RS-LiDAR-32", 3: "Bpearl"}
@@ -291,7 +290,7 @@ def decode(
     return returns_batch(
         np.add(late_ns, epochs[:, None, None], out=late_ns).reshape(-1)[rows],
         [one.reshape(-1)[rows] for one in (x, y, z)],
-        bright.reshape(-1)[rows] * _EIGHT_TO_SIXTEEN_BITS,
+        bright.reshape(-1)[rows] * EIGHT_TO_SIXTEEN_BITS,
         np.broadcast_to(lasers, distance.shape).reshape(-1)[rows],
         np.broadcast_to(sweeps[:, :, None], distance.shape).reshape(-1)[rows],
     )
@@ -336,7 +335,7 @@ def decode_m1(raw: Raw, epochs: Int64, sweeps: Int32) -> pa.RecordBatch:
     return returns_batch(
         np.broadcast_to(epochs[:, None, None] + late_ns, shape).reshape(-1)[rows],
         [one.astype(np.float32) for one in xyz],
-        points["intensity"].reshape(-1)[rows] * _EIGHT_TO_SIXTEEN_BITS,
+        points["intensity"].reshape(-1)[rows] * EIGHT_TO_SIXTEEN_BITS,
         np.broadcast_to(np.arange(5, dtype=np.uint8), shape).reshape(-1)[rows],
         np.broadcast_to(sweeps[:, None, None], shape).reshape(-1)[rows],
     )

@@ -16,7 +16,6 @@ clock, they are UTC if the clock of the recording computer agrees within 5 s, an
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -29,10 +28,9 @@ import pyarrow as pa
 from pydantic import Field
 
 from roadscan.core.errors import ConfigError, FormatError, Missing
-from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.strict import Strict
-from roadscan.formats.lidars.dated_clock import dated_clock
-from roadscan.formats.lidars.pcap import MAGICS, PCAPNG, Datagram, Wanted, batches, datagrams
+from roadscan.formats.lidars.dated_clock import TIME, clock_of, dated_clock
+from roadscan.formats.lidars.pcap import Datagram, Wanted, batches, capture_start, datagrams, need_one_sender
 from roadscan.formats.lidars.robosense_packets import (
     DIFOP_BYTES,
     DIFOP_ID,
@@ -46,7 +44,7 @@ from roadscan.formats.lidars.robosense_packets import (
     odd_steps,
     posix_us,
 )
-from roadscan.formats.lidars.view_gaps import TURN, Gap, gap_of, mean_rate, waits_ns
+from roadscan.formats.lidars.view_gaps import Gap, Turns, gap_of, mean_rate, waits_ns
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 
@@ -58,7 +56,6 @@ Source: TypeAlias = Callable[[int, str | None], Iterator[Datagram | Reject]]
 
 _CHUNK_SLOTS: Final = 200_000  # slots that are decoded at once
 _FIRST_LOOK: Final = 5_000  # packets of the first look: some turns, and some DIFOP packets
-_SNIFFED: Final = 1 << 20  # bytes of a file's start that are searched
 _ONE_RETURN_US: Final = 80.0  # a block of an RS-LiDAR-16 lasts 111 µs, and with both returns of a firing 55.5
 _REVERSED_AT: Final = 337  # byte of a Bpearl's DIFOP packet that is not 0 where its head turns the other way
 _RESTART: Final = 300  # packets by which an M1's count falls from one frame to the next, at least
@@ -93,22 +90,12 @@ class RobosensePcap(LogFormat):
         "x points along azimuth 0°, y along azimuth 270°, z out of the top (M1: x out of the window, y left, z up)"
     )
     usual_axes: ClassVar[Mapping[str, str]] = {"flu": "it stands upright and azimuth 0° lies ahead"}
-    time: ClassVar[str] = (
-        "date and time in UTC where GPS sets the sensor, and whatever the master sends under PTP; a log without a "
-        "stated clock is UTC where the recording computer's clock agrees"
-    )
+    time = TIME
     options: ClassVar[type[Strict]] = RobosenseOptions
 
     def sniff(self, path: Path) -> bool:
         """True for a capture (PCAP or PCAPNG) that begins with a RoboSense packet."""
-        try:
-            if not path.is_file():
-                return False
-            with path.open("rb") as stream:
-                start = stream.read(_SNIFFED)
-        except OSError:
-            return False
-        return start[:4] in {*MAGICS, PCAPNG} and _has_packet(start)
+        return _has_packet(capture_start(path))
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
         """Return the angle file, where one is stated."""
@@ -139,9 +126,7 @@ class RobosensePcap(LogFormat):
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream packets, decoded some hundreds at a time."""
         known = _survey(source, options_of(source, RobosenseOptions), self.packets(source))
-        clock = source.any_clock or Clock(TimeSystem.UNIX_UTC)
-        clock = dataclasses.replace(clock, system=TimeSystem(header.attributes["clock"]), unit="us")
-        decoder = _Decoder(known, EpochReader(clock, source.path))
+        decoder = _Decoder(known, EpochReader(clock_of(source, header.attributes["clock"]), source.path))
         layout = known.model.layout
         slots = layout["block"].shape[0] * layout["block"].base["returns"].shape[0]
         for packets in batches(self.packets(source)(layout.itemsize, known.sender), max(1, _CHUNK_SLOTS // slots)):
@@ -171,9 +156,10 @@ class _Decoder:
 
     known: _Known
     epochs: EpochReader
-    _sweep: int = 0
+    _turns: Turns = field(default_factory=Turns)
+    _frame: int = 0
     _before: int = -1
-    """Last azimuth (0.01°), or last count of a packet."""
+    """Last count of a packet of an M1, whose frames are numbered by it."""
     _rate: float = 0.0
     _recent: set[bytes] = field(default_factory=set)
 
@@ -196,13 +182,13 @@ class _Decoder:
         raw, epochs, numbers = raw[sieve.kept], epochs[sieve.kept], numbers[sieve.kept]
         order = np.argsort(epochs, kind="stable")
         raw, epochs = raw[order], epochs[order]
-        batch = self._frames(raw, epochs) if self.known.angles is None else self._turns(raw, epochs, self.known.angles)
+        batch = self._frames(raw, epochs) if self.known.angles is None else self._turned(raw, epochs, self.known.angles)
         if batch.num_rows:
             yield Rows("returns", batch, first_record=int(numbers[0]))
 
-    def _turns(self, raw: npt.NDArray[np.void], epochs: Int64, angles: Angles) -> pa.RecordBatch:
+    def _turned(self, raw: npt.NDArray[np.void], epochs: Int64, angles: Angles) -> pa.RecordBatch:
         model, azimuth = self.known.model, np.ascontiguousarray(raw["block"]["azimuth"].astype(np.uint16))
-        sweeps = self._sweeps(azimuth)
+        sweeps = self._turns.of(azimuth)
         self._rate = mean_rate(azimuth, epochs) or self._rate
         odd = odd_steps(azimuth, model)
         cycle_ns = round(model.block_us * 1e3) * (1 + (model.twice and not self.known.both))
@@ -212,17 +198,9 @@ class _Decoder:
     def _frames(self, raw: npt.NDArray[np.void], epochs: Int64) -> pa.RecordBatch:
         count = raw["sequence"].astype(np.int64)
         before = count[0] if self._before < 0 else self._before
-        sweeps = self._sweep + np.cumsum(np.diff(count, prepend=before) < -_RESTART)
-        self._sweep, self._before = int(sweeps[-1]), int(count[-1])
-        return decode_m1(raw, epochs, sweeps.astype(np.int32))
-
-    def _sweeps(self, azimuth: npt.NDArray[np.uint16]) -> Int32:
-        """Return (n, blocks) sweep of each block: incremented wherever the azimuth passes 360°, either way."""
-        flat = azimuth.reshape(-1).astype(np.int32)
-        before = flat[0] if self._before < 0 else self._before
-        sweeps = self._sweep + np.cumsum(np.abs(np.diff(flat, prepend=before)) > TURN // 2)
-        self._sweep, self._before = int(sweeps[-1]), int(flat[-1])
-        return np.asarray(sweeps.reshape(azimuth.shape), dtype=np.int32)
+        frames = self._frame + np.cumsum(np.diff(count, prepend=before) < -_RESTART)
+        self._frame, self._before = int(frames[-1]), int(count[-1])
+        return decode_m1(raw, epochs, frames.astype(np.int32))
 
     def _copies(self, packets: list[Datagram]) -> npt.NDArray[np.bool_]:
         """Return which packets (n,) repeat the bytes of one of this chunk or of the last."""
@@ -272,23 +250,14 @@ def _survey(source: LogSource, options: RobosenseOptions, packets_of: Source) ->
     if not seen:
         raise FormatError(
             "the log holds no MSOP packet of a known RoboSense lidar",
-            expected="packets of a "
-            + ", ".join(m.name for m in MODELS)
-            + "; others are not read: record their driver's "
+            expected=f"packets of a {', '.join(m.name for m in MODELS)}; others are not read: record their driver's "
             "PointCloud2 with a time of each point in a ROS bag",
             change="for a capture, state options.port (and options.sender)",
             file=source.path,
             missing=Missing("options.port"),
         )
     senders = sorted({p.sender for p in seen})
-    if len(senders) > 1:
-        raise FormatError(
-            f"{len(senders)} sensors sent to port {options.port}: {', '.join(senders)}",
-            expected="one sensor a log",
-            change="list the capture once a sensor, each with its address as options.sender",
-            file=source.path,
-            missing=Missing("options.sender", choices=tuple(senders)),
-        )
+    need_one_sender(senders, options.port, source.path)
     model = _model(source, options, seen[0].payload)
     info = difop.get(senders[0], b"")
     alike = [p for p in seen if models_of(p.payload) == models_of(seen[0].payload)]

@@ -38,7 +38,7 @@ import yaml
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.formats.lidars.returns_batch import returns_batch
+from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS, returns_batch
 from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, mean_rate, steps, waits_ns
 
 Bool = npt.NDArray[np.bool_]
@@ -63,7 +63,6 @@ MODES: Final = {0x37: "strongest", 0x38: "last", DUAL: "dual"}
 LATEST_STAMP_US: Final = 3_660_000_000
 """Stamps run a little past the hour before they restart; beyond a minute they are wrong."""
 
-_EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)  # scales 255 to 65,535
 _FASTEST_HZ: Final = 25.0  # fastest turn that is accepted
 _LARGEST_STEP_CENTIDEG: Final = 300  # larger steps from block to block are no turn of a head (0.01°)
 _SLACK_CENTIDEGREES: Final = 10  # tolerance of azimuth steps (0.01°)
@@ -325,7 +324,7 @@ def decode(
     return returns_batch(
         epoch,
         [one.reshape(-1)[rows] for one in (x, y, z)],
-        reflectivity.reshape(-1)[rows] * _EIGHT_TO_SIXTEEN_BITS,
+        reflectivity.reshape(-1)[rows] * EIGHT_TO_SIXTEEN_BITS,
         np.broadcast_to(lasers, shape).reshape(-1)[rows],
         np.broadcast_to(sweeps[:, : shape[1], None], shape).reshape(-1)[rows],
     )

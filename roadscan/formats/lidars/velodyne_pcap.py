@@ -41,7 +41,7 @@ from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemEr
 from roadscan.core.gpstime import NS_PER_S, TimeSystem
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
-from roadscan.formats.lidars.pcap import MAGICS, PCAPNG, Datagram, Wanted, datagrams
+from roadscan.formats.lidars.pcap import Datagram, Wanted, capture_start, datagrams, need_one_sender
 from roadscan.formats.lidars.velodyne_hours import Hours, Start, first_hour_unix_s, leaps
 from roadscan.formats.lidars.velodyne_packets import (
     BLOCKS,
@@ -171,14 +171,7 @@ class VelodynePcap(LogFormat):
 
     def sniff(self, path: Path) -> bool:
         """True for a capture (PCAP or PCAPNG) that begins with Velodyne data packets."""
-        try:
-            if not path.is_file():
-                return False
-            with path.open("rb") as stream:
-                start = stream.read(1 << 20)
-        except OSError:
-            return False
-        return start[:4] in {*MAGICS, PCAPNG} and _has_data_packet(start)
+        return _has_data_packet(capture_start(path))
 
     def companions(self, path: Path, options: Strict) -> list[Path]:
         """Return the calibration file, where one is stated."""
@@ -551,14 +544,8 @@ def _survey(path: Path, options: VelodyneOptions, packets_of: Source, whole_of: 
             file=path,
             missing=Missing("options.port"),
         )
-    if options.sender is None and len(known.senders) > 1:
-        raise FormatError(
-            f"{len(known.senders)} sensors sent to port {options.port}: {', '.join(sorted(known.senders))}",
-            expected="one sensor a log",
-            change="list the capture once a sensor, each with its address as options.sender",
-            file=path,
-            missing=Missing("options.sender", choices=tuple(sorted(known.senders))),
-        )
+    if options.sender is None:
+        need_one_sender(known.senders, options.port, path)
     if known.turned >= _MIXED_LEAST and known.astray > _MIXED_SHARE * known.turned:
         raise FormatError(
             f"{known.astray:,} of {known.turned:,} packets begin at another azimuth than the packet before them leads "

@@ -6,6 +6,7 @@ length shows. A jump of the azimuth counts as the gap where other packets jump b
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -74,6 +75,23 @@ def mean_rate(azimuth: Azimuths, epochs: Int64) -> float:
     passed_ns = np.diff(epochs)
     good = passed_ns > 0
     return float(np.median(steps(azimuth[:, :1].T)[0][good] / passed_ns[good])) if good.any() else 0.0
+
+
+@dataclass
+class Turns:
+    """Numbers the turns of a head over the packets of a log, which come in pieces."""
+
+    number: int = 0
+    _azimuth: int = -1
+    """Last azimuth (0.01°)."""
+
+    def of(self, azimuth: Azimuths) -> Int32:
+        """Return the turn (n, blocks) of each block: one more wherever the azimuth passes 360°, either way."""
+        flat = azimuth.reshape(-1).astype(np.int32)
+        before = flat[0] if self._azimuth < 0 else self._azimuth
+        turns = self.number + np.cumsum(np.abs(np.diff(flat, prepend=before)) > TURN // 2)
+        self.number, self._azimuth = int(turns[-1]), int(flat[-1])
+        return np.asarray(turns.reshape(azimuth.shape), dtype=np.int32)
 
 
 def _edges(azimuth: Azimuths, odd: Bool) -> tuple[Int32, Int32]:

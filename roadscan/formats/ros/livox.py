@@ -12,6 +12,7 @@ import numpy as np
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
+from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS
 from roadscan.formats.ros.bag import Bag, Topic
 from roadscan.formats.ros.definitions import Decode
 from roadscan.formats.ros.return_rows import ReturnRows
@@ -23,7 +24,6 @@ _POINT: Final = (
     ("offset_ns", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"),
 )  # fmt: skip
 """CustomPoint of livox_ros_driver and livox_ros_driver2."""
-_EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)  # scales 255 to 65,535, as for all sensors of 8 bits
 _ROS1_BYTES: Final = 19  # bytes of a point in ROS 1, where fields follow one another
 _CDR_BYTES: Final = 20  # bytes from one point to the next in ROS 2, where the first field lies at a multiple of four
 _BEHIND_HEADER: Final = 16  # bytes of timebase, number of points, lidar and three reserved ones, before the points
@@ -85,7 +85,7 @@ class RosLivox(TopicFormat):
                     stamp = timebases.stamp_ns(stamp, item.content.timebase)
                 yield from rows.items(
                     item.message, stamp, [points[axis] for axis in "xyz"], points["offset_ns"].astype(np.int64),
-                    points["reflectivity"] * _EIGHT_TO_SIXTEEN_BITS, points["line"],
+                    points["reflectivity"] * EIGHT_TO_SIXTEEN_BITS, points["line"],
                 )  # fmt: skip
             yield from timebases.findings()
 

@@ -42,8 +42,12 @@ class RunLogs:
         return (*self.imu, *self.gnss, *self.encoder)
 
 
-def chosen(records: Sequence[LogRecord], run: str, table: str, stated: str | None) -> tuple[LogRecord, ...]:
+def chosen(
+    records: Sequence[LogRecord], run: str, table: str, stated: str | None, setting: str
+) -> tuple[LogRecord, ...]:
     """Return logs of one sensor of a run with rows in `table`: the stated sensor's, or those of the only one.
+
+    setting : that states it, with its section, such as ``[navigation.smoother] imu``.
 
     Raises
     ------
@@ -57,11 +61,10 @@ def chosen(records: Sequence[LogRecord], run: str, table: str, stated: str | Non
     if stated is not None:
         return tuple(r for r in own if r.sensor == stated)
     if len(names) > 1:
-        key = {"imu": "imu", "gnss": "gnss", "encoder": "encoder"}[table]
         raise ConfigError(
             f"run '{run}' has logs of {len(names)} sensors in the table {table}: {', '.join(names)}",
             expected="to know which of them navigates",
-            change=f'state [navigation.smoother] {key} = "{names[0]}" (or another)',
+            change=f'state {setting} = "{names[0]}" (or another)',
         )
     return tuple(own)
 
@@ -144,7 +147,7 @@ def vehicle_sensors(rig: Rig, logs: RunLogs) -> VehicleSensors:
     ConfigError
         where the rig file does not say where antenna or IMU are, or how good the IMU is.
     """
-    imu, gnss = _sensor(rig, logs.imu[0], "imu"), _sensor(rig, logs.gnss[0], "gnss")
+    imu, gnss = sensor_of(rig, logs.imu[0], "imu"), sensor_of(rig, logs.gnss[0], "gnss")
     errors = imu.imu_errors()
     if errors is None:
         raise unknown_imu(logs.imu[0].sensor)
@@ -170,7 +173,8 @@ def unknown_imu(name: str) -> ConfigError:
     )
 
 
-def _sensor(rig: Rig, record: LogRecord, kind: str) -> Sensor:
+def sensor_of(rig: Rig, record: LogRecord, kind: str) -> Sensor:
+    """Return the sensor of the rig that wrote a log, which has to be of a kind."""
     sensor = rig.sensors.get(record.sensor)
     if sensor is None or sensor.kind != kind:
         raise ConfigError(

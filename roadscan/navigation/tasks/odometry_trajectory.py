@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import LOCAL_WORLD
-from roadscan.core.errors import ConfigError, NavigationError
+from roadscan.core.errors import NavigationError
 from roadscan.core.extras import is_installed
 from roadscan.core.frames import quaternion_from_rotation
 from roadscan.core.gpstime import NS_PER_S
@@ -37,7 +37,7 @@ from roadscan.navigation.odometry.rig_motion import (
 )
 from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.navigation.tasks.computed_trajectory import Computed, sigma_figures, trajectory_rows
-from roadscan.navigation.tasks.navigation_logs import imu_readings
+from roadscan.navigation.tasks.navigation_logs import chosen, imu_readings, sensor_of
 from roadscan.navigation.tasks.solve_trajectory import on_time
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
@@ -80,7 +80,7 @@ class PlannedOdometry:
         RoadscanError
             where the library is not installed, or the log has no sweeps to match.
         """
-        config, sensor = self.config, _sensor(self.survey, self.lidar)
+        config, sensor = self.config, _mounted(self.survey, self.lidar[0], "lidar")
         far_m = min(config.range_max_m, sensor.range_max_m)
         matched = match(sweeps_of(self._pieces()), config, sensor.range_min_m, far_m)
         if matched.epochs_gps_ns.size < 3:
@@ -126,7 +126,7 @@ class PlannedOdometry:
         if not self.imu:
             return way, None, standing
         readings: ImuReadings = on_time(imu_readings(self.store, self.imu), dict(self.clocks).get(self.imu[0].sensor))
-        sensor = _sensor(self.survey, self.imu)
+        sensor = _mounted(self.survey, self.imu[0], "imu")
         turn, _ = sensor.mounting().arrays()
         samples = (
             readings.epochs_gps_ns,
@@ -185,8 +185,8 @@ def plan_odometry(
     for run in runs:
         if any(r.run == run and r.tables.get("trajectory") and r.sensor != NAVIGATION for r in records):
             continue
-        lidar = _of_one(records, run, "returns", config.lidar, "lidar")
-        imu = _of_one(records, run, "imu", config.imu, "imu")
+        lidar = chosen(records, run, "returns", config.lidar, "[navigation.odometry] lidar")
+        imu = chosen(records, run, "imu", config.imu, "[navigation.odometry] imu")
         if not lidar:
             continue
         sensors = sorted({r.sensor for r in (*lidar, *imu)})
@@ -201,29 +201,6 @@ def plan_odometry(
     return found
 
 
-def _of_one(
-    records: Sequence[LogRecord], run: str, table: str, stated: str | None, setting: str
-) -> tuple[LogRecord, ...]:
-    """Return logs of one sensor of a run with rows in `table`: the stated sensor's, or those of the only one."""
-    own = [r for r in records if r.run == run and r.tables.get(table) and stated in (None, r.sensor)]
-    names = sorted({r.sensor for r in own})
-    if len(names) > 1:
-        raise ConfigError(
-            f"run '{run}' has logs of {len(names)} sensors in the table {table}: {', '.join(names)}",
-            expected="to know whose poses are made",
-            change=f'state [navigation.odometry] {setting} = "{names[0]}" (or another)',
-        )
-    return tuple(own)
-
-
-def _sensor(survey: Survey, logs: Sequence[LogRecord]) -> Sensor:
-    """Return the sensor of logs with the mounting that they state, where the rig file states none."""
-    sensor: Any = survey.rig.sensors.get(logs[0].sensor)
-    if sensor is None:
-        raise ConfigError(
-            f"log '{logs[0].path}' of run '{logs[0].run}' names no sensor of the rig (it is '{logs[0].sensor}')",
-            expected="a sensor with axes and lever arm: poses are those of the rig's reference point",
-            change='add it to the rig file and sensor = "…" to the log',
-        )
-    mounted: Sensor = sensor.mounted_as(logs[0].attributes.get("mounting", {}))
-    return mounted
+def _mounted(survey: Survey, log: LogRecord, kind: str) -> Sensor:
+    """Return the sensor of a log with the mounting that the log states, where the rig file states none."""
+    return sensor_of(survey.rig, log, kind).mounted_as(log.attributes.get("mounting", {}))

@@ -114,7 +114,10 @@ def plan_solutions(survey: Survey, store: Store, records: Sequence[LogRecord]) -
             continue
         logs = RunLogs(
             run,
-            *(chosen(records, run, t, getattr(settings.smoother, t)) for t in ("imu", "gnss", "encoder")),
+            *(
+                chosen(records, run, t, getattr(settings.smoother, t), f"[navigation.smoother] {t}")
+                for t in ("imu", "gnss", "encoder")
+            ),
         )
         if not logs.imu or not logs.gnss:
             continue

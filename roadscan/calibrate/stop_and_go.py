@@ -32,7 +32,7 @@ from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
-from roadscan.core.imu import ImuErrors
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2, ImuErrors
 from roadscan.core.rig import Mounting
 from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, gravity_ecef
 from roadscan.navigation.inertial.readings import ImuReadings
@@ -59,7 +59,6 @@ _UNKNOWN_RAD: Final = 1.0
 """Prior σ of the orientation, which stands for no prior."""
 _ROUNDS: Final = 12  # Most rounds of the adjustment.
 _HUBER: Final = 3.0  # Residuals beyond this many times the robust scale get less weight.
-_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # Also gravity in local frames.
 _LOCAL_GRAVITY_SIGMA_M_PER_S2: Final = 0.03  # Of gravity in local frames.
 _LOCAL_RATE_SIGMA_RAD_PER_S: Final = 7.3e-5
 """In a local frame the Earth's rotation is not known better; it is added to the gyroscopes' bias."""
@@ -263,7 +262,7 @@ class _Run:
 
     def _gravity(self, position_m: Float64) -> Float64:
         if self._local:
-            return np.broadcast_to(np.array([0.0, 0.0, -_STANDARD_GRAVITY_M_PER_S2]), position_m.shape)
+            return np.broadcast_to(np.array([0.0, 0.0, -STANDARD_GRAVITY_M_PER_S2]), position_m.shape)
         return np.array([gravity_ecef(p) for p in position_m]).reshape(-1, 3)
 
     def _turn_windows(self) -> None:
@@ -295,7 +294,7 @@ class _Run:
         self._origin, self._knot_s = first, span_s / (knots - 1)
         self.knots = knots
         apart = np.abs(np.arange(knots)[:, None] - np.arange(knots)) * self._knot_s
-        accelerometer = errors.accel_bias_mg * 1e-3 * _STANDARD_GRAVITY_M_PER_S2
+        accelerometer = errors.accel_bias_mg * 1e-3 * STANDARD_GRAVITY_M_PER_S2
         gyroscope = np.radians(errors.gyro_bias_deg_per_h) / 3600.0
         if self._local:
             accelerometer = np.hypot(accelerometer, _LOCAL_GRAVITY_SIGMA_M_PER_S2)
@@ -433,7 +432,7 @@ class _Noise:
     @classmethod
     def first(cls, errors: ImuErrors, step_s: float) -> _Noise:
         """Return the noise that the IMU states; the noise from residuals is not taken lower."""
-        density = errors.accel_noise_ug_per_sqrt_hz * 1e-6 * _STANDARD_GRAVITY_M_PER_S2
+        density = errors.accel_noise_ug_per_sqrt_hz * 1e-6 * STANDARD_GRAVITY_M_PER_S2
         force = max(density * np.sqrt(2 / (3 * _FORCE_S)), 1e-5)
         walk = np.radians(errors.gyro_noise_deg_per_sqrt_h) / 60.0
         turn = max(walk * np.sqrt(max(_TURN_S, step_s)), 1e-7)

@@ -70,6 +70,16 @@ def leap_seconds_at_unix(unix_utc_s: npt.ArrayLike) -> Int64:
     return np.searchsorted(_LEAP_UNIX_S, np.asarray(unix_utc_s), side="right").astype(np.int64)
 
 
+SCALES: Final = {TimeSystem.UNIX_GPS: "GPS time", TimeSystem.UNIX_TAI: "TAI"}
+"""Names of the scales without leap seconds that stamps from 1970 may count."""
+
+
+def ahead_of_utc_s(unix_utc_s: float) -> dict[TimeSystem, int]:
+    """Return by how many seconds each of `SCALES` is ahead of UTC at POSIX seconds."""
+    leap_s = int(leap_seconds_at_unix(int(unix_utc_s)))
+    return {TimeSystem.UNIX_GPS: leap_s, TimeSystem.UNIX_TAI: leap_s + TAI_MINUS_GPS_S}
+
+
 def leap_seconds_at_gps(gps_s: npt.ArrayLike) -> Int64:
     """GPS − UTC in whole seconds at GPS seconds `gps_s` (any shape)."""
     return np.searchsorted(_LEAP_GPS_S, np.asarray(gps_s), side="right").astype(np.int64)

@@ -8,6 +8,8 @@ from pydantic import Field
 
 from roadscan.core.strict import Strict
 
+STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
+"""Size of the unit g (CGPM 1901), and the gravity of local frames."""
 ImuGrade = Literal["perfect", "navigation", "tactical", "industrial", "mems"]
 """How good an inertial measurement unit is."""
 

@@ -14,6 +14,7 @@ from roadscan.core.canvas import empty_figure, save_whole
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, Solution
 
 if TYPE_CHECKING:
@@ -287,7 +288,7 @@ def _draw_states(axes: Axes, s: Solution, axis: _Axis, name: str) -> None:
     key = next((k for k in s.states if k.startswith(name)), None)
     scale, unit, title = {
         "gyro_bias": (np.degrees(1.0) * 3600.0, "°/h", "Bias of the gyroscopes"),
-        "accel_bias": (1000.0 / 9.80665, "mg", "Bias of the accelerometers"),
+        "accel_bias": (1000.0 / STANDARD_GRAVITY_M_PER_S2, "mg", "Bias of the accelerometers"),
     }[name]
     if key is not None:
         value, sigma = (scale * x.reshape(len(x), -1) for x in s.states[key])

@@ -13,6 +13,7 @@ from pyproj.exceptions import CRSError as ProjCrsError
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import ConfigError
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 
 Float64 = npt.NDArray[np.float64]
 
@@ -22,7 +23,6 @@ LOCAL: Final = "local"
 _ENU_FROM_NED: Final = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # its own inverse
 _RATE_RAD_PER_S: Final = 7.292115e-5
 """Rate of the Earth's rotation: WGS 84."""
-_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # gravity of a local frame, upwards
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Earth:
         """
         level = self.ecef_from_level(xyz_m)
         if self.is_local:
-            gravity = np.full(len(xyz_m), _STANDARD_GRAVITY_M_PER_S2)
+            gravity = np.full(len(xyz_m), STANDARD_GRAVITY_M_PER_S2)
         else:
             _, lat, height = self.geographic_from_ecef(xyz_m).T
             sine2 = np.sin(np.radians(lat)) ** 2

@@ -26,6 +26,7 @@ from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, 
 from roadscan.navigation.tasks.pose_sigma import median_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.poses.level import level_poses
+from roadscan.poses.trajectory import Trajectory
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.fingerprint import key_of
@@ -39,6 +40,7 @@ from roadscan.strips.tilt import Sway, Tilt, tilts_of
 from roadscan.tiles.tasks.tile_plan import tiles_of
 
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
 
 PRODUCT: Final = "strips"
 """Name in the manifest of a stretch's comparisons; there is no file."""
@@ -118,7 +120,8 @@ def _tasks(session: Session) -> Iterator[StripTask]:
         own, poses = by_run[run], trajectories[run]
         sigma_m = _sigma(plan, poses)
         for number, (first, last) in enumerate(_stretches(own)):
-            way = _way(plan.store, plan.ground, poses, (first, last))
+            recorded = load_recorded(plan.store, poses, [(first, last)], plan.ground.max_gap_s)
+            way = _way(recorded, plan.ground, (first, last))
             if way is None:
                 continue
             pad = first - _PAD_NS, last + _PAD_NS
@@ -153,11 +156,15 @@ def _stretches(own: Sequence[RawSlice]) -> list[tuple[int, int]]:
     return [(int(begin), int(begin) + length) for begin in begins]
 
 
-def _way(store: Store, ground: MapSettings, poses: TrajectorySource, span: tuple[int, int]) -> Way | None:
+def _knots(recorded: Trajectory, span: tuple[int, int]) -> Int64:
+    """Returns the epochs (n,) of the recorded poses of a time span."""
+    epochs = recorded.epochs_gps_ns
+    return np.asarray(epochs[(epochs >= span[0]) & (epochs <= span[1])])
+
+
+def _way(recorded: Trajectory, ground: MapSettings, span: tuple[int, int]) -> Way | None:
     """Returns the way within a time span, or its beginning; None where the vehicle stands or there are no poses."""
-    recorded = load_recorded(store, poses, [span], ground.max_gap_s)
-    knots = recorded.epochs_gps_ns
-    knots = knots[(knots >= span[0]) & (knots <= span[1])]
+    knots = _knots(recorded, span)
     thin = knots[np.unique(knots // _STEP_NS, return_index=True)[1]]
     if thin.size < 2:
         return None
@@ -243,11 +250,13 @@ class Pair:
 
 def compare_strip(task: StripTask) -> OutputRecord:
     """Returns the comparison of the sensors that saw a stretch."""
-    way = _way(task.store, task.ground, task.poses, (task.first_gps_ns, task.last_gps_ns))
+    pad = task.first_gps_ns - _PAD_NS, task.last_gps_ns + _PAD_NS
+    recorded = load_recorded(task.store, task.poses, [pad], task.ground.max_gap_s)
+    way = _way(recorded, task.ground, (task.first_gps_ns, task.last_gps_ns))
     seen: list[tuple[SeenBy, Strip]] = []
     if way is not None:
         placer = Georeferencer(task.store, task.ground, task.slices, recorded=True)
-        sway = _sway(task)
+        sway = Sway.of(level_poses(recorded, task.ground.map, _knots(recorded, pad)))
         order = sorted(task.slices, key=lambda one: (one.source.run != task.run, one.source.run, one.source.sensor))
         for _, slices in itertools.groupby(order, lambda one: (one.source.run, one.source.sensor)):
             seen.append(_seen_by(task, placer, way, sway, list(slices)))
@@ -264,14 +273,6 @@ def compare_strip(task: StripTask) -> OutputRecord:
         "pairs": [asdict(pair) for pair in pairs if pair is not None],
     }
     return OutputRecord(PRODUCT, task.unit, task.key, "", 0, "", json.dumps(figures))
-
-
-def _sway(task: StripTask) -> Sway:
-    """Returns how the vehicle swayed on the stretch."""
-    pad = task.first_gps_ns - _PAD_NS, task.last_gps_ns + _PAD_NS
-    recorded = load_recorded(task.store, task.poses, [pad], task.ground.max_gap_s)
-    knots = recorded.epochs_gps_ns
-    return Sway.of(level_poses(recorded, task.ground.map, knots[(knots >= pad[0]) & (knots <= pad[1])]))
 
 
 def _seen_by(

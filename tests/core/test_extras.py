@@ -76,6 +76,14 @@ def test_all_has_every_extra() -> None:
     assert everything.extras == PROJECT["optional-dependencies"].keys() - {"all", "dev"}
 
 
+def test_the_readme_lists_every_extra_and_first_those_that_make_installs() -> None:
+    table = (REPOSITORY / "README.md").read_text(encoding="utf-8").split("| extra |")[1].split("\n\n")[0]
+    listed = [name for row in table.splitlines()[2:] for name in re.findall(r"`([a-z0-9]+)`", row.split("|")[1])]
+    assert set(listed) == PROJECT["optional-dependencies"].keys() - {"dev"}
+    installed = re.findall(r"install_into_venv,\.\[(.*)\]\)", (REPOSITORY / "Makefile").read_text(encoding="utf-8"))[0]
+    assert set(listed[:5]) == set(installed.split("$(comma)"))
+
+
 def test_every_module_can_be_imported_without_extras() -> None:
     outcome = subprocess.run(
         [sys.executable, "-c", BLOCKED + IMPORT_ALL], cwd=REPOSITORY, capture_output=True, text=True, check=False

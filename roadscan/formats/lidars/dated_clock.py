@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from roadscan.core.errors import Missing, TimeSystemError
-from roadscan.core.gpstime import TAI_MINUS_GPS_S, Clock, TimeSystem, leap_seconds_at_unix
+from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, Clock, TimeSystem, ahead_of_utc_s
 from roadscan.core.witness import Witness
 from roadscan.ingest.reading.format import LogSource
 
@@ -57,11 +57,12 @@ def dated_clock(source: LogSource, stamp_s: float, ahead_s: float) -> Clock:
         return stated
     if abs(ahead_s) <= _AGREE_S:
         return Clock(TimeSystem.UNIX_UTC)
-    leaps = int(leap_seconds_at_unix(int(stamp_s + ahead_s)))
-    proposed: dict[str, object] = {"system": "free", "offset_s": round(ahead_s + leaps - 315_964_800, 3)}
-    for system, early in (("unix_gps", leaps), ("unix_tai", leaps + TAI_MINUS_GPS_S)):
-        if abs(ahead_s + early) < _NEAR_S:
-            proposed = {"system": system}
+    scales = ahead_of_utc_s(stamp_s + ahead_s)
+    offset_s = ahead_s + scales[TimeSystem.UNIX_GPS] - GPS_EPOCH_UNIX_S
+    proposed: dict[str, object] = {"system": "free", "offset_s": round(offset_s, 3)}
+    for system, early_s in scales.items():
+        if abs(ahead_s + early_s) < _NEAR_S:
+            proposed = {"system": str(system)}
     raise TimeSystemError(
         f"the sensor's date and time are {-ahead_s:+,.3f} s from the recording computer's clock: they are not UTC, or "
         "that clock is wrong",

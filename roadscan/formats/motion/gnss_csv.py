@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Final, Literal
+from typing import ClassVar, Final, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.formats.trajectories.level_poses import GEODETIC, GRID, LOCAL, SIGMAS, position_of
 from roadscan.ingest.reading.columns import UNITS, ColumnOption, Found, Quantity, find_columns, fits, word_of
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
-from roadscan.ingest.reading.gnss import QUALITIES, UNKNOWN_QUALITY, GnssReader, RawSolutions
+from roadscan.ingest.reading.gnss import QUALITIES, UNKNOWN_QUALITY, GnssReader, RawSolutions, StatedQuality
 from roadscan.ingest.reading.poses import Placement, level_placement
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.stamps import TIME, StampColumn
@@ -55,7 +55,7 @@ class GnssCsvOptions(TextOptions):
     For example { latitude = { name = "Lat", unit = "deg" } }."""
     height_unit: Literal["m", "ft", "ft_us"] | None = None
     """Unit of heights where neither the column's name nor the CRS says it (ft_us: US survey foot)."""
-    quality: Literal["single", "sbas", "dgps", "float", "fixed", "ppp"] | None = None
+    quality: StatedQuality | None = None
     """Kind of the solutions, where no column says it: "single" for phones and portable receivers, "fixed" for RTK."""
 
 
@@ -149,7 +149,7 @@ def _plan(source: LogSource) -> _Plan:
             "no column says what kind of solution the positions are",
             expected='options.quality: "single" for phones and portable receivers, "fixed" for RTK',
             file=source.path,
-            missing=Missing("options.quality", choices=("single", "sbas", "dgps", "float", "fixed", "ppp")),
+            missing=Missing("options.quality", choices=get_args(StatedQuality)),
         )
     stamps = StampColumn.of(source, source.path, layout, columns["time"])
     kinds: dict[str, Kind] = {

@@ -6,7 +6,7 @@ import functools
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
-from roadscan.ingest.reading.gnss import QUALITIES, GnssReader, RawSolutions, utc_clock
+from roadscan.ingest.reading.gnss import QUALITIES, GnssReader, RawSolutions, StatedQuality, utc_clock
 from roadscan.ingest.reading.poses import GeodeticPlacement
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
 from roadscan.ingest.reading.stamps import calendar_ns
@@ -63,7 +63,7 @@ def _patterns(prefix: bytes) -> _Patterns:
 class GpxOptions(Strict):
     """Settings of `gpx`."""
 
-    quality: Literal["single", "sbas", "dgps", "float", "fixed", "ppp"] | None = None
+    quality: StatedQuality | None = None
     """Kind of the solutions whose points state no `fix`: "single" for phones, watches and portable receivers."""
 
 
@@ -105,7 +105,7 @@ class Gpx(LogFormat):
                 "the points do not say what kind of solution they are (fix)",
                 expected='options.quality: "single" for phones, watches and portable receivers',
                 file=source.path,
-                missing=Missing("options.quality", choices=("single", "sbas", "dgps", "float", "fixed", "ppp")),
+                missing=Missing("options.quality", choices=get_args(StatedQuality)),
             )
         return LogHeader({"world_frame": placement.world})
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, Final, Literal
+from typing import ClassVar, Final, get_args
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from roadscan.core.strict import Strict
 from roadscan.formats.trajectories.inertial_explorer import InertialExplorer
 from roadscan.formats.trajectories.office_text import OfficeTrajectory, Preamble, position_of, stamps_of
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
-from roadscan.ingest.reading.gnss import NO_POSITION, QUALITIES, GnssReader, RawSolutions
+from roadscan.ingest.reading.gnss import NO_POSITION, QUALITIES, GnssReader, RawSolutions, StatedQuality
 from roadscan.ingest.reading.poses import North
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.text_table import text_blocks
@@ -26,7 +26,7 @@ _QUALITIES: Final = {1: "fixed", 2: "float", 3: "float", 4: "float", 5: "dgps", 
 class GrafNavOptions(Strict):
     """Settings of `grafnav`."""
 
-    quality: Literal["single", "sbas", "dgps", "float", "fixed", "ppp"] | None = None
+    quality: StatedQuality | None = None
     """Kind of the solutions, where no column Q says it."""
 
 
@@ -66,7 +66,7 @@ class GrafNav(OfficeTrajectory):
                 "no column Q says what kind of solution the positions are",
                 expected="options.quality",
                 file=source.path,
-                missing=Missing("options.quality", choices=("single", "sbas", "dgps", "float", "fixed", "ppp")),
+                missing=Missing("options.quality", choices=get_args(StatedQuality)),
             )
         return header
 

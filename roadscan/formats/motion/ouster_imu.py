@@ -13,6 +13,7 @@ import pyarrow as pa
 from pydantic import Field
 
 from roadscan.core.errors import FormatError, Missing
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.strict import Strict
 from roadscan.formats.lidars.ouster_metadata import IMU_SAMPLES, LEGACY, OusterMetadata
 from roadscan.formats.lidars.ouster_packets import joined, sensor_clock, serials
@@ -24,7 +25,6 @@ from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, opt
 
 Float64 = npt.NDArray[np.float64]
 
-_G_M_PER_S2: Final = 9.80665  # unit of the old packets' acceleration
 _BEFORE_SAMPLES: Final = 32 + 100
 """Bytes of the newer packets before their samples: header, and a stamp with an NMEA sentence."""
 _AROUND_SAMPLES: Final = _BEFORE_SAMPLES + 32  # with the footer
@@ -186,7 +186,7 @@ Samples = tuple[npt.NDArray[np.uint64], Float64, Float64, npt.NDArray[np.bool_]]
 def _old_samples(raw: npt.NDArray[np.uint8]) -> Samples:
     packets = np.ascontiguousarray(raw).view(_OLD)[:, 0]
     with np.errstate(invalid="ignore", over="ignore"):  # what is no number is rejected
-        force = packets["force"].astype(np.float64)[:, None] * _G_M_PER_S2
+        force = packets["force"].astype(np.float64)[:, None] * STANDARD_GRAVITY_M_PER_S2
         rate = np.radians(packets["rate"].astype(np.float64))[:, None]
     return np.ascontiguousarray(packets["stamps"][:, 2:]), force, rate, np.ones((len(raw), 1), bool)
 
@@ -218,4 +218,4 @@ def _is_new(payload: bytes) -> bool:
     follow = (np.diff(samples["number"].astype(int)) == 1).all() and (
         np.diff(samples["stamp"].view(np.int64)) > 0
     ).all()
-    return bool(follow and (force < _MOST_FORCE_G * _G_M_PER_S2).all() and force.max() > 0)
+    return bool(follow and (force < _MOST_FORCE_G * STANDARD_GRAVITY_M_PER_S2).all() and force.max() > 0)

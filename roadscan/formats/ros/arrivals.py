@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from roadscan.core.gpstime import NS_PER_S, TAI_MINUS_GPS_S, Clock, TimeSystem, leap_seconds_at_unix
+from roadscan.core.gpstime import NS_PER_S, SCALES, Clock, TimeSystem, ahead_of_utc_s
 from roadscan.core.witness import Finding, Witness
 
 STAMPS_OF_A_BAG: Final = Witness(
@@ -81,17 +81,14 @@ class Arrivals:
         """Say what a constant difference means; '' where it is the way of a message."""
         if abs(late_ns) > _OWN_COUNT_NS or self._clock.system is TimeSystem.FREE:
             return ""  # a counter of its own, which the stated clock explains
-        leap_s = int(leap_seconds_at_unix(unix_s))
-        for words, system, ahead_s in (
-            ("GPS time", TimeSystem.UNIX_GPS, leap_s),
-            ("TAI", TimeSystem.UNIX_TAI, leap_s + TAI_MINUS_GPS_S),
-        ):
+        for system, ahead_s in ahead_of_utc_s(unix_s).items():
             if abs(late_ns + ahead_s * NS_PER_S) < _SAME_SCALE_NS:
                 if self._clock.system is system:
                     return ""
                 return (
-                    f"the headers' stamps are {ahead_s} s ahead of the receive stamps, as {words} is ahead of UTC, and "
-                    f"the log's clock says {self._clock.system}: headers on that scale need clock.system = {system}"
+                    f"the headers' stamps are {ahead_s} s ahead of the receive stamps, as {SCALES[system]} is ahead of "
+                    f"UTC, and the log's clock says {self._clock.system}: headers on that scale need clock.system = "
+                    f"{system}"
                 )
         if late_ns < -_EARLY_NS:
             return f"messages were received {-late_ns / NS_PER_S:.3f} s before their headers' stamps: the clocks differ"

@@ -39,16 +39,17 @@ class CloudWatch:
 
     def times(self, offsets_ns: npt.NDArray[np.int64]) -> None:
         """Take the times (n,) of a message's points after its stamp, which count from the origin of the clock."""
-        known = offsets_ns[offsets_ns != UNKNOWN_NS]
-        if known.size:
-            self._middle_ns.append((int(known.min()) + int(known.max())) // 2)
+        if offsets_ns.size and offsets_ns.max() == UNKNOWN_NS:
+            offsets_ns = offsets_ns[offsets_ns != UNKNOWN_NS]
+        if offsets_ns.size:
+            self._middle_ns.append((int(offsets_ns.min()) + int(offsets_ns.max())) // 2)
 
     def intensity(self, values: npt.NDArray[np.generic]) -> None:
         """Take the intensities (n,) of a message, which are stored as whole numbers up to 65,535."""
         numbers: Any = values
-        if numbers.size and numbers.dtype.kind == "f":
-            self._rounded += int(np.count_nonzero(numbers != np.rint(numbers)) - np.count_nonzero(np.isnan(numbers)))
-        if numbers.size and numbers.dtype.itemsize > 2 and numbers.max() > INTENSITY_MAX:
+        if numbers.dtype.kind == "f" and (odd := numbers[numbers != np.rint(numbers)]).size:
+            self._rounded += int(np.count_nonzero(~np.isnan(odd)))
+        if numbers.dtype.itemsize > 2:
             self._bright += int(np.count_nonzero(numbers > INTENSITY_MAX))
 
     def findings(self) -> Iterator[Finding]:

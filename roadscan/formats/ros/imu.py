@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from roadscan.core.errors import ConfigError, Missing
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.strict import Strict
 from roadscan.formats.motion.imu_csv import FORCE_MAX_M_PER_S2, RATE_MAX_RAD_PER_S
 from roadscan.formats.ros.bag import Bag, Topic
@@ -18,8 +19,6 @@ from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions, messag
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import block_rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
-
-STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # one g (CGPM 1901)
 
 _LOOKED_AT: Final = 400  # messages from whose forces the unit is checked
 _LEAST_FORCE_M_PER_S2: Final = 8.0

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import Missing, TimeSystemError
-from roadscan.core.gpstime import NS_PER_S, UNIT_NS
+from roadscan.core.gpstime import NS_PER_S, SCALES, TAI_MINUS_GPS_S, UNIT_NS, ahead_of_utc_s
 
 Float64 = npt.NDArray[np.float64]
 
@@ -66,16 +66,12 @@ class PointTimes:
             if scale != 1:
                 whole *= scale
             return whole - stamp_ns if self.origin == "epoch" else whole
-        numbers = values.astype(np.float64)
-        if not (known := np.isfinite(numbers)).all():
-            found = np.full(numbers.size, UNKNOWN_NS)
-            found[known] = self.offsets_ns(numbers[known], stamp_ns - self.ahead_ns)
-            return found
-        if self.origin == "epoch":
-            # Whole units first: a double holds the difference of two near times better than either of them in ns.
-            units, rest_ns = divmod(stamp_ns, scale)
-            return np.rint((numbers - units) * scale).astype(np.int64) - rest_ns
-        return np.rint(numbers * scale).astype(np.int64)
+        # Whole units first: a double holds the difference of two near times better than either of them in ns.
+        units, rest_ns = divmod(stamp_ns, scale) if self.origin == "epoch" else (0, 0)
+        late_ns = np.rint((values.astype(np.float64) - units) * scale)
+        if (known := np.isfinite(late_ns)).all():
+            return late_ns.astype(np.int64) - rest_ns
+        return np.where(known, np.where(known, late_ns, 0.0).astype(np.int64) - rest_ns, UNKNOWN_NS)
 
 
 def found(
@@ -126,8 +122,10 @@ def _check_ahead(times: PointTimes, samples: Sequence[Sample], file: Path) -> No
     left_s = ahead_s - times.ahead_ns / NS_PER_S
     if abs(left_s) < _MOST_AHEAD_S:
         return
-    scales = {18: "as GPS time is ahead of UTC", 37: "as TAI is ahead of UTC", 19: "as TAI is ahead of GPS time"}
-    why = scales.get(round(abs(ahead_s)), "which is no difference of two time scales")
+    scales = ahead_of_utc_s(samples[0].header_ns / NS_PER_S).items()
+    known = {scale_s: f"as {SCALES[system]} is ahead of UTC" for system, scale_s in scales}
+    known[TAI_MINUS_GPS_S] = "as TAI is ahead of GPS time"
+    why = known.get(round(abs(ahead_s)), "which is no difference of two time scales")
     raise TimeSystemError(
         f"the points' own times ('{times.field}') are {ahead_s:+.1f} s ahead of the headers' stamps, {why}",
         expected="options.time_ahead_s, which is taken off the points' times",

@@ -55,7 +55,6 @@ HEIGHT: Final = Quantity(
     "length",
     ("altitude", "elevation", "höhe", "hoehe", "elev", "alt", "cota", "z", "h"),
 )
-LOCAL_HEIGHT: Final = HEIGHT
 SIGMAS: Final = (
     Quantity("sigma_horizontal", "length", optional=True),
     Quantity("sigma_height", "length", ("sigma_vertical",), optional=True),
@@ -149,7 +148,7 @@ class ControlCsv(LogFormat):
 def _plan(source: LogSource) -> _Plan:
     options = options_of(source, ControlCsvOptions)
     frame = ControlFrame.of(source)
-    position = {"local": (*LOCAL, LOCAL_HEIGHT), "projected": (*GRID, HEIGHT), "geographic": (*GEODETIC, HEIGHT)}
+    position = {"local": (*LOCAL, HEIGHT), "projected": (*GRID, HEIGHT), "geographic": (*GEODETIC, HEIGHT)}
     layout = text_layout(source.path, options)
     if options.names is None and (proposed := _nameless(layout.names)) is not None:
         orders = [order[: len(layout.names)] for order in (PNEZD, PENZD)]

@@ -15,7 +15,7 @@ import shapely
 
 from roadscan.core.errors import ConfigError, FormatError, RoadscanError
 from roadscan.formats.vectors.control import NO_TEXT, SIGMA_MAX_M, ControlFrame, Role
-from roadscan.formats.vectors.control_csv import GEODETIC, GRID, HEIGHT, LOCAL, LOCAL_HEIGHT, SIGMAS, units_of
+from roadscan.formats.vectors.control_csv import GEODETIC, GRID, HEIGHT, LOCAL, SIGMAS, units_of
 from roadscan.formats.vectors.control_vector import check_crs
 from roadscan.formats.vectors.vector_layer import (
     attribute_values,
@@ -187,7 +187,7 @@ def _of_layer(source: LogSource, frame: ControlFrame, options: ControlLinesOptio
 def _of_text(source: LogSource, frame: ControlFrame, options: ControlLinesOptions) -> Iterator[_Line | Reject]:
     """Yield lines of text rows, in the order in which their names first occur."""
     layout = text_layout(source.path, options)
-    position = {"local": (*LOCAL, LOCAL_HEIGHT), "projected": (*GRID, HEIGHT), "geographic": (*GEODETIC, HEIGHT)}
+    position = {"local": (*LOCAL, HEIGHT), "projected": (*GRID, HEIGHT), "geographic": (*GEODETIC, HEIGHT)}
     *place, height = position[frame.kind]
     upright = replace(height, optional=True)
     quantities = (_LINE, *_WORDS, *place, upright, *SIGMAS)

@@ -15,6 +15,7 @@ from typing import Final, Literal, TypeAlias
 
 from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
 from roadscan.core.gpstime import UNIT_NS, Clock
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.strict import Strict
 
 Dimension: TypeAlias = Literal[
@@ -36,8 +37,6 @@ _BRACKET_UNITS: Final = {
 """Units as programs write them in brackets. Not "ft": which foot it is, it does not say."""
 _BRACKETED: Final = re.compile(r"\s*[(\[<{]([^)\]>}]*)[)\]>}]\s*$")
 
-STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
-"""Size of the unit g (CGPM 1901)."""
 
 UNITS: Final[dict[Dimension, dict[str, float]]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180, "arcmin": math.pi / 10_800, "arcsec": math.pi / 648_000},

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,8 @@ QUALITIES: Final = (
     "none", "fixed", "float", "sbas", "dgps", "ppp", "pps", "single", "dead_reckoning", "manual", "simulated",
 )  # fmt: skip
 """Kinds of solutions (column `quality`); a quality is stored as its index in this list."""
+StatedQuality: TypeAlias = Literal["single", "sbas", "dgps", "float", "fixed", "ppp"]
+"""Kinds that a setting may state where a log says none."""
 NO_POSITION: Final = 0  # index of `none`
 UNKNOWN_QUALITY: Final = -1  # a kind that is not in `QUALITIES`
 

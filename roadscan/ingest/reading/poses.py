@@ -225,8 +225,10 @@ class GridPlacement(Placement):
 
     def _refuse_local(self, position: Float64, degrees: Float64) -> None:
         """Raise where positions lie about the origin of the grid, outside the area that the CRS is made for."""
+        if np.abs(position[:2]).max(initial=0.0) > _LOCAL_M:
+            return
         area = pyproj.CRS.from_user_input(self._crs).area_of_use
-        if area is None or np.abs(position[:2]).max(initial=0.0) > _LOCAL_M:
+        if area is None:
             return
         west, south, east, north = area.bounds
         longitude, latitude = degrees[:, 0], degrees[:, 1]

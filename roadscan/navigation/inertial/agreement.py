@@ -15,7 +15,8 @@ import numpy.typing as npt
 from roadscan.compute.flags import runs_of
 from roadscan.core.errors import ConfigError, NavigationError, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.navigation.inertial.motion import GRAVITY_M_PER_S2, STEP_S, Windows, imu_means
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
+from roadscan.navigation.inertial.motion import STEP_S, Windows, imu_means
 from roadscan.navigation.inertial.readings import ImuReadings, VehicleSensors
 
 Float64 = npt.NDArray[np.float64]
@@ -80,7 +81,7 @@ def check_gravity(imu: ImuReadings, vehicle: VehicleSensors) -> None:
     size = np.linalg.norm(imu.specific_force_m_per_s2, axis=1)
     felt = float(np.median(size))
     step_s = float(np.median(np.diff(imu.epochs_gps_ns))) / NS_PER_S
-    if not 0.95 < felt / GRAVITY_M_PER_S2 < 1.05:
+    if not 0.95 < felt / STANDARD_GRAVITY_M_PER_S2 < 1.05:
         _wrong_force(felt, step_s)
     mean = vehicle.body_from_imu @ imu.specific_force_m_per_s2.mean(axis=0)
     tilt = np.degrees(np.arccos(np.clip(-mean[2] / np.linalg.norm(mean), -1.0, 1.0)))
@@ -106,11 +107,11 @@ def check_tipping(imu: ImuReadings, vehicle: VehicleSensors) -> None:
     tipped, moved = _detrended(np.cumsum(rate[:, :2], axis=0) * STEP_S, size), _detrended(force[:, 1::-1], size)
     angle, feels = np.sqrt((tipped**2).mean(axis=0)), np.sqrt((moved**2).mean(axis=0))
     for axis in range(2):
-        if angle[axis] > _TIPPED_RAD and feels[axis] < 0.2 * GRAVITY_M_PER_S2 * np.sin(min(angle[axis], 1.5)):
+        if angle[axis] > _TIPPED_RAD and feels[axis] < 0.2 * STANDARD_GRAVITY_M_PER_S2 * np.sin(min(angle[axis], 1.5)):
             raise ConfigError(
                 f"the gyroscope about the {_BODY[axis]} axis says that the vehicle tips by "
                 f"{np.degrees(angle[axis]):.0f}° (1 σ within {_LEAST_S:g} s), but gravity moves only as for "
-                f"{np.degrees(feels[axis] / GRAVITY_M_PER_S2):.1f}°",
+                f"{np.degrees(feels[axis] / STANDARD_GRAVITY_M_PER_S2):.1f}°",
                 expected="angular rates in rad/s",
                 change="state that the log's rates are in degrees a second, if they are",
             )
@@ -406,7 +407,7 @@ def _check_tilt(felt: Felt, signs: Float64, vehicle: VehicleSensors) -> None:
     w = felt.windows
     sense = np.where(signs < 0, -1.0, 1.0)
     level = felt.force[:, :2] - np.stack([sense * w.surge, np.where(w.driving, sense * w.aside, 0.0)], axis=1)
-    shown = np.stack([-level[:, 1], level[:, 0]], axis=1) / GRAVITY_M_PER_S2
+    shown = np.stack([-level[:, 1], level[:, 0]], axis=1) / STANDARD_GRAVITY_M_PER_S2
     turned = np.cumsum(np.nan_to_num(felt.rate[:, :2]), axis=0) * STEP_S
     size = round(_LEAST_S / STEP_S)
     pairs = [
@@ -484,13 +485,14 @@ def _refuse_lag(lag_s: float, alike: float, sigma_s: float) -> NoReturn:
 
 
 def _wrong_force(felt: float, step_s: float) -> NoReturn:
-    units = {"g": 1 / GRAVITY_M_PER_S2, "mg": 1000 / GRAVITY_M_PER_S2, "cm/s² (Gal)": 100.0, "ft/s²": 3.28084,
+    units = {"g": 1 / STANDARD_GRAVITY_M_PER_S2, "mg": 1000 / STANDARD_GRAVITY_M_PER_S2,
+             "cm/s² (Gal)": 100.0, "ft/s²": 3.28084,
              "m/s over each sample (velocity increments)": step_s,
-             "g·s over each sample": step_s / GRAVITY_M_PER_S2}  # fmt: skip
-    fitting = [name for name, factor in units.items() if 0.95 < felt / (GRAVITY_M_PER_S2 * factor) < 1.05]
+             "g·s over each sample": step_s / STANDARD_GRAVITY_M_PER_S2}  # fmt: skip
+    fitting = [name for name, factor in units.items() if 0.95 < felt / (STANDARD_GRAVITY_M_PER_S2 * factor) < 1.05]
     raise ConfigError(
         f"the IMU feels a force of {felt:.4g} (median), at samples {step_s * 1e3:.4g} ms apart",
-        expected=f"about {GRAVITY_M_PER_S2:.2f} m/s², gravity's, for the most part",
+        expected=f"about {STANDARD_GRAVITY_M_PER_S2:.2f} m/s², gravity's, for the most part",
         change=f"the log seems to be in {' or '.join(fitting)}: state its unit"
         if fitting
         else "check the unit of the accelerations, and that gravity was not removed",

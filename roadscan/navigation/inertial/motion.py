@@ -20,6 +20,7 @@ from roadscan.compute.robust import scatter_about
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned
 from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
 
 Float64 = npt.NDArray[np.float64]
@@ -28,7 +29,6 @@ Flags = npt.NDArray[np.bool_]
 
 STEP_S: Final = 0.1
 """Interval between the windows' middles."""
-GRAVITY_M_PER_S2: Final = 9.80665  # Standard gravity.
 SLOWEST_M_PER_S: Final = 2.0
 """Least speed (and least multiple of 20 of its noise) at which a course is used."""
 _SPIKE_M_PER_S: Final = 0.5  # A velocity farther than this from the median of its neighbours is a spike …
@@ -143,7 +143,7 @@ def windows_of(track: Track, span_gps_ns: tuple[int, int]) -> Windows:
         speed,
         turn,
         surge,
-        surge + GRAVITY_M_PER_S2 * slope,
+        surge + STANDARD_GRAVITY_M_PER_S2 * slope,
         noise / np.maximum(speed, 1.0),
         noise,
     )

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
 
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.kernels.kalman_states import Fixes
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
@@ -92,7 +93,6 @@ def colour_restarts(gnss: GnssSolutions) -> npt.NDArray[np.bool_]:
     return np.append(False, gnss.quality[1:] != gnss.quality[:-1])
 
 
-_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # Unit of the stated noise.
 _LEAST_DENSITY: Final = 1e-8
 """Noise of a perfect IMU, rad/√s and m/s/√s, from rounding."""
 _TREMBLING_S: Final = 1.0  # Time over which vibration is measured.
@@ -104,7 +104,7 @@ def imu_noise(
     """Return noise of gyroscopes (rad²/s) and accelerometers (m²/s³), (k, 3) in the IMU's axes, around epochs (k,)."""
     errors = vehicle.imu_errors
     gyro = max(float(np.radians(errors.gyro_noise_deg_per_sqrt_h)) / 60.0, _LEAST_DENSITY)
-    accel = max(errors.accel_noise_ug_per_sqrt_hz * 1e-6 * _STANDARD_GRAVITY_M_PER_S2, _LEAST_DENSITY)
+    accel = max(errors.accel_noise_ug_per_sqrt_hz * 1e-6 * STANDARD_GRAVITY_M_PER_S2, _LEAST_DENSITY)
     at = np.clip(np.searchsorted(imu.epochs_gps_ns, epochs), 0, imu.epochs_gps_ns.size - 1)
     step = float(np.median(np.diff(imu.epochs_gps_ns))) * 1e-9
     share = config.vibration_share**2 * step

@@ -20,6 +20,7 @@ from scipy.special import chdtri
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import quaternion_from_rotation
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.alignment import Alignment, align
 from roadscan.navigation.inertial.earth import ecef_from_level
@@ -54,7 +55,6 @@ Bool = npt.NDArray[np.bool_]
 KINDS: Final = np.array(
     ["gnss position", "gnss velocity", "odometer", "non-holonomic", "zero velocity", "zero rotation"]
 )
-_STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # Unit of the stated bias.
 _SHORTEST_PIECE_S: Final = 5.0  # Least time of GNSS in a piece that is solved.
 _FINE_S: Final = 60.0
 """The first pass over the beginning continues for this long after the coarse alignment."""
@@ -205,7 +205,7 @@ def _gyro_bias_sigma(vehicle: VehicleSensors) -> float:
 
 
 def _accel_bias_sigma(vehicle: VehicleSensors) -> float:
-    return vehicle.imu_errors.accel_bias_mg * 1e-3 * _STANDARD_GRAVITY_M_PER_S2
+    return vehicle.imu_errors.accel_bias_mg * 1e-3 * STANDARD_GRAVITY_M_PER_S2
 
 
 def _start(

@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.gpstime import iso_from_gps_ns
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.settings.odometry import OdometryConfig
 from roadscan.core.witness import Finding, Witness
 from roadscan.navigation.odometry.registration import FEWEST_POINTS, LEAST_HELD, Matched
-from roadscan.navigation.odometry.rig_motion import GRAVITY_M_PER_S2, WINDOW_S, Way, Windows
+from roadscan.navigation.odometry.rig_motion import WINDOW_S, Way, Windows
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
@@ -29,7 +30,7 @@ LIDAR_ODOMETRY: Final = Witness(
     "not held along the road, no trajectory is made",
     told=("findings", "error"),
 )
-_LEAP_M, _LEAP_M_PER_S2 = 0.5, 1.5 * GRAVITY_M_PER_S2
+_LEAP_M, _LEAP_M_PER_S2 = 0.5, 1.5 * STANDARD_GRAVITY_M_PER_S2
 """A pose lies off a steady motion by at most this, and by what brakes and kerbs do."""
 _TURN_RAD: Final = np.radians(1.5)  # turn within a window that gyroscope and sweeps may differ by
 _TILT_RAD: Final = np.radians(2.0)  # gravity of a window against that of the drive

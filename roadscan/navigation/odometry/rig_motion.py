@@ -11,13 +11,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from roadscan.core.frames import ENU_FROM_NED
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.imu import ImuErrors
+from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2, ImuErrors
 from roadscan.core.settings.odometry import OdometryConfig
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-GRAVITY_M_PER_S2: Final = 9.80665  # standard gravity (CGPM 1901)
 WINDOW_S: Final = 5.0
 """Length of the pieces over which accelerations are averaged and turns compared (s): shorter than a turn of a road."""
 _FLOOR_M, _FLOOR_DEG = 0.02, 0.1
@@ -154,7 +153,9 @@ def _to_up(up: Float64) -> Float64:
 
 def tilt_sigma_rad(errors: ImuErrors) -> float:
     """Return 1 σ of roll and pitch of a way that was unbent."""
-    return float(np.hypot(1e-3 * errors.accel_bias_mg, np.sqrt(2) * _SPEED_SIGMA_M_PER_S / WINDOW_S / GRAVITY_M_PER_S2))
+    return float(
+        np.hypot(1e-3 * errors.accel_bias_mg, np.sqrt(2) * _SPEED_SIGMA_M_PER_S / WINDOW_S / STANDARD_GRAVITY_M_PER_S2)
+    )
 
 
 def sigmas(

@@ -14,7 +14,7 @@ import pyarrow.csv as pa_csv
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.imu import IMU_GRADES, ImuErrors
+from roadscan.core.imu import IMU_GRADES, STANDARD_GRAVITY_M_PER_S2, ImuErrors
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import Mount, Scene
@@ -24,7 +24,6 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 CHUNK: Final = 16_384  # samples of a chunk
-STANDARD_GRAVITY_M_PER_S2: Final = 9.80665  # size of the unit g (m/s²)
 AT_BODY: Final = Mount(lever_arm_body_m=(0.0, 0.0, 0.0))
 """An IMU at the IMU reference point, axes forward, right, down."""
 _STENCIL_S: Final = 0.010

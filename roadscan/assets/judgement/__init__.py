@@ -1,0 +1,1 @@
+"""Judgements of segments: boosted trees that were fitted to labelled streets, a file a question."""

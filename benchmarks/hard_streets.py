@@ -7,6 +7,7 @@ passes and all errors are drawn, too. The same seed gives the same scene.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from roadscan.simulate import Scene
 from roadscan.simulate.scene.roadside import Roadside
+from roadscan.simulate.vehicles import SIZES_M
 
 KINDS: Final = ("town", "suburb", "old_town", "country", "industrial", "motorway")
 """Kinds of streets."""
@@ -22,8 +24,8 @@ SCANNERS: Final = ("HDL-64E", "HDL-32E", "VLP-16", "OS1-128", "XT32")
 _OFF: Final = {key: {"on": False} for key in ("profilers", "sick", "camera", "imu", "gnss", "encoder")}
 _LEAD_M: Final = 60.0
 _FIRINGS_A_SECOND: Final = {"HDL-64E": 1.33e6, "HDL-32E": 0.69e6, "VLP-16": 0.29e6, "OS1-128": 1.31e6, "XT32": 0.64e6}
-_MOST_FIRINGS: Final = 4.5e6
-"""Firings of all passes of a street, at most: with more it takes longer than 20 s."""
+_MOST_FIRINGS: Final = 3.0e6
+"""Firings of all passes of a street, at most, for its time; half as many again of those with a million a second."""
 _UPRIGHT: Final = {"lever_arm_body_m": (0.0, 0.0, -1.73), "roll_deg": 0.0, "pitch_deg": 0.0, "heading_deg": 0.0}
 _HALF_LANE: Final = {"town": 3.25, "suburb": 3.0, "old_town": 2.75, "country": 3.25, "industrial": 3.75,
                      "motorway": 7.5}  # fmt: skip
@@ -164,7 +166,8 @@ def _break_ground(street: _Street) -> None:
             })  # fmt: skip
         if chance(0.3):  # a gutter
             street.patches.append({**here, "offset_m": side * (street.paved_m - 0.16), "width_m": 0.3,
-                                   "height_m": -between(0.008, 0.025), "edge_m": 0.1, "shade": between(80, 150)})  # fmt: skip
+                                   "height_m": -between(0.008, 0.025), "edge_m": 0.1,
+                                   "shade": between(80, 150)})  # fmt: skip
 
 
 def _road(street: _Street) -> dict[str, Any]:
@@ -297,9 +300,9 @@ def _boundaries(street: _Street) -> None:
             _boundary(street, side * at, span)
             start = span["end_m"]
             if chance(0.5):
-                street.add("fences", what="gate", offset_m=side * at, start_m=start + 0.1, end_m=start + between(1.2, 3.5),
-                           height_m=between(0.9, 1.6), style=street.one_of("pickets", "mesh"),
-                           density=between(0.25, 0.7), picket_m=0.05)  # fmt: skip
+                street.add("fences", what="gate", offset_m=side * at, start_m=start + 0.1,
+                           end_m=start + between(1.2, 3.5), height_m=between(0.9, 1.6),
+                           style=street.one_of("pickets", "mesh"), density=between(0.25, 0.7), picket_m=0.05)  # fmt: skip
                 start += 3.6
 
 
@@ -360,9 +363,9 @@ def _posts(street: _Street) -> None:
                    clearance_m=between(1.2, 3.0), shade=between(180, 255) if bright else between(90, 180),
                    faces=street.one_of("forward", "backward"), back_shade=between(60, 140))  # fmt: skip
     if chance(0.3):
-        street.add("signs", station_m=between(5, street.length_m - 5), offset_m=street.side() * (kerb + between(1.5, 3)),
-                   width_m=between(1.2, 3.5), height_m=between(0.8, 2.2), clearance_m=between(1.5, 2.5),
-                   shade=between(170, 255), faces=street.one_of("forward", "backward"))  # fmt: skip
+        street.add("signs", station_m=between(5, street.length_m - 5),
+                   offset_m=street.side() * (kerb + between(1.5, 3)), width_m=between(1.2, 3.5),
+                   height_m=between(0.8, 2.2), clearance_m=between(1.5, 2.5), shade=between(170, 255), faces=street.one_of("forward", "backward"))  # fmt: skip
     for station, offset in street.places(6, kerb + 0.15, kerb + 2.5):
         street.add("poles", station_m=station, offset_m=offset, height_m=street.log_between(0.7, 9.0),
                    diameter_m=street.log_between(0.05, 0.35), shade=between(50, 200))  # fmt: skip
@@ -402,8 +405,9 @@ def _traffic(street: _Street) -> None:
                            heading_deg=between(-4, 4) + 180.0 * chance(0.5), form=int(street.random.integers(0, 60)),
                            glass=between(0.3, 0.7), shade=between(20, 240))  # fmt: skip
                 if chance(0.2):  # a post at 0.3 m from it
-                    street.add("poles", station_m=station + between(-half, half), offset_m=side * (street.paved_m + 0.3),
-                               height_m=between(0.8, 4.0), diameter_m=between(0.06, 0.16))  # fmt: skip
+                    street.add("poles", station_m=station + between(-half, half),
+                               offset_m=side * (street.paved_m + 0.3), height_m=between(0.8, 4.0),
+                               diameter_m=between(0.06, 0.16))  # fmt: skip
             station += half + between(0.4, 6.0)
     _move(street)
 
@@ -414,8 +418,7 @@ def _move(street: _Street) -> None:
     fast = {"town": 9.0, "suburb": 8.0, "old_town": 5.0, "country": 18.0, "industrial": 8.0, "motorway": 24.0}
     for _ in range(int(street.random.integers(0, 4))):
         what = street.one_of("car", "car", "van", "lorry", "motorcycle", "bicycle")
-        size = {"car": (4.4, 1.8, 1.5), "van": (5.4, 2.0, 2.4), "lorry": (8.5, 2.5, 3.6), "motorcycle": (2.1, 0.8, 1.15),
-                "bicycle": (1.75, 0.6, 1.05)}[what]  # fmt: skip
+        size = SIZES_M[what]
         side, speed = street.side(), (4.5 if what == "bicycle" else fast[street.kind] * between(0.5, 1.2))
         street.add("moving_cars", what=what, station_m=between(-20, street.length_m), speed_m_per_s=side * speed,
                    offset_m=side * street.half_m * (0.85 if what == "bicycle" else 0.5), form=int(between(0, 60)),
@@ -437,7 +440,9 @@ def _furnish(street: _Street) -> None:
     """Add furniture between kerb and fronts, covers and drains."""
     between = street.between
     far = max(street.edge_m - 0.4, street.paved_m + 0.8)
-    rich = {"town": 1.0, "suburb": 0.8, "old_town": 0.8, "country": 0.3, "industrial": 0.6, "motorway": 0.2}[street.kind]
+    rich = {"town": 1.0, "suburb": 0.8, "old_town": 0.8, "country": 0.3, "industrial": 0.6, "motorway": 0.2}[
+        street.kind
+    ]
     most = {"cabinet": 3, "bin": 5, "litter_bin": 2, "bench": 2, "hydrant": 2, "bus_shelter": 1, "bollard": 6,
             "advertising_column": 1, "billboard": 1, "letter_box": 1, "parking_meter": 1, "planter": 2,
             "sandwich_board": 2}  # fmt: skip
@@ -470,7 +475,7 @@ def _hang_wires(street: _Street) -> None:
     stations = [first + span * n for n in range(int((street.length_m + 15.0 - first) / span) + 1)]
     for station in stations:
         street.add("poles", station_m=station, offset_m=offset, height_m=height + 0.3, diameter_m=between(0.15, 0.3))
-    for start, end in zip(stations[:-1], stations[1:], strict=True):
+    for start, end in itertools.pairwise(stations):
         for number in range(int(street.random.integers(1, 4))):
             up = height - 0.35 * number
             street.add("wires", station_m=start, offset_m=offset, to_station_m=end, to_offset_m=offset, height_m=up,
@@ -488,8 +493,9 @@ def _survey(street: _Street, model: str) -> dict[str, Any]:
     """Return scanner, mounting, speed, passes and errors."""
     between, chance = street.between, street.chance
     low, high = (12.0, 25.0) if street.kind == "motorway" else (7.0, 14.0)
-    most = _MOST_FIRINGS / _FIRINGS_A_SECOND[model]
-    least = (street.length_m + 8.0) / most
+    a_second = _FIRINGS_A_SECOND[model]
+    most_s = (1.5 if a_second > 1e6 else 1.0) * _MOST_FIRINGS / a_second
+    least = street.length_m / (most_s - 0.6)
     speed = max(between(low, high), least)
     passes = [{"lane": 1 + n % 2, "direction": "forward" if n % 2 or chance(0.5) else "backward"}
               for n in range(1 + min(int(street.random.integers(0, 3)), int(speed / least) - 1))]  # fmt: skip
@@ -498,7 +504,8 @@ def _survey(street: _Street, model: str) -> dict[str, Any]:
              "roll_deg": between(-1, 1), "pitch_deg": between(12, 25) if tilted else between(-1.5, 1.5),
              "heading_deg": between(-180, 180) if not tilted else between(-4, 4)}  # fmt: skip
     return {
-        "bag": {"on": model in ("HDL-64E", "VLP-16")}, "passes": passes, "vehicle": {"speed_m_per_s": speed, "standstill_s": 0.0},
+        "bag": {"on": model in ("HDL-64E", "VLP-16")}, "passes": passes,
+        "vehicle": {"speed_m_per_s": speed, "standstill_s": 0.0},
         "lidar": {"model": model, "range_max_m": between(28.0, 45.0), "divergence_deg": "data sheet", "errors": "model",
                   "laser_range_m": between(0.0, 0.02), "laser_gain": between(0.0, 0.35), "dark_m": between(25, 70),
                   "false_returns": street.log_between(1e-4, 4e-3), "mount": mount},
@@ -507,5 +514,3 @@ def _survey(street: _Street, model: str) -> dict[str, Any]:
                   "attitude_time_constant_s": 8.0, "time_constant_s": 10.0, "pass_step_m": between(0.01, 0.05),
                   "step_m": between(0.01, 0.05) * chance(0.6), "steps_per_minute": 20.0},
     }  # fmt: skip
-
-

@@ -39,6 +39,7 @@ class Place:
 
 
 def place_at(surface: Surface, station_m: float, offset_m: float) -> Place:
+    """Return the place on the ground at a station and an offset."""
     e, n, heading = surface.place(station_m, offset_m)
     origin = surface.origin_enh_m
     e0, n0 = float(e) - float(origin[0]), float(n) - float(origin[1])
@@ -76,6 +77,7 @@ def body_row(
 
 
 def post(place: tuple[float, float], low: float, high: float, radius: float, shade: float) -> Float64:
+    """Return the row (19,) of an upright cylinder that reaches into the ground."""
     return body_row(body.CYLINDER, place, 0.0, (radius, 0.0), (low - BURIED_M, high), shade)
 
 
@@ -128,6 +130,21 @@ class Assembly:
         """Return all bodies (n, 19)."""
         return np.stack(self.rows)
 
+    @property
+    def extent_m(self) -> tuple[float, float, float]:
+        """Return length and width of the smallest rectangle around its foot that holds it, and its height (m)."""
+        rows = self.bodies
+        east, north = rows[:, body.EASTING] - self.place.enh_m[0], rows[:, body.NORTHING] - self.place.enh_m[1]
+        sine, cosine = math.sin(self.heading_rad), math.cos(self.heading_rad)
+        half, wide = rows[:, body.HALF_LENGTH], rows[:, body.HALF_WIDTH]
+        is_round = np.isin(rows[:, body.KIND], (body.CYLINDER, body.ELLIPSOID, body.BUSH))
+        along = np.abs(rows[:, body.SINE] * sine + rows[:, body.COSINE] * cosine)
+        across = np.abs(rows[:, body.COSINE] * sine - rows[:, body.SINE] * cosine)
+        ahead = np.abs(east * sine + north * cosine) + np.where(is_round, half, along * half + across * wide)
+        right = np.abs(east * cosine - north * sine) + np.where(is_round, half, across * half + along * wide)
+        up = float(rows[:, [body.HIGH, body.HIGH_END]].max()) - self.place.enh_m[2]
+        return 2.0 * float(ahead.max()), 2.0 * float(right.max()), up
+
     def _add(self, row: Float64, part: int) -> None:
         row[body.PART] = part
         self.rows.append(row)
@@ -173,17 +190,17 @@ class Assembly:
 
     def plate(
         self, ahead: float, right: float, up: tuple[float, float], width: float, shade: float, *,
-        turned_rad: float = math.pi / 2, density: float = 1.0, glass: bool = False, part: int = 0,
+        turned_rad: float = math.pi / 2, density: float = 1.0, glass: bool = False,
     ) -> None:  # fmt: skip
-        """Add an upright thin rectangle, across the heading unless it is turned; of glass, it stops a share of beams."""
+        """Add an upright thin rectangle, across the heading unless it is turned; `density`: share of beams it stops."""
         at, z = self.place.beside(ahead, right, self.heading_rad), self.place.enh_m[2]
         kind = body.GLAZED if glass else body.WALL
         half, heights = (width / 2, 0.0), (z + up[0], z + up[1])
-        self._add(body_row(kind, at, self.heading_rad + turned_rad, half, heights, shade, density), part)
+        self._add(body_row(kind, at, self.heading_rad + turned_rad, half, heights, shade, density), 0)
 
     def slope(
         self, ahead: tuple[float, float], right: tuple[float, float], up: tuple[float, float, float], shade: float, *,
-        density: float = 1.0, glass: bool = False, lid: bool = False, part: int = 0,
+        density: float = 1.0, glass: bool = False, lid: bool = False,
     ) -> None:  # fmt: skip
         """Add a leaning rectangle (or the ellipse in it) between two places ahead and two to the right.
 
@@ -197,7 +214,7 @@ class Assembly:
         row[body.ALONG], row[body.STOREY] = up[1] / length, up[2] / width
         row[[body.HIGH, body.HIGH_END]] = z + (abs(up[1]) + abs(up[2])) / 2
         row[body.WINDOW] = float(glass)
-        self._add(row, part)
+        self._add(row, 0)
 
 
 def rod_row(

@@ -74,7 +74,8 @@ class Hits:
     is_mixed: npt.NDArray[np.bool_]
     """(g, m) True where the range is a mixture: the point is then in the ray's middle, and on nothing."""
     part: npt.NDArray[np.int8]
-    """(g, m) class of the body met, where it differs from its object's (:mod:`roadscan.simulate.semantics`); 0: none."""
+    """(g, m) class of the body met, where it is another than its object's; 0: it is not, or none was met. Numbers of
+    :mod:`roadscan.simulate.semantics`."""
 
     def of_groups(self, groups: int) -> Self:
         """Return the same rays in another number of groups."""

@@ -521,11 +521,7 @@ def _(one: Furniture, place: Place, surface: Surface) -> tuple[tuple[float, floa
     turned = math.radians(one.heading_deg) + (0.0 if one.offset_m > 0.0 else math.pi)
     made = Assembly(place, place.heading_rad + turned)
     MADE[one.what](made, one.scale, one.shade)
-    rows = made.bodies
-    extent = np.ptp(np.stack([rows[:, body.LOW], rows[:, body.HIGH]]))
-    beside = np.hypot(rows[:, body.EASTING] - place.enh_m[0], rows[:, body.NORTHING] - place.enh_m[1])
-    around = 2.0 * float((beside + rows[:, body.HALF_LENGTH]).max())
-    return (around, around, float(extent)), turned, rows
+    return made.extent_m, turned, made.bodies
 
 
 @_made.register

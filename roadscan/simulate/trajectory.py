@@ -93,7 +93,7 @@ def write_accuracy(scene: Scene, drive: Drive, file: Path) -> Iterator[int]:
 
 
 class PoseErrors:
-    """Gauss–Markov errors of position (north, east, down) and attitude (roll, pitch, heading), and steps of position."""
+    """Gauss–Markov errors of position (north, east, down; with steps) and of attitude (roll, pitch, heading)."""
 
     def __init__(self, scene: Scene, number: int) -> None:
         sigma = np.array(scene.noise.pose_sigma())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import Final
@@ -132,7 +133,7 @@ def _ring(one: Assembly, ahead: float, radius: float) -> None:
     """Add a wheel of eight straight pieces."""
     corners = [(ahead + radius * math.cos(a), 0.0, radius + radius * math.sin(a))
                for a in np.linspace(0.0, 2 * math.pi, 9)]  # fmt: skip
-    for first, last in zip(corners[:-1], corners[1:], strict=True):
+    for first, last in itertools.pairwise(corners):
         one.rod(first, last, 0.02, _RUBBER)
 
 

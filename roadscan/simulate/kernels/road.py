@@ -72,8 +72,8 @@ class RoadArrays(NamedTuple):
     """(m, 4) by node. Station, half of the top with both ramps, 1 / length of a ramp, height."""
     items: Float64
     """(m, 8) by node, what is painted or spilt: kind, intensity, station, offset, and
-    0 rectangle: half length, half width, share of the paint that is worn off; 1 ellipse with a soft edge: the same; 2 ring: inner and outer radius;
-    3 band: half width, 0, station and offset of its other end."""
+    0 rectangle: half length, half width, share of the paint that is worn off; 1 ellipse with a soft edge: half length,
+    half width; 2 ring: inner and outer radius; 3 band: half width, 0, station and offset of its other end."""
     tracks: Float64
     """(t, s) unevenness (m) at even offsets and stations; (0, 0): none."""
     texture: Float32

@@ -18,8 +18,8 @@ Float64 = npt.NDArray[np.float64]
 BOX, CYLINDER, ELLIPSOID, WALL, DISC, TRIANGLE, OCTAGON, DIAMOND = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
 """Kinds of bodies. Walls, discs and the four after them are thin, upright, and visible from both sides."""
 SLOPE, LID, ROD, VOLUME, BUSH, PICKETS, GLAZED = 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0
-"""A leaning rectangle and ellipse; a cylinder in any direction; a box and an ellipsoid that stop beams within; a wall with
-slots; a wall of glass, or with windows of it."""
+"""A leaning rectangle and ellipse; a cylinder in any direction; a box and an ellipsoid that stop beams within; a wall
+with slots; a wall of glass, or with windows of it."""
 
 # Columns of a body.
 KIND, EASTING, NORTHING, SINE, COSINE, HALF_LENGTH, HALF_WIDTH, LOW, HIGH = 0, 1, 2, 3, 4, 5, 6, 7, 8
@@ -33,10 +33,10 @@ _OCTAGON_CUT = math.sqrt(2.0)
 # an ellipsoid seen from above, of a disc. A wall runs along its length from LOW … HIGH at its start to LOW_END …
 # HIGH_END; it goes on SKIRT below that, and if BAY > 0 it has windows of WINDOW by WINDOW in bays and storeys, whose
 # pattern is ALONG past its beginning at the wall's start. DENSITY: share of beams that it stops each time they pass.
-# SLOPE and LID: LOW is the height of the middle, ALONG and STOREY the rise ahead and to the right (m/m), WINDOW > 0: it is
-# of glass; HIGH only bounds it. ROD: LOW and LOW_END are the heights of the ends of its axis, half a width is its radius.
-# VOLUME and BUSH: DENSITY is the extinction along a beam (1/m). PICKETS: WINDOW of each BAY is solid. GLAZED: its windows
-# stop the share DENSITY, those of BAY 0 are the whole wall.
+# SLOPE and LID: LOW is the height of the middle, ALONG and STOREY the rise ahead and to the right (m/m), WINDOW > 0: it
+# is of glass; HIGH only bounds it. ROD: LOW and LOW_END are heights of its axis' ends, half its width is the radius.
+# VOLUME and BUSH: DENSITY is the extinction along a beam (1/m). PICKETS: WINDOW of each BAY is solid. GLAZED: windows
+# stop the share DENSITY; with BAY 0 the whole wall is one.
 FRAME_M = 0.07
 """Width of the frame of a glazed wall's windows, which is solid (m)."""
 FRAME_SHADE = 170.0
@@ -158,7 +158,7 @@ def meet_plate(
 
 @inlined
 def window_depth(rows: Float64, i: int, along: float, z: float) -> float:
-    """Return how far inside a window a point of a wall is, from the window's outline (m); not positive: in no window."""
+    """Return how far a point of a wall lies within a window's outline (m); not positive: in no window."""
     half = rows[i, HALF_LENGTH]
     if rows[i, BAY] == 0.0:
         return np.inf

@@ -110,9 +110,9 @@ class Lidar(Strict):
     on: bool = True
     """Whether the rig carries it."""
     model: str = "HDL-32E"
-    """Its model (HDL-32E, HDL-64E, Mid-360, OS1-128, VLP-16, XT32): a file of figures with elevations, firing times, unit of
-    ranges, width of the beams and errors. HDL-32E, OS1-128 and XT32 are recorded as captures of their packets, or in a
-    bag (`bag.on`), as the others always are."""
+    """Its model (HDL-32E, HDL-64E, Mid-360, OS1-128, VLP-16, XT32): a file of figures with elevations, firing times,
+    unit of ranges, width of the beams and errors. HDL-32E, OS1-128 and XT32 are recorded as captures of their packets,
+    or in a bag (`bag.on`), as the others always are."""
     turns_per_s: float = Field(default=10.0, ge=5.0, le=20.0)
     """Turns of the head a second; frames a second of a Mid-360."""
     range_max_m: float = Field(default=20.0, gt=2.0, le=100.0)

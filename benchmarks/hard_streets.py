@@ -302,7 +302,8 @@ def _boundaries(street: _Street) -> None:
             if chance(0.5):
                 street.add("fences", what="gate", offset_m=side * at, start_m=start + 0.1,
                            end_m=start + between(1.2, 3.5), height_m=between(0.9, 1.6),
-                           style=street.one_of("pickets", "mesh"), density=between(0.25, 0.7), picket_m=0.05)  # fmt: skip
+                           style=street.one_of("pickets", "mesh"), density=between(0.25, 0.7),
+                           picket_m=0.05)  # fmt: skip
                 start += 3.6
 
 
@@ -365,7 +366,8 @@ def _posts(street: _Street) -> None:
     if chance(0.3):
         street.add("signs", station_m=between(5, street.length_m - 5),
                    offset_m=street.side() * (kerb + between(1.5, 3)), width_m=between(1.2, 3.5),
-                   height_m=between(0.8, 2.2), clearance_m=between(1.5, 2.5), shade=between(170, 255), faces=street.one_of("forward", "backward"))  # fmt: skip
+                   height_m=between(0.8, 2.2), clearance_m=between(1.5, 2.5),
+                   shade=between(170, 255), faces=street.one_of("forward", "backward"))  # fmt: skip
     for station, offset in street.places(6, kerb + 0.15, kerb + 2.5):
         street.add("poles", station_m=station, offset_m=offset, height_m=street.log_between(0.7, 9.0),
                    diameter_m=street.log_between(0.05, 0.35), shade=between(50, 200))  # fmt: skip

@@ -25,7 +25,7 @@ _OFF: Final = {key: {"on": False} for key in ("profilers", "sick", "camera", "im
 _LEAD_M: Final = 60.0
 _FIRINGS_A_SECOND: Final = {"HDL-64E": 1.33e6, "HDL-32E": 0.69e6, "VLP-16": 0.29e6, "OS1-128": 1.31e6, "XT32": 0.64e6}
 _MOST_FIRINGS: Final = 3.0e6
-"""Firings of all passes of a street, at most, for its time; half as many again of those with a million a second."""
+"""Firings of all passes of a street, at most, for its time; a quarter more of those with a million a second."""
 _UPRIGHT: Final = {"lever_arm_body_m": (0.0, 0.0, -1.73), "roll_deg": 0.0, "pitch_deg": 0.0, "heading_deg": 0.0}
 _HALF_LANE: Final = {"town": 3.25, "suburb": 3.0, "old_town": 2.75, "country": 3.25, "industrial": 3.75,
                      "motorway": 7.5}  # fmt: skip
@@ -496,7 +496,7 @@ def _survey(street: _Street, model: str) -> dict[str, Any]:
     between, chance = street.between, street.chance
     low, high = (12.0, 25.0) if street.kind == "motorway" else (7.0, 14.0)
     a_second = _FIRINGS_A_SECOND[model]
-    most_s = (1.5 if a_second > 1e6 else 1.0) * _MOST_FIRINGS / a_second
+    most_s = (1.25 if a_second > 1e6 else 1.0) * _MOST_FIRINGS / a_second
     least = street.length_m / (most_s - 0.6)
     speed = max(between(low, high), least)
     passes = [{"lane": 1 + n % 2, "direction": "forward" if n % 2 or chance(0.5) else "backward"}

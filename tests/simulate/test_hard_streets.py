@@ -12,6 +12,8 @@ from benchmarks.hard_streets import KINDS, SCANNERS, hard_street
 from benchmarks.labelled_returns import CLASSES, LabelledReturns, labelled_returns
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.semantics import CLASS_OF_KIND, class_number
+from roadscan.simulate.sensors.lidar import laser_errors
+from roadscan.simulate.trajectory import PoseErrors
 
 SEED = 6
 SHORT = {"length_m": 5.0, "lidar": {"model": "VLP-16", "range_max_m": 20.0}, "bag": {"on": True}}
@@ -106,3 +108,35 @@ def test_labels_say_where_returns_lie():
 @pytest.mark.parametrize("name", sorted(set(CLASS_OF_KIND.values())))
 def test_classes_of_kinds_are_classes(name):
     assert name in CLASSES
+
+
+def test_lasers_are_off_for_good_and_dark_things_are_lost():
+    exact = short().noiseless()
+    scene = exact.changed(lidar={"laser_range_m": 0.02, "dark_m": 25.0, "false_returns": 0.003})
+    street, whole = labelled_returns(scene), seen(exact=True)
+    met = street.object_id >= 0
+    true_m = np.linalg.norm(street.true_xyh_m - _sensor(street), axis=1)
+    off = street.returns.range_m - true_m
+    known, _ = laser_errors(scene, 16)
+    for laser in range(16):
+        np.testing.assert_allclose(off[met & (street.returns.laser == laser)], known[laser], atol=0.002)
+    assert np.isnan(true_m).sum() > 20  # false returns
+    dark, bright = (
+        [np.mean((one.returns.intensity < 257 * 20) == low) * len(one.returns) for one in (street, whole)]
+        for low in (True, False)
+    )
+    assert dark[0] / dark[1] < bright[0] / bright[1] <= 1.01
+
+
+def test_stated_poses_step_between_passes_and_within():
+    scene = hard_street(SEED).changed(
+        noise={"position_m": 0.0, "attitude_deg": 0.0, "pass_step_m": 0.05, "step_m": 0.03, "steps_per_minute": 30.0}
+    )
+    taken = [PoseErrors(scene, number).take(60 * scene.trajectory.poses_per_s)[0] for number in range(8)]
+    first = np.array([one[0] for one in taken])
+    assert 0.02 < first.std() < 0.1
+    steps = [np.diff(one, axis=0) for one in taken]
+    count = np.mean([(one != 0.0).any(axis=1).sum() for one in steps])
+    assert count == pytest.approx(30.0, abs=8.0)
+    sizes = np.concatenate([one[(one != 0.0).any(axis=1)].ravel() for one in steps])
+    assert sizes.std() == pytest.approx(0.03, rel=0.15)

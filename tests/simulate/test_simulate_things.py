@@ -63,7 +63,9 @@ def cast(world: World, at, direction: np.ndarray, *, key=1, wide_deg=0.0, beside
     begin = tripod.start_gps_ns
     interval = np.array([[[begin, begin + 1_000]]])
     found = world.cast(tripod, HERE, np.eye(3), interval, np.ascontiguousarray(direction[None]), pattern, key)
-    return Hits(*(getattr(found, name)[0] for name in ("range_m", "enh_m", "intensity", "object_id", "is_mixed")))
+    return Hits(
+        *(getattr(found, name)[0] for name in ("range_m", "enh_m", "intensity", "object_id", "is_mixed", "part"))
+    )
 
 
 def world_of(scene: Scene) -> World:

@@ -239,7 +239,8 @@ class Scene(Strict):
             values[name]["mount"]["error"] = {}
         for name in ("lidar", "sick"):
             values[name]["divergence_deg"] = 0.0
-        values["lidar"]["errors"] = "noise"
+        values["lidar"] |= {"errors": "noise", "laser_range_m": 0.0, "laser_gain": 0.0, "dark_m": None}
+        values["lidar"]["false_returns"] = 0.0
         values["imu"] |= {"grade": "perfect", "errors": None}
         if self.profilers.head_imus is not None:
             values["profilers"]["head_imus"] = "perfect"

@@ -13,7 +13,7 @@ from roadscan.simulate.cells import cells_of
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.earth import LocalMap
 from roadscan.simulate.kernels import rays as kernels
-from roadscan.simulate.kernels.things import BODY_COLUMNS, EASTING, KIND, NORTHING
+from roadscan.simulate.kernels.things import BODY_COLUMNS, EASTING, KIND, NORTHING, PART
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Mount, Scene
 from roadscan.simulate.surface import Surface
@@ -73,6 +73,8 @@ class Hits:
     """(g, m) 0: the road, −1: nothing."""
     is_mixed: npt.NDArray[np.bool_]
     """(g, m) True where the range is a mixture: the point is then in the ray's middle, and on nothing."""
+    part: npt.NDArray[np.int8]
+    """(g, m) class of the body met, where it differs from its object's (:mod:`roadscan.simulate.semantics`); 0: none."""
 
     def of_groups(self, groups: int) -> Self:
         """Return the same rays in another number of groups."""
@@ -83,6 +85,7 @@ class Hits:
             self.intensity.reshape(shape),
             self.object_id.reshape(shape),
             self.is_mixed.reshape(shape),
+            self.part.reshape(shape),
         )
 
 
@@ -103,6 +106,7 @@ class World:
         """Moving objects, as they are at a pass's first profile."""
         bodies = np.concatenate([np.zeros((0, BODY_COLUMNS)), *(o.bodies for o in self.objects)])
         owners = [np.full(len(o.bodies), o.id, np.int32) for o in self.objects]
+        self._parts = bodies[:, PART].astype(np.int8)
         self.arrays = kernels.World(
             road=surface.arrays,
             cells=cells_of(scene.road, surface, bodies),
@@ -145,11 +149,15 @@ class World:
         fan, weight = pattern.fan()
         beside = np.full((count, 4), -1) if pattern.beside is None else pattern.beside
         found = kernels.Found(
-            np.empty((groups, count, 5)), np.empty((groups, count), np.int32), np.empty((groups, count), np.bool_)
+            np.empty((groups, count, 5)),
+            np.empty((groups, count), np.int32),
+            np.empty((groups, count), np.int32),
+            np.empty((groups, count), np.bool_),
         )
+        movers = self._movers(drive, first_slot, int((flat.max() - drive.start_gps_ns) // SLOT_NS), centre, reach)
         kernels.cast_rays(
             self.arrays,
-            self._movers(drive, first_slot, int((flat.max() - drive.start_gps_ns) // SLOT_NS), centre, reach),
+            movers,
             local.bases,
             kernels.Poses(
                 np.ascontiguousarray(origin[:, 0]),
@@ -176,8 +184,9 @@ class World:
                 np.empty((1, BODY_COLUMNS)),
                 np.empty(kernels.STATE_SIZE),
                 np.empty((2, 3)),
-                np.empty((weight.size, 5)),
-                np.empty((count, 5)),
+                np.empty((weight.size, 6)),
+                np.empty((count, 6)),
+                np.empty((3, 3)),
             ),
         )
         place = found.place
@@ -187,6 +196,7 @@ class World:
             place[..., 4],
             found.object_id,
             found.is_mixed,
+            np.concatenate([self._parts, movers.bodies[0, :, PART].astype(np.int8), np.zeros(1, np.int8)])[found.body],
         )
 
     def _movers(self, drive: Drive, first: int, last: int, centre: Float64, reach_m: float) -> kernels.Movers:

@@ -24,7 +24,7 @@ _IN_TILE: Final = TILE_CELLS * TILE_CELLS
 
 
 def cells_of(road: Road, surface: Surface, bodies: Float64) -> Cells:
-    """Return the map of a road and of the bodies (n, 18) beside it."""
+    """Return the map of a road and of the bodies (n, 19) beside it."""
     extent = _extents(bodies)
     corner, tiles = _tiles(road, surface, extent)
     count = int(tiles.max()) + 1
@@ -64,10 +64,12 @@ def _bound(road: Road, surface: Surface, cells: Cells) -> None:
 def _extents(bodies: Float64) -> Float64:
     """Return the least and greatest easting and northing (n, 4) of bodies."""
     half_length, half_width = bodies[:, body.HALF_LENGTH], bodies[:, body.HALF_WIDTH]
-    is_round = np.isin(bodies[:, body.KIND], (body.CYLINDER, body.ELLIPSOID))
+    is_round = np.isin(bodies[:, body.KIND], (body.CYLINDER, body.ELLIPSOID, body.BUSH))
     sine, cosine = np.abs(bodies[:, body.SINE]), np.abs(bodies[:, body.COSINE])
-    east = np.where(is_round, half_length, sine * half_length + cosine * half_width) + 0.01
-    north = np.where(is_round, half_length, cosine * half_length + sine * half_width) + 0.01
+    # The flat ends of a leaning rod reach out to all sides by its radius at most.
+    ends = np.where(bodies[:, body.KIND] == body.ROD, half_width, 0.0)
+    east = np.where(is_round, half_length, sine * half_length + np.maximum(cosine * half_width, ends)) + 0.01
+    north = np.where(is_round, half_length, cosine * half_length + np.maximum(sine * half_width, ends)) + 0.01
     e, n = bodies[:, body.EASTING], bodies[:, body.NORTHING]
     return np.stack([e - east, n - north, e + east, n + north], axis=-1)
 

@@ -76,13 +76,15 @@ def humps(road: Road) -> tuple[Float64, Float64]:
 
 
 def lines(road: Road) -> Float64:
-    """Return (m, 6) markings along the road."""
+    """Return (m, 8) markings along the road."""
     rows = []
     for line in road.markings:
         broken = line.dash_m > 0.0 and line.gap_m > 0.0
         period = line.dash_m + line.gap_m if broken else 0.0
-        rows.append([line.offset_m, line.width_m / 2, line.dash_m, period, line.start_m, line.end_m])
-    return _table(rows, 6)
+        shade = road.brightness.marking if line.shade is None else line.shade
+        place = [line.offset_m, line.width_m / 2, line.dash_m, period, line.start_m, line.end_m]
+        rows.append([*place, line.worn, shade])
+    return _table(rows, 8)
 
 
 def _table(rows: list[list[float]], columns: int) -> Float64:
@@ -256,11 +258,11 @@ def _painted(road: Road) -> list[list[float]]:
     rows: list[list[float]] = []
     for bar in road.stop_bars:
         middle, half = (bar.from_m + bar.to_m) / 2, abs(bar.to_m - bar.from_m) / 2
-        rows.append([RECTANGLE, paint, bar.station_m, middle, bar.width_m / 2, half, 0.0, 0.0])
+        rows.append([RECTANGLE, paint, bar.station_m, middle, bar.width_m / 2, half, bar.worn, 0.0])
     for walk in road.crosswalks:
         left, right = min(walk.from_m, walk.to_m), max(walk.from_m, walk.to_m)
         rows += [
-            [RECTANGLE, paint, walk.station_m, float(offset), walk.length_m / 2, walk.stripe_m / 2, 0.0, 0.0]
+            [RECTANGLE, paint, walk.station_m, float(offset), walk.length_m / 2, walk.stripe_m / 2, walk.worn, 0.0]
             for offset in np.arange(left + walk.stripe_m / 2, right, walk.stripe_m + walk.gap_m)
         ]
     for target in road.targets:

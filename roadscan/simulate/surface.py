@@ -156,6 +156,11 @@ def _section(road: Road, tracks: Float64, first_m: float, textured: bool, seed: 
     constants[kernels.ASPHALT : kernels.KERB + 1] = [
         shades.asphalt, shades.marking, shades.defect, shades.shoulder, shades.verge, shades.kerb,
     ]  # fmt: skip
+    if road.grass is not None:
+        grass = [road.grass.height_m, road.grass.from_m, road.grass.shade]
+        constants[kernels.GRASS : kernels.GRASS_SHADE + 1] = grass
+    else:
+        constants[kernels.GRASS_FROM], constants[kernels.GRASS_SHADE] = np.inf, shades.verge
     phases = stream(seed, 0, "ruts").uniform(0, 2 * math.pi, len(road.ruts))
     ruts = [
         [r.offset_m, 2.0 / r.width_m, r.depth_m, r.variation, 2 * math.pi / r.variation_m, phase]

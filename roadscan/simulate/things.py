@@ -12,34 +12,54 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.simulate.bodies import (
+    BURIED_M,
+    PIECE_M,
+    Assembly,
+    Place,
+    along,
+    body_row,
+    ground_at,
+    place_at,
+    points_on,
+    post,
+    rod_row,
+    walls,
+)
+from roadscan.simulate.furniture import MADE
 from roadscan.simulate.kernels import things as body
 from roadscan.simulate.kernels.road import STATION
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.scene.roadside import (
     Barrier,
     Box,
+    Cover,
     Facade,
     Fence,
+    Furniture,
     Guardrail,
+    Hedge,
     LampPost,
     MovingCar,
     Overhead,
     ParkedCar,
+    Person,
     Planting,
     Pole,
     Sign,
     Signal,
     Standing,
     Tree,
+    Vehicle,
+    Wall,
+    Wire,
 )
+from roadscan.simulate.semantics import SIGN, TRUNK, WALL
 from roadscan.simulate.surface import Surface
+from roadscan.simulate.vehicles import SIZES_M, vehicle_bodies
 
 Float64 = npt.NDArray[np.float64]
 
-PIECE_M: Final = 2.0
-"""Barriers follow the road in straight pieces no longer than this (m)."""
-BURIED_M: Final = 0.3
-"""Depth below the ground to which objects extend, so that no beam passes beneath them (m)."""
 _POST_RADIUS_M: Final = 0.03  # of posts of signs
 _RAIL_POST_RADIUS_M: Final = 0.05  # of posts of guardrails
 _PLATE_BEFORE_POST_M: Final = 0.04  # from a post's middle to a sign's face
@@ -54,6 +74,11 @@ _ARM_M: Final = 0.12  # thickness of an arm
 _LAMP_M: Final = (0.5, 0.25, 0.12)  # width, length and height of a lamp
 _WHEEL_M: Final = (0.62, 0.20, 0.60)  # length, width and greatest height of a wheel
 _CLEARANCE_SHARE, _BODY_SHARE, _CABIN_SHARE, _CABIN_BACK = 0.14, 0.62, 0.55, 0.06  # of height or length
+_FENCE_POST_RADIUS_M: Final = 0.04  # of posts of fences
+_WALL_BURIED_M: Final = 1.5
+"""Depth to which walls reach below the ground at their road side (m): behind them it may lie lower."""
+_WIRE_PIECES: Final = 12
+"""Straight pieces of a wire: over 20 m with a sag of 0.5 m they leave its parabola by 4 mm."""
 _RUBBER: Final = 30.0  # intensity of tyres
 
 
@@ -74,7 +99,7 @@ class Object:
     """Grid heading of its length."""
     intensity: float
     bodies: Float64 = field(repr=False)
-    """(n, 18), see :mod:`roadscan.simulate.kernels.things`."""
+    """(n, 19), see :mod:`roadscan.simulate.kernels.things`."""
     speed_m_per_s: float = 0.0
 
 
@@ -88,13 +113,14 @@ def moving_objects(scene: Scene, surface: Surface) -> list[Object]:
     first = sum(1 for _ in _standing(scene)) + 1
     out = []
     for i, car in enumerate(scene.roadside.moving_cars):
-        place = _place(surface, car.station_m, car.offset_m)
+        place = place_at(surface, car.station_m, car.offset_m)
         turned = place.heading_rad + (math.pi if car.speed_m_per_s < 0 else 0.0)
-        bodies = car_bodies(place.enh_m, turned, car.length_m, car.width_m, car.height_m, car.shade, None)
+        bodies = _moving_bodies(car, place.enh_m, turned)
         size = (car.length_m, car.width_m, car.height_m)
+        kind = "moving_car" if car.what == "plain" else f"moving_{car.what}"
         out.append(
             Object(
-                first + i, "moving_car", car.station_m, car.offset_m, place.enh_m, size, turned, car.shade, bodies,
+                first + i, kind, car.station_m, car.offset_m, place.enh_m, size, turned, car.shade, bodies,
                 car.speed_m_per_s,
             )
         )  # fmt: skip
@@ -140,13 +166,14 @@ def _standing(scene: Scene) -> Iterator[tuple[str, Standing | Barrier, float]]:
         ("sign", side.signs), ("pole", side.poles), ("lamp_post", side.lamp_posts), ("tree", side.trees),
         ("parked_car", side.parked_cars), ("guardrail", side.guardrails), ("fence", side.fences),
         ("facade", side.facades), ("box", side.boxes), ("signal", side.signals), ("overhead", side.overheads),
-        ("planting", side.plantings),
+        ("planting", side.plantings), ("", side.vehicles), ("person", side.persons), ("wall", side.walls),
+        ("hedge", side.hedges), ("", side.furniture), ("", side.covers), ("wire", side.wires),
     )  # fmt: skip
     for kind, described in kinds:
         for one in described:
             on_road = _on_road(one, *scene.stations_m)
             for station in _stations(on_road, *scene.stations_m):
-                yield kind, on_road, station
+                yield getattr(one, "what", kind), on_road, station
 
 
 def described_signs(scene: Scene) -> list[tuple[int, Sign]]:
@@ -171,81 +198,7 @@ def _stations(one: Standing | Barrier, first_m: float, last_m: float) -> list[fl
     return [s for s in stations if first_m <= s <= last_m]
 
 
-@dataclass(frozen=True)
-class _Place:
-    """A place on the ground."""
-
-    station_m: float
-    offset_m: float
-    enh_m: tuple[float, float, float]
-    """From the scene's origin."""
-    heading_rad: float
-    """Of the road."""
-
-    def beside(self, ahead_m: float, right_m: float, heading_rad: float) -> tuple[float, float]:
-        """Return easting and northing of a point ahead and to the right along a heading."""
-        s, c = math.sin(heading_rad), math.cos(heading_rad)
-        return self.enh_m[0] + ahead_m * s + right_m * c, self.enh_m[1] + ahead_m * c - right_m * s
-
-
-def _place(surface: Surface, station_m: float, offset_m: float) -> _Place:
-    e, n, heading = surface.place(station_m, offset_m)
-    origin = surface.origin_enh_m
-    e0, n0 = float(e) - float(origin[0]), float(n) - float(origin[1])
-    return _Place(station_m, offset_m, (e0, n0, _ground(surface, e0, n0)), float(heading))
-
-
-def _ground(surface: Surface, easting: float, northing: float) -> float:
-    """Return the height of the ground at a place from the origin (m), extended beside the surface as the verge is."""
-    e, n = easting + surface.origin_enh_m[0], northing + surface.origin_enh_m[1]
-    height = float(surface.height_m(e, n, texture=False))
-    if math.isnan(height):
-        station, offset = surface.station_offset_m(e, n)
-        height = float(surface.points_at(np.atleast_1d(station), np.atleast_1d(offset))[0, 2])
-    return height - float(surface.origin_enh_m[2])
-
-
 # --- bodies ------------------------------------------------------------------------------------------
-
-
-def _body(
-    kind: float,
-    place: tuple[float, float],
-    heading_rad: float,
-    half: tuple[float, float],
-    low_high: tuple[float, float],
-    shade: float,
-    density: float = 1.0,
-) -> Float64:
-    """Return a body's row (18,)."""
-    row = np.zeros(body.BODY_COLUMNS)
-    row[body.KIND] = kind
-    row[[body.EASTING, body.NORTHING]] = place
-    row[[body.SINE, body.COSINE]] = math.sin(heading_rad), math.cos(heading_rad)
-    row[[body.HALF_LENGTH, body.HALF_WIDTH]] = half
-    row[[body.LOW, body.HIGH]] = row[[body.LOW_END, body.HIGH_END]] = low_high
-    row[[body.INTENSITY, body.DENSITY]] = shade, density
-    return row
-
-
-def _post(place: tuple[float, float], low: float, high: float, radius: float, shade: float) -> Float64:
-    return _body(body.CYLINDER, place, 0.0, (radius, 0.0), (low - BURIED_M, high), shade)
-
-
-def _walls(points: Float64, low: Float64, high: Float64, shade: float, skirt: float, density: float = 1.0) -> Float64:
-    """Return walls (n, 18) between points (n + 1, 2), with heights (n + 1,) of their lower and upper edge."""
-    rows = np.zeros((len(points) - 1, body.BODY_COLUMNS))
-    run = np.diff(points, axis=0)
-    length = np.hypot(run[:, 0], run[:, 1])
-    rows[:, body.KIND] = body.WALL
-    rows[:, [body.EASTING, body.NORTHING]] = (points[:-1] + points[1:]) / 2
-    rows[:, [body.SINE, body.COSINE]] = run / length[:, None]
-    rows[:, body.HALF_LENGTH] = length / 2
-    rows[:, body.LOW], rows[:, body.LOW_END] = low[:-1], low[1:]
-    rows[:, body.HIGH], rows[:, body.HIGH_END] = high[:-1], high[1:]
-    rows[:, body.SKIRT] = skirt
-    rows[:, body.INTENSITY], rows[:, body.DENSITY] = shade, density
-    return rows
 
 
 def car_bodies(
@@ -257,26 +210,26 @@ def car_bodies(
     shade: float,
     wheel_feet: Sequence[float] | None,
 ) -> Float64:
-    """Return bodies (6, 18) of a car: body, cabin, four wheels.
+    """Return bodies (6, 19) of a car: body, cabin, four wheels.
 
     wheel_feet : height of the ground under each wheel (m); that under the car's middle where left out.
     """
-    place = _Place(0.0, 0.0, foot, heading_rad)
+    place = Place(0.0, 0.0, foot, heading_rad)
     z = foot[2]
     middle = (foot[0], foot[1])
     low, waist = z + _CLEARANCE_SHARE * height_m, z + _BODY_SHARE * height_m
     back = place.beside(-_CABIN_BACK * length_m, 0.0, heading_rad)
     cabin = (_CABIN_SHARE * length_m / 2, 0.45 * width_m)
     rows = [
-        _body(body.BOX, middle, heading_rad, (length_m / 2, width_m / 2), (low, waist), shade),
-        _body(body.BOX, back, heading_rad, cabin, (waist, z + height_m), shade),
+        body_row(body.BOX, middle, heading_rad, (length_m / 2, width_m / 2), (low, waist), shade),
+        body_row(body.BOX, back, heading_rad, cabin, (waist, z + height_m), shade),
     ]
     wheel = (_WHEEL_M[0] / 2, _WHEEL_M[1] / 2)
     top = z + min(_WHEEL_M[2], _BODY_SHARE * height_m)
     for i, (ahead, right) in enumerate(wheel_places(length_m, width_m)):
         foot_m = z if wheel_feet is None else wheel_feet[i]
         at = place.beside(ahead, right, heading_rad)
-        rows.append(_body(body.BOX, at, heading_rad, wheel, (foot_m - 0.05, top), _RUBBER))
+        rows.append(body_row(body.BOX, at, heading_rad, wheel, (foot_m - 0.05, top), _RUBBER))
     return np.stack(rows)
 
 
@@ -291,7 +244,7 @@ def wheel_places(length_m: float, width_m: float) -> list[tuple[float, float]]:
 
 def _object(number: int, kind: str, one: Standing | Barrier, station_m: float, surface: Surface) -> Object:
     """Return the object of a description at one of its stations."""
-    place = _place(surface, station_m, one.offset_m)
+    place = place_at(surface, station_m, one.offset_m)
     size, turned, bodies = _made(one, place, surface)
     shade = one.shade  # type: ignore[union-attr]  # every concrete description has one
     heading = place.heading_rad + turned
@@ -299,13 +252,13 @@ def _object(number: int, kind: str, one: Standing | Barrier, station_m: float, s
 
 
 @functools.singledispatch
-def _made(one: object, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
-    """Return size (length, width, height), heading past the road's (rad) and bodies (n, 18) of an object."""
+def _made(one: object, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    """Return size (length, width, height), heading past the road's (rad) and bodies (n, 19) of an object."""
     raise TypeError(f"nothing stands for {type(one).__name__}")
 
 
 @_made.register
-def _(one: Sign, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+def _(one: Sign, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
     z = place.enh_m[2]
     height = one.width_m * _HEIGHT_SHARE[one.shape] if one.shape in _HEIGHT_SHARE else one.height_m
     low, high = z + one.clearance_m, z + one.clearance_m + height
@@ -314,47 +267,48 @@ def _(one: Sign, place: _Place, surface: Surface) -> tuple[tuple[float, float, f
     kind = _PLATES[one.shape]
     behind = place.beside(side * (_PLATE_BEFORE_POST_M - _PLATE_M), 0.0, place.heading_rad)
     face, back = (
-        _body(kind, middle, place.heading_rad + math.pi / 2, (one.width_m / 2, 0.0), (low, high), shade)
+        body_row(kind, middle, place.heading_rad + math.pi / 2, (one.width_m / 2, 0.0), (low, high), shade)
         for middle, shade in ((at, one.shade), (behind, one.back_shade))
     )
-    post = _post(place.enh_m[:2], z, high, _POST_RADIUS_M, 120.0)
-    return (one.width_m, 2 * _PLATE_BEFORE_POST_M, high - z), math.pi / 2, np.stack([face, back, post])
+    face[body.PART] = back[body.PART] = SIGN
+    pole = post(place.enh_m[:2], z, high, _POST_RADIUS_M, 120.0)
+    return (one.width_m, 2 * _PLATE_BEFORE_POST_M, high - z), math.pi / 2, np.stack([face, back, pole])
 
 
 @_made.register
-def _(one: Pole, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+def _(one: Pole, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
     z = place.enh_m[2]
-    post = _post(place.enh_m[:2], z, z + one.height_m, one.diameter_m / 2, one.shade)
-    return (one.diameter_m, one.diameter_m, one.height_m), 0.0, post[None]
+    row = post(place.enh_m[:2], z, z + one.height_m, one.diameter_m / 2, one.shade)
+    return (one.diameter_m, one.diameter_m, one.height_m), 0.0, row[None]
 
 
 @_made.register
-def _(one: LampPost, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+def _(one: LampPost, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
     z = place.enh_m[2]
     top = z + one.height_m
     inwards = -1.0 if one.offset_m > 0.0 else 1.0
-    rows = [_post(place.enh_m[:2], z, top, one.diameter_m / 2, one.shade)]
+    rows = [post(place.enh_m[:2], z, top, one.diameter_m / 2, one.shade)]
     if one.arm_m > 0.0:
         lamp = (_LAMP_M[1] / 2, _LAMP_M[0] / 2)
         for side in (inwards, -inwards)[: 1 + one.is_double]:
             rows.append(_arm(place, side * one.arm_m, top, one.shade))
             end = place.beside(0.0, side * one.arm_m, place.heading_rad)
-            rows.append(_body(body.BOX, end, place.heading_rad, lamp, (top - _LAMP_M[2], top), one.shade))
+            rows.append(body_row(body.BOX, end, place.heading_rad, lamp, (top - _LAMP_M[2], top), one.shade))
     return (one.diameter_m, 2 * one.arm_m + _LAMP_M[0], one.height_m), 0.0, np.stack(rows)
 
 
-def _arm(place: _Place, right_m: float, top: float, shade: float) -> Float64:
+def _arm(place: Place, right_m: float, top: float, shade: float) -> Float64:
     """Return an arm from a post to the right (negative: to the left) of the road's direction."""
     middle = place.beside(0.0, right_m / 2, place.heading_rad)
-    return _body(body.BOX, middle, place.heading_rad, (_ARM_M / 2, abs(right_m) / 2), (top - _ARM_M, top), shade)
+    return body_row(body.BOX, middle, place.heading_rad, (_ARM_M / 2, abs(right_m) / 2), (top - _ARM_M, top), shade)
 
 
 @_made.register
-def _(one: Signal, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+def _(one: Signal, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
     z = place.enh_m[2]
     top, radius = z + one.height_m, one.diameter_m / 2
     width, depth, tall = one.head_m
-    rows = [_post(place.enh_m[:2], z, top, radius, one.shade)]
+    rows = [post(place.enh_m[:2], z, top, radius, one.shade)]
     right = 0.0
     if one.arm_m > 0.0:
         right = -one.arm_m if one.offset_m > 0.0 else one.arm_m
@@ -362,53 +316,83 @@ def _(one: Signal, place: _Place, surface: Surface) -> tuple[tuple[float, float,
     side = 1.0 if one.faces == "forward" else -1.0
     before = _ARM_M / 2 if one.arm_m > 0.0 else radius
     head = place.beside(side * (before + 0.02 + depth / 2), right, place.heading_rad)
-    rows.append(_body(body.BOX, head, place.heading_rad, (depth / 2, width / 2), (top - tall, top), one.head_shade))
+    rows.append(body_row(body.BOX, head, place.heading_rad, (depth / 2, width / 2), (top - tall, top), one.head_shade))
     return (one.diameter_m, max(one.arm_m, width), one.height_m), 0.0, np.stack(rows)
 
 
 @_made.register
-def _(one: Overhead, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+def _(one: Overhead, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
     turned = math.radians(one.heading_deg)
     low = place.enh_m[2] + one.clearance_m
     half = (one.length_m / 2, one.width_m / 2)
-    slab = _body(
+    slab = body_row(
         body.BOX, place.enh_m[:2], place.heading_rad + turned, half, (low, low + one.thickness_m), one.shade
     )  # fmt: skip
     return (one.length_m, one.width_m, one.clearance_m + one.thickness_m), turned, slab[None]
 
 
 @_made.register
-def _(one: Planting, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+def _(one: Planting, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
     rows_along, rows_across = (max(round(m / one.tuft_m), 1) for m in (one.length_m, one.width_m))
     ahead = (np.arange(rows_along) + 0.5) / rows_along * one.length_m - one.length_m / 2
     right = (np.arange(rows_across) + 0.5) / rows_across * one.width_m - one.width_m / 2
     stations, offsets = (v.ravel() for v in np.meshgrid(place.station_m + ahead, one.offset_m + right))
-    at, feet = _points(surface, stations, offsets)
+    at, feet = points_on(surface, stations, offsets)
     # the golden ratio's multiples are spread evenly: tufts of all heights are everywhere
     tall = one.height_m * (0.5 + 0.5 * np.mod(np.arange(feet.size) * 0.6180339887, 1.0))
     radius = 0.6 * one.tuft_m
     tufts = [
-        _body(body.ELLIPSOID, (e, n), 0.0, (radius, 0.0), (z - h, z + h), one.shade, one.density)
+        body_row(body.ELLIPSOID, (e, n), 0.0, (radius, 0.0), (z - h, z + h), one.shade, one.density)
         for (e, n), z, h in zip(at.tolist(), feet.tolist(), tall.tolist(), strict=True)
     ]
     return (one.length_m, one.width_m, one.height_m), 0.0, np.stack(tufts)
 
 
 @_made.register
-def _(one: Tree, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+def _(one: Tree, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    foot = max(0.3 * one.height_m, one.height_m - 1.4 * one.crown_m) if one.crown_from_m is None else one.crown_from_m
+    size = (one.crown_m, one.crown_m, one.height_m)
+    shade = 0.8 * one.shade if one.trunk_shade is None else one.trunk_shade
+    if one.lean_deg or one.stems > 1 or one.extinction_per_m or one.bush_m:
+        return size, 0.0, _grown_tree(one, place, foot, shade)
     z, at = place.enh_m[2], place.enh_m[:2]
-    low, high = z + max(0.3 * one.height_m, one.height_m - 1.4 * one.crown_m), z + one.height_m
-    trunk = _post(at, z, (low + high) / 2, one.trunk_m / 2, 0.8 * one.shade)
-    crown = _body(body.ELLIPSOID, at, 0.0, (one.crown_m / 2, 0.0), (low, high), one.shade, one.density)
-    return (one.crown_m, one.crown_m, one.height_m), 0.0, np.stack([trunk, crown])
+    low, high = z + foot, z + one.height_m
+    trunk = post(at, z, (low + high) / 2, one.trunk_m / 2, shade)
+    trunk[body.PART] = TRUNK
+    crown = body_row(body.ELLIPSOID, at, 0.0, (one.crown_m / 2, 0.0), (low, high), one.shade, one.density)
+    return size, 0.0, np.stack([trunk, crown])
+
+
+def _grown_tree(one: Tree, place: Place, foot_m: float, shade: float) -> Float64:
+    """Return bodies (n, 19) of a tree that leans, is forked, or has a crown that beams enter."""
+    tree = Assembly(place, place.heading_rad + math.radians(one.lean_towards_deg))
+    lean = math.tan(math.radians(one.lean_deg))
+    top, radius = (foot_m + one.height_m) / 2, one.trunk_m / 2
+    fork = min(one.fork_m, 0.8 * top) if one.stems > 1 else top
+    if fork > 0.0:
+        tree.rod((-BURIED_M * lean, 0.0, -BURIED_M), (fork * lean, 0.0, fork), radius, shade, TRUNK)
+    for number in range(one.stems if one.stems > 1 else 0):
+        around = 2.0 * math.pi * number / one.stems + 0.4
+        away = 0.3 * (top - fork) + 0.4 * radius
+        end = (top * lean + away * math.cos(around), away * math.sin(around), top)
+        tree.rod((fork * lean, 0.0, fork or -BURIED_M), end, radius / math.sqrt(one.stems), shade, TRUNK)
+    if one.extinction_per_m > 0.0:
+        tree.ball(top * lean, 0.0, (foot_m, one.height_m), one.crown_m / 2, one.shade, one.extinction_per_m)
+    else:
+        tree.ball(top * lean, 0.0, (foot_m, one.height_m), one.crown_m / 2, one.shade)
+        tree.rows[-1][body.DENSITY] = one.density
+    if one.bush_m > 0.0:
+        tall = 0.45 * one.bush_m
+        tree.ball(0.0, 0.0, (-tall, tall), one.bush_m / 2, one.shade, max(one.extinction_per_m, 3.0))
+    return tree.bodies
 
 
 @_made.register
-def _(one: ParkedCar, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+def _(one: ParkedCar, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
     turned = math.radians(one.heading_deg)
     heading = place.heading_rad + turned
     feet = [
-        _ground(surface, *place.beside(ahead, right, heading))
+        ground_at(surface, *place.beside(ahead, right, heading))
         for ahead, right in wheel_places(one.length_m, one.width_m)
     ]
     size = (one.length_m, one.width_m, one.height_m)
@@ -416,78 +400,182 @@ def _(one: ParkedCar, place: _Place, surface: Surface) -> tuple[tuple[float, flo
 
 
 @_made.register
-def _(one: Box, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+def _(one: Box, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
     turned = math.radians(one.heading_deg)
     heading = place.heading_rad + turned
     half = (one.length_m / 2, one.width_m / 2)
     corners = [
-        _ground(surface, *place.beside(a * half[0], b * half[1], heading)) for a in (-1.0, 1.0) for b in (-1.0, 1.0)
+        ground_at(surface, *place.beside(a * half[0], b * half[1], heading)) for a in (-1.0, 1.0) for b in (-1.0, 1.0)
     ]
     top = place.enh_m[2] + one.height_m
     low = min([*corners, place.enh_m[2]]) - BURIED_M
     size = (one.length_m, one.width_m, one.height_m)
-    return size, turned, _body(body.BOX, place.enh_m[:2], heading, half, (low, max(top, low + 0.001)), one.shade)[None]
+    return (
+        size,
+        turned,
+        body_row(body.BOX, place.enh_m[:2], heading, half, (low, max(top, low + 0.001)), one.shade)[None],
+    )
 
 
 @_made.register
-def _(one: Guardrail, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
-    points, ground = _along(surface, one, PIECE_M)
-    rail = _walls(points, ground + one.height_m - one.rail_m, ground + one.height_m, one.shade, 0.0)
+def _(one: Guardrail, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    points, ground = along(surface, one, PIECE_M)
+    rail = walls(points, ground + one.height_m - one.rail_m, ground + one.height_m, one.shade, 0.0)
     # The posts are behind the rail, away from the road.
     behind = _RAIL_POST_RADIUS_M + 0.02 if one.offset_m > 0.0 else -_RAIL_POST_RADIUS_M - 0.02
     count = math.floor((one.end_m - one.start_m) / one.post_every_m + 1e-9) + 1
     stations = one.start_m + one.post_every_m * np.arange(count, dtype=np.float64)
-    at, feet = _points(surface, stations, np.full(count, one.offset_m + behind))
+    at, feet = points_on(surface, stations, np.full(count, one.offset_m + behind))
     posts = [
-        _post((e, n), z, z + one.height_m - 0.02, _RAIL_POST_RADIUS_M, one.shade)
+        post((e, n), z, z + one.height_m - 0.02, _RAIL_POST_RADIUS_M, one.shade)
         for (e, n), z in zip(at.tolist(), feet.tolist(), strict=True)
     ]
     return (one.end_m - one.start_m, 2 * abs(behind), one.height_m), 0.0, np.concatenate([rail, np.stack(posts)])
 
 
 @_made.register
-def _(one: Fence, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
-    points, ground = _along(surface, one, PIECE_M)
-    walls = _walls(points, ground, ground + one.height_m, one.shade, BURIED_M, one.density)
-    return (one.end_m - one.start_m, 0.0, one.height_m), 0.0, walls
+def _(one: Fence, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    points, ground = along(surface, one, PIECE_M)
+    density = one.density if one.style == "mesh" else 1.0
+    rows = walls(points, ground, ground + one.height_m, one.shade, BURIED_M, density)
+    if one.style == "pickets":
+        rows[:, body.KIND] = body.PICKETS
+        rows[:, body.ALONG] = np.append(0.0, np.cumsum(2 * rows[:-1, body.HALF_LENGTH]))
+        rows[:, [body.BAY, body.WINDOW]] = one.picket_m / one.density, one.picket_m
+    if one.post_every_m > 0.0:
+        rows = np.concatenate([rows, _posts(one, surface)])
+    return (one.end_m - one.start_m, 0.0, one.height_m), 0.0, rows
+
+
+def _posts(one: Fence, surface: Surface) -> Float64:
+    """Return the posts (n, 19) of a fence, behind it."""
+    count = math.floor((one.end_m - one.start_m) / one.post_every_m + 1e-9) + 1
+    stations = one.start_m + one.post_every_m * np.arange(count, dtype=np.float64)
+    behind = math.copysign(_FENCE_POST_RADIUS_M + 0.01, one.offset_m)
+    at, feet = points_on(surface, stations, np.full(count, one.offset_m + behind))
+    return np.stack(
+        [
+            post((e, n), z, z + one.height_m + 0.05, _FENCE_POST_RADIUS_M, one.shade)
+            for (e, n), z in zip(at.tolist(), feet.tolist(), strict=True)
+        ]
+    )
 
 
 @_made.register
-def _(one: Facade, place: _Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
-    points, ground = _along(surface, one, PIECE_M)
-    front = _walls(points, ground, ground + one.height_m, one.shade, BURIED_M)
+def _(one: Wall, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    rows = _row_of_boxes(one, surface, one.thickness_m, one.height_m, one.shade)
+    return (one.end_m - one.start_m, one.thickness_m, one.height_m), 0.0, rows
+
+
+def _row_of_boxes(one: Wall | Hedge, surface: Surface, thick_m: float, high_m: float, shade: float) -> Float64:
+    """Return boxes (n, 19) that follow the road, each as high above the lowest ground of its road side."""
+    points, ground = along(surface, one, PIECE_M)
+    away = math.copysign(thick_m / 2, one.offset_m)
+    rows = walls(points, ground, ground, shade, 0.0)
+    rows[:, body.KIND], rows[:, body.HALF_WIDTH] = body.BOX, thick_m / 2
+    rows[:, body.EASTING] += away * rows[:, body.COSINE]
+    rows[:, body.NORTHING] -= away * rows[:, body.SINE]
+    low, high = np.minimum(ground[:-1], ground[1:]), np.maximum(ground[:-1], ground[1:])
+    rows[:, body.LOW] = rows[:, body.LOW_END] = low - _WALL_BURIED_M
+    rows[:, body.HIGH] = rows[:, body.HIGH_END] = high + high_m
+    return rows
+
+
+@_made.register
+def _(one: Hedge, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    rows = _row_of_boxes(one, surface, one.width_m, one.height_m, one.shade)
+    if one.ragged_m > 0.0:
+        number = np.arange(len(rows))
+        # multiples of two irrational numbers are spread evenly
+        rows[:, body.HIGH] += one.ragged_m * (np.mod(number * 0.6180339887, 1.0) - 0.5)
+        rows[:, body.HALF_WIDTH] += 0.3 * one.ragged_m * (np.mod(number * 0.7548776662, 1.0) - 0.5)
+        rows[:, body.HIGH_END] = rows[:, body.HIGH]
+    rows[:, body.KIND], rows[:, body.DENSITY] = body.VOLUME, -math.log(one.passing) / one.width_m
+    if one.foot_wall_m > 0.0:
+        foot = _row_of_boxes(one, surface, one.width_m, one.foot_wall_m, 130.0)
+        foot[:, body.HALF_WIDTH] += 0.02
+        foot[:, body.PART] = WALL
+        rows = np.concatenate([rows, foot])
+    return (one.end_m - one.start_m, one.width_m, one.height_m), 0.0, rows
+
+
+@_made.register
+def _(one: Vehicle, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    turned = math.radians(one.heading_deg)
+    size = one.size_m or SIZES_M[one.what]
+    heading = place.heading_rad + turned
+    return size, turned, vehicle_bodies(one.what, place.enh_m, heading, size, one.shade, one.glass, seed=one.form)
+
+
+@_made.register
+def _(one: Person, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    turned = math.radians(one.heading_deg)
+    size = (*SIZES_M["person"][:2], one.height_m)
+    return size, turned, vehicle_bodies(
+        "person", place.enh_m, place.heading_rad + turned, size, one.shade, 1.0, seed=one.form
+    )  # fmt: skip
+
+
+@_made.register
+def _(one: Furniture, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    turned = math.radians(one.heading_deg) + (0.0 if one.offset_m > 0.0 else math.pi)
+    made = Assembly(place, place.heading_rad + turned)
+    MADE[one.what](made, one.scale, one.shade)
+    rows = made.bodies
+    extent = np.ptp(np.stack([rows[:, body.LOW], rows[:, body.HIGH]]))
+    beside = np.hypot(rows[:, body.EASTING] - place.enh_m[0], rows[:, body.NORTHING] - place.enh_m[1])
+    around = 2.0 * float((beside + rows[:, body.HALF_LENGTH]).max())
+    return (around, around, float(extent)), turned, rows
+
+
+@_made.register
+def _(one: Cover, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    half = (one.length_m / 2, one.width_m / 2)
+    ends = [place.beside(a * half[0], b * half[1], place.heading_rad) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    front, rear, right, left = (ground_at(surface, *at) - place.enh_m[2] for at in ends)
+    lid = Assembly(place, place.heading_rad)
+    middle = max(0.0, (front + rear) / 2, (right + left) / 2) + one.height_m
+    lid.slope((-half[0], half[0]), (-half[1], half[1]), (middle, front - rear, right - left), one.shade,
+              lid=one.what == "cover")  # fmt: skip
+    return (one.length_m, one.width_m, one.height_m), 0.0, lid.bodies
+
+
+@_made.register
+def _(one: Wire, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    end = place_at(surface, one.to_station_m, one.to_offset_m)
+    share = np.linspace(0.0, 1.0, _WIRE_PIECES + 1)
+    first = np.array([*place.enh_m[:2], place.enh_m[2] + one.height_m])
+    last = np.array([*end.enh_m[:2], end.enh_m[2] + one.to_height_m])
+    points = first + share[:, None] * (last - first)
+    points[:, 2] -= 4.0 * one.sag_m * share * (1.0 - share)
+    rows = [rod_row(tuple(a), tuple(b), one.diameter_m / 2, one.shade)
+            for a, b in zip(points[:-1].tolist(), points[1:].tolist(), strict=True)]  # fmt: skip
+    across = last - first
+    turned = math.atan2(across[0], across[1]) - place.heading_rad
+    return (float(np.hypot(across[0], across[1])), one.diameter_m, one.height_m), turned, np.stack(rows)
+
+
+@_made.register
+def _(one: Facade, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    points, ground = along(surface, one, PIECE_M)
+    front = walls(points, ground, ground + one.height_m, one.shade, BURIED_M)
     if one.window_m > 0.0:
         front[:, body.ALONG] = np.append(0.0, np.cumsum(2 * front[:-1, body.HALF_LENGTH]))
         front[:, [body.BAY, body.WINDOW, body.STOREY]] = one.bay_m, one.window_m, one.storey_m
     away = math.copysign(one.depth_m, one.offset_m)
     parts = [front]
+    if one.glass > 0.0:
+        front[:, body.KIND], front[:, body.DENSITY] = body.GLAZED, one.glass
+        rooms = one.model_copy(update={"offset_m": one.offset_m + math.copysign(one.room_m, one.offset_m)})
+        behind, _ = along(surface, rooms, PIECE_M)
+        parts.append(walls(behind, ground, ground + one.height_m, 110.0, BURIED_M))
     for i, station in ((0, one.start_m), (-1, one.end_m)):
         pieces = math.ceil(one.depth_m / PIECE_M)
         across = one.offset_m + away / pieces * np.arange(pieces + 1, dtype=np.float64)
-        ends, _ = _points(surface, np.full(across.size, station), np.asarray(across, np.float64), heights=False)
+        ends, _ = points_on(surface, np.full(across.size, station), np.asarray(across, np.float64), heights=False)
         level = np.full(across.size, ground[i])
-        parts.append(_walls(ends, level, level + one.height_m, one.shade, 10.0 * BURIED_M))
+        parts.append(walls(ends, level, level + one.height_m, one.shade, 10.0 * BURIED_M))
     return (one.end_m - one.start_m, one.depth_m, one.height_m), 0.0, np.concatenate(parts)
-
-
-def _along(surface: Surface, one: Barrier, piece_m: float) -> tuple[Float64, Float64]:
-    """Return points (n, 2) along the road and the ground there (n,), from the origin."""
-    count = math.ceil((one.end_m - one.start_m) / piece_m - 1e-9)
-    stations: Float64 = np.linspace(one.start_m, one.end_m, count + 1)
-    return _points(surface, stations, np.full(count + 1, one.offset_m))
-
-
-def _points(
-    surface: Surface, stations: Float64, offsets: Float64, *, heights: bool = True
-) -> tuple[Float64, Float64]:  # fmt: skip
-    """Return points (n, 2) and the ground there (n,), from the origin."""
-    e, n, _ = surface.place(stations, offsets)
-    at = np.stack([e, n], axis=-1) - surface.origin_enh_m[:2]
-    if not heights:
-        return at, np.zeros(len(at))
-    on_surface = surface.height_m(e, n, texture=False)
-    beside = surface.points_at(np.asarray(stations, np.float64), np.asarray(offsets, np.float64))[:, 2]
-    return at, np.where(np.isnan(on_surface), beside, on_surface) - surface.origin_enh_m[2]
 
 
 # --- what moves --------------------------------------------------------------------------------------
@@ -496,7 +584,7 @@ def _points(
 def mover_bodies(
     car: MovingCar, surface: Surface, begin_s: float, end_s: float
 ) -> tuple[Float64, Float64] | None:  # fmt: skip
-    """Return bodies (6, 18) of a moving car at the beginning of a time slot, and its velocity (3,) within it.
+    """Return bodies (6, 19) of a moving car at the beginning of a time slot, and its velocity (3,) within it.
 
     begin_s, end_s : since the pass's first profile. None where the car has left the road.
     """
@@ -504,9 +592,16 @@ def mover_bodies(
     nodes = surface.arrays.nodes
     if stations.min() < nodes[0, STATION] or stations.max() > nodes[-1, STATION]:
         return None
-    at, feet = _points(surface, stations, np.full(2, car.offset_m))
+    at, feet = points_on(surface, stations, np.full(2, car.offset_m))
     _, _, headings = surface.place(np.array([stations.mean()]), np.array([car.offset_m]))
     heading = float(headings[0]) + (math.pi if car.speed_m_per_s < 0 else 0.0)
     foot = (float(at[0, 0]), float(at[0, 1]), float(feet[0]))
-    bodies = car_bodies(foot, heading, car.length_m, car.width_m, car.height_m, car.shade, None)
-    return bodies, np.append(at[1] - at[0], feet[1] - feet[0]) / (end_s - begin_s)
+    return _moving_bodies(car, foot, heading), np.append(at[1] - at[0], feet[1] - feet[0]) / (end_s - begin_s)
+
+
+def _moving_bodies(car: MovingCar, foot: tuple[float, float, float], heading_rad: float) -> Float64:
+    """Return bodies (n, 19) of what moves, at a place."""
+    size = (car.length_m, car.width_m, car.height_m)
+    if car.what == "plain":
+        return car_bodies(foot, heading_rad, *size, car.shade, None)
+    return vehicle_bodies(car.what, foot, heading_rad, size, car.shade, car.glass, ridden=True, seed=car.form)

@@ -64,7 +64,7 @@ def write_trajectory(scene: Scene, drive: Drive, file: Path, truth_file: Path) -
     """Write the poses of one pass, one chunk per step; yields the poses of each."""
     step = NS_PER_S // scene.trajectory.poses_per_s
     first, last = first_gps_ns(scene, drive), drive.recorded_span_gps_ns[1]
-    errors = _Errors(scene, drive.number)
+    errors = PoseErrors(scene, drive.number)
     with pq.ParquetWriter(truth_file, _TRUTH_SCHEMA, use_dictionary=False) as truth, _Log(drive, file) as log:
         for begin in range(first, last + step, step * CHUNK_POSES):
             epochs = np.arange(begin, min(begin + step * CHUNK_POSES, last + step), step)
@@ -92,8 +92,8 @@ def write_accuracy(scene: Scene, drive: Drive, file: Path) -> Iterator[int]:
     yield epochs.size
 
 
-class _Errors:
-    """Gauss–Markov errors of position (north, east, down) and attitude (roll, pitch, heading)."""
+class PoseErrors:
+    """Gauss–Markov errors of position (north, east, down) and attitude (roll, pitch, heading), and steps of position."""
 
     def __init__(self, scene: Scene, number: int) -> None:
         sigma = np.array(scene.noise.pose_sigma())
@@ -104,11 +104,21 @@ class _Errors:
             np.array(scene.noise.pose_time_constants_s()),
             1.0 / scene.trajectory.poses_per_s,
         )
+        noise, rng = scene.noise, stream(scene.seed, number, "steps")
+        self._level_m = noise.pass_step_m * rng.standard_normal(3)
+        self._step_m, self._rng = noise.step_m, rng
+        self._share = noise.steps_per_minute / 60.0 / scene.trajectory.poses_per_s
 
     def take(self, count: int) -> tuple[Float64, Float64]:
         """Return position errors (count, 3) in metres and attitude errors (count, 3) in radians of the next poses."""
         values = self._process.take(count)
-        return values[:, :3], values[:, 3:]
+        position = values[:, :3] + self._level_m
+        if self._step_m > 0.0 and self._share > 0.0:
+            steps = self._step_m * self._rng.standard_normal((count, 3))
+            steps = np.cumsum(np.where(self._rng.random((count, 1)) < self._share, steps, 0.0), axis=0)
+            position = position + steps
+            self._level_m = self._level_m + steps[-1]
+        return position, values[:, 3:]
 
 
 class _Log:
@@ -128,7 +138,7 @@ class _Log:
             if one is not None:
                 one.close()
 
-    def write(self, epochs: Int64, errors: _Errors) -> None:
+    def write(self, epochs: Int64, errors: PoseErrors) -> None:
         """Append poses, with the next errors."""
         if self._table is not None:
             self._table.write_batch(_local_rows(self._drive, epochs, errors))
@@ -143,10 +153,10 @@ def _true_rows(drive: Drive, epochs: Int64) -> pa.RecordBatch:
     return _batch([epochs, *poses.position_ecef_m.T, *quaternion.T], _TRUTH_SCHEMA)
 
 
-def _local_rows(drive: Drive, epochs: Int64, errors: _Errors) -> pa.RecordBatch:
+def _local_rows(drive: Drive, epochs: Int64, errors: PoseErrors) -> pa.RecordBatch:
     """Return stated poses in the local frame, axes forward, right, down."""
     here = drive.poses(epochs)
-    position, attitude = _stated(drive, here, errors)
+    position, attitude = stated_poses(drive, here, *errors.take(len(here.position_ecef_m)))
     quaternion = attitude.as_quat(canonical=True, scalar_first=True)
     return _batch([epochs, *quaternion.T, *position.T], _LOCAL_SCHEMA)
 
@@ -155,15 +165,19 @@ def _batch(columns: list[npt.NDArray[np.generic]], schema: pa.Schema) -> pa.Reco
     return pa.RecordBatch.from_arrays([pa.array(np.ascontiguousarray(c)) for c in columns], schema=schema)
 
 
-def _stated(drive: Drive, here: Poses, errors: _Errors) -> tuple[Float64, Rotation]:
-    """Return ECEF positions (n, 3) and attitudes with errors, those of attitude added to roll, pitch and heading."""
-    position_error, attitude_error = errors.take(len(here.position_ecef_m))
+def stated_poses(
+    drive: Drive, here: Poses, position_error_m: Float64, attitude_error_rad: Float64
+) -> tuple[Float64, Rotation]:
+    """Return ECEF positions (n, 3) and attitudes of poses with errors (n, 3) each.
+
+    Errors are those of north, east and down, and of roll, pitch and heading.
+    """
     level = drive.earth.ecef_from_level(here.position_ecef_m)
-    angles = (level.inv() * here.ecef_from_body).as_euler("ZYX") + attitude_error[:, ::-1]
-    return here.position_ecef_m + level.apply(position_error), level * Rotation.from_euler("ZYX", angles)
+    angles = (level.inv() * here.ecef_from_body).as_euler("ZYX") + attitude_error_rad[:, ::-1]
+    return here.position_ecef_m + level.apply(position_error_m), level * Rotation.from_euler("ZYX", angles)
 
 
-def _sbet(drive: Drive, epochs: Int64, errors: _Errors, wander: float) -> Float64:
+def _sbet(drive: Drive, epochs: Int64, errors: PoseErrors, wander: float) -> Float64:
     """Return SBET records (n, 17); platform heading = true heading + wander angle.
 
     Velocities are along the wander frame (x at azimuth −wander, y to its left, z up); accelerations are the
@@ -172,7 +186,7 @@ def _sbet(drive: Drive, epochs: Int64, errors: _Errors, wander: float) -> Float6
     before, here, after = (drive.poses(epochs + shift) for shift in (-_DIFFERENCE_NS, 0, _DIFFERENCE_NS))
     dt = _DIFFERENCE_NS * 1e-9
     level = drive.earth.ecef_from_level(here.position_ecef_m)
-    position, attitude = _stated(drive, here, errors)
+    position, attitude = stated_poses(drive, here, *errors.take(len(here.position_ecef_m)))
     stated = drive.earth.geographic_from_ecef(position)
     heading, pitch, roll = (level.inv() * attitude).as_euler("ZYX").T
     velocity = level.inv().apply((after.position_ecef_m - before.position_ecef_m) / (2 * dt))

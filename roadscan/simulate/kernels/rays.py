@@ -12,10 +12,22 @@ from roadscan.simulate.kernels.beams import along_beam, through
 from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.ground import CELL_M, TILE_CELLS, TILE_M, Cells, first_ground, into_hole
 from roadscan.simulate.kernels.options import compiled, inlined, inner
-from roadscan.simulate.kernels.road import DEFECTS, DEFECTS_END, RoadArrays, brightness, defect_depth, on_surface
+from roadscan.simulate.kernels.road import (
+    DEFECTS,
+    DEFECTS_END,
+    GRASS,
+    GRASS_FROM,
+    PAVED_EDGE,
+    RoadArrays,
+    brightness,
+    defect_depth,
+    on_surface,
+)
 from roadscan.simulate.kernels.things import (
     BODY_COLUMNS,
     EASTING,
+    GLARE_COSINE,
+    GLARE_SHADE,
     HALF_LENGTH,
     HALF_WIDTH,
     HIGH,
@@ -23,8 +35,13 @@ from roadscan.simulate.kernels.things import (
     KIND,
     LOW,
     LOW_END,
+    MIRROR_SHARE,
     NORTHING,
+    WEAK_SHADE,
+    WEAK_SHARE,
+    is_glass,
     meet,
+    normal,
     shade,
 )
 
@@ -42,11 +59,17 @@ ON_GROUND, NO_OBJECT = 0, -1
 BEST, HIT, NODE, PAST, OFFSET, DEPTH = 0, 1, 2, 3, 4, 5
 STATE_SIZE = 6  # numbers of a ray's search state
 
+GRASS_WAY_M = 1.0
+"""Longest way of a beam through grass (m): on longer ones the ground's own shape counts."""
+GRASS_PATH_SHARE = 2.0
+"""Mean free path of a beam in grass over the grass's height."""
 MIXED_WITHIN_M = 0.15
 """Sub-rays that meet things closer together than this see the same thing (m)."""
 BENT_SHARE = 0.5
 """Ranges across a beam, and from ray to ray, leave a plane by less than this share of their change where they lie on
 one smooth surface: at a low angle they change fast, and small bumps move them far."""
+LEAVE_M = 1e-4
+"""Way from a pane at which a mirrored beam begins (m)."""
 PULSE_M = 1.5
 """Echoes closer together than this merge (m): half the length of a pulse of 10 ns."""
 
@@ -57,7 +80,7 @@ class World(NamedTuple):
     road: RoadArrays
     cells: Cells
     bodies: Float64
-    """(n, 18), see :mod:`roadscan.simulate.kernels.things`."""
+    """(n, 19), see :mod:`roadscan.simulate.kernels.things`."""
     object_id: Int32
     """(n,) object of each body."""
 
@@ -66,7 +89,7 @@ class Movers(NamedTuple):
     """Moving bodies at the beginning of each time slot; within a slot they move evenly."""
 
     bodies: Float64
-    """(slots, n, 18)"""
+    """(slots, n, 19)"""
     velocity: Float64
     """(slots, n, 3) east, north, up (m/s)."""
     object_id: Int32
@@ -124,6 +147,8 @@ class Found(NamedTuple):
     """(g, m, 5) range, easting, northing, height (m), intensity; range NaN: nothing; intensity NaN: glass."""
     object_id: Int32
     """(g, m) 0: the road, −1: nothing."""
+    body: Int32
+    """(g, m) the body met, numbers of moving ones follow on those of the world; −1: none."""
     is_mixed: Flags
     """(g, m) the range is a mixture of several things', or another's than that in the ray's middle."""
 
@@ -134,15 +159,17 @@ class Scratch(NamedTuple):
     beam: Float64
     """(3, 3) easting, northing and height by range."""
     body: Float64
-    """(1, 18) a moving body at the time of a ray."""
+    """(1, 19) a moving body at the time of a ray."""
     state: Float64
     """(6,) see :func:`cast`."""
     axes: Float64
     """(2, 3) see :func:`lay_axes`."""
     echoes: Float64
-    """(s, 5) results of a ray's sub-rays, see :func:`note_echo`; column 4: whether it was cast, then its group."""
+    """(s, 6) results of a ray's sub-rays, see :func:`note_echo`; column 4: whether it was cast, then its group."""
     centres: Float64
-    """(m, 5) the same for the middles of a group's rays."""
+    """(m, 6) the same for the middles of a group's rays."""
+    mirrored: Float64
+    """(3, 3) easting, northing and height of a beam behind a pane that mirrors it."""
 
 
 # --- frames ------------------------------------------------------------------------------------------
@@ -217,7 +244,7 @@ def cast(
     time_s : since the movers' first slot.
     beam : (3, 3) easting, northing and height by range.
     reach : how far to look (m).
-    body : (1, 18) scratch.
+    body : (1, 19) scratch.
     state : (6,) out: range, what was met (a body's number, those of movers follow on the still ones'; or
         :data:`ROAD`, :data:`LOST`, :data:`NOTHING`), node, u, offset and depth of the road there.
     """
@@ -229,6 +256,8 @@ def cast(
     meet_movers(world, movers, time_s, beam, dx, dy, dz, key, body, state)
     walk_tiles(world, beam, dx, dy, dz, reach, key, state)
     hit = int(state[HIT])
+    if hit == ROAD and world.road.section[GRASS] > 0.0:
+        stop_in_grass(world.road, beam, key, state)
     if hit >= 0:
         still = world.bodies.shape[0]
         if hit >= still:
@@ -248,8 +277,21 @@ def cast(
 
 
 @inner
+def stop_in_grass(road: RoadArrays, beam: Float64, key: np.uint64, state: Float64) -> None:
+    """Stop a beam that meets the ground under grass among the blades: its free path there is exponential."""
+    tall = road.section[GRASS]
+    if abs(state[OFFSET]) < road.section[PAVED_EDGE] + road.section[GRASS_FROM]:
+        return
+    r = state[BEST]
+    fall = max(-(beam[2, 1] + 2.0 * r * beam[2, 2]), 0.02)
+    share = (float(mixed(key ^ np.uint64(0x14057B7EF767814F)) >> np.uint64(11)) + 0.5) / 9007199254740992.0
+    stopped = r - min(tall / fall, GRASS_WAY_M) - GRASS_PATH_SHARE * tall * math.log(share)
+    state[BEST] = min(max(stopped, 0.5 * r), r)
+
+
+@inner
 def place_mover(movers: Movers, time_s: float, i: int, body: Float64) -> None:
-    """Write body `i` of the movers at a time. body : (1, 18), out."""
+    """Write body `i` of the movers at a time. body : (1, 19), out."""
     slot = min(max(int(time_s / movers.slot_s), 0), movers.bodies.shape[0] - 1)
     past = time_s - slot * movers.slot_s
     for column in range(BODY_COLUMNS):
@@ -415,12 +457,13 @@ def cast_rays(
         for i in range(count):
             cast_one(world, movers, bases, poses, rays, g, i, 0, scratch, centres, i)
             write_found(rays, scratch.beam, found, g, i, centres[i, 0], centres[i, 1], centres[i, 2], False)
+            found.body[g, i] = int(centres[i, 5]) if found.object_id[g, i] != NO_OBJECT else NO_OBJECT
         if rays.fan_rad.shape[0] == 1:
             continue
         for i in range(count):
             if not may_meet_edge(centres, rays, i):
                 continue
-            for column in range(4):
+            for column in range(6):
                 echoes[0, column] = centres[i, column]
             if meets_edge(world, movers, bases, poses, rays, g, i, scratch):
                 for s in range(1, 5):
@@ -429,6 +472,7 @@ def cast_rays(
                 if is_mixed:
                     lay_ray(bases, poses, rays, g, i, 0, scratch)
                     write_found(rays, scratch.beam, found, g, i, r, value, number, True)
+                    found.body[g, i] = strongest_body(echoes, number)
 
 
 @inlined
@@ -491,8 +535,57 @@ def cast_one(
     number = np.uint64(g * rays.direction.shape[1] + i)
     time_s = lay_ray(bases, poses, rays, g, i, s, scratch)
     key = mixed(rays.key + number) + np.uint64(s)
-    cast(world, movers, time_s, scratch.beam, rays.limits_m[1], key, scratch.body, scratch.state)
-    note_echo(world, movers, time_s, scratch.beam, rays.weight[s], scratch.body, scratch.state, echoes, row)
+    beam, state = scratch.beam, scratch.state
+    cast(world, movers, time_s, beam, rays.limits_m[1], key, scratch.body, state)
+    note_echo(world, movers, time_s, beam, rays.weight[s], scratch.body, state, echoes, row)
+    if state[HIT] >= 0.0 and meets_glass(world, movers, time_s, beam, scratch.body, state):
+        see_glass(world, movers, time_s, rays.limits_m[1], key, rays.weight[s], scratch, echoes, row)
+
+
+@inner
+def meets_glass(world: World, movers: Movers, time_s: float, beam: Float64, body: Float64, state: Float64) -> bool:
+    """Return whether a beam that met a body was stopped by glass; a moving body is then written to `body`."""
+    hit, r, still = int(state[HIT]), state[BEST], world.bodies.shape[0]
+    x, y, z = along_beam(beam, 0, r), along_beam(beam, 1, r), along_beam(beam, 2, r)
+    if hit < still:
+        return is_glass(world.bodies, hit, x, y, z)
+    place_mover(movers, time_s, hit - still, body)
+    return is_glass(body, 0, x, y, z)
+
+
+@inner
+def see_glass(
+    world: World, movers: Movers, time_s: float, reach: float, key: np.uint64, weight: float, scratch: Scratch,
+    echoes: Float64, row: int,
+) -> None:  # fmt: skip
+    """Replace the echo of a pane: it glares along its normal; else it is weak, mirrored, or nothing.
+
+    What is mirrored appears on the beam behind the pane, as far off as the whole way is long, on no object.
+    """
+    beam, state, out = scratch.beam, scratch.state, scratch.mirrored
+    hit, r, still = int(state[HIT]), state[BEST], world.bodies.shape[0]
+    n = normal(world.bodies, hit) if hit < still else normal(scratch.body, 0)
+    way = (beam[0, 1] + 2.0 * r * beam[0, 2], beam[1, 1] + 2.0 * r * beam[1, 2], beam[2, 1] + 2.0 * r * beam[2, 2])
+    cosine = way[0] * n[0] + way[1] * n[1] + way[2] * n[2]
+    share = float(mixed(key ^ np.uint64(0x5851F42D4C957F2D)) >> np.uint64(11)) / 9007199254740992.0
+    value = np.nan
+    if abs(cosine) > GLARE_COSINE:
+        value = GLARE_SHADE
+    elif share < WEAK_SHARE:
+        value = WEAK_SHADE
+    elif share < WEAK_SHARE + MIRROR_SHARE and reach - r > MIXED_WITHIN_M:
+        for axis in range(3):
+            out[axis, 0] = along_beam(beam, axis, r)
+            out[axis, 1], out[axis, 2] = way[axis] - 2.0 * cosine * n[axis], 0.0
+            out[axis, 0] += LEAVE_M * out[axis, 1]
+        cast(world, movers, time_s, out, reach - r, key ^ np.uint64(1), scratch.body, state)
+        note_echo(world, movers, time_s, out, weight, scratch.body, state, echoes, row)
+        echoes[row, 2], echoes[row, 0], echoes[row, 5] = NO_OBJECT, echoes[row, 0] + r, -1.0
+        if not math.isnan(echoes[row, 0]):
+            value = 0.5 * echoes[row, 1]
+    echoes[row, 1] = value
+    total = echoes[row, 0]
+    echoes[row, 3] = weight * max(value, 1.0) / (total * total) if value >= 0.0 else 0.0
 
 
 @inner
@@ -624,6 +717,7 @@ def note_echo(
     """Write row `s` of the echoes: range (NaN: none), intensity, object, energy."""
     hit, r = int(state[HIT]), state[BEST]
     echoes[s, 0], echoes[s, 1], echoes[s, 2], echoes[s, 3] = np.nan, np.nan, NO_OBJECT, 0.0
+    echoes[s, 5] = max(hit, -1)
     if hit in (NOTHING, LOST):
         return
     still = world.bodies.shape[0]
@@ -675,6 +769,16 @@ def merged(echoes: Float64) -> tuple[float, float, float, bool]:
             if echoes[s, 3] > strongest:
                 number, strongest = echoes[s, 2], echoes[s, 3]
     return r, value, number, True
+
+
+@inner
+def strongest_body(echoes: Float64, number: float) -> int:
+    """Return the body of the strongest of a ray's echoes from an object; −1: none."""
+    body, strongest = -1, 0.0
+    for s in range(echoes.shape[0]):
+        if echoes[s, 2] == number and echoes[s, 3] > strongest:
+            body, strongest = int(echoes[s, 5]), echoes[s, 3]
+    return body
 
 
 @inlined

@@ -12,11 +12,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.options import compiled, inlined, inner
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Int64 = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 NODE_STEP_M = 0.5
 """Distance from node to node of the reference line."""
@@ -33,8 +35,13 @@ NODE_COLUMNS = 29  # numbers of a node
 CROWN, LANES_EDGE, SHOULDER_SLOPE, PAVED_EDGE, VERGE_SLOPE, ROUNDING, SURFACE_EDGE, KERB_FACE = 0, 1, 2, 3, 4, 5, 6, 7
 TRACK_FIRST, TRACK_PER_M, TRACK_STATION, TRACK_STATION_PER_M, TEXTURE_PER_M, CONTRAST = 8, 9, 10, 11, 12, 13  # tracks
 ASPHALT, PAINT, DEFECT, SHOULDER, VERGE, KERB = 14, 15, 16, 17, 18, 19  # places of the intensities of materials
-RUTS = 20  # place of the first rut
+GRASS, GRASS_FROM, GRASS_SHADE = 20, 21, 22  # height of grass, where it begins beyond the paved edge, its intensity
+RUTS = 23  # place of the first rut
 RUT_COLUMNS = 6  # numbers of a rut
+WEAR_PLACE_M = 0.6
+"""Size of places where paint is worn more or less than its mean (m)."""
+FLAKE_M = 0.03
+"""Size of a flake of worn paint (m)."""
 KERB_TOP_M = 0.15
 """Width of a kerb's top, which differs in intensity."""
 
@@ -49,7 +56,7 @@ class RoadArrays(NamedTuple):
     `items`; fall to the left (m/m) and its change per metre, fall to the right, height of the left kerb (m; 0: none)
     and of the right kerb, likewise; first row and end row in `humps`."""
     section: Float64
-    """(20 + 6m,) constants, see the names above; then offset, 1 / half width, depth, variation, its wave number
+    """(23 + 6m,) constants, see the names above; then offset, 1 / half width, depth, variation, its wave number
     (rad/m) and phase of each rut."""
     defects: Float64
     """(m, 8) by node, repeated where one reaches over several. Pothole: 0, depth, 1 / radius, station, offset, 0, 0;
@@ -59,12 +66,13 @@ class RoadArrays(NamedTuple):
     """(m, 9) by node. Rectangle (0) or circle (1), station, offset, half length, half width, height in the middle,
     1 / edge, intensity, slope along the road."""
     lines: Float64
-    """(m, 6) offset, half width, dash and period (0: solid), first and last station of each marking."""
+    """(m, 8) offset, half width, dash and period (0: solid), first and last station of each marking, the share of its
+    paint that is worn off, its intensity."""
     humps: Float64
     """(m, 4) by node. Station, half of the top with both ramps, 1 / length of a ramp, height."""
     items: Float64
     """(m, 8) by node, what is painted or spilt: kind, intensity, station, offset, and
-    0 rectangle: half length, half width; 1 ellipse with a soft edge: the same; 2 ring: inner and outer radius;
+    0 rectangle: half length, half width, share of the paint that is worn off; 1 ellipse with a soft edge: the same; 2 ring: inner and outer radius;
     3 band: half width, 0, station and offset of its other end."""
     tracks: Float64
     """(t, s) unevenness (m) at even offsets and stations; (0, 0): none."""
@@ -372,7 +380,7 @@ def material(road: RoadArrays, k: int, u: float, offset: float) -> float:
     away = abs(offset)
     value = section[ASPHALT]
     if away > section[PAVED_EDGE]:
-        value = section[VERGE]
+        value = section[VERGE] if away < section[PAVED_EDGE] + section[GRASS_FROM] else section[GRASS_SHADE]
         column = KERB_RIGHT if offset > 0.0 else KERB_LEFT
         if nodes[k, column] > 0.0 and away < section[PAVED_EDGE] + KERB_TOP_M:
             value = section[KERB]
@@ -399,12 +407,34 @@ def brightness(road: RoadArrays, k: int, u: float, offset: float, depth: float, 
         for i in range(lines.shape[0]):
             if abs(offset - lines[i, 0]) <= lines[i, 1] and lines[i, 4] <= station <= lines[i, 5]:
                 period = lines[i, 3]
-                if period == 0.0 or station % period < lines[i, 2]:
-                    value = section[PAINT]
+                is_dash = period == 0.0 or station % period < lines[i, 2]
+                if is_dash and not is_worn(lines[i, 6], station, offset):
+                    value = lines[i, 7]
     for i in range(int(nodes[k, ITEMS]), int(nodes[k, ITEMS_END])):
         value = painted(items, i, station, offset, value)
     shade: float = value + section[CONTRAST] * stone
     return shade
+
+
+@inlined
+def lattice(i: int, j: int) -> float:
+    """Return the random number, 0 to 1, of a node of a lattice."""
+    bits = mixed(mixed(np.uint64(i + (1 << 30))) ^ np.uint64(j + (1 << 30)))
+    value: float = float(bits >> np.uint64(11)) / 9007199254740992.0
+    return value
+
+
+@inlined
+def is_worn(share: float, station: float, offset: float) -> bool:
+    """Return whether paint of which a share is worn off is lost here: in flakes, in some places more than in others."""
+    if share <= 0.0:
+        return False
+    u, v = station / WEAR_PLACE_M, offset / WEAR_PLACE_M
+    i, j = math.floor(u), math.floor(v)
+    u, v = u - i, v - j
+    place = (1.0 - v) * ((1.0 - u) * lattice(i, j) + u * lattice(i + 1, j))
+    place += v * ((1.0 - u) * lattice(i, j + 1) + u * lattice(i + 1, j + 1))
+    return lattice(math.floor(station / FLAKE_M), math.floor(offset / FLAKE_M)) < share + place - 0.5
 
 
 @inlined
@@ -415,7 +445,8 @@ def painted(items: Float64, i: int, station: float, offset: float, under: float)
     do = offset - items[i, 3]
     cover = 0.0
     if kind == 0.0:
-        cover = 1.0 if abs(ds) <= items[i, 4] and abs(do) <= items[i, 5] else 0.0
+        inside = abs(ds) <= items[i, 4] and abs(do) <= items[i, 5]
+        cover = 1.0 if inside and not is_worn(items[i, 6], station, offset) else 0.0
     elif kind == 1.0:
         x = (ds / items[i, 4]) ** 2 + (do / items[i, 5]) ** 2
         cover = (1.0 - x * x) if x < 1.0 else 0.0
@@ -463,3 +494,21 @@ def heights_along(road: RoadArrays, station: Float64, offset: Float64, out: Floa
     for i in range(station.size):
         k = node_at(road, station[i])
         out[i] = worn_height(road, k, station[i] - road.nodes[k, STATION], offset[i])
+
+
+@compiled
+def find_paint(road: RoadArrays, station: Float64, offset: Float64, out: Flags) -> None:
+    """Write whether places are on paint that is not worn off: lines, stop bars, zebra crossings. All arrays (n,)."""
+    nodes, lines, items = road.nodes, road.lines, road.items
+    for p in range(station.size):
+        s, o = station[p], offset[p]
+        found = False
+        for i in range(lines.shape[0]):
+            if abs(o - lines[i, 0]) <= lines[i, 1] and lines[i, 4] <= s <= lines[i, 5]:
+                is_dash = lines[i, 3] == 0.0 or s % lines[i, 3] < lines[i, 2]
+                found = found or (is_dash and not is_worn(lines[i, 6], s, o))
+        k = node_at(road, s)
+        for i in range(int(nodes[k, ITEMS]), int(nodes[k, ITEMS_END])):
+            inside = items[i, 0] == 0.0 and abs(s - items[i, 2]) <= items[i, 4] and abs(o - items[i, 3]) <= items[i, 5]
+            found = found or (inside and not is_worn(items[i, 6], s, o))
+        out[p] = found

@@ -110,7 +110,7 @@ class Lidar(Strict):
     on: bool = True
     """Whether the rig carries it."""
     model: str = "HDL-32E"
-    """Its model (HDL-32E, Mid-360, OS1-128, VLP-16, XT32): a file of figures with elevations, firing times, unit of
+    """Its model (HDL-32E, HDL-64E, Mid-360, OS1-128, VLP-16, XT32): a file of figures with elevations, firing times, unit of
     ranges, width of the beams and errors. HDL-32E, OS1-128 and XT32 are recorded as captures of their packets, or in a
     bag (`bag.on`), as the others always are."""
     turns_per_s: float = Field(default=10.0, ge=5.0, le=20.0)
@@ -126,6 +126,15 @@ class Lidar(Strict):
     errors: Literal["noise", "model"] = "noise"
     """How it errs: by `noise` alone, or also as its model's file says: noise of ranges and of directions, lost returns,
     drops of rain before the rest, jitter of stamps."""
+    laser_range_m: float = Field(default=0.0, ge=0.0, le=0.1)
+    """How far the ranges of each laser are off for good (m, 1 σ over the lasers)."""
+    laser_gain: float = Field(default=0.0, ge=0.0, le=0.6)
+    """How much the intensities of lasers differ (logarithm, 1 σ over the lasers)."""
+    dark_m: float | None = Field(default=None, gt=1.0)
+    """Distance at which one in e returns of a black surface (10 digital numbers) is lost (m): of intensity I at a range
+    r one in exp(I / 10 · (dark_m / r)²) is. None is where left out."""
+    false_returns: float = Field(default=0.0, ge=0.0, le=0.05)
+    """Share of the firings that meet nothing, but return a range: the sun's light."""
     mount: Mount = Mount(lever_arm_body_m=(-1.72, 0.06, -1.36), roll_deg=1.2, pitch_deg=18.0, heading_deg=-2.5)
     """Mounting of the head (axes flu); it leans back, so that the road behind is seen."""
     clock: ClockError = ClockError()
@@ -305,6 +314,12 @@ class Noise(Strict):
     """Time constant of the trajectory's errors (s)."""
     attitude_time_constant_s: float | None = Field(default=None, gt=0.0)
     """The same of roll, pitch and heading, where it differs from that of the position (s)."""
+    pass_step_m: float = Field(default=0.0, ge=0.0)
+    """How far the stated trajectory of a whole pass is off, on each of north, east, down (m)."""
+    step_m: float = Field(default=0.0, ge=0.0)
+    """Steps of the stated position within a pass, on each axis (m) …"""
+    steps_per_minute: float = Field(default=0.0, ge=0.0, le=60.0)
+    """… and how often they come."""
     control_m: float = Field(default=0.0, ge=0.0)
     """Error of the control points, on each coordinate (m)."""
 

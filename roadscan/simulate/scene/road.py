@@ -276,11 +276,12 @@ class Patch(Strict):
     """Extent along the road (m)."""
     width_m: float = Field(default=1.0, gt=0.1)
     """Extent across the road (m)."""
-    height_m: float = Field(default=-0.004, ge=-0.3, le=0.3)
-    """Height of its surface above the road around it, in its middle (m); negative: sunk."""
+    height_m: float = Field(default=-0.004, ge=-3.0, le=3.0)
+    """Height of its surface above the road around it, in its middle (m); negative: sunk. Beside the road: a terrace, a
+    bank, a raised bed or a ditch, by its edge."""
     rise_m: float = Field(default=0.0, ge=-0.3, le=0.3)
     """By how much its far end stands higher than its near end (m)."""
-    edge_m: float = Field(default=0.03, ge=0.001, le=0.5)
+    edge_m: float = Field(default=0.03, ge=0.001, le=10.0)
     """Width of the slope along its edge, inside the outline (m); at most half of its shorter extent."""
     shade: Shade = 52.0
     """Intensity."""
@@ -335,6 +336,10 @@ class Marking(Strict):
     """Length of the gap between dashes (m)."""
     colour: Literal["white", "yellow"] = "white"
     """Colour."""
+    worn: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Share of its paint that is worn off, in flakes of 3 cm."""
+    shade: Shade | None = None
+    """Its intensity, where it differs from `brightness.marking`."""
     start_m: float = Field(default=float("-inf"), allow_inf_nan=True)
     """First station (m)."""
     end_m: float = Field(default=float("inf"), allow_inf_nan=True)
@@ -352,6 +357,8 @@ class StopBar(Strict):
     """Offset of its right end (m)."""
     width_m: float = Field(default=0.5, gt=0.05)
     """Extent along the road (m)."""
+    worn: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Share of its paint that is worn off, in flakes of 3 cm."""
 
 
 class Crosswalk(Strict):
@@ -369,6 +376,8 @@ class Crosswalk(Strict):
     """Width of a stripe (m)."""
     gap_m: float = Field(default=0.5, gt=0.05)
     """Gap between stripes (m)."""
+    worn: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Share of its paint that is worn off, in flakes of 3 cm."""
 
 
 class Target(Strict):
@@ -428,6 +437,17 @@ class Brightness(Strict):
     """Verge, or pavement for pedestrians, beside the road."""
     kerb: Shade = 135.0
     """Kerbs."""
+
+
+class Grass(Strict):
+    """Grass on the verge: each beam is stopped somewhere among the blades, or by the soil."""
+
+    height_m: float = Field(default=0.05, gt=0.0, le=0.6)
+    """Height of the blades: 0.03 mown, 0.3 rough (m)."""
+    from_m: float = Field(default=0.0, ge=0.0)
+    """Where it begins beyond the paved edge: the width of a sidewalk, say (m)."""
+    shade: Shade = 85.0
+    """Intensity."""
 
 
 class Road(Strict):
@@ -496,6 +516,8 @@ class Road(Strict):
     """Zebra crossings."""
     targets: list[Target] = []
     """Painted control targets; they are the survey's control points where there are any."""
+    grass: Grass | None = None
+    """Grass on the verge; bare where left out."""
     stains: list[Stain] = []
     """Oil stains."""
     tyre_marks: list[TyreMark] = []

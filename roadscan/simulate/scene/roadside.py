@@ -111,6 +111,22 @@ class Tree(Standing):
     """Share of beams that the crown stops on each of its sides."""
     shade: Shade = 95.0
     """Intensity of the leaves."""
+    lean_deg: float = Field(default=0.0, ge=0.0, le=45.0)
+    """How far the trunk leans from the vertical (degrees) …"""
+    lean_towards_deg: float = 0.0
+    """… and whereto, from the direction of the road, clockwise (degrees)."""
+    stems: int = Field(default=1, ge=1, le=6)
+    """Stems into which it is forked."""
+    fork_m: float = Field(default=0.0, ge=0.0, le=5.0)
+    """Height of the fork where it has more than one; 0: from the ground (m)."""
+    extinction_per_m: float = Field(default=0.0, ge=0.0, le=20.0)
+    """The crown stops beams within, with this extinction (1/m); 0: on its outside, by `density`."""
+    crown_from_m: float | None = Field(default=None, ge=0.0)
+    """Height of the crown's lower end (m); from height and crown where left out."""
+    bush_m: float = Field(default=0.0, ge=0.0, le=6.0)
+    """Diameter of a bush around the trunk's foot; 0: none (m)."""
+    trunk_shade: Shade | None = None
+    """Intensity of the trunk; 0.8 of that of the leaves where left out."""
 
 
 class ParkedCar(Standing):
@@ -128,8 +144,45 @@ class ParkedCar(Standing):
     """Intensity of the body."""
 
 
+class Vehicle(Standing):
+    """A vehicle that stands: with windows, number plates that shine, and lights."""
+
+    what: Literal["car", "van", "lorry", "bicycle", "motorcycle"] = "car"
+    """Kind."""
+    size_m: tuple[float, float, float] | None = None
+    """Length, width and height (m); those of its kind where left out."""
+    heading_deg: float = 0.0
+    """Direction from that of the road, clockwise (degrees)."""
+    glass: float = Field(default=0.45, gt=0.0, le=1.0)
+    """Share of beams that a window stops, to glare, to return weakly, to mirror or to lose them; the rest pass."""
+    form: int = Field(default=0, ge=0, le=60)
+    """Which of the forms of its kind: height of the waist, length of the roof, what is on the rear."""
+    shade: Shade = 160.0
+    """Intensity of the body."""
+
+
+class Person(Standing):
+    """A person who stands."""
+
+    height_m: float = Field(default=1.75, gt=0.6, le=2.2)
+    """Height (m)."""
+    heading_deg: float = 0.0
+    """Direction from that of the road, clockwise (degrees)."""
+    form: int = Field(default=0, ge=0, le=60)
+    """Which stride, and whether with a rucksack."""
+    shade: Shade = 100.0
+    """Intensity of the clothes."""
+
+
 class MovingCar(Strict):
-    """A car that drives along the road at constant speed while a pass is recorded."""
+    """What moves along the road at constant speed while a pass is recorded: a car, another vehicle, a person."""
+
+    what: Literal["plain", "car", "van", "lorry", "bicycle", "motorcycle", "person"] = "plain"
+    """Kind; plain: a car of six boxes."""
+    glass: float = Field(default=0.45, gt=0.0, le=1.0)
+    """Share of beams that its windows stop, but for a plain car, which has none."""
+    form: int = Field(default=0, ge=0, le=60)
+    """Which of the forms of its kind."""
 
     passes: list[int] = []
     """Passes during which it drives, counted from 1; all of them where empty."""
@@ -186,6 +239,14 @@ class Fence(Barrier):
     """Height (m)."""
     density: float = Field(default=0.4, gt=0.0, le=1.0)
     """Share of beams that it stops."""
+    what: Literal["fence", "gate"] = "fence"
+    """Kind."""
+    style: Literal["mesh", "pickets", "panels"] = "mesh"
+    """A mesh stops beams by chance, pickets by where they are; panels stop all, whatever `density` says."""
+    picket_m: float = Field(default=0.09, gt=0.01, le=0.5)
+    """Width of a picket (m); the gaps follow from `density`."""
+    post_every_m: float = Field(default=0.0, ge=0.0)
+    """From post to post; 0: none (m)."""
     shade: Shade = 110.0
     """Intensity."""
 
@@ -203,8 +264,41 @@ class Facade(Barrier):
     """From window to window (m)."""
     depth_m: float = Field(default=8.0, gt=0.5, le=60.0)
     """Depth of the buildings away from the road (m)."""
+    glass: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Share of beams that the windows, then with frames, stop to glare, return weakly, mirror or lose them; the rest
+    pass into rooms. 0: windows without frames mirror all beams away."""
+    room_m: float = Field(default=3.5, gt=0.5, le=20.0)
+    """Depth of the rooms behind such windows (m)."""
     shade: Shade = 140.0
     """Intensity."""
+
+
+class Wall(Barrier):
+    """A wall: of a garden, of a terrace, of blocks."""
+
+    height_m: float = Field(default=1.0, gt=0.05, le=8.0)
+    """Height above the ground at its road side (m)."""
+    thickness_m: float = Field(default=0.25, gt=0.02, le=2.0)
+    """Thickness away from the road (m)."""
+    shade: Shade = 120.0
+    """Intensity."""
+
+
+class Hedge(Barrier):
+    """A hedge, trimmed flat: each beam is stopped somewhere within, or passes."""
+
+    height_m: float = Field(default=1.4, gt=0.1, le=6.0)
+    """Height (m)."""
+    width_m: float = Field(default=0.8, gt=0.1, le=5.0)
+    """Width away from the road (m)."""
+    passing: float = Field(default=0.05, gt=0.0, lt=1.0)
+    """Share of the beams that pass when they cross its width at right angles."""
+    ragged_m: float = Field(default=0.0, ge=0.0, le=1.0)
+    """How much its height and its sides vary from metre to metre; 0: trimmed (m)."""
+    foot_wall_m: float = Field(default=0.0, ge=0.0, le=2.0)
+    """Height of a wall at its foot; 0: none (m)."""
+    shade: Shade = 95.0
+    """Intensity of the leaves."""
 
 
 class Box(Standing):
@@ -256,6 +350,57 @@ class Planting(Standing):
     """Intensity."""
 
 
+class Furniture(Standing):
+    """A piece of street furniture, or what is fixed to the front of a house (which stands at `offset_m`)."""
+
+    what: Literal[
+        "cabinet", "bin", "litter_bin", "bench", "hydrant", "bus_shelter", "bollard", "advertising_column", "billboard",
+        "letter_box", "parking_meter", "planter", "sandwich_board", "steps", "door", "balcony", "shop_sign",
+        "hanging_sign",
+    ]  # fmt: skip
+    """Kind. Signs of shops are no traffic signs."""
+    heading_deg: float = 0.0
+    """Turned from how it faces the road, clockwise (degrees)."""
+    scale: float = Field(default=1.0, ge=0.4, le=2.5)
+    """Its size over that of its kind."""
+    shade: Shade = 110.0
+    """Intensity."""
+
+
+class Cover(Standing):
+    """A manhole's cover or a drain's grate: it lies on the road, as that falls."""
+
+    what: Literal["cover", "drain"] = "cover"
+    """Kind: a cover is round, a drain rectangular."""
+    length_m: float = Field(default=0.62, gt=0.1, le=2.0)
+    """Extent along the road, a diameter (m)."""
+    width_m: float = Field(default=0.62, gt=0.1, le=2.0)
+    """Extent across the road (m)."""
+    height_m: float = Field(default=0.003, gt=0.0, le=0.05)
+    """How far it stands out (m)."""
+    shade: Shade = 110.0
+    """Intensity."""
+
+
+class Wire(Standing):
+    """An overhead wire between two places, with sag."""
+
+    to_station_m: float
+    """Station of its other end (m)."""
+    to_offset_m: float
+    """Offset of its other end (m)."""
+    height_m: float = Field(default=6.5, gt=1.0, le=40.0)
+    """Height of its first end above the ground (m)."""
+    to_height_m: float = Field(default=6.5, gt=1.0, le=40.0)
+    """Height of its other end above the ground (m)."""
+    sag_m: float = Field(default=0.4, ge=0.0, le=5.0)
+    """How far its middle hangs below the straight line (m)."""
+    diameter_m: float = Field(default=0.02, gt=0.002, le=0.2)
+    """Diameter (m)."""
+    shade: Shade = 70.0
+    """Intensity."""
+
+
 class Roadside(Strict):
     """Everything that stands and moves."""
 
@@ -285,3 +430,17 @@ class Roadside(Strict):
     """Bridges and gantries."""
     plantings: list[Planting] = []
     """Beds of plants."""
+    vehicles: list[Vehicle] = []
+    """Vehicles that stand, with windows and bright plates."""
+    persons: list[Person] = []
+    """People who stand."""
+    walls: list[Wall] = []
+    """Walls."""
+    hedges: list[Hedge] = []
+    """Hedges."""
+    furniture: list[Furniture] = []
+    """Street furniture and parts of house fronts."""
+    covers: list[Cover] = []
+    """Covers and drains."""
+    wires: list[Wire] = []
+    """Overhead wires."""

@@ -22,6 +22,7 @@ from roadscan.simulate.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 INTERVALS: Final = 4
 """Intervals of a block of cycles (an HDL-32E's packet), within which the sensor moves evenly."""
@@ -133,6 +134,8 @@ def _measure_block(
         key,
     )
     found = groups.of_groups(epochs.size)
+    if scene.lidar.false_returns > 0.0:
+        _blind(scene, stream(scene.seed, drive.number, "lidar sun", block), found)
     if errors.clutter > 0.0:
         _strew(stream(scene.seed, drive.number, "lidar clutter", block), model, errors, found)
     ranges, intensity = _recorded(scene, drive, block, found)
@@ -163,6 +166,27 @@ def _strew(rng: np.random.Generator, model: LidarModel, errors: ModelErrors, fou
     met &= ~(found.range_m <= near)
     found.range_m[met], found.enh_m[met], found.object_id[met] = near[met], np.nan, -1
     found.intensity[met], found.is_mixed[met] = _CLUTTER_INTENSITY / REFLECTIVITY, False
+
+
+def _blind(scene: Scene, rng: np.random.Generator, found: Hits) -> None:
+    """Give some firings that met nothing a range anywhere: they are on no object."""
+    lost = np.isnan(found.range_m) & (rng.random(found.range_m.shape) < scene.lidar.false_returns)
+    found.range_m[lost] = rng.uniform(1.0, scene.lidar.range_max_m, np.count_nonzero(lost))
+    found.enh_m[lost], found.object_id[lost], found.part[lost], found.is_mixed[lost] = np.nan, -1, 0, False
+    found.intensity[lost] = rng.uniform(3.0, 40.0, np.count_nonzero(lost)) / REFLECTIVITY
+
+
+def _lost_in_the_dark(scene: Scene, rng: np.random.Generator, exact: Float64, intensity: Float64) -> Flags:
+    """Return which firings (p, c, n) are lost because too little light comes back."""
+    signal = np.nan_to_num(intensity.reshape(exact.shape)) / 10.0 * ((scene.lidar.dark_m or np.inf) / exact) ** 2
+    return np.asarray(rng.random(exact.shape) < np.exp(-signal))
+
+
+def laser_errors(scene: Scene, lasers: int) -> tuple[Float64, Float64]:
+    """Return how far each laser's ranges are off for good (n,; m), and its gain of intensity (n,)."""
+    rng = stream(scene.seed, 0, "lasers")
+    offset, gain = rng.standard_normal((2, lasers))
+    return scene.lidar.laser_range_m * offset, np.exp(scene.lidar.laser_gain * gain)
 
 
 def _pattern(scene: Scene, model: LidarModel) -> Pattern:
@@ -235,12 +259,19 @@ def _recorded(
     seen = np.isfinite(exact)
     if wrong.dropout > 0.0:
         seen &= rng.random(seen.shape, dtype=np.float32) >= wrong.dropout
+    if scene.lidar.dark_m is not None:
+        dark = stream(scene.seed, drive.number, "lidar dark", block)
+        seen &= ~_lost_in_the_dark(scene, dark, exact, found.intensity)
+    if scene.lidar.laser_range_m > 0.0:
+        exact = exact + laser_errors(scene, model.lasers)[0]
     errors = rng.standard_normal((2, np.count_nonzero(seen)), dtype=np.float32)
     ranges, intensity = np.zeros(seen.shape, np.uint32), np.zeros(seen.shape, np.uint8)
     units = np.rint((exact[seen] + wrong.range_m * errors[0]) / model.figures.range_step_m)
     ranges[seen] = np.maximum(units, 1)
     value = REFLECTIVITY * (found.intensity.reshape(seen.shape)[seen] + scene.noise.intensity * errors[1])
-    intensity[seen] = np.clip(np.rint(value), 1, 100)
+    if scene.lidar.laser_gain > 0.0:
+        value *= np.broadcast_to(laser_errors(scene, model.lasers)[1], seen.shape)[seen]
+    intensity[seen] = np.clip(np.rint(value), 1, 100 if scene.lidar.laser_gain == 0.0 else 255)
     return ranges, intensity
 
 

@@ -1,0 +1,215 @@
+"""Bodies of which things beside the road consist: rows of numbers for the kernels, placed on the ground."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.simulate.kernels import things as body
+from roadscan.simulate.scene.roadside import Barrier
+from roadscan.simulate.surface import Surface
+
+Float64 = npt.NDArray[np.float64]
+
+PIECE_M: Final = 2.0
+"""Barriers follow the road in straight pieces no longer than this (m)."""
+BURIED_M: Final = 0.3
+"""Depth below the ground to which objects extend, so that no beam passes beneath them (m)."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place on the ground."""
+
+    station_m: float
+    offset_m: float
+    enh_m: tuple[float, float, float]
+    """From the scene's origin."""
+    heading_rad: float
+    """Of the road."""
+
+    def beside(self, ahead_m: float, right_m: float, heading_rad: float) -> tuple[float, float]:
+        """Return easting and northing of a point ahead and to the right along a heading."""
+        s, c = math.sin(heading_rad), math.cos(heading_rad)
+        return self.enh_m[0] + ahead_m * s + right_m * c, self.enh_m[1] + ahead_m * c - right_m * s
+
+
+def place_at(surface: Surface, station_m: float, offset_m: float) -> Place:
+    e, n, heading = surface.place(station_m, offset_m)
+    origin = surface.origin_enh_m
+    e0, n0 = float(e) - float(origin[0]), float(n) - float(origin[1])
+    return Place(station_m, offset_m, (e0, n0, ground_at(surface, e0, n0)), float(heading))
+
+
+def ground_at(surface: Surface, easting: float, northing: float) -> float:
+    """Return the height of the ground at a place from the origin (m), extended beside the surface as the verge is."""
+    e, n = easting + surface.origin_enh_m[0], northing + surface.origin_enh_m[1]
+    height = float(surface.height_m(e, n, texture=False))
+    if math.isnan(height):
+        station, offset = surface.station_offset_m(e, n)
+        height = float(surface.points_at(np.atleast_1d(station), np.atleast_1d(offset))[0, 2])
+    return height - float(surface.origin_enh_m[2])
+
+
+def body_row(
+    kind: float,
+    place: tuple[float, float],
+    heading_rad: float,
+    half: tuple[float, float],
+    low_high: tuple[float, float],
+    shade: float,
+    density: float = 1.0,
+) -> Float64:
+    """Return a body's row (19,)."""
+    row = np.zeros(body.BODY_COLUMNS)
+    row[body.KIND] = kind
+    row[[body.EASTING, body.NORTHING]] = place
+    row[[body.SINE, body.COSINE]] = math.sin(heading_rad), math.cos(heading_rad)
+    row[[body.HALF_LENGTH, body.HALF_WIDTH]] = half
+    row[[body.LOW, body.HIGH]] = row[[body.LOW_END, body.HIGH_END]] = low_high
+    row[[body.INTENSITY, body.DENSITY]] = shade, density
+    return row
+
+
+def post(place: tuple[float, float], low: float, high: float, radius: float, shade: float) -> Float64:
+    return body_row(body.CYLINDER, place, 0.0, (radius, 0.0), (low - BURIED_M, high), shade)
+
+
+def walls(points: Float64, low: Float64, high: Float64, shade: float, skirt: float, density: float = 1.0) -> Float64:
+    """Return walls (n, 19) between points (n + 1, 2), with heights (n + 1,) of their lower and upper edge."""
+    rows = np.zeros((len(points) - 1, body.BODY_COLUMNS))
+    run = np.diff(points, axis=0)
+    length = np.hypot(run[:, 0], run[:, 1])
+    rows[:, body.KIND] = body.WALL
+    rows[:, [body.EASTING, body.NORTHING]] = (points[:-1] + points[1:]) / 2
+    rows[:, [body.SINE, body.COSINE]] = run / length[:, None]
+    rows[:, body.HALF_LENGTH] = length / 2
+    rows[:, body.LOW], rows[:, body.LOW_END] = low[:-1], low[1:]
+    rows[:, body.HIGH], rows[:, body.HIGH_END] = high[:-1], high[1:]
+    rows[:, body.SKIRT] = skirt
+    rows[:, body.INTENSITY], rows[:, body.DENSITY] = shade, density
+    return rows
+
+
+def along(surface: Surface, one: Barrier, piece_m: float) -> tuple[Float64, Float64]:
+    """Return points (n, 2) along the road and the ground there (n,), from the origin."""
+    count = math.ceil((one.end_m - one.start_m) / piece_m - 1e-9)
+    stations: Float64 = np.linspace(one.start_m, one.end_m, count + 1)
+    return points_on(surface, stations, np.full(count + 1, one.offset_m))
+
+
+def points_on(
+    surface: Surface, stations: Float64, offsets: Float64, *, heights: bool = True
+) -> tuple[Float64, Float64]:  # fmt: skip
+    """Return points (n, 2) and the ground there (n,), from the origin."""
+    e, n, _ = surface.place(stations, offsets)
+    at = np.stack([e, n], axis=-1) - surface.origin_enh_m[:2]
+    if not heights:
+        return at, np.zeros(len(at))
+    on_surface = surface.height_m(e, n, texture=False)
+    beside = surface.points_at(np.asarray(stations, np.float64), np.asarray(offsets, np.float64))[:, 2]
+    return at, np.where(np.isnan(on_surface), beside, on_surface) - surface.origin_enh_m[2]
+
+
+@dataclass
+class Assembly:
+    """Bodies of one thing, in its own axes: ahead along its heading, right, up from its foot (m)."""
+
+    place: Place
+    heading_rad: float
+    rows: list[Float64] = field(default_factory=list)
+
+    @property
+    def bodies(self) -> Float64:
+        """Return all bodies (n, 19)."""
+        return np.stack(self.rows)
+
+    def _add(self, row: Float64, part: int) -> None:
+        row[body.PART] = part
+        self.rows.append(row)
+
+    def box(
+        self,
+        ahead: float,
+        right: float,
+        up: tuple[float, float],
+        size: tuple[float, float],
+        shade: float,
+        part: int = 0,
+    ) -> None:
+        """Add a box around a place, from one height to another; size: along and across."""
+        at, z = self.place.beside(ahead, right, self.heading_rad), self.place.enh_m[2]
+        half = (size[0] / 2, size[1] / 2)
+        self._add(body_row(body.BOX, at, self.heading_rad, half, (z + up[0], z + up[1]), shade), part)
+
+    def post(
+        self, ahead: float, right: float, up: tuple[float, float], radius: float, shade: float, part: int = 0
+    ) -> None:
+        """Add an upright cylinder."""
+        at, z = self.place.beside(ahead, right, self.heading_rad), self.place.enh_m[2]
+        self._add(body_row(body.CYLINDER, at, 0.0, (radius, 0.0), (z + up[0], z + up[1]), shade), part)
+
+    def ball(
+        self, ahead: float, right: float, up: tuple[float, float], radius: float, shade: float,
+        per_m: float = 0.0, part: int = 0,
+    ) -> None:  # fmt: skip
+        """Add an ellipsoid: solid, or porous with an extinction (1/m)."""
+        at, z = self.place.beside(ahead, right, self.heading_rad), self.place.enh_m[2]
+        kind, density = (body.BUSH, per_m) if per_m > 0.0 else (body.ELLIPSOID, 1.0)
+        self._add(body_row(kind, at, 0.0, (radius, 0.0), (z + up[0], z + up[1]), shade, density), part)
+
+    def rod(
+        self, start: tuple[float, float, float], end: tuple[float, float, float], radius: float, shade: float,
+        part: int = 0,
+    ) -> None:  # fmt: skip
+        """Add a cylinder around the line between two places (ahead, right, up)."""
+        first, last = (self.place.beside(p[0], p[1], self.heading_rad) for p in (start, end))
+        z = self.place.enh_m[2]
+        self._add(rod_row((*first, z + start[2]), (*last, z + end[2]), radius, shade), part)
+
+    def plate(
+        self, ahead: float, right: float, up: tuple[float, float], width: float, shade: float, *,
+        turned_rad: float = math.pi / 2, density: float = 1.0, glass: bool = False, part: int = 0,
+    ) -> None:  # fmt: skip
+        """Add an upright thin rectangle, across the heading unless it is turned; of glass, it stops a share of beams."""
+        at, z = self.place.beside(ahead, right, self.heading_rad), self.place.enh_m[2]
+        kind = body.GLAZED if glass else body.WALL
+        half, heights = (width / 2, 0.0), (z + up[0], z + up[1])
+        self._add(body_row(kind, at, self.heading_rad + turned_rad, half, heights, shade, density), part)
+
+    def slope(
+        self, ahead: tuple[float, float], right: tuple[float, float], up: tuple[float, float, float], shade: float, *,
+        density: float = 1.0, glass: bool = False, lid: bool = False, part: int = 0,
+    ) -> None:  # fmt: skip
+        """Add a leaning rectangle (or the ellipse in it) between two places ahead and two to the right.
+
+        up : height of its middle, rise from its rear to its front edge, rise from left to right (m).
+        """
+        middle = self.place.beside((ahead[0] + ahead[1]) / 2, (right[0] + right[1]) / 2, self.heading_rad)
+        length, width = ahead[1] - ahead[0], right[1] - right[0]
+        z = self.place.enh_m[2] + up[0]
+        kind = body.LID if lid else body.SLOPE
+        row = body_row(kind, middle, self.heading_rad, (length / 2, width / 2), (z, z), shade, density)
+        row[body.ALONG], row[body.STOREY] = up[1] / length, up[2] / width
+        row[[body.HIGH, body.HIGH_END]] = z + (abs(up[1]) + abs(up[2])) / 2
+        row[body.WINDOW] = float(glass)
+        self._add(row, part)
+
+
+def rod_row(
+    start: tuple[float, float, float], end: tuple[float, float, float], radius: float, shade: float
+) -> Float64:  # fmt: skip
+    """Return the row (19,) of a cylinder around the line between two points (easting, northing, height)."""
+    if math.hypot(end[0] - start[0], end[1] - start[1]) < 1e-6:
+        end = (end[0] + 1e-6, end[1], end[2])
+    heading = math.atan2(end[0] - start[0], end[1] - start[1])
+    half = math.hypot(end[0] - start[0], end[1] - start[1]) / 2
+    middle = ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2)
+    row = body_row(body.ROD, middle, heading, (half, radius), (start[2], end[2]), shade)
+    row[body.LOW], row[body.LOW_END] = start[2], end[2]
+    row[[body.HIGH, body.HIGH_END]] = max(start[2], end[2]) + radius
+    return row

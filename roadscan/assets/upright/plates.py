@@ -59,7 +59,7 @@ _SPOT_SHARE: Final = 0.25
 """1 σ of where within its spot the middle of a beam lies that a plate just stops, as a share of half the spot."""
 _USUAL_HALF_RAD: Final = math.radians(0.17 / 2.0)
 """Half the angle of a beam whose width is not known (rad): that of common spinning lidars."""
-JUDGE: Final = Judge("sign", "square 11 False 0.021 {'returns': 2.71, 'bright_median': 0.53, 'residual_m': 0.02, 'beside': 0.33, 'behind': 0.07, 'around': 1.33, 'below_wide': nan, 'width_m': 0.71, 'height_m': 0.61, 'misfit': 0.16, 'filled': nan}")
+JUDGE: Final = Judge("sign", "00c8eb2b7c050222")
 
 
 class SignOptions(KindOptions):

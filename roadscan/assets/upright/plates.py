@@ -233,7 +233,8 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     rows = np.union1d(cluster, inside)
     wide = _wide(scene, rows, middle, normal)
     sure = cluster[brightness(scene)[cluster] >= options.intensity_ratio]
-    edge = sure if sure.size >= max(_ENOUGH_BRIGHT, _MOST_BRIGHT * wide.size) else wide
+    facing = _in_front(scene, wide, middle, normal).sum()
+    edge = sure if sure.size >= max(_ENOUGH_BRIGHT, _MOST_BRIGHT * facing) else wide
     right, up = _axes(normal)
     placed = np.column_stack([returns.x_m[edge], returns.y_m[edge], returns.height_m[edge]]) - middle
     outline = outline_of(np.column_stack([placed @ right, placed @ up]))
@@ -250,10 +251,10 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     above = float(place[2]) - ground
     plane = PlaneOfPlate(rows, near, place, normal, right, up)
     features = features_of(scene, plane, outline, beams, residual, about, above)
-    facing = math.degrees(math.atan2(float(normal[0]), float(normal[1]))) % 360.0
+    azimuth = math.degrees(math.atan2(float(normal[0]), float(normal[1]))) % 360.0
     lean = math.degrees(math.asin(max(-1.0, min(1.0, float(normal[2])))))
     clearance = above - outline.height_m / 2
-    return Plate(rows, tuple(map(float, place)), outline, facing, lean, clearance, features)  # type: ignore[arg-type]
+    return Plate(rows, tuple(map(float, place)), outline, azimuth, lean, clearance, features)  # type: ignore[arg-type]
 
 
 def _spot(scene: Scene, rows: Int64) -> Spot:

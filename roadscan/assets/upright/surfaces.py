@@ -43,7 +43,7 @@ def told(chain: Chain) -> Surface | None:
         return None
     if top > 3.0 or (top > 1.4 and chain.open_top > 0.4):
         return "facade" if chain.passing < 0.4 and chain.length_m >= 2.0 else None
-    if low > 0.6 and (chain.hovering > _HOVERS or low > 1.2):
+    if low > 0.6 and (low > 1.2 or (chain.hovering > _HOVERS and chain.porous < _POROUS)):
         return None
     if bulk > 0.36 and 0.5 <= top <= 1.15 and top - bulk < 0.5:
         return "guardrail" if chain.length_m >= 4.0 else None

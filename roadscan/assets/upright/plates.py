@@ -232,9 +232,8 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     inside = inside[_in_front(scene, inside, middle, normal) | ~bright[inside]]
     rows = np.union1d(cluster, inside)
     wide = _wide(scene, rows, middle, normal)
-    sure = cluster[brightness(scene)[cluster] >= options.intensity_ratio]
-    facing = _in_front(scene, wide, middle, normal).sum()
-    edge = sure if sure.size >= max(_ENOUGH_BRIGHT, _MOST_BRIGHT * facing) else wide
+    lit, facing = wide[bright[wide]], _in_front(scene, wide, middle, normal).sum()
+    edge = lit if lit.size >= max(_ENOUGH_BRIGHT, _MOST_BRIGHT * facing) else wide
     right, up = _axes(normal)
     placed = np.column_stack([returns.x_m[edge], returns.y_m[edge], returns.height_m[edge]]) - middle
     outline = outline_of(np.column_stack([placed @ right, placed @ up]))

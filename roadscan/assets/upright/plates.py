@@ -49,12 +49,14 @@ _ENOUGH_BRIGHT: Final = 60
 """Number of bright returns that suffice for the outline, …"""
 _MOST_BRIGHT: Final = 0.85
 """… where they make this share of those on its plane."""
+_BOARD_M: Final = 0.04
+"""Boards, which are larger than signs, are plane within this (m), poses of several passes included."""
 _POST_M: Final = 0.15
 """Levels of a plate narrower than this (m), or than an eighth of the widest, are its post."""
 _RIM_SHARE: Final = 0.7
 """Beside returns of full brightness those of this share of it belong to a plate: spots at its rim, dark symbols."""
 _SAME_PLATE: Final = 0.3
-"""Thin elements of which this share lies on a bright plate are that plate."""
+"""Of candidates that share so many of their returns the most probable one is kept."""
 _SPOT_SHARE: Final = 0.25
 """1 σ of where within its spot the middle of a beam lies that a plate just stops, as a share of half the spot."""
 _USUAL_HALF_RAD: Final = math.radians(0.17 / 2.0)
@@ -104,20 +106,22 @@ def plates_of(scene: Scene, options: SignOptions) -> list[Plate]:
         return []
     features = {name: np.array([one.features[name] for one in found]) for name in found[0].features}
     stated = JUDGE.probability(features).tolist()
-    return [replace(one, probability=p) for one, p in zip(found, stated, strict=True)]
+    taken, kept = np.zeros(len(scene.returns), np.bool_), []
+    for one, p in sorted(zip(found, stated, strict=True), key=lambda pair: (-pair[1], pair[0].middle_m)):
+        if taken[one.rows].mean() < _SAME_PLATE:
+            kept.append(replace(one, probability=p))
+            taken[one.rows] = True
+    return sorted(kept, key=lambda plate: plate.middle_m)
 
 
 def candidates_of(scene: Scene, options: SignOptions) -> list[Plate]:
-    """Returns what might be plates, by their place; they are not yet judged."""
+    """Returns what might be plates, by their place; they are not yet judged, and some may be one and the same."""
     bright, sure = (_bright(scene, share * options.intensity_ratio) for share in (_RIM_SHARE, 1.0))
     free = ~_in_large_planes(scene, options.greatest_board_m)
     found = _plates(scene, np.flatnonzero(bright & free), bright, options)
     found = [one for one in found if sure[one.rows].sum() >= _LEAST_BRIGHT]
-    taken = np.zeros(len(scene.returns), np.bool_)
-    for one in found:
-        taken[one.rows] = True
     thin = on_thin(scene) & free & (scene.above_ground_m > _SEARCHED_ABOVE_M)
-    found += [p for p in _plates(scene, np.flatnonzero(thin), bright, options) if taken[p.rows].mean() < _SAME_PLATE]
+    found += _plates(scene, np.flatnonzero(thin), bright, options)
     return sorted((p for p in found if not _on_thick_shaft(scene, p)), key=lambda p: p.middle_m)
 
 
@@ -241,6 +245,9 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     ground = float(scene.ground.height_at(place[0], place[1]))
     above = float(place[2]) - ground
     if not _has_size(outline, options) or not options.least_height_m <= above <= options.greatest_height_m:
+        return None
+    large = max(outline.width_m, outline.height_m) > options.greatest_size_m
+    if large and residual > _BOARD_M:
         return None
     if _stands(scene, near, (place, normal), outline, ground):
         return None

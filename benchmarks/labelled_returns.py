@@ -32,7 +32,7 @@ from roadscan.simulate.earth import Earth, LocalMap
 from roadscan.simulate.kernels.ground import kerb_heights
 from roadscan.simulate.kernels.road import KERB_TOP_M, find_paint
 from roadscan.simulate.semantics import CLASSES, class_number, class_of_kind
-from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, Packets, measure
+from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, Packets, beam_width_deg, measure
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import objects_table
 from roadscan.simulate.trajectory import PoseErrors, first_gps_ns, stated_poses
@@ -88,7 +88,10 @@ def labelled_returns(scene: Scene, *, laser_numbers: bool = True) -> LabelledRet
         columns["laser"] = np.zeros_like(columns["laser"])
     corner = surface.origin_enh_m[:2]
     returns = Returns(
-        corner_m=(float(corner[0]), float(corner[1])), sensors=(scene.lidar.model.lower().replace("-", ""),), **columns
+        corner_m=(float(corner[0]), float(corner[1])),
+        sensors=(scene.lidar.model.lower().replace("-", ""),),
+        divergence_deg=(beam_width_deg(scene),),
+        **columns,
     )
     kinds, kind = _kinds(world, label["object_id"])
     return LabelledReturns(

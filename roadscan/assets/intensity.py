@@ -177,7 +177,7 @@ def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Return
 
     The angle of incidence is known on the ground; the gain of incidence of all other returns is 1.
     """
-    log_gain = np.zeros(len(returns))
+    log_gain, of_lasers = np.zeros(len(returns)), np.zeros(len(returns))
     on_ground = np.abs(returns.height_m - ground.height_at(returns.x_m, returns.y_m)) <= 3 * ON_GROUND_M
     range_m, incidence = _beams(returns, ground, on_ground)
     sensors = gains["sensor"].to_numpy(zero_copy_only=False)
@@ -196,10 +196,12 @@ def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Return
         lasers, of_laser = of("laser")
         by_laser = np.zeros(int(np.iinfo(np.uint16).max) + 1)
         by_laser[lasers.astype(np.int64)] = of_laser
+        of_lasers[mine] = by_laser[returns.laser[mine]] - float(np.median(of_laser))
         log_gains(mine, returns.laser, range_m, incidence, on_ground, by_laser, of("range"), of("incidence"), log_gain)
     log_gain[np.isnan(log_gain)] = 0.0  # the sensor's place is not known
     intensity = (returns.intensity * np.exp(log_gain)).astype(np.float32)
-    return replace(returns, intensity=intensity, calibrated=True)
+    evened = (returns.intensity * np.exp(of_lasers)).astype(np.float32)
+    return replace(returns, intensity=intensity, calibrated=True, evened=evened)
 
 
 def calibrated_scene(scene: Scene, gains: pa.Table) -> Scene:

@@ -43,7 +43,11 @@ class Returns:
     sensor_height_m: Float64
     sensors: tuple[str, ...] = ()
     """Names of the sensors."""
+    divergence_deg: tuple[float, ...] = ()
+    """Full angle of the beam of each sensor (degrees), NaN where it is not known; empty: of none."""
     calibrated: bool = False
+    evened: Float32 | None = None
+    """(n,) intensity with the gains of lasers alone; None: as `intensity`."""
 
     def __len__(self) -> int:
         return int(self.x_m.size)
@@ -56,6 +60,17 @@ class Returns:
             + (self.y_m - self.sensor_y_m) ** 2
             + (self.height_m - self.sensor_height_m) ** 2
         )
+
+    @property
+    def light(self) -> Float32:
+        """Returns the light (n,) that came back, lasers made alike; it still falls with range and incidence."""
+        return self.intensity if self.evened is None else self.evened
+
+    def half_beam_rad(self, rows: npt.NDArray[np.integer[Any]]) -> Float64:
+        """Returns half the angle (n,) of the beams of some returns (rad); NaN where it is not known."""
+        known = np.full(256, np.nan)
+        known[: len(self.divergence_deg)] = np.radians(self.divergence_deg) / 2.0
+        return np.asarray(known[self.sensor[rows]])
 
     def at(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.integer[Any]]) -> Self:
         """Returns the returns at `rows`, a mask (n,) or indices."""

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from roadscan.core.beam_widths import divergence_of
 from roadscan.core.camera import Interior
 from roadscan.core.frames import BODY_FROM_AXES, body_from_axes, rotation_from_rph
 from roadscan.core.imu import IMU_GRADES, ImuErrors, ImuGrade
@@ -92,7 +93,7 @@ class Sensor(Strict):
     """What it is: profiler, lidar, camera, gnss, imu or encoder. A log that it cannot have written is refused: scans
     are of a profiler or lidar, returns of a lidar, images of a camera, clouds of any of these three."""
     model: str = ""
-    """Maker's name, for the reader of the file only."""
+    """Maker's name, such as "Velodyne HDL-32E"; it tells the width of a lidar's beam."""
     axes: str = "frd"
     """Where the sensor's x, y, z point when it is mounted without misalignment: three letters of f(orward) b(ack)
     r(ight) l(eft) u(p) d(own), right-handed: one of 24 codes such as frd, flu or urf. Ignored with
@@ -110,6 +111,10 @@ class Sensor(Strict):
     """Returns and readings of profiles nearer than this are left out (own vehicle); points of clouds have no range."""
     range_max_m: float = Field(default=float("inf"), gt=0.0, allow_inf_nan=True)
     """Returns and readings of profiles farther than this are left out."""
+    divergence_deg: float | None = Field(default=None, ge=0.0, le=2.0)
+    """Full angle of a lidar's beam (degrees), the wider one where its maker states two. Things appear larger by the
+    spot, and sizes of signs are reduced by it. Left out, it is that of the `model`, where that is known (HDL-64E,
+    HDL-32E, VLP-16, VLP-32C, OS0, OS1, PandarXT-32)."""
     metres_per_tick: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     """Nominal way of one tick of an encoder (m): its wheel's circumference over its ticks a turn."""
     lever_arm_sigma_m: tuple[float, float, float] | None = None
@@ -160,6 +165,10 @@ class Sensor(Strict):
         turned = {"axes", "boresight"} if "body_from_sensor" in stated else set()
         added = {key: value for key, value in known.items() if key not in {*stated, *turned}}
         return self.parse({**self.model_dump(exclude_unset=True), **added}) if added else self
+
+    def beam_divergence_deg(self) -> float | None:
+        """Return the full angle of a lidar's beam (degrees), as stated or the model's; None where it is not known."""
+        return divergence_of(self.model) if self.divergence_deg is None else self.divergence_deg
 
     def imu_errors(self) -> ImuErrors | None:
         """Return the errors of an IMU; None where the rig file states none."""

@@ -21,6 +21,7 @@ from roadscan.simulate.scene import Camera, Mount, Scene
 from roadscan.simulate.sensors import sick
 from roadscan.simulate.sensors.gnss import antenna_mount
 from roadscan.simulate.sensors.imu import AT_BODY, head_imus
+from roadscan.simulate.sensors.lidar import beam_width_deg
 from roadscan.simulate.sensors.lens import Lens
 from roadscan.simulate.sensors.profiler import Head, heads
 from roadscan.simulate.surface import Surface
@@ -71,9 +72,11 @@ def write_rig(scene: Scene, file: Path, *, nominal: bool = True) -> None:
         figures = lidar_model(scene.lidar.model).figures
         limits = (figures.range_min_m, scene.lidar.range_max_m + 1.0)
         lines += _sensor("lidar", "lidar", figures.title, "flu", mounted(scene.lidar.mount), limits)
+        lines.append(f"divergence_deg = {beam_width_deg(scene)!r}")
     if scene.sick.on:
         limits = (sick.RANGE_MIN_M, scene.sick.range_max_m + 1.0)
         lines += _sensor("sick", "lidar", "SICK LMS 200", "frd", mounted(scene.sick.mount), limits)
+        lines.append(f"divergence_deg = {scene.sick.divergence_deg!r}")
     if scene.camera.on:
         lines += _sensor(
             "camera", "camera", "pinhole camera, Brown-Conrady distortion", "frd", mounted(scene.camera.mount)

@@ -107,3 +107,13 @@ def test_what_a_log_knows_holds_where_the_rig_states_nothing() -> None:
     turned = Sensor(kind="profiler", body_from_sensor=((1, 0, 0), (0, 1, 0), (0, 0, 1)))
     assert turned.mounted_as(known).mounting().body_from_sensor == ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     assert turned.mounted_as(known).lever_arm_body_m == (0.3, 0.0, 0.0)
+
+
+def test_the_width_of_a_beam_is_stated_or_follows_from_the_model() -> None:
+    def width(**stated: object) -> float | None:
+        return Sensor.parse({"kind": "lidar", **stated}).beam_divergence_deg()
+
+    assert width() is None and width(model="own build") is None
+    assert width(model="Velodyne HDL-32E") == width(model="hdl_32e") == 0.17
+    assert width(model="Ouster OS1-128") == 0.18 and width(model="Ouster OS1-64") == 0.13
+    assert width(model="Velodyne HDL-32E", divergence_deg=0.0) == 0.0

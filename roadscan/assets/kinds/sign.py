@@ -30,7 +30,7 @@ class Sign(AssetKind):
 
     name = "sign"
     title = "Road Signs/Boards"
-    curve = "signs"
+    curve = "products"
     options = SignOptions
     after: ClassVar[Sequence[str]] = ("pole", "lighting", "signal")
     piece_schema = schema_of(

@@ -21,6 +21,11 @@ _FULL_STEP: Final = 60.0
 _WEIGHT: Final = 14.0  # Weight of a mean edge in the logarithm of a shape's weight.
 _FROM_RETURNS: Final = 0.7
 """Probability that the outline of the returns alone has the right shape."""
+_UNKNOWN: Final = 0.02
+"""Weight of shapes that nobody lists, as a share of that of the best one: no shape is certain."""
+_NO_EDGE, _MOST_ODDS = 0.25, 1.5
+"""Mean step of colours at which a picture says neither that a plate is there nor that there is none, and the greatest
+logarithm of the odds that pictures add or take: a grey plate before a grey wall shows no edge either."""
 _LEAST_PX: Final = 12.0  # Smaller cut-outs (pixels) are not used.
 
 
@@ -44,7 +49,7 @@ def shape_of(cut_outs: Sequence[CutOut], shape: str, width_m: float, height_m: f
         names.append(own)
     score = {n: np.log(_FROM_RETURNS if n == own else (1.0 - _FROM_RETURNS) / max(len(names) - 1, 1)) for n in names}
     for one in cut_outs:
-        if float(np.ptp(one.outline_px, axis=0).min()) >= _LEAST_PX:
+        if _is_large(one):
             for name in names:
                 score[name] += _WEIGHT / len(cut_outs) * _edges(one, name)
     joined: dict[str, float] = {}
@@ -53,10 +58,28 @@ def shape_of(cut_outs: Sequence[CutOut], shape: str, width_m: float, height_m: f
         key = name.split()[0]
         joined[key] = joined.get(key, 0.0) + float(np.exp(value - top))
     best = min(joined, key=lambda n: (-joined[n], n))
-    probability = joined[best] / sum(joined.values())
+    unknown = _UNKNOWN * joined[best] if any(map(_is_large, cut_outs)) else 0.0
+    probability = joined[best] / (sum(joined.values()) + unknown)
     if best == "rectangle" and shape == "square":
         best = "square"
     return best, probability
+
+
+def plate_odds(cut_outs: Sequence[CutOut], shape: str) -> float:
+    """Returns the logarithm of the odds that cut-outs add to those of a plate of a shape: negative ones veto it.
+
+    Colours differ across the whole outline of a plate; where they do not, a picture sees the place and no plate there.
+    """
+    name = "rectangle" if shape in ("square", "other") else shape
+    names = [n for n in SHAPES if n.split()[0] == name]
+    seen = [max(_edges(one, n) for n in names) for one in cut_outs if _is_large(one)]
+    if not seen:
+        return 0.0
+    return float(np.clip(_WEIGHT * (np.mean(seen) - _NO_EDGE), -_MOST_ODDS, _MOST_ODDS))
+
+
+def _is_large(one: CutOut) -> bool:
+    return float(np.ptp(one.outline_px, axis=0).min()) >= _LEAST_PX
 
 
 def _fits(name: str, width_m: float, height_m: float) -> bool:

@@ -50,6 +50,8 @@ class ReturnsTask:
     """Row groups that may touch them."""
     sensors: tuple[str, ...]
     """All sensors in whose returns the survey seeks assets, by name."""
+    divergence_deg: tuple[float, ...]
+    """Full angle of the beam of each, NaN where it is not known (degrees)."""
     ways: tuple[tuple[str, TrajectorySource], ...]
     """Trajectories of runs whose clouds are used, by run."""
 
@@ -142,6 +144,7 @@ class _Block:
             sensor_y_m=places[:, 1] - corner[1],
             sensor_height_m=np.ascontiguousarray(places[:, 2]),
             sensors=self._task.sensors,
+            divergence_deg=self._task.divergence_deg,
         )
         return LoadedSquare(square, returns, self._drives(own, square))
 

@@ -79,7 +79,8 @@ class AssetPlan:
         known = self.tiles.tiles.number
         under = dict.fromkeys(t for square in squares for t in self.grid.tiles_under(square) if t in known)
         own = tuple(sorted(under, key=lambda t: (t.row, t.column)))
-        return ReturnsTask(self.grid, squares, self.tiles.task(Block(own)), self.sensors, self.ways)
+        widths = _divergences(self.survey.survey, self.sensors)
+        return ReturnsTask(self.grid, squares, self.tiles.task(Block(own)), self.sensors, widths, self.ways)
 
     def near(self, chosen: Sequence[TileId]) -> set[TileId]:
         """Returns squares that see one of some of the survey's tiles, in themselves or in their halo."""
@@ -104,6 +105,7 @@ def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
     common = key_of(
         grid, chosen, config.ground.model_dump(mode="json"), None if plan.centre_lines is None else
         plan.centre_lines.key(), [[w.world, [f.digest for f in w.files], _corrections(plan, run)] for run, w in ways],
+        [str(width) for width in _divergences(plan.survey, chosen)],
     )  # fmt: skip
     own = _looked_at(footprints, config)
     tiles = plan_tiles(own, replace(plan, tile_key=common))
@@ -170,6 +172,14 @@ def _ways(plan: SurveyPlan, config: AssetsConfig) -> tuple[tuple[str, Trajectory
     runs = sorted({s.run for s, _ in plan.sources if s.table == "cloud" and is_looked_at(s, config)})
     held = {r.run for r in plan.records if r.tables.get("trajectory")}
     return tuple((run, trajectory_source(run, plan.records)) for run in runs if run in held)
+
+
+def _divergences(survey: Survey, sensors: Sequence[str]) -> tuple[float, ...]:
+    """Returns the full angles of the beams of some sensors (degrees), NaN where they are not known."""
+    stated = [
+        survey.rig.sensors[name].beam_divergence_deg() if name in survey.rig.sensors else None for name in sensors
+    ]
+    return tuple(float("nan") if one is None else one for one in stated)
 
 
 def _corrections(plan: SurveyPlan, run: str) -> str:

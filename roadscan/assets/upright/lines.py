@@ -17,7 +17,9 @@ from roadscan.compute.robust import SIGMA_OF_MAD
 
 Float64 = npt.NDArray[np.float64]
 
-STRETCHES: Final = ("ground_m", "low_m", "high_m", "bulk_m", "length_m", "returns", "stopped", "passed", "open_top")
+STRETCHES: Final = (
+    "ground_m", "low_m", "high_m", "bulk_m", "length_m", "returns", "stopped", "passed", "under", "open_top",
+)  # fmt: skip
 PIECE_SCHEMA: Final = pa.schema(
     [("x_m", pa.list_(pa.float64())), ("y_m", pa.list_(pa.float64()))]
     + [(name, pa.list_(pa.float64())) for name in STRETCHES]
@@ -36,6 +38,8 @@ _JOIN_LEVEL_M: Final = 0.15
 """Low surfaces join where they start at one height above the ground, within this (m): rail and solid end do not …"""
 _LOW_M: Final = 1.2
 """… and low ones are up to this height (m)."""
+_LEAST_LINES: Final = 15.0  # Fewer sight lines at a stretch do not tell whether it is porous.
+_LEAST_PASSING: Final = 0.02  # Share of the sight lines that a porous stretch lets through.
 _SHORTEST_M: Final = 0.02  # Shorter pieces and gaps are left out (m).
 
 
@@ -75,6 +79,32 @@ class Chain:
         """Returns the share of the sight lines at it that pass through."""
         passed, stopped = float(self.values["passed"].sum()), float(self.values["stopped"].sum())
         return passed / max(passed + stopped, 1.0)
+
+    @property
+    def porous(self) -> float:
+        """Returns the share of its length, where enough sight lines tell it, that lets some of them through.
+
+        A solid surface lets lines through where it has a gap, a porous one all along. One line may be a false return.
+        """
+        passed, lines = self.values["passed"], self.values["passed"] + self.values["stopped"]
+        told = lines >= _LEAST_LINES
+        length = self.values["length_m"] * told
+        through = passed - 1.0 >= _LEAST_PASSING * lines
+        return float(length @ through) / float(length.sum()) if told.any() else 0.0
+
+    @property
+    def sigma_passing(self) -> float:
+        """Returns 1 σ of `passing`: of its scatter over the stretches, and of the number of lines."""
+        passed, lines = self.values["passed"], np.maximum(self.values["passed"] + self.values["stopped"], 1.0)
+        p, total = self.passing, float(lines.sum())
+        spread = float(np.sqrt(np.sum((passed - p * lines) ** 2))) / total
+        return max(spread, math.sqrt((p * (1.0 - p) + 1.0 / total) / total))
+
+    @property
+    def hovering(self) -> float:
+        """Returns the share of the sight lines at it and below it that pass below it."""
+        under, stopped = float(self.values["under"].sum()), float(self.values["stopped"].sum())
+        return under / max(under + stopped, 1.0)
 
     @property
     def open_top(self) -> float:
@@ -137,7 +167,7 @@ def _row(scene: Scene, panel: Panel, run: list[tuple[int, float, float]]) -> dic
         if rows.size
         else {"returns": 0, "passes": [], "first_epoch_gps_ns": None, "last_epoch_gps_ns": None}
     )
-    counts = {name: getattr(panel, name)[numbers] * shares for name in ("returns", "stopped", "passed")}
+    counts = {name: getattr(panel, name)[numbers] * shares for name in ("returns", "stopped", "passed", "under")}
     heights = {name: getattr(panel, name)[numbers] for name in ("ground_m", "low_m", "high_m", "bulk_m")}
     return {
         "x_m": (east + xy[:, 0]).tolist(), "y_m": (north + xy[:, 1]).tolist(),

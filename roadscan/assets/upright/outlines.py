@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import expit
+from scipy.special import expit, ndtri
 
 from roadscan.assets.upright.plate_beams import Beams
 
@@ -32,11 +32,25 @@ _NEAR_EDGE_M: Final = (-0.05, 0.6)
 """Two beams that pass this far (m) beyond a side bound it."""
 _LEAST_GAP_M: Final = 0.005
 """Least gap between lines that is assumed (m)."""
-_SIGMA_SHARE, _LEAST_SIGMA_M = 0.1, 0.002
-"""σ of the size as a share of half the widest gap between lines, and least σ (m): 95 % of 172 drawn signs lie within
-2 σ."""
+_LEAST_SIGMA_M: Final = 0.002
+"""Least σ of the place of a side (m)."""
+_BEYOND_SIDE_M: Final = 0.3
+"""Beams that pass a side within this (m) tell how much of a spot has to lie on the plate."""
+_SIDES_THAT_TELL: Final = 4.0  # Number of sides whose errors are independent, of shapes with one size.
 _HOLD: Final = 0.002
 """Weight of the first solution, where nothing else determines the result (1/m)."""
+
+
+class Spot(NamedTuple):
+    """Spot of the beams on a plate."""
+
+    half_m: float
+    """Half its width (m); 0 where it is not known."""
+    doubt_m: float
+    """1 σ of how far beyond a side the middle of a beam lies that the plate just stops (m)."""
+
+
+NO_SPOT: Final = Spot(0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -51,15 +65,16 @@ class Outline:
     misfit_m: float
     """Root mean square distance of the returns' hull from it."""
     sigma_m: float = math.inf
-    """1 σ of its size, where beams are known."""
+    """1 σ of its size (m)."""
 
 
-def outline_of(points: Float64, beams: Beams | None = None) -> Outline:
+def outline_of(points: Float64, beams: Beams | None = None, spot: Spot = NO_SPOT) -> Outline:
     """Best of rectangle, disc, octagon, diamond and triangles about points (n, 2) of a plane, second axis up.
 
     A convex shape is known by how far it reaches in each direction (its support function), which is linear in its place
     and its size; each template is fitted by least squares. Where beams are known, the shapes that fit best are then set
-    between those that they stopped and those that went by; the one that parts them best is taken.
+    between those that they stopped and those that went by; the one that parts them best is taken. Where they are not
+    known, half a spot is taken off each side.
     """
     hulls = _hulls(points)
     if not hulls:
@@ -67,14 +82,17 @@ def outline_of(points: Float64, beams: Beams | None = None) -> Outline:
         middle = (low + high) / 2
         wide, tall = map(float, high - low)
         return Outline("other", (float(middle[0]), float(middle[1])), wide, tall, math.inf)
-    (misfit, shape, solution), sigma = hulls[0], math.inf
+    misfit, shape, solution = hulls[0]
+    room = math.sqrt(float(solution[2] * solution[-1]) / len(points))
+    sigma = math.sqrt(2.0 * (room**2 / 12.0 + spot.doubt_m**2 + _LEAST_SIGMA_M**2))
+    solution[2:] = np.maximum(solution[2:] - 2.0 * spot.half_m, 0.5 * solution[2:]) if beams is None else solution[2:]
     if beams is not None:
         parted = []
         for other, name, first in hulls:
             if other <= _CLOSE * misfit:
-                loss, fitted, room = _parting(name, first, beams)
+                loss, fitted, own = _parting(name, _without_spot(first, beams), beams, spot.doubt_m)
                 if (fitted[2:] > _LEAST_M).all():
-                    parted.append((loss, other, name, fitted, room))
+                    parted.append((loss, other, name, fitted, own))
         if parted:
             _, misfit, shape, solution, sigma = min(parted, key=lambda p: p[0])
     width, height = float(solution[2]), float(solution[-1])
@@ -101,7 +119,7 @@ def _hulls(points: Float64) -> list[tuple[float, str, Float64]]:
     return sorted(found, key=lambda f: f[0])
 
 
-def _parting(shape: str, first: Float64, beams: Beams) -> tuple[float, Float64, float]:
+def _parting(shape: str, first: Float64, beams: Beams, doubt_m: float) -> tuple[float, Float64, float]:
     """Returns loss, place and size, and σ of the size, of the template that separates hitting from passing beams.
 
     The loss is logistic in the distance of a beam beyond the nearest side or within it. It grows linearly on the
@@ -112,10 +130,13 @@ def _parting(shape: str, first: Float64, beams: Beams) -> tuple[float, Float64, 
     angle = np.deg2rad(_SIDES[shape])
     ways = np.column_stack([np.cos(angle), np.sin(angle)])
     columns = np.column_stack([ways, *[t(ways) for t in _TEMPLATES[shape]]])
-    within, beyond = beams.hits @ ways.T, beams.passed @ ways.T
+    needed = _needed(columns @ first, ways, beams)
+    within = beams.hits @ ways.T - needed * beams.hit_spot.reach(ways)
+    beyond = beams.passed @ ways.T - needed * beams.passed_spot.reach(ways)
     within = within[(within - columns @ first).max(axis=1) > -_WELL_INSIDE * first[2:].min()]
     lines = _half_gap(ways, beams)
-    beyond = np.concatenate([beyond, _expected(first, ways, columns, beams, lines) @ ways.T])
+    spot = needed * np.median(beams.hit_spot.reach(ways), axis=0)
+    beyond = np.concatenate([beyond, _expected(first, ways, columns, beams, lines) @ ways.T - spot])
 
     def loss(solution: Float64, blur: float) -> tuple[float, Float64]:
         value, slope = 0.5 * _HOLD * float(((solution - first) ** 2).sum()), _HOLD * (solution - first)
@@ -134,7 +155,53 @@ def _parting(shape: str, first: Float64, beams: Beams) -> tuple[float, Float64, 
     if shape == "rectangle":
         reach = columns @ solution
         solution = solution + np.linalg.solve(columns, _to_sides(within - reach, beyond - reach, lines))
-    return value, solution, max(_SIGMA_SHARE * float(lines.max()), _LEAST_SIGMA_M)
+    reach = columns @ solution
+    return value, solution, _sigma_of_size(shape, _rooms(within - reach, beyond - reach, lines), doubt_m)
+
+
+def _without_spot(first: Float64, beams: Beams) -> Float64:
+    """Returns place and size of a template without the reach of the spots on both sides."""
+    wide = 2.0 * np.median(beams.hit_spot.reach(np.eye(2)), axis=0)
+    least = np.full(first.size - 2, 0.5) * first[2:]
+    return np.concatenate([first[:2], np.maximum(first[2:] - (wide if first.size == 4 else wide.mean()), least)])
+
+
+def _needed(reach: Float64, ways: Float64, beams: Beams) -> Float64:
+    """Returns how far beyond each side (k,) the middle of a beam lies that the plate just stops, in shares of its
+    spot.
+
+    Where nothing else answers, the rim of the spot suffices: 1. Where something behind does, the plate has to send more
+    light back than that, of a beam that fades as a Gaussian to e⁻² at its rim.
+    """
+    past = beams.passed @ ways.T - reach
+    near = (past > _NEAR_EDGE_M[0]) & (past < _BEYOND_SIDE_M) & (past.argmax(axis=1)[:, None] == np.arange(len(ways)))
+    share = np.where(beams.lit > 0.0, 0.5 * ndtri(1.0 / (1.0 + np.maximum(beams.lit, 1e-3))), 1.0)
+    share = np.clip(share, -1.0, 1.0)
+    told = near.sum(axis=0)
+    every = float(share.mean()) if share.size else 1.0
+    return np.where(told > 0, (near * share[:, None]).sum(axis=0) / np.maximum(told, 1), every)
+
+
+def _rooms(within: Float64, beyond: Float64, half_gap: Float64) -> Float64:
+    """Returns the room (k,) between the outermost beam on the plate and the nearest one that went by, at each side (m).
+
+    within, beyond : (n, k) how far beams that hit and that passed lie past each side. half_gap : (k,).
+    """
+    room = 2.0 * half_gap
+    for k in range(room.size):
+        level = (np.delete(beyond, k, axis=1) < 0.0).all(axis=1)
+        outside = beyond[level & (beyond[:, k] > -room[k]), k]
+        if outside.size:
+            room[k] = min(room[k], abs(float(outside.min()) - float(within[:, k].max())))
+    return room
+
+
+def _sigma_of_size(shape: str, room: Float64, doubt_m: float) -> float:
+    """Returns 1 σ of the size: a side lies anywhere in its room, and as far off as the spots are not known."""
+    side = np.sqrt(room**2 / 12.0 + doubt_m**2 + _LEAST_SIGMA_M**2)
+    if shape == "rectangle":
+        return float(max(math.hypot(side[0], side[2]), math.hypot(side[1], side[3])))
+    return float(2.0 * np.sqrt(np.mean(side**2) / _SIDES_THAT_TELL))
 
 
 def _to_sides(within: Float64, beyond: Float64, half_gap: Float64) -> Float64:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -27,6 +28,10 @@ _HIGH_M: Final = 4.0
 """Sight lines through higher surfaces (m) are not counted."""
 _BESIDE_M: Final = 0.2
 """Returns of a region up to this distance beside its line (m) make the surface."""
+_RIM_M: Final = 0.08
+"""Sight lines nearer than this to an edge of a surface (m) do not count."""
+_ABOVE_GROUND_M: Final = 0.12
+"""Sight lines below this height above the ground (m) do not tell whether the space below a surface is free."""
 _OPEN_DEG: Final = 1.2  # The top of a surface is open within this angle of the highest beam (degrees).
 _NEAR_M: Final = 3.0
 """Returns within this distance of its line (m) may belong to a surface."""
@@ -50,8 +55,10 @@ class Panel:
     returns: Int64
     """(k,)"""
     stopped: Int64
-    """(k,) sight lines of the sample that end on it; `passed` is the number of those through it."""
+    """(k,) sight lines of the sample that end on it, between its edges; `passed` is the number of those through it
+    there, and `under` of those between the ground and its lower edge. Lines that end before it are in none."""
     passed: Int64
+    under: Int64
     open_top: npt.NDArray[np.bool_]
     """(k,) True where the highest laser still meets it: its top is not seen."""
     across_m: float
@@ -123,7 +130,8 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     vegetation = float(np.bincount(scene.classes[rows], minlength=256)[list(_VEGETATION)].sum() / rows.size)
     return Panel(
         xy, scene.ground.height_at(centre[:, 0], centre[:, 1]), low, high, bulk,
-        np.bincount(stretch, minlength=count), none, none, open_top, region.across_m, vegetation, sensor, rows, stretch,
+        np.bincount(stretch, minlength=count), none, none, none, open_top, region.across_m, vegetation, sensor, rows,
+        stretch,
     )  # fmt: skip
 
 
@@ -150,25 +158,30 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     taken = np.zeros(len(returns), np.bool_)
     taken[some] = True
     low = [p.comes_near(scene.tile) and _is_low(p) for p in panels]
-    rectangles = np.concatenate(
-        [np.zeros((0, 6))]
-        + [
-            np.column_stack([p.xy_m[:-1], p.xy_m[1:], p.low_m + 0.08, p.high_m - 0.08])
-            for p, asked in zip(panels, low, strict=True)
-            if asked
-        ]
-    )
-    passed = np.zeros(len(rectangles), np.int64)
-    passing_lines(
-        returns.x_m[some], returns.y_m[some], returns.height_m[some], returns.sensor_x_m[some],
-        returns.sensor_y_m[some], returns.sensor_height_m[some], rectangles, passed,
-    )  # fmt: skip
+    known = [p for p, asked in zip(panels, low, strict=True) if asked]
+
+    def lines(edges: Callable[[Panel], tuple[Float64, Float64]]) -> Int64:
+        """Returns the sight lines through each stretch between two heights."""
+        rectangles = np.concatenate([np.zeros((0, 6)), *(np.column_stack([p.xy_m[:-1], p.xy_m[1:], *edges(p)])
+                                                         for p in known)])  # fmt: skip
+        found = np.zeros(len(rectangles), np.int64)
+        passing_lines(
+            returns.x_m[some], returns.y_m[some], returns.height_m[some], returns.sensor_x_m[some],
+            returns.sensor_y_m[some], returns.sensor_height_m[some], rectangles, found,
+        )  # fmt: skip
+        return found
+
+    passed = lines(lambda p: (p.low_m + _RIM_M, p.high_m - _RIM_M))
+    under = lines(lambda p: (p.ground_m + _ABOVE_GROUND_M, p.low_m - _RIM_M))
     out, first = [], 0
     for p, asked in zip(panels, low, strict=True):
         count = p.returns.size
-        stopped = np.bincount(p.stretch[taken[p.rows]], minlength=count)
-        through = passed[first : first + count] if asked else np.zeros(count, np.int64)
-        out.append(replace(p, stopped=stopped, passed=through))
+        height = returns.height_m[p.rows]
+        between = (height > p.low_m[p.stretch] + _RIM_M) & (height < p.high_m[p.stretch] - _RIM_M)
+        stopped = np.bincount(p.stretch[taken[p.rows] & between], minlength=count)
+        own = slice(first, first + count) if asked else slice(0, 0)
+        none = np.zeros(0 if asked else count, np.int64)
+        out.append(replace(p, stopped=stopped, passed=np.append(passed[own], none), under=np.append(under[own], none)))
         first += count if asked else 0
     return out
 

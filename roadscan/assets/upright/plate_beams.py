@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,6 +24,8 @@ _ABOUT_M: Final = 0.6
 """Beams that pass farther from the returns (m) are left out."""
 _BEHIND_M: Final = 0.15
 """Returns this far behind the plane (m) passed it."""
+_LEAST_OF_LINE, _STRAIGHT_M = 4, 0.04
+"""Lines of so many returns are looked at; they are straight within this standard deviation (m)."""
 _LEAST_GAP: Final = 1e-4
 """Lasers nearer to one another (rad) draw the same line."""
 
@@ -36,6 +39,24 @@ class Beams(NamedTuple):
     """(n,) number of the line that one laser drew in one sweep, ascending."""
     passed: Float64
     """(m, 2)"""
+    hit_spot: Spots
+    passed_spot: Spots
+    lit: Float64
+    """(m,) intensity of what a passing beam met behind the plane as a share of the plate's; 0 where it met nothing."""
+
+
+class Spots(NamedTuple):
+    """Spots of beams on a plane, ellipses about the places where their middles meet it."""
+
+    half_m: Float64
+    """(n,) half the width of each beam (m); NaN where it is not known."""
+    slope: Float64
+    """(n, 2) tangents of the angles between a beam and the plane's normal, to the right and up."""
+
+    def reach(self, ways: Float64) -> Float64:
+        """Returns how far the spots reach (n, k) in some directions (k, 2) of the plane (m); 0 where not known."""
+        out = np.nan_to_num(self.half_m)[:, None] * np.sqrt(1.0 + (self.slope @ ways.T) ** 2)
+        return np.asarray(out)
 
 
 class _Fan(NamedTuple):
@@ -47,6 +68,8 @@ class _Fan(NamedTuple):
     way: Float64
     """(k, 3) unit vectors of the beams."""
     range_m: Float64
+    half_rad: Float64
+    """Half the angle of the beams."""
     on: Bool
     """Mask of those on the plane."""
     sweep: Int64
@@ -73,22 +96,42 @@ def beams_of(scene: Scene, edge: Int64, rows: Int64, middle: Float64, axes: tupl
     if fan is None:
         return None
 
-    def met(sensor: Float64, way: Float64) -> tuple[Float64, Float64]:
-        """Returns where beams meet the plane (n, 2), and the distance from the sensor; NaN for grazing ones."""
-        rate = way @ normal
-        away = np.where(np.abs(rate) > _LEAST_COSINE, ((middle - sensor) @ normal) / rate, np.nan)
-        past = sensor + away[:, None] * way - middle
-        return np.column_stack([past @ axes[0], past @ axes[1]]), away
+    plane = np.column_stack(axes)
 
-    at, away = met(fan.sensor, fan.way)
+    def met(sensor: Float64, way: Float64, half_rad: Float64) -> tuple[Float64, Float64, Spots]:
+        """Returns where beams meet the plane (n, 2), the distance from the sensor, and spots; NaN for grazing ones."""
+        rate = way @ normal
+        rate = np.where(np.abs(rate) > _LEAST_COSINE, rate, np.nan)
+        away = ((middle - sensor) @ normal) / rate
+        spots = Spots(np.abs(away) * np.tan(half_rad), (way @ plane) / rate[:, None])
+        return (sensor + away[:, None] * way - middle) @ plane, away, spots
+
+    at, away, spots = met(fan.sensor, fan.way, fan.half_rad)
     hit = fan.on & np.isin(fan.rows, edge)
-    if not hit.any():
+    if not hit.any() or not _are_lines(at[hit], fan.line[hit]):
         return None
     single = scene.returns.number_of_returns[fan.rows] == 1
     behind = ~fan.on & single & (away > 0.0) & (fan.range_m > away + _BEHIND_M)
-    passed = np.concatenate([at[behind], met(*_beside_lines(fan))[0], met(*_beside_lasers(fan))[0]])
+    void = [met(*_beside_lines(fan)), met(*_beside_lasers(fan))]
+    passed = np.concatenate([at[behind], *(v[0] for v in void)])
+    beside = Spots._make(np.concatenate([own[behind], *(v[2][k] for v in void)]) for k, own in enumerate(spots))
+    light = scene.returns.intensity[fan.rows].astype(np.float64)
+    lit = np.zeros(len(passed))
+    lit[: np.count_nonzero(behind)] = light[behind] / max(float(np.median(light[hit])), 1.0)
     low, high = at[hit].min(axis=0) - _ABOUT_M, at[hit].max(axis=0) + _ABOUT_M
-    return Beams(at[hit], fan.line[hit], passed[((passed > low) & (passed < high)).all(axis=1)])
+    near = ((passed > low) & (passed < high)).all(axis=1)
+    return Beams(at[hit], fan.line[hit], passed[near], Spots._make(v[hit] for v in spots),
+                 Spots._make(v[near] for v in beside), lit[near])  # fmt: skip
+
+
+def _are_lines(at: Float64, line: Int64) -> bool:
+    """Returns whether most lines are straight: the returns of a reader without laser numbers are not sorted in any."""
+    bent = []
+    for own in np.split(at, np.flatnonzero(np.diff(line)) + 1):
+        if len(own) >= _LEAST_OF_LINE:
+            _, spread, _ = np.linalg.svd(own - own.mean(axis=0), full_matrices=False)
+            bent.append(float(spread[1]) / math.sqrt(len(own)) > _STRAIGHT_M)
+    return not bent or float(np.mean(bent)) < 0.5
 
 
 def _fan(scene: Scene, rows: Int64, normal: Float64) -> _Fan | None:
@@ -120,14 +163,15 @@ def _fan(scene: Scene, rows: Int64, normal: Float64) -> _Fan | None:
     about, sweep, laser = about[order], sweep[order], laser[order]
     line = np.cumsum(np.append(0, (np.diff(sweep) != 0) | (np.diff(laser) != 0)))
     step = (epoch[order] - epoch[order[0]]) / period
-    return _Fan(about, *beam(about), np.isin(about, rows), sweep, laser, line, step)
+    half_rad = returns.half_beam_rad(about)
+    return _Fan(about, *beam(about), half_rad, np.isin(about, rows), sweep, laser, line, step)
 
 
-def _beside_lines(fan: _Fan) -> tuple[Float64, Float64]:
-    """Returns sensor and direction (n, 3) of the firings without a return before and after each line on the plate."""
+def _beside_lines(fan: _Fan) -> tuple[Float64, Float64, Float64]:
+    """Returns sensor, direction (n, 3), half the angle (n,) of firings without a return beside lines on the plate."""
     on = np.flatnonzero(fan.on)
     starts = np.flatnonzero(np.append(True, np.diff(fan.line[on]) != 0))
-    sensor, way = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    sensor, way, half = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
     for ends, inwards in ((starts, 1), (np.append(starts[1:], on.size) - 1, -1)):
         long = np.append(starts[1:], on.size) - starts > 1
         end, inner = on[ends[long]], on[ends[long] + inwards]
@@ -137,11 +181,12 @@ def _beside_lines(fan: _Fan) -> tuple[Float64, Float64]:
         steps = np.maximum(np.abs(fan.step[end] - fan.step[inner]), 0.5)
         sensor.append(fan.sensor[end])
         way.append(fan.way[end] + (fan.way[end] - fan.way[inner]) / steps[:, None])
-    return np.concatenate(sensor), np.concatenate(way)
+        half.append(fan.half_rad[end])
+    return np.concatenate(sensor), np.concatenate(way), np.concatenate(half)
 
 
-def _beside_lasers(fan: _Fan) -> tuple[Float64, Float64]:
-    """Sensor and direction (n, 3) of the lasers next to the outermost ones on the plate, where they saw nothing.
+def _beside_lasers(fan: _Fan) -> tuple[Float64, Float64, Float64]:
+    """Sensor, direction (n, 3) and half the angle (n,) of lasers next to the outermost ones, where they saw nothing.
 
     The angles between lasers are those of sweeps in which both saw something, on the plate or elsewhere.
     """
@@ -169,7 +214,7 @@ def _beside_lasers(fan: _Fan) -> tuple[Float64, Float64]:
     met[fan.sweep[on], laser[on]] = True
     answered[fan.sweep, laser] = True
     sweeps = np.arange(len(angle))
-    sensor, way = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    sensor, way, half = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
     for side in (1.0, -1.0):
         outermost = np.where(met & np.isfinite(angle), side * angle, -np.inf).argmax(axis=1)
         apart = np.where(side * gaps > _LEAST_GAP, side * gaps, np.inf)[outermost]
@@ -182,4 +227,5 @@ def _beside_lasers(fan: _Fan) -> tuple[Float64, Float64]:
         aside *= side / np.sqrt((aside**2).sum(axis=1))[:, None]
         sensor.append(fan.sensor[line])
         way.append(np.cos(turn) * fan.way[line] + np.sin(turn) * aside)
-    return np.concatenate(sensor), np.concatenate(way)
+        half.append(fan.half_rad[line])
+    return np.concatenate(sensor), np.concatenate(way), np.concatenate(half)

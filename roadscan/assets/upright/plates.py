@@ -1,23 +1,30 @@
-"""Plates of signs: bright returns on a small upright plane, high enough above the ground."""
+"""Plates of signs: small upright planes, high enough above the ground, bright or not.
+
+What might be a plate is found in two ways: bright returns that lie together, and returns on thin upright elements that
+belong to no large surface. Whether it is one is judged by its features (:mod:`roadscan.assets.upright.plate_features`).
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kind import KindOptions
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
-from roadscan.assets.upright.outlines import Outline, outline_of
-from roadscan.assets.upright.places import ground_light, places_of
+from roadscan.assets.upright.brightness import brightness
+from roadscan.assets.upright.outlines import Outline, Spot, outline_of
+from roadscan.assets.upright.places import places_of
 from roadscan.assets.upright.plate_beams import beams_of
-from roadscan.assets.upright.probability import logistic
-from roadscan.assets.upright.regions import regions_of
+from roadscan.assets.upright.plate_features import PlaneOfPlate, features_of
+from roadscan.assets.upright.regions import on_thin, regions_of
 from roadscan.assets.upright.shafts import shafts_of
 from roadscan.assets.upright.slices import usable
 from roadscan.compute.robust import SIGMA_OF_MAD
@@ -39,14 +46,29 @@ _ITSELF: Final = 0.7
 _BACK_TO_BACK_M: Final = 0.04
 """Two plates on one post are at least this far apart (m); the two sides of one plate are not."""
 _ENOUGH_BRIGHT: Final = 60
-"""Number of bright returns that suffice for the outline."""
+"""Number of bright returns that suffice for the outline, …"""
+_MOST_BRIGHT: Final = 0.85
+"""… where they make this share of those on its plane."""
+_BOARD_M: Final = 0.04
+"""Boards, which are larger than signs, are plane within this (m), poses of several passes included."""
+_POST_M: Final = 0.15
+"""Levels of a plate narrower than this (m), or than an eighth of the widest, are its post."""
+_RIM_SHARE: Final = 0.7
+"""Beside returns of full brightness those of this share of it belong to a plate: spots at its rim, dark symbols."""
+_SAME_PLATE: Final = 0.3
+"""Of candidates that share so many of their returns the most probable one is kept."""
+_SPOT_SHARE: Final = 0.25
+"""1 σ of where within its spot the middle of a beam lies that a plate just stops, as a share of half the spot."""
+_USUAL_HALF_RAD: Final = math.radians(0.17 / 2.0)
+"""Half the angle of a beam whose width is not known (rad): that of common spinning lidars."""
+JUDGE: Final = Judge("sign", "00c8eb2b7c050222")
 
 
 class SignOptions(KindOptions):
     """What counts as a sign."""
 
     intensity_ratio: float = Field(default=2.0, gt=1.0)
-    """Least intensity of a retroreflecting return, as a multiple of the median of the ground about."""
+    """Least light of a bright return, as a multiple of the median of upright things at its range."""
     least_height_m: float = Field(default=1.524, ge=0.0)
     """Least height of the plate's middle above the ground (m): 5 feet."""
     greatest_height_m: float = Field(default=9.0, gt=1.0)
@@ -72,17 +94,42 @@ class Plate:
     facing_deg: float
     tilt_deg: float
     clearance_m: float
-    residual_m: float
-    probability: float
+    features: Mapping[str, float]
+    probability: float = math.nan
+    """NaN: not yet judged."""
 
 
 def plates_of(scene: Scene, options: SignOptions) -> list[Plate]:
     """Returns plates of which the scene's tile may contain a part, by their place."""
-    bright = _bright(scene, options.intensity_ratio)
-    rows = np.flatnonzero(bright & ~_in_large_planes(scene, options.greatest_board_m))
+    found = candidates_of(scene, options)
+    if not found:
+        return []
+    features = {name: np.array([one.features[name] for one in found]) for name in found[0].features}
+    stated = JUDGE.probability(features).tolist()
+    taken, kept = np.zeros(len(scene.returns), np.bool_), []
+    for one, p in sorted(zip(found, stated, strict=True), key=lambda pair: (-pair[1], pair[0].middle_m)):
+        if taken[one.rows].mean() < _SAME_PLATE:
+            kept.append(replace(one, probability=p))
+            taken[one.rows] = True
+    return sorted(kept, key=lambda plate: plate.middle_m)
+
+
+def candidates_of(scene: Scene, options: SignOptions) -> list[Plate]:
+    """Returns what might be plates, by their place; they are not yet judged, and some may be one and the same."""
+    bright, sure = (_bright(scene, share * options.intensity_ratio) for share in (_RIM_SHARE, 1.0))
+    free = ~_in_large_planes(scene, options.greatest_board_m)
+    found = _plates(scene, np.flatnonzero(bright & free), bright, options)
+    found = [one for one in found if sure[one.rows].sum() >= _LEAST_BRIGHT]
+    thin = on_thin(scene) & free & (scene.above_ground_m > _SEARCHED_ABOVE_M)
+    found += _plates(scene, np.flatnonzero(thin), bright, options)
+    return sorted((p for p in found if not _on_thick_shaft(scene, p)), key=lambda p: p.middle_m)
+
+
+def _plates(scene: Scene, rows: Int64, bright: npt.NDArray[np.bool_], options: SignOptions) -> list[Plate]:
+    """Returns plates of clusters of rows."""
     clusters = [side for cluster in _clusters(scene, rows) for side in _sides(scene, cluster)]
-    found = [_plate(scene, cluster, bright, options) for cluster in clusters]
-    return sorted((p for p in found if p is not None and not _on_thick_shaft(scene, p)), key=lambda p: p.middle_m)
+    found = (_plate(scene, cluster, bright, options) for cluster in clusters)
+    return [one for one in found if one is not None]
 
 
 def _on_thick_shaft(scene: Scene, plate: Plate) -> bool:
@@ -97,9 +144,8 @@ def _on_thick_shaft(scene: Scene, plate: Plate) -> bool:
 
 
 def _bright(scene: Scene, ratio: float) -> npt.NDArray[np.bool_]:
-    """Returns a mask (n,) of returns more than a metre above the ground, as bright as `ratio` times its median."""
-    least = ratio * ground_light(scene)
-    return usable(scene) & (scene.above_ground_m > _SEARCHED_ABOVE_M) & (scene.returns.intensity >= least)
+    """Returns a mask (n,) of returns more than a metre above the ground, of this brightness or more."""
+    return usable(scene) & (scene.above_ground_m > _SEARCHED_ABOVE_M) & (brightness(scene) >= ratio)
 
 
 def _in_large_planes(scene: Scene, longest_m: float) -> npt.NDArray[np.bool_]:
@@ -183,10 +229,15 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     seen = np.array([np.median(returns.sensor_x_m[cluster]), np.median(returns.sensor_y_m[cluster])])
     normal = normal if float(normal[:2] @ (seen - middle[:2])) > 0.0 else -normal
     near = places_of(scene).within(float(middle[0]), float(middle[1]), reach)
-    inside, about = _on_plane(scene, near, middle, normal, xyh)
+    inside, _ = _on_plane(scene, near, middle, normal, xyh)
+    wide = _wide(scene, np.union1d(cluster, inside), middle, normal)
+    whole = np.column_stack([returns.x_m[wide], returns.y_m[wide], returns.height_m[wide]])
+    inside, about = _on_plane(scene, near, middle, normal, whole)
     inside = inside[_in_front(scene, inside, middle, normal) | ~bright[inside]]
     rows = np.union1d(cluster, inside)
-    edge = cluster if cluster.size >= _ENOUGH_BRIGHT else _wide(scene, rows, middle, normal)
+    wide = _wide(scene, rows, middle, normal)
+    lit, facing = wide[bright[wide]], _in_front(scene, wide, middle, normal).sum()
+    edge = lit if lit.size >= max(_ENOUGH_BRIGHT, _MOST_BRIGHT * facing) else wide
     right, up = _axes(normal)
     placed = np.column_stack([returns.x_m[edge], returns.y_m[edge], returns.height_m[edge]]) - middle
     outline = outline_of(np.column_stack([placed @ right, placed @ up]))
@@ -195,24 +246,30 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     above = float(place[2]) - ground
     if not _has_size(outline, options) or not options.least_height_m <= above <= options.greatest_height_m:
         return None
+    large = max(outline.width_m, outline.height_m) > options.greatest_size_m
+    if large and residual > _BOARD_M:
+        return None
     if _stands(scene, near, (place, normal), outline, ground):
         return None
     beams = beams_of(scene, edge, rows, middle, (right, up))
-    if beams is not None:
-        outline = outline_of(np.column_stack([placed @ right, placed @ up]), beams)
-        place = middle + outline.middle[0] * right + outline.middle[1] * up
-        above = float(place[2]) - ground
-    large = outline.width_m > options.greatest_size_m or outline.height_m > options.greatest_size_m
-    share = float(bright[rows].mean())
-    probability = logistic(
-        -1.5,
-        [(0.05, min(cluster.size, 80)), (3.0, share), (-60.0, max(residual - 0.025, 0.0)), (-6.0, about),
-         (-60.0 * large, max(residual - 0.02, 0.0)), (-25.0, min(max(outline.misfit_m - 0.04, 0.0), 0.5))],
-    )  # fmt: skip
-    facing = math.degrees(math.atan2(float(normal[0]), float(normal[1]))) % 360.0
+    outline = outline_of(np.column_stack([placed @ right, placed @ up]), beams, _spot(scene, edge))
+    place = middle + outline.middle[0] * right + outline.middle[1] * up
+    above = float(place[2]) - ground
+    plane = PlaneOfPlate(rows, near, place, normal, right, up)
+    features = features_of(scene, plane, outline, beams, residual, about, above)
+    azimuth = math.degrees(math.atan2(float(normal[0]), float(normal[1]))) % 360.0
     lean = math.degrees(math.asin(max(-1.0, min(1.0, float(normal[2])))))
     clearance = above - outline.height_m / 2
-    return Plate(rows, tuple(map(float, place)), outline, facing, lean, clearance, residual, probability)  # type: ignore[arg-type]
+    return Plate(rows, tuple(map(float, place)), outline, azimuth, lean, clearance, features)  # type: ignore[arg-type]
+
+
+def _spot(scene: Scene, rows: Int64) -> Spot:
+    """Returns the spot of the beams that met some rows."""
+    range_m = float(np.median(scene.returns.range_m[rows]))
+    half_rad = float(np.median(scene.returns.half_beam_rad(rows)))
+    if math.isnan(half_rad):
+        return Spot(0.0, range_m * _USUAL_HALF_RAD)
+    return Spot(range_m * math.tan(half_rad), _SPOT_SHARE * range_m * math.tan(half_rad))
 
 
 def _in_front(scene: Scene, rows: Int64, middle: Float64, normal: Float64) -> npt.NDArray[np.bool_]:
@@ -271,7 +328,8 @@ def _wide(scene: Scene, rows: Int64, middle: Float64, normal: Float64) -> Int64:
     right, up = _axes(normal)
     u, level = past @ right, np.floor((past @ up) / 0.1).astype(np.int64)
     widths = {k: float(np.ptp(u[level == k])) for k in np.unique(level).tolist()}
-    least = 0.4 * max(widths.values())
+    widest = max(widths.values())
+    least = min(max(_POST_M, 0.12 * widest), 0.4 * widest)
     kept: Int64 = rows[np.array([widths[k] >= least for k in level.tolist()])]
     return kept
 

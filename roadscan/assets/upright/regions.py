@@ -66,9 +66,22 @@ class Region:
         return abs(dy * float(self.along[0]) - dx * float(self.along[1]))
 
 
+@dataclass(frozen=True, eq=False)
+class _Voxels:
+    """Voxels of the returns that may belong to something upright."""
+
+    index: npt.NDArray[np.int32]
+    """(layers, rows, columns) number of a voxel; −1: empty."""
+    elements: Float64
+    """(voxels, 6) as :func:`thin_elements` has them, places from the corner of the voxels."""
+    voxel: npt.NDArray[np.int32]
+    """(n,) voxel of each return; −1: none."""
+    corner_m: Float64
+    found: int
+
+
 @once_a_scene
-def regions_of(scene: Scene) -> list[Region]:
-    """Returns upright surfaces at least 0.7 m long, with pieces on one plane joined over gaps of 1.6 m."""
+def _voxels(scene: Scene) -> _Voxels:
     window, returns = scene.extent, scene.returns
     columns = int(np.ceil((window.x_max_m - window.x_min_m) / SIDE_M - 1e-9))
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / SIDE_M - 1e-9))
@@ -81,6 +94,20 @@ def regions_of(scene: Scene) -> list[Region]:
     found = gather_moments(returns.x_m, returns.y_m, above, corner, sizes, index, moments, voxel)
     elements = np.zeros((max(found, 1), 6))
     thin_elements(index, moments, SIDE_M, _LIMITS, elements)
+    return _Voxels(index, elements, voxel, corner, found)
+
+
+def on_thin(scene: Scene) -> npt.NDArray[np.bool_]:
+    """Returns a mask (n,) of the returns in voxels that, with those beside them, lie on an upright plane."""
+    v = _voxels(scene)
+    return np.asarray((v.voxel >= 0) & (v.elements[v.voxel, 0] > 0.0))
+
+
+@once_a_scene
+def regions_of(scene: Scene) -> list[Region]:
+    """Returns upright surfaces at least 0.7 m long, with pieces on one plane joined over gaps of 1.6 m."""
+    seen = _voxels(scene)
+    index, elements, found = seen.index, seen.elements.copy(), seen.found
     region = np.zeros(max(found, 1), np.int32)
     turn = math.cos(math.radians(_TURN_DEG))
     count = grow_regions(
@@ -88,14 +115,14 @@ def regions_of(scene: Scene) -> list[Region]:
     )
     members, starts = np.empty(region.size, np.int64), np.empty(count + 2, np.int64)
     region_ranges(region, members, starts)
-    elements[:, 1:3] += corner[:2]
+    elements[:, 1:3] += seen.corner_m[:2]
     groups = [members[starts[k] : starts[k + 1]] for k in range(1, count + 1)]
     groups = [g for g in groups if g.size >= 3]
     joined = _joined(elements, groups)
     group_of = np.full(found + 1, -1, np.int32)
     for number, group in enumerate(joined):
         group_of[group] = number
-    first, order = in_bins(group_of[voxel], len(joined))  # voxel −1 is the last entry, which belongs to none
+    first, order = in_bins(group_of[seen.voxel], len(joined))  # voxel −1 is the last entry, which belongs to none
     regions = (_region(scene, elements[group], order[first[k] : first[k + 1]]) for k, group in enumerate(joined))
     return [one for one in regions if one is not None]
 

@@ -22,8 +22,11 @@ Surface = Literal["facade", "wall", "barrier", "guardrail", "fence"]
 
 _SIMPLE_M: Final = 0.03  # Tolerance of the simplified line (m).
 _GROUND_SIGMA_M: Final = 0.03  # 1 σ of the height of the ground at a surface (m).
-_FENCE_PASSES: Final = 0.12
-"""Share of the sight lines through a surface from which it is a fence."""
+_POROUS: Final = 0.5
+"""A surface is a fence where more than this share of its length lets sight lines through."""
+_HOVERS: Final = 0.05
+"""A surface that begins high above the ground hovers where this share of the sight lines passes below it; elsewhere
+something stands before its foot."""
 _LEAST_FENCE_M: Final = 2.5  # Least length of a fence or a wall (m).
 _MOST_VEGETATION: Final = 0.5  # Surfaces with a larger share of vegetation are none.
 
@@ -32,19 +35,19 @@ def told(chain: Chain) -> Surface | None:
     """Returns the kind of an upright surface; None where it is none of these.
 
     A façade is solid and rises to 3 m or above what scanners saw; a wall ends lower, a barrier at 1.25 m at the most; a
-    guardrail has free space below its rail; a fence lets sight lines through. What begins 2 m above the ground or
-    higher (crowns, boards, roofs), and hedges, are none.
+    guardrail has free space below its rail; a fence lets sight lines through all along. What begins 2 m above the
+    ground or higher (crowns, boards, roofs), and hedges, are none.
     """
     top, low, bulk = chain.median("high_m"), chain.median("low_m"), chain.median("bulk_m")
     if not np.isfinite(top) or chain.vegetation > _MOST_VEGETATION or low > 2.0 or chain.length_m < 1.5:
         return None
     if top > 3.0 or (top > 1.4 and chain.open_top > 0.4):
         return "facade" if chain.passing < 0.4 and chain.length_m >= 2.0 else None
-    if low > 0.6:
+    if low > 0.6 and (low > 1.2 or (chain.hovering > _HOVERS and chain.porous < _POROUS)):
         return None
     if bulk > 0.36 and 0.5 <= top <= 1.15 and top - bulk < 0.5:
         return "guardrail" if chain.length_m >= 4.0 else None
-    if chain.passing >= _FENCE_PASSES:
+    if chain.porous >= _POROUS:
         return "fence" if top >= 0.6 and chain.length_m >= _LEAST_FENCE_M else None
     if top > 1.25:
         return "wall" if chain.length_m >= _LEAST_FENCE_M else None

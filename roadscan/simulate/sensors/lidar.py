@@ -189,6 +189,12 @@ def laser_errors(scene: Scene, lasers: int) -> tuple[Float64, Float64]:
     return scene.lidar.laser_range_m * offset, np.exp(scene.lidar.laser_gain * gain)
 
 
+def beam_width_deg(scene: Scene) -> float:
+    """Return the full angle of the lidar's beam (degrees)."""
+    stated = scene.lidar.divergence_deg
+    return lidar_model(scene.lidar.model).figures.divergence_deg if stated == "data sheet" else stated
+
+
 def _pattern(scene: Scene, model: LidarModel) -> Pattern:
     """Return the firings of a group of packets."""
     figures, interval_ns = model.figures, model.block_ns // INTERVALS
@@ -196,7 +202,7 @@ def _pattern(scene: Scene, model: LidarModel) -> Pattern:
     origin = np.zeros((cycles, model.lasers, 3))
     origin[:, :, 2] = model.rise_m
     past_ns = (figures.cycle_ns * np.arange(cycles)[:, None] + model.firing_ns).ravel()
-    wide_deg = scene.lidar.divergence_deg if scene.lidar.divergence_deg != "data sheet" else figures.divergence_deg
+    wide_deg = beam_width_deg(scene)
     return Pattern(
         origin.reshape(-1, 3),
         past_ns // interval_ns,

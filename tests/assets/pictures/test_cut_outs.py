@@ -9,7 +9,7 @@ import pytest
 from roadscan.assets.pictures.colour_classes import colour_of, hue_saturation_value
 from roadscan.assets.pictures.paint_colours import paint_colour
 from roadscan.assets.pictures.plate_outlines import plate_outline
-from roadscan.assets.pictures.plate_shapes import shape_of
+from roadscan.assets.pictures.plate_shapes import plate_odds, shape_of
 from roadscan.assets.pictures.reader import CutOut
 
 PAINTS = {
@@ -99,6 +99,21 @@ def test_edges_tell_the_shape(shape: str, said: str):
     found, probability = shape_of(cuts, returns, 0.8, 0.8 * ratio)
     if said == "same" or {shape, returns} != {"octagon", "round"}:  # these differ by 2 % of their width
         assert found == shape and probability > 0.5
+
+
+def test_no_shape_is_certain():
+    cuts = [plate("round", "yellow", size_px=120.0, seed=k) for k in range(3)]
+    assert 0.9 < shape_of(cuts, "round", 0.8, 0.8)[1] <= 1.0 / 1.02
+
+
+@pytest.mark.parametrize("shape", ["rectangle", "round", "triangle"])
+def test_a_picture_confirms_a_plate_and_vetoes_one_that_is_not_there(shape: str):
+    there, wall = plate(shape, "yellow", size_px=60.0), plate(shape, "yellow", size_px=60.0)
+    noise = np.random.default_rng(1).normal(128.0, 4.0, wall.pixels.shape)
+    nothing = CutOut(noise.astype(np.uint8), wall.outline_px, wall.resolution_m, False)
+    assert plate_odds([there], shape) > 1.0
+    assert plate_odds([nothing], shape) < -1.0
+    assert plate_odds([plate(shape, "yellow", size_px=8.0)], shape) == 0.0
 
 
 def test_a_plate_that_is_too_small_keeps_the_shape_of_the_returns():

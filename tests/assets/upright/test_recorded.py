@@ -67,12 +67,13 @@ def test_hardly_anything_else_is_taken_for_a_pole_or_a_trunk() -> None:
     assert right / (right + wrong) >= 0.80  # 0.875
 
 
-def test_the_two_strong_signs_are_found_and_no_other() -> None:
+def test_the_two_strong_signs_are_found_and_what_is_no_sign_is_not() -> None:
     scene, labels = semantic_kitti_scene()
     plates = [p for p in plates_of(scene, SignOptions()) if p.probability >= 0.5]
     wanted = clusters(SIGN, 100)
     judged = [p for p in plates if not np.isin(labels[p.rows], NOT_JUDGED).mean() > 0.5]
-    assert len(wanted) == 2 == len(judged)
+    assert len(wanted) == 2 and len(judged) >= 2
+    assert all((labels[p.rows] == SIGN).mean() > 0.5 for p in judged)  # a third one has 24 labelled returns
     for rows in wanted:
         assert any(np.isin(p.rows, rows).sum() >= 50 for p in plates)
 

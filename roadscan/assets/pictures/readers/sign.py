@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -12,11 +13,12 @@ from roadscan.assets.kind import AssetObject
 from roadscan.assets.object_table import reference_point
 from roadscan.assets.pictures.colour_classes import colour_of
 from roadscan.assets.pictures.plate_outlines import on_plate, plate_axes, plate_outline
-from roadscan.assets.pictures.plate_shapes import shape_of
+from roadscan.assets.pictures.plate_shapes import plate_odds, shape_of
 from roadscan.assets.pictures.reader import CutOut, CutOutReader, Recognition, Sight
 
 Float64 = npt.NDArray[np.float64]
 
+_MOST: Final = 0.999  # Greatest probability that is stated.
 _BOX: Final = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])  # Corners of a plate of 1 by 1: right, up.
 
 
@@ -42,10 +44,13 @@ class SignReader(CutOutReader):
         return np.vstack([on_plate(_BOX * _size(one), middle, *turn), on_plate(shape, middle, *turn)])
 
     def read(self, one: AssetObject, cut_outs: Sequence[CutOut], recognition: Recognition) -> Mapping[str, Any]:
-        """Returns columns colour, shape, message and type, each with its probability where it is known."""
+        """Returns columns colour, shape, message and type, each with its probability where it is known, and that of the
+        plate itself: a picture that sees the place confirms it or not.
+        """
         told: dict[str, Any] = {}
         shape, probability = shape_of(cut_outs, one.attributes.get("shape") or "other", *_size(one).tolist())
         told |= {"shape": shape, "shape_probability": probability}
+        told["probability"] = _with_odds(one.probability, plate_odds(cut_outs, shape))
         colour = colour_of([_within_shape(c) for c in cut_outs])
         if colour is not None:
             told |= {"colour": colour[0], "colour_probability": colour[1]}
@@ -55,6 +60,12 @@ class SignReader(CutOutReader):
                 words, probability = max(read, key=lambda r: r[1])
                 told |= {column: words, f"{column}_probability": probability}
         return told
+
+
+def _with_odds(probability: float, added: float) -> float:
+    """Returns a probability with so much added to the logarithm of its odds."""
+    odds = math.log(probability / max(1.0 - probability, 1e-4)) + added
+    return min(1.0 / (1.0 + math.exp(-odds)), _MOST)
 
 
 def _within_shape(one: CutOut) -> CutOut:

@@ -286,8 +286,13 @@ def _places(ground: Returns) -> Int64:
     """Returns the number (n,) of the place of each return; −1 for places beyond those of a sample."""
     column = np.floor((ground.corner_m[0] + ground.x_m) / PLACE_M).astype(np.int64)
     row = np.floor((ground.corner_m[1] + ground.y_m) / PLACE_M).astype(np.int64)
-    _, place = np.unique(np.stack([row, column]), axis=1, return_inverse=True)
-    return np.asarray(place, np.int64).reshape(-1)
+    if not row.size:
+        return row
+    row, column = row - row.min(), column - column.min()
+    flat = row * (int(column.max()) + 1) + column
+    held = np.zeros(int(flat.max()) + 1, np.int64)
+    held[flat] = 1
+    return np.asarray(np.cumsum(held)[flat] - 1)
 
 
 def _together(samples: Sequence[IntensitySample]) -> IntensitySample:

@@ -30,7 +30,7 @@ from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import bytes_digest
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.blocks import Block
+from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.tasks.tile_files import publish_file
 from roadscan.tiles.tasks.tiles import TaskResult
 
@@ -44,6 +44,8 @@ _HALOS: Final = Halos(2.0, 6.0, 24.0)
 """Halos of the samples (m): medians over them do not depend on what few returns near their borders are taken for."""
 _MOST_SQUARES: Final = 24
 """Number of sampled squares; a digest of their place selects them."""
+_BLOCK_SQUARES: Final = 4
+"""Edge of the largest block of squares of one task: neighbours read the same row groups."""
 _LEAST_RETURNS: Final = 20_000  # Squares with fewer returns are sampled only if no square has more.
 _COLUMNS: Final = ("place", "sensor", "laser", "range_m", "incidence_deg", "intensity", "returns")
 
@@ -110,12 +112,15 @@ def _grid(plan: AssetPlan) -> AssetGrid:
 def sample_tasks(
     plan: AssetPlan, due: Sequence[tuple[TileId, str]], squares: Sequence[TileId] = ()
 ) -> list[SampleTask]:
-    """Returns a task for each sample that is due, or for some of them."""
-    wanted = set(squares) or {square for square, _ in due}
-    grid = _grid(plan)
-    return [
-        SampleTask(plan.load((square,), grid), (key,), plan.config.ground) for square, key in due if square in wanted
-    ]
+    """Returns tasks over neighbouring samples that are due, or a task for each of some of them."""
+    if squares:  # those of a task that failed, one by one
+        blocks: list[tuple[TileId, ...]] = [(square,) for square in squares]
+    else:
+        readings = readings_of(_grid(plan), plan.tiles.tiles)
+        wanted = {square: readings[square] for square, _ in due}
+        blocks = [b.tiles for b in cut_blocks(wanted, _BLOCK_SQUARES, plan.config.max_block_returns)]
+    keys, grid = dict(due), _grid(plan)
+    return [SampleTask(plan.load(own, grid), tuple(keys[s] for s in own), plan.config.ground) for own in blocks]
 
 
 def find_samples(task: SampleTask) -> TaskResult:

@@ -32,6 +32,8 @@ _HIGHEST_FOOT_M: Final = 2.0
 _FOOT_SLICES: Final = round((_HIGHEST_FOOT_M - LOWEST_M) / SLICE_M) + 1  # Slices in which the foot of a shaft may lie.
 _MOST_FITTED: Final = 3000  # Returns used for the axis, at most.
 _RING_M: Final = 0.6  # Outer radius of the ring that must be free (m).
+_AROUND_TILE_M: Final = 6.0
+"""Shafts farther from the tile (m) are not measured: no crown, arm or plate of it reaches them."""
 ALONE_M: Final = 0.6  # Radius of the space about a shaft (m).
 _LEAST_ALONE: Final = 0.25
 """Least share of the returns around that belong to a shaft: clumps of leaves and pieces of façades have less."""
@@ -66,7 +68,7 @@ class Shaft:
 
 @once_a_scene
 def shafts_of(scene: Scene) -> list[Shaft]:
-    """Returns all shafts of a scene with its halo, those with most slices first."""
+    """Returns all shafts in and near a scene's tile, those with most slices first."""
     slices = slices_of(scene)
     if slices.level.size == 0:
         return []
@@ -84,6 +86,8 @@ def shafts_of(scene: Scene) -> list[Shaft]:
         if members.size == 0:
             continue
         used[members] = True
+        if not _reads(scene, slices, members):
+            continue
         if LOWEST_M + SLICE_M * float(slices.level[members].min()) > _HIGHEST_FOOT_M:
             continue
         rows = np.sort(np.concatenate([order[starts[m] : starts[m + 1]] for m in members.tolist()]))
@@ -91,6 +95,11 @@ def shafts_of(scene: Scene) -> list[Shaft]:
         if rows.size >= _LEAST_RETURNS and alone >= _LEAST_ALONE:
             found.append(_measured(scene, slices, members, rows, alone))
     return [shaft for shaft in found if shaft is not None]
+
+
+def _reads(scene: Scene, slices: Slices, members: Int64) -> bool:
+    """Returns whether what stands in the tile may be judged by a shaft."""
+    return scene.tile.comes_near(np.column_stack([slices.x_m[members], slices.y_m[members]]), _AROUND_TILE_M)
 
 
 def _alone(slices: Slices, members: Int64, returns: int) -> float:

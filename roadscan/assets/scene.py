@@ -41,7 +41,7 @@ class Box(NamedTuple):
 
 
 def extent_of(window: Box, returns: Returns) -> Box:
-    """Returns the part of a window with returns, 2 m wider and in steps of 3 m.
+    """Returns the part of a window with returns, 2 m wider and in steps of 3 m from its south-western corner.
 
     3 m is a whole number of the cells of all rasters, so these have the same cells as over the whole window.
     """
@@ -49,9 +49,9 @@ def extent_of(window: Box, returns: Returns) -> Box:
         return window
     sides = []
     for least, greatest, values in zip(window[:2], window[2:], (returns.x_m, returns.y_m), strict=True):
-        first = math.floor((float(values.min()) - _AROUND_M) / _STEP_M) * _STEP_M
-        last = math.floor((float(values.max()) + _AROUND_M) / _STEP_M + 1) * _STEP_M
-        sides.append((max(first, least), min(last, greatest)))
+        first = math.floor((float(values.min()) - _AROUND_M - least) / _STEP_M)
+        last = math.floor((float(values.max()) + _AROUND_M - least) / _STEP_M) + 1
+        sides.append((least + _STEP_M * max(first, 0), min(least + _STEP_M * last, greatest)))
     (west, east), (south, north) = sides
     return Box(west, south, east, north)
 

@@ -15,9 +15,9 @@ _ORIGINS_M: Final = 960.0
 squares of any edge, so that a return has the same place and lies in the same cells however squares are cut."""
 _STEP_M: Final = 3.0
 """Scenes end at multiples of this (m): whole numbers of the cells of all rasters."""
-_GROUND_STEP_M: Final = 12.0
-"""The windows of the ground end at multiples of this (m): also whole numbers of the cells that are made by halving its
-rasters thrice, to fill their holes."""
+_GROUND_STEP_M: Final = 24.0
+"""The windows of the ground end at multiples of this (m): also whole numbers of the cells of up to 8 m that are made by
+halving its rasters, to fill their holes."""
 
 
 class Halos(NamedTuple):

@@ -294,7 +294,8 @@ def test_reprocessing_a_tile_redoes_what_it_touches(
     evidence = Posts.evidence
 
     def watched(self: Posts, scene: Scene, options: Any) -> Evidence:
-        searched.append(scene.returns.corner_m)
+        east, north = scene.returns.corner_m
+        searched.append((east + scene.tile.x_min_m, north + scene.tile.y_min_m))
         return evidence(self, scene, options)
 
     monkeypatch.setattr(Posts, "evidence", watched)

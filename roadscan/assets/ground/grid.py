@@ -38,7 +38,7 @@ class Grid(NamedTuple):
 
 
 def grid_over(window: Box, cell_m: float) -> Grid:
-    """Returns cells that cover the window; their corners are multiples of their edge."""
-    column, row = (math.floor(side / cell_m + 1e-9) for side in window[:2])
-    columns, rows = (math.ceil(side / cell_m - 1e-9) for side in window[2:])
-    return Grid(column * cell_m, row * cell_m, cell_m, max(rows - row, 1), max(columns - column, 1))
+    """Returns cells that cover the window from its south-western corner."""
+    columns = max(math.ceil((window.x_max_m - window.x_min_m) / cell_m - 1e-9), 1)
+    rows = max(math.ceil((window.y_max_m - window.y_min_m) / cell_m - 1e-9), 1)
+    return Grid(window.x_min_m, window.y_min_m, cell_m, rows, columns)

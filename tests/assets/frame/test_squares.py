@@ -36,9 +36,9 @@ def test_squares_are_whole_tiles_and_look_as_far_as_their_halos() -> None:
     assert grid.own_box(TileId(1, 0)) == (40.0, 0.0, 80.0, 40.0)
     assert grid.scene_box(TileId(1, 0)) == (24.0, -15.0, 96.0, 54.0)
     assert grid.classes_box(TileId(1, 0)) == (18.0, -24.0, 102.0, 63.0)
-    assert grid.ground_box(TileId(1, 0)) == (-36.0, -72.0, 156.0, 108.0)
+    assert grid.ground_box(TileId(1, 0)) == (-48.0, -72.0, 168.0, 120.0)
     under = grid.tiles_under(TileId(1, 0))
-    assert (under[0], under[-1]) == (TileId(-4, -8), TileId(15, 10))
+    assert (under[0], under[-1]) == (TileId(-5, -8), TileId(16, 11))
 
 
 def test_a_place_has_the_same_coordinates_in_squares_of_any_edge() -> None:

@@ -73,4 +73,4 @@ def test_squares_of_any_edge_find_the_same_on_the_labelled_street(recordings: Pa
         for table in POINTS:
             one, other = objects[table], found[table]
             assert len(one) - twins(one, other) <= 1 + 0.2 * len(one), (tile_m, table)
-            assert abs(len(one) - len(other)) <= 1, (tile_m, table)
+            assert abs(len(one) - len(other)) <= 2, (tile_m, table)

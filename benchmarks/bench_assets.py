@@ -14,9 +14,9 @@ import pyarrow as pa
 from benchmarks.timing import Figure
 from roadscan.assets.intensity import calibrated_scene, gains_of, intensity_sample
 from roadscan.assets.kind import asset_kinds
-from roadscan.assets.make_scene import make_scene
+from roadscan.assets.statistics import Statistics
 from roadscan.assets.tasks.kinds import wanted_kinds
-from roadscan.assets.tasks.load_returns import load_squares
+from roadscan.assets.tasks.load_returns import load_squares, scene_of
 from roadscan.assets.tasks.plan import AssetPlan, plan_assets
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of
@@ -76,8 +76,7 @@ def search(plan: AssetPlan) -> tuple[dict[str, float], dict[str, list[pa.Table]]
             began = spent("loading", began)
             if not len(one.returns):
                 continue
-            grid = plan.grid
-            scene = make_scene(one.returns, grid.own_box, grid.window_box, one.drive_xyh_m, plan.config.ground)
+            scene = scene_of(plan.grid, one, plan.config.ground, Statistics())
             began = spent("scenes", began)
             if gains is None:
                 gains, began = gains_of([intensity_sample(scene)]), time.process_time()

@@ -162,6 +162,30 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
     return _table(terms, solution, np.sqrt(np.diag(covariance)), told.astype(np.int64))
 
 
+def light_of(samples: Sequence[IntensitySample], gains: pa.Table) -> float | None:
+    """Returns the median calibrated intensity of the returns of the samples; None of none."""
+    names, terms = (gains[name].to_numpy(zero_copy_only=False) for name in ("sensor", "term"))
+    nodes, logs = gains["node"].to_numpy(), np.log(gains["gain"].to_numpy())
+    light, weight = [np.zeros(0)], [np.zeros(0)]
+    for sample in samples:
+        log_gain = np.zeros(sample.place.size)
+        for number, name in enumerate(sample.sensors):
+            mine = sample.sensor == number
+            for term, at in (("laser", sample.laser), ("range", sample.range_m), ("incidence", sample.incidence_deg)):
+                rows = np.flatnonzero((names == name) & (terms == term))
+                if rows.size and mine.any():
+                    rows = rows[np.argsort(nodes[rows])]
+                    log_gain[mine] += np.interp(at[mine], nodes[rows], logs[rows])
+        light.append(sample.intensity * np.exp(log_gain))
+        weight.append(sample.returns.astype(np.float64))
+    values, weights = np.concatenate(light), np.concatenate(weight)
+    if not values.size:
+        return None
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2.0)])
+
+
 def _place_means(rows: IntensitySample, response: Float64, weights: Float64) -> Float64:
     """Expected intensity (m,) of each row: the reflectance of its place, from all its rows, times the response."""
     weighted = weights * rows.returns
@@ -264,8 +288,13 @@ def _places(ground: Returns) -> Int64:
     """Returns the number (n,) of the place of each return; −1 for places beyond those of a sample."""
     column = np.floor((ground.corner_m[0] + ground.x_m) / PLACE_M).astype(np.int64)
     row = np.floor((ground.corner_m[1] + ground.y_m) / PLACE_M).astype(np.int64)
-    _, place = np.unique(np.stack([row, column]), axis=1, return_inverse=True)
-    return np.asarray(place, np.int64).reshape(-1)
+    if not row.size:
+        return row
+    row, column = row - row.min(), column - column.min()
+    flat = row * (int(column.max()) + 1) + column
+    held = np.zeros(int(flat.max()) + 1, np.int64)
+    held[flat] = 1
+    return np.asarray(np.cumsum(held)[flat] - 1)
 
 
 def _together(samples: Sequence[IntensitySample]) -> IntensitySample:

@@ -94,6 +94,9 @@ class AssetKind(ABC):
     after: ClassVar[Sequence[str]] = ()
     """Kinds whose objects this one uses when it joins."""
     piece_schema: ClassVar[pa.Schema]
+    reach_m: ClassVar[float] = 8.0
+    """What lies farther from a square than this (m) does not change the kind's evidence in it: 8 m holds a vehicle, a
+    crown, a crosswalk, a fence's least length, and the surface behind a kerb with its slope."""
 
     @abstractmethod
     def evidence(self, scene: Scene, options: Any) -> Evidence:

@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.bins import distinct_steps
 from roadscan.assets.cubes import Cubes
 from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.kernels import columns, voxels
@@ -19,11 +18,14 @@ from roadscan.core.extras import cv2
 Bools = npt.NDArray[np.bool_]
 Int32 = npt.NDArray[np.int32]
 
+REACH_M: Final = 8.0
+"""A vehicle of 7 m with the ground around it, by which it is told from other things, lies within this (m)."""
 CELL_M: Final = 0.2  # Edge of a cell (m).
 LEVEL_M: Final = 0.2  # Height of a level (m).
 SLOT_NS: Final = 200_000_000
-"""Length of a slot of time (ns); slots are longer if there would be more than 64."""
-_SLOTS: Final = 64  # Slots of time, at most: bits of a number.
+"""Length of a slot of time (ns), counted from the epoch of GPS time: the same for squares of any edge."""
+_WORDS: Final = 4
+"""Slots are counted by so many numbers of 64 bits, again from the first after 51 s: longer than a cell is in sight."""
 _THING_M: Final = (0.3, 2.5, 4.4)
 """Returns between the first two heights (m) may be moving, those up to the last may be the tops of these."""
 _GAP: Final = 2
@@ -64,7 +66,7 @@ class Columns(NamedTuple):
     things: npt.NDArray[np.uint64]
     grounds: npt.NDArray[np.uint64]
     highs: npt.NDArray[np.uint64]
-    """Slots of time in which things, ground and higher things were seen, as bits."""
+    """(rows, columns, words) slots of time in which things, ground and higher things were seen, as bits."""
 
 
 def road_users(
@@ -85,13 +87,14 @@ def columns_of(returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bo
     """Returns what stands in each cell of a window, and when it was seen."""
     grid = grid_over(window, CELL_M)
     levels = np.zeros(grid.shape, np.uint32)
-    seen = np.zeros((3, *grid.shape), np.uint64)
+    seen = np.zeros((3, *grid.shape, _WORDS), np.uint64)
     columns.columns(
         returns.x_m,
         returns.y_m,
         above_m,
         on_ground,
-        time_slots(returns.epoch_gps_ns),
+        returns.epoch_gps_ns,
+        SLOT_NS,
         grid.origin,
         1.0 / CELL_M,
         LEVEL_M,
@@ -104,19 +107,16 @@ def columns_of(returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bo
     return Columns(grid, levels, top, *seen)
 
 
-def time_slots(epoch_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-    """Returns the slot (n,) of each epoch: empty ones are left out, so that passes follow one another."""
-    steps = distinct_steps(epoch_gps_ns, SLOT_NS)
-    slot = np.empty(epoch_gps_ns.size, np.uint8)
-    columns.slots(epoch_gps_ns, SLOT_NS, steps, max(1, -(-steps.size // _SLOTS)), slot)
-    return slot
+def number_of(slots: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
+    """Returns how many slots each cell (rows, columns) has, from their bits (rows, columns, words)."""
+    return np.asarray(np.bitwise_count(slots).sum(axis=-1, dtype=np.int64))
 
 
 def moving_cells(held: Columns) -> Bools:
     """Mask (rows, columns) of cells where things were seen for a while, and longer the ground without them."""
-    things = np.bitwise_count(held.things).astype(np.int64)
-    free = np.bitwise_count(held.grounds & ~held.things).astype(np.int64)
-    both = np.bitwise_count(held.grounds & held.things).astype(np.int64)
+    things = number_of(held.things)
+    free = number_of(held.grounds & ~held.things)
+    both = number_of(held.grounds & held.things)
     apart = (free >= 2) & (2 * free >= 3 * things) & (2 * both <= things)
     moving = (things > 0) & (apart | ((free >= 3) & (free >= 2 * things)))
     around = _around(moving)
@@ -160,21 +160,28 @@ def load_levels(held: Columns, part: tuple[slice, slice], inside: Bools) -> Int3
     branches, signs and decks are seen before and after. From afar a scanner shows some heights only, and not each in
     each cell, so lower things within two cells count.
     """
-    things = np.where(inside, held.things[part], np.uint64(0))
+    things = np.where(inside[..., None], held.things[part], np.uint64(0))
     for axis in (0, 1):
         things = functools.reduce(np.bitwise_or, (_shifted(things, step, axis) for step in range(-2, 3)))
-    one = np.uint64(1)
     highs = held.highs[part]
-    high = (highs > 0) & (things > 0)
-    along = high & ((highs & ~(things | (things << one) | (things >> one))) == 0)
+    high = highs.any(axis=-1) & things.any(axis=-1)
+    along = high & ((highs & ~with_neighbours(things)) == 0).all(axis=-1)
     if 2 * np.count_nonzero(along) < np.count_nonzero(high):
         return np.zeros(inside.shape, np.int32)
     bits = np.maximum(held.levels[part] & np.uint32((1 << (_TALLEST + 1)) - 1), 1)
     return np.where(along, np.log2(bits).astype(np.int32) + 1, 0)
 
 
+def with_neighbours(slots: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """Returns slots, as bits (rows, columns, words), and those before and after them."""
+    one, last = np.uint64(1), np.uint64(63)
+    before = (slots >> one) | (np.roll(slots, -1, axis=-1) << last)
+    after = (slots << one) | (np.roll(slots, 1, axis=-1) >> last)
+    return slots | before | after
+
+
 def _shifted(bits: npt.NDArray[np.uint64], step: int, axis: int) -> npt.NDArray[np.uint64]:
-    """Returns the bits (rows, columns) of the cell so many steps away; 0 beyond the border."""
+    """Returns the bits (rows, columns, words) of the cell so many steps away; 0 beyond the border."""
     out = np.zeros_like(bits)
     size = bits.shape[axis]
     into, of = slice(max(-step, 0), size - max(step, 0)), slice(max(step, 0), size - max(-step, 0))
@@ -254,7 +261,7 @@ def parked_cells(held: Columns, moving: Bools, bodies: Bodies) -> Int32:
         inside = label[part] == k
         length_m, width_m = sides_m(inside)
         top = held.top[part][inside]
-        ground = ground_around(inside, held.grounds[part] > 0)
+        ground = ground_around(inside, np.asarray(held.grounds[part].any(axis=-1)))
         fill = float(cells) * CELL_M**2 / (length_m * width_m)
         top_m = float(np.quantile(top, 0.9) + 1.0) * LEVEL_M
         if Shape(length_m, width_m, top_m, fill, float(scattering[k]), ground).is_vehicle:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from roadscan.assets.kernels.beams import ground_heights
 from roadscan.assets.returns import Returns
+from roadscan.assets.statistics import Statistics
 from roadscan.compute.kernel_options import read_only
 
 Float64 = npt.NDArray[np.float64]
@@ -95,10 +96,11 @@ class Scene:
     """(n,) class of each return (:mod:`roadscan.assets.classes`): ground, vegetation, building, vehicle, person …"""
     drive_xyh_m: Float64
     """(p, 4) the drives through the window: x, y, height of the sensor, and the pass, in the order of time."""
+    statistics: Statistics = field(default_factory=Statistics)
 
     @cached_property
     def extent(self) -> Box:
-        """Returns the part of the window with returns, 2 m wider and in steps of 3 m from its south-western corner.
+        """Returns the part of the window with returns, 2 m wider and in steps of 3 m.
 
         Rasters are made over it; a window without returns is its own extent.
         """

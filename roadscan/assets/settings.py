@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
@@ -36,10 +35,9 @@ class AssetsConfig(SurveySection):
     sensors: list[str] | None = None
     """Sensors whose returns are looked at. Left out, all lidars, line scanners with a turning mirror and clouds;
     profilers that measure by triangulation see the pavement alone."""
-    tile_m: float = Field(default=40.0, ge=5.0, le=500.0)
-    """Edge of the squares that are searched one by one (m); the next multiple of `tiles.size_m` is taken."""
-    halo_m: float = Field(default=8.0, ge=0.0, le=100.0)
-    """How far beyond its square a search looks (m)."""
+    tile_m: float = Field(default=80.0, ge=5.0, le=500.0)
+    """Edge of the squares that are searched one by one (m); the next multiple of `tiles.size_m` is taken. Changes no
+    result but where lines are cut. A search looks beyond its square as far as the ground filter and the kinds need."""
     max_block_returns: int = Field(default=6_000_000, ge=1)
     """Squares that are expected to hold more returns together are not searched by one task; a worker needs about
     400 MB and 120 bytes a return. Changes no result."""
@@ -62,12 +60,18 @@ class AssetsConfig(SurveySection):
     cross_sections: GroundSectionsConfig | None = None
     """Cross-sections of bare earth by station (CSV, DXF); left out, none."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _no_halo(cls, stated: Any) -> Any:
+        if isinstance(stated, dict) and "halo_m" in stated:
+            raise ValueError(
+                "halo_m: how far a search looks beyond its square follows from the ground filter and the kinds; "
+                "remove this line"
+            )
+        return stated
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.cross_sections is not None and not self.bare_earth:
             raise ValueError("cross_sections are made of bare earth: bare_earth = false leaves them without it")
         return self
-
-    def edge_m(self, tile_size_m: float) -> float:
-        """Edge of the squares (m): the least multiple of the survey's tiles that is no shorter than `tile_m`."""
-        return tile_size_m * max(1, math.ceil(self.tile_m / tile_size_m - 1e-9))

@@ -59,8 +59,8 @@ class Assets(Stage):
         "corrections", "footprints", "reference_lines", "images",
     )  # fmt: skip
     writes = (
-        "intensity_samples", "intensity_gains", "asset_evidence", "asset_screens", "asset_visibility", "asset_objects",
-        "classified_points", "bare_earth", "ground_sections", AssetKind,
+        "intensity_samples", "intensity_gains", "scene_statistics", "asset_evidence", "asset_screens",
+        "asset_visibility", "asset_objects", "classified_points", "bare_earth", "ground_sections", AssetKind,
     )  # fmt: skip
 
     def run(self, session: Session) -> None:
@@ -80,15 +80,15 @@ class Assets(Stage):
             self._write(session, work.plan, self._look(session, work.plan))
 
     def _calibrate(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
-        """Compute gains of the intensity: samples of some squares, then the table."""
+        """Compute what all squares share: samples of the map, then gains of the intensity and statistics."""
         manifest, due = session.manifest, work.samples
         failures = run_tasks(
             find_samples, sample_tasks(plan, due), len(due), lambda squares: sample_tasks(plan, due, squares),
-            manifest, session.compute, session.bar("squares that tell of intensity"),
+            manifest, session.compute, session.bar("samples of the map"),
         )  # fmt: skip
         session.failed(self.name, failures)
         if not work.gains.due(manifest):
-            manifest.add([write_gains(work.gains, manifest, plan, work.gains.key(manifest))])
+            manifest.add(write_gains(work.gains, manifest, plan, work.gains.key(manifest)))
 
     def _search(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
         manifest = session.manifest
@@ -211,7 +211,8 @@ class Assets(Stage):
     def folders(self) -> Sequence[str]:
         """Returns folders: evidence, objects, tables and files, classified points, bare earth."""
         return (
-            "tables/intensity_samples", "tables/intensity_gains", "tables/asset_evidence", "tables/asset_objects",
+            "tables/intensity_samples", "tables/intensity_gains", "tables/scene_statistics", "tables/asset_evidence",
+            "tables/asset_objects",
             "tables/asset_screens", "tables/asset_visibility", "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,
             "products/classified_points", "products/ground_sections", "products/bare_earth",
         )  # fmt: skip

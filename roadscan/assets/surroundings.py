@@ -21,6 +21,8 @@ from roadscan.core.extras import cv2
 Bools = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]
 
+REACH_M: Final = 8.0
+"""A roof of 6 m, with the cubes around that tell its scatter, lies within this (m)."""
 _PLANAR, _UPRIGHT, _THICK = 0.4, 0.25, 0.4
 """A cube is part of an upright plane with at least this planarity, at most this upward part of its normal, and at most
 this thickness (cubes)."""

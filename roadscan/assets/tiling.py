@@ -1,12 +1,34 @@
-"""Squares of the map that are searched for assets separately, each with a halo around it."""
+"""Squares of the map that are searched for assets separately, each with halos around it."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 from roadscan.assets.scene import Box
 from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
+
+_ORIGINS_M: Final = 960.0
+"""Returns count from the multiples of this in the map (m): whole numbers of the cells of all rasters, and the same for
+squares of any edge, so that a return has the same place and lies in the same cells however squares are cut."""
+_STEP_M: Final = 3.0
+"""Scenes end at multiples of this (m): whole numbers of the cells of all rasters."""
+_GROUND_STEP_M: Final = 24.0
+"""The windows of the ground end at multiples of this (m): also whole numbers of the cells of up to 8 m that are made by
+halving its rasters, to fill their holes."""
+
+
+class Halos(NamedTuple):
+    """How far beyond its square a search looks (m)."""
+
+    scene_m: float
+    """Kinds look for evidence."""
+    classes_m: float
+    """Returns are classified."""
+    ground_m: float
+    """Returns tell of bare earth."""
 
 
 @dataclass(frozen=True)
@@ -17,7 +39,7 @@ class AssetGrid:
     """The survey's tiles."""
     per_edge: int
     """Tiles along the edge of a square."""
-    halo_m: float
+    halos: Halos
 
     @property
     def edge_m(self) -> float:
@@ -37,21 +59,39 @@ class AssetGrid:
         """Returns easting and northing of the south-west corner of a square (m)."""
         return square.column * self.edge_m, square.row * self.edge_m
 
+    def origin_m(self, square: TileId) -> tuple[float, float]:
+        """Returns easting and northing of the place from which the coordinates of its returns count (m)."""
+        east, north = (math.floor(at / _ORIGINS_M) * _ORIGINS_M for at in self.corner_m(square))
+        return east, north
+
+    def own_box(self, square: TileId) -> Box:
+        """Returns a square, from its origin."""
+        (east, north), (x, y) = self.corner_m(square), self.origin_m(square)
+        return Box(east - x, north - y, east - x + self.edge_m, north - y + self.edge_m)
+
+    def scene_box(self, square: TileId) -> Box:
+        """Returns the window in which kinds look for evidence, from the square's origin."""
+        return _around(self.own_box(square), self.halos.scene_m, _STEP_M)
+
+    def classes_box(self, square: TileId) -> Box:
+        """Returns the window in which returns are classified, from the square's origin."""
+        return _around(self.own_box(square), self.halos.classes_m, _STEP_M)
+
+    def ground_box(self, square: TileId) -> Box:
+        """Returns the window whose returns tell of bare earth, from the square's origin."""
+        return _around(self.own_box(square), self.halos.ground_m, _GROUND_STEP_M)
+
     def window(self, square: TileId) -> Bounds:
-        """Returns a square with its halo on the map (m)."""
-        (east, north), h, edge = self.corner_m(square), self.halo_m, self.edge_m
-        return Bounds(east - h, north - h, east + edge + h, north + edge + h)
-
-    @property
-    def own_box(self) -> Box:
-        """Returns a square relative to its corner (m)."""
-        return Box(0.0, 0.0, self.edge_m, self.edge_m)
-
-    @property
-    def window_box(self) -> Box:
-        """Returns a square with its halo relative to its corner (m)."""
-        return Box(-self.halo_m, -self.halo_m, self.edge_m + self.halo_m, self.edge_m + self.halo_m)
+        """Returns the map (m) on which a square depends."""
+        (east, north), box = self.origin_m(square), self.ground_box(square)
+        return Bounds(east + box.x_min_m, north + box.y_min_m, east + box.x_max_m, north + box.y_max_m)
 
     def tiles_under(self, square: TileId) -> list[TileId]:
-        """Returns the survey's tiles that share ground with a square or its halo, by row and column."""
+        """Returns the survey's tiles that share ground with a square or its halos, by row and column."""
         return self.tiles.tiles_in(self.window(square))
+
+
+def _around(box: Box, halo_m: float, step_m: float) -> Box:
+    least = (math.floor((side - halo_m) / step_m + 1e-9) * step_m for side in box[:2])
+    most = (math.ceil((side + halo_m) / step_m - 1e-9) * step_m for side in box[2:])
+    return Box(*least, *most)

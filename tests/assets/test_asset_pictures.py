@@ -68,7 +68,6 @@ SCENE = (
 def session(street: Simulated, block_returns: int = 6_000_000, **pictures: object) -> Session:
     assets = {
         "tile_m": 10.0,
-        "halo_m": 2.0,
         "intensity": "raw",
         "max_block_returns": block_returns,
         "pictures": pictures,

@@ -47,7 +47,7 @@ from roadscan.survey.run import run_stages
 from tests.assets.posts import Posts, only_kinds
 from tests.surveys import Lines, Simulated, changed
 
-SETTINGS = {"tile_m": 5.0, "halo_m": 4.0, "cross_sections": {"spacing_m": 4.0, "half_width_m": 4.0}}
+SETTINGS = {"tile_m": 5.0, "cross_sections": {"spacing_m": 4.0, "half_width_m": 4.0}}
 STAGES = ("ingest", "navigate", "footprints", "assets")
 
 
@@ -111,6 +111,25 @@ def test_the_inventory_learns_which_places_the_pass_had_in_sight(street: Simulat
     assert cells.to_pylist() == [{"most": 1}]
     unasked = Session(changed(own.survey, {"assets": None}), own.store)
     assert truth_of(unasked).rules.visibility.expected_passes("pole", true).tolist() == [-1, -1, -1]
+
+
+@pytest.mark.parametrize("tile_m", [10.0, 15.0, 60.0])
+def test_objects_and_classes_are_the_same_for_any_cut(street: Simulated, tile_m: float, tmp_path: Path) -> None:
+    own, other = session(street), run(again(street, tmp_path, tile_m=tile_m), ["assets"])
+    posts = [geopandas.read_parquet(one.store.path("products/assets/poles.parquet")) for one in (own, other)]
+    assert len(posts[0]) == len(posts[1]) == 3
+    assert shapely.distance(posts[0].geometry.values, posts[1].geometry.values).max() <= 1e-3
+    classes = [classified(one) for one in (own, other)]
+    np.testing.assert_array_equal(classes[0][:, :3], classes[1][:, :3])
+    assert np.mean(classes[0][:, 3] != classes[1][:, 3]) <= 1e-4
+
+
+def classified(of: Session) -> np.ndarray:
+    """Place (mm) and class of all returns, sorted."""
+    read = [laspy.read(of.store.path(path)) for path in of.store.files("products/classified_points")]
+    rows = [np.column_stack([*(np.rint(1e3 * np.asarray(v)) for v in (r.x, r.y, r.z)), r.classification]) for r in read]
+    joined = np.concatenate(rows).astype(np.int64)
+    return joined[np.lexsort(joined.T[::-1])]
 
 
 def test_posts_stand_where_the_truth_has_them(street: Simulated) -> None:
@@ -275,7 +294,8 @@ def test_reprocessing_a_tile_redoes_what_it_touches(
     evidence = Posts.evidence
 
     def watched(self: Posts, scene: Scene, options: Any) -> Evidence:
-        searched.append(scene.returns.corner_m)
+        east, north = scene.returns.corner_m
+        searched.append((east + scene.tile.x_min_m, north + scene.tile.y_min_m))
         return evidence(self, scene, options)
 
     monkeypatch.setattr(Posts, "evidence", watched)

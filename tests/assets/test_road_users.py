@@ -82,7 +82,9 @@ def test_the_top_of_a_lorry_moves_along_and_a_branch_over_its_track_does_not() -
         highs[3:10:2, column], levels[3:10:2, column] = slot, 1 << 17
     highs[5, 8:11], levels[5, 8:11] = np.uint64(2**20 - 1), 1 << 15
     grid = Grid(0.0, 0.0, 0.2, *shape)
-    held = Columns(grid, levels, np.full(shape, 5, np.int32), things, np.zeros(shape, np.uint64), highs)
+    held = Columns(
+        grid, levels, np.full(shape, 5, np.int32), things[..., None], np.zeros((*shape, 1), np.uint64), highs[..., None]
+    )
     found = load_levels(held, (slice(None), slice(None)), inside)
     assert (found[3, :] == 18).all() and (found[5, :7] == 18).all()
     assert (found[5, 8:11] == 0).all() and (found[2::2] == 0).all()
@@ -94,8 +96,8 @@ def test_a_post_stands_although_its_edges_are_seen_now_and_then() -> None:
     """Slots of 0.2 s: the middle cell shows the post ten times, those around it once, as of somebody who passes."""
     things, grounds = np.zeros((9, 9), np.uint64), np.full((9, 9), 0b1111, np.uint64)
     things[3:6, 3:6] = 1 << 8
-    held = Columns(Grid(0.0, 0.0, 0.2, 9, 9), np.zeros((9, 9), np.uint32), np.zeros((9, 9), np.int32), things, grounds,
-                   np.zeros((9, 9), np.uint64))  # fmt: skip
+    held = Columns(Grid(0.0, 0.0, 0.2, 9, 9), np.zeros((9, 9), np.uint32), np.zeros((9, 9), np.int32),
+                   things[..., None], grounds[..., None], np.zeros((9, 9, 1), np.uint64))  # fmt: skip
     assert moving_cells(held)[3:6, 3:6].all()
     things[4, 4] = 0b11_1111_1111 << 8
     assert not moving_cells(held)[4, 4] and moving_cells(held)[3, 3:6].all()

@@ -40,7 +40,7 @@ TRUNK: Final = 71
 _BODY_FROM_VELODYNE: Final = np.diag([1.0, -1.0, -1.0])
 _SENSOR_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
-_SURVEY: Final = """
+SURVEY: Final = """
 id = "semantic_kitti_00"
 rig = "rig.toml"
 store = "store"
@@ -130,8 +130,8 @@ def recorded_street(recording: Path, folder: Path) -> RecordedStreet:
     _write_csv(
         folder / "pictures.csv", ["file", "time"], [n for n in names if (recording / "image_0" / n[0]).is_file()]
     )
-    (folder / "rig.toml").write_text(_rig())
-    (folder / "SURVEY.toml").write_text(_SURVEY)
+    (folder / "rig.toml").write_text(rig_text())
+    (folder / "SURVEY.toml").write_text(SURVEY)
     survey = Survey.load(folder / "SURVEY.toml")
     session = Session(survey, Store(survey.store_url, survey.config.id), Inline())
     run_stages(session, [stage_named(name) for name in ("ingest", "footprints", "tiles", "products")])
@@ -150,7 +150,7 @@ def recorded_street(recording: Path, folder: Path) -> RecordedStreet:
     )
 
 
-def _rig() -> str:
+def rig_text() -> str:
     turn = _BODY_FROM_VELODYNE @ CAMERA_FROM_VELODYNE.T @ _SENSOR_FROM_CAMERA.T
     arm_m = _BODY_FROM_VELODYNE @ (-CAMERA_FROM_VELODYNE.T @ CAMERA_FROM_VELODYNE_M)
     return f"""

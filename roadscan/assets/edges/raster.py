@@ -28,6 +28,8 @@ REACH_M: Final = 0.45
 BESIDE_VEHICLE_M: Final = 0.15  # Ground this near to a vehicle is left out (m).
 UNEVENNESS_M: Final = 0.004
 """Standard deviation of a cell's true height about a smooth surface (m), whatever the number of returns."""
+_SEVERAL: Final = 4
+"""Least number of heights of a cell for their scatter."""
 COARSE_M: Final = 1.5
 """Standard deviation of the window from which the slope of the ground at large is computed (m)."""
 NOT_GROUND: Final = (
@@ -52,7 +54,7 @@ class HeightRaster:
     spread_m: Float64
     """(rows, columns) standard deviation of the heights in a cell."""
     noise_m: float
-    """Median of these over the cells with four heights or more; 0 where there is none."""
+    """Median of these over the survey's cells with four heights or more; 0 where there is none."""
     used: npt.NDArray[np.bool_]
     """(n,) returns of the scene that count as ground; none where the raster was made of cells."""
     cell: npt.NDArray[np.int32]
@@ -112,7 +114,8 @@ def raster_of(scene: Scene) -> HeightRaster:
     low_heights(cell, returns.height_m, used, DEPTH_M, count, mean, variance)
     shape = (rows, columns)
     spread = np.sqrt(variance).reshape(shape)
-    raster = of_cells(x_min, y_min, CELL_M, count.reshape(shape), mean.reshape(shape), spread)
+    noise = scene.statistics.of("edge_noise_m", 0.5, lambda: spread[count.reshape(shape) >= _SEVERAL])
+    raster = of_cells(x_min, y_min, CELL_M, count.reshape(shape), mean.reshape(shape), spread, noise or 0.0)
     return replace(raster, used=used, cell=cell)
 
 
@@ -134,6 +137,7 @@ def of_cells(
     count: npt.NDArray[np.int32],
     mean_m: Float64,
     spread_m: Float64,
+    noise_m: float | None = None,
 ) -> HeightRaster:
     """Returns a raster of cells whose mean height and spread are known.
 
@@ -142,12 +146,14 @@ def of_cells(
     x_min_m, y_min_m, cell_m : the corner of the first cell, and the edge of a cell (m).
     count : (rows, columns) heights in each cell, 0 where there is none.
     mean_m, spread_m : (rows, columns) their mean and standard deviation (m).
+    noise_m : that of the survey; where it is left out, the raster's own.
     """
-    many = count >= 4
-    noise = float(np.median(spread_m[many])) if many.any() else 0.0
+    if noise_m is None:
+        several = count >= _SEVERAL
+        noise_m = float(np.median(spread_m[several])) if several.any() else 0.0
     known = count > 0
-    sigma = np.sqrt(UNEVENNESS_M**2 + max(noise, 0.001) ** 2 / np.maximum(count, 1))
+    sigma = np.sqrt(UNEVENNESS_M**2 + max(noise_m, 0.001) ** 2 / np.maximum(count, 1))
     return HeightRaster(
         x_min_m, y_min_m, cell_m, count, np.where(known, mean_m, np.nan), np.where(known, sigma, np.nan), spread_m,
-        noise, np.zeros(0, np.bool_), np.zeros(0, np.int32),
+        noise_m, np.zeros(0, np.bool_), np.zeros(0, np.int32),
     )  # fmt: skip

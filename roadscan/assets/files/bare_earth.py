@@ -9,28 +9,12 @@ import numpy.typing as npt
 import rasterio
 from rasterio.transform import Affine
 
-from roadscan.assets.scene import Box, GroundModel
+from roadscan.assets.scene import GroundModel
 from roadscan.core.errors import StoreError
 from roadscan.store.codecs.cog import Band, dense_image, write_cog
 from roadscan.store.codecs.gdal import raster_settings
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.raster import about, height_unit
-
-
-def within(model: GroundModel, box: Box) -> GroundModel | None:
-    """Returns the cells of a model whose middle lies in a box; None without any."""
-    rows, columns = model.height_m.shape
-    x = model.x_min_m + (np.arange(columns) + 0.5) * model.cell_m
-    y = model.y_min_m + (np.arange(rows) + 0.5) * model.cell_m
-    c = np.flatnonzero((x >= box.x_min_m) & (x < box.x_max_m))
-    r = np.flatnonzero((y >= box.y_min_m) & (y < box.y_max_m))
-    if not (c.size and r.size):
-        return None
-    part = slice(int(r[0]), int(r[-1]) + 1), slice(int(c[0]), int(c[-1]) + 1)
-    return GroundModel(
-        model.x_min_m + int(c[0]) * model.cell_m, model.y_min_m + int(r[0]) * model.cell_m, model.cell_m,
-        model.height_m[part], model.seen[part], None if model.sigma_m is None else model.sigma_m[part],
-    )  # fmt: skip
 
 
 def write_bare_earth(path: Path, model: GroundModel, corner_m: tuple[float, float], context: ProductContext) -> None:

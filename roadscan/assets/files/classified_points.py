@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from roadscan.assets.classes import CLASS_NAMES
 from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Box
 from roadscan.core.grid import QUANTA_PER_M, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.georeference.cloud import TilePoints
@@ -21,9 +22,10 @@ _OWN_CODES: Final = {code: name for code, name in CLASS_NAMES.items() if code >=
 """LAS leaves the meaning of these codes to the file, which names them."""
 
 
-def classified_points(returns: Returns, classes: npt.NDArray[np.uint8], square: TileId) -> TilePoints:
-    """Returns returns (n,) of a square as points, each with its class (n,)."""
-    quanta = [np.rint(v * QUANTA_PER_M).astype(np.int32) for v in (returns.x_m, returns.y_m, returns.height_m)]
+def classified_points(returns: Returns, classes: npt.NDArray[np.uint8], square: TileId, tile: Box) -> TilePoints:
+    """Returns returns (n,) of a square as points, each with its class (n,); `tile` is the square as they have it."""
+    values = (returns.x_m, tile.x_min_m), (returns.y_m, tile.y_min_m), (returns.height_m, 0.0)
+    quanta = [(np.rint(v * QUANTA_PER_M) - round(first * QUANTA_PER_M)).astype(np.int32) for v, first in values]
     return TilePoints(
         tile=square,
         x_quanta=quanta[0],

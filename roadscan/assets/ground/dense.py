@@ -14,6 +14,7 @@ from roadscan.assets.ground.surface import Found, Place, Surface
 from roadscan.assets.ground.undersides import undersides
 from roadscan.assets.kernels.ground_cells import on_ground, scatter
 from roadscan.assets.kernels.lowest import lowest_returns
+from roadscan.assets.statistics import Statistics
 from roadscan.core.extras import cv2
 
 Float32 = npt.NDArray[np.float32]
@@ -68,7 +69,7 @@ def dense_ground(place: Place) -> Found:
     limits = np.array([*_NEAR_M, _CLOSE_M])
     per_m = 1.0 / fine.cell_m
     scatter(x, y, z, grid.origin, 1.0 / grid.cell_m, base.height_m, per_m, limits, above, sums)
-    cells = judged(sums)
+    cells = judged(sums, place.statistics)
     tolerance = tolerances(base, fine)
     found = np.empty(x.size, np.bool_)
     reach = _REACH_M + cells.noise_m
@@ -76,15 +77,15 @@ def dense_ground(place: Place) -> Found:
     return Found(base, above, found)
 
 
-def judged(sums: npt.NDArray[np.float64]) -> Cells:
+def judged(sums: npt.NDArray[np.float64], statistics: Statistics) -> Cells:
     """Returns rough and even cells, from their sums (rows, columns, 5) as `scatter` makes them."""
     count, total, squares, close, close_total = np.moveaxis(sums, -1, 0)
     several = count >= _LEAST
     mean = np.divide(total, count, out=np.zeros(count.shape), where=several)
     variance = np.divide(squares, count, out=np.zeros(count.shape), where=several) - mean * mean
     scattered = np.sqrt(np.maximum(variance, 0.0))
-    noise = float(np.quantile(scattered[several], 0.25)) if several.any() else 0.0
-    noise = min(noise, _NOISIEST_M)
+    noise = statistics.of("ground_noise_m", 0.25, lambda: scattered[several])
+    noise = min(noise or 0.0, _NOISIEST_M)
     rough = around(several & (scattered > _ROUGH_M + noise)) * 2 > around(several)
     even = several & ~rough & (scattered <= _EVEN_M + noise) & (close > 0)
     height = np.full(count.shape, np.nan, np.float32)

@@ -12,6 +12,7 @@ from roadscan.assets.ground.grid import grid_over
 from roadscan.assets.ground.surface import Found, Place
 from roadscan.assets.kernels.ground_cells import cell_heights
 from roadscan.assets.scene import GroundModel
+from roadscan.assets.statistics import Statistics
 
 Float32 = npt.NDArray[np.float32]
 
@@ -40,21 +41,22 @@ def ground_model(place: Place, found: Found) -> GroundModel:
     seen = sums[..., 0] > 0
     height = filled(found.base.at(grid) + middle, seen)
     away = distances(seen, grid.cell_m)
-    sigma = sigmas(sums[..., 0], scatter, away)
+    sigma = sigmas(sums[..., 0], scatter, away, place.statistics)
     for array in (height, sigma):
         array[(away > place.settings.reach_m) | ~seen.any()] = np.nan
     return GroundModel(grid.x_min_m, grid.y_min_m, grid.cell_m, height, seen, sigma)
 
 
-def sigmas(count: npt.NDArray[np.float64], scatter: Float32, away_m: Float32) -> Float32:
+def sigmas(count: npt.NDArray[np.float64], scatter: Float32, away_m: Float32, statistics: Statistics) -> Float32:
     """Returns 1 σ (rows, columns) of the heights of cells: of a mean where returns were seen, else by distance.
 
     count : returns of each cell; scatter : their standard deviation (m), which few returns underestimate: it is no less
-    than the median of all.
+    than the median of the survey.
     """
     seen = count > 0
     several = count >= _SEVERAL
-    usual = np.float32(np.median(scatter[several])) if several.any() else np.float32(_UNKNOWN_M)
+    told = statistics.of("ground_scatter_m", 0.5, lambda: scatter[several])
+    usual = np.float32(_UNKNOWN_M if told is None else told)
     single = np.where(several, scatter, np.maximum(scatter, usual))
     mean = (single / np.sqrt(np.maximum(count, 1.0))).astype(np.float32)
     return np.asarray(np.hypot(filled(mean, seen), np.where(seen, 0.0, _GROWTH * away_m)), np.float32)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.kernels.lowest import counts
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
+from roadscan.assets.statistics import Statistics
 from roadscan.core.extras import cv2
 
 Float32 = npt.NDArray[np.float32]
@@ -30,6 +31,7 @@ class Place:
     returns: Returns
     window: Box
     settings: GroundSettings
+    statistics: Statistics = field(default_factory=Statistics)
 
 
 class Surface(NamedTuple):
@@ -70,9 +72,12 @@ def sampled(z: Float32, grid: Grid, other: Grid) -> Float32:
 
 
 def is_dense(place: Place) -> bool:
-    """Returns whether the returns of the window are as dense as those of a scanner on the road."""
-    grid = grid_over(place.window, 1.0)
-    found = np.zeros(grid.shape, np.int32)
-    counts(place.returns.x_m, place.returns.y_m, grid.origin, 1.0, found)
-    held = found[found > 0]
-    return bool(held.size and np.median(held) >= DENSE_PER_M2)
+    """Returns whether the returns of the survey are as dense as those of a scanner on the road."""
+
+    def held() -> npt.NDArray[np.float64]:
+        grid = grid_over(place.window, 1.0)
+        found = np.zeros(grid.shape, np.int32)
+        counts(place.returns.x_m, place.returns.y_m, grid.origin, 1.0, found)
+        return found[found > 0].astype(np.float64)
+
+    return (place.statistics.of("returns_per_m2", 0.5, held) or 0.0) >= DENSE_PER_M2

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from roadscan.compute.kernel_options import inlined, kernel
 
 
@@ -33,6 +35,14 @@ def by_number(number, starts, order):
         if number[i] >= 0:
             order[at[number[i]]] = i
             at[number[i]] += 1
+
+
+@kernel
+def sort_groups(key, begins, order):
+    """Compute the order (n,) int64 of items by their key (n,) int64 within each group, which begins (groups + 1,)."""
+    for g in range(begins.size - 1):
+        first, end = begins[g], begins[g + 1]
+        order[first:end] = first + np.argsort(key[first:end])
 
 
 @kernel

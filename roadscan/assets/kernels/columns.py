@@ -32,41 +32,33 @@ def distinct(epoch, step, out):
 
 
 @kernel
-def slots(epoch, step, steps, per_slot, out):
-    """Compute the slot (n,) uint8 of each epoch: its step's place in the sorted `steps` (m,) int64, so many a slot."""
-    last, slot = np.int64(-1), 0
-    for k in range(epoch.size):
-        at = epoch[k] // step
-        if at != last or k == 0:
-            last = at
-            slot = np.searchsorted(steps, at) // per_slot
-        out[k] = slot
-
-
-@kernel
-def columns(x, y, above, on_ground, slot, origin, per_m, level_m, band, levels, seen):
+def columns(x, y, above, on_ground, epoch, slot_ns, origin, per_m, level_m, band, levels, seen):
     """Compute the heights in each cell, and the time slots in which things, ground, and higher things were seen there.
 
     Parameters
     ----------
-    x, y : (n,) float64 (m); above : (n,) float32 (m); on_ground : (n,) bool; slot : (n,) uint8 below 64.
+    x, y : (n,) float64 (m); above : (n,) float32 (m); on_ground : (n,) bool.
+    epoch : (n,) int64; slot_ns : length of a slot: its number, by the number of bits, is a bit.
     origin : (2,) float64; per_m : cells a metre; level_m : height of a level.
     band : (3,) float64, things are returns between the first two of these heights, what is higher reaches the last (m).
-    levels : (rows, columns) uint32, bits of heights; seen : (3, rows, columns) uint64, bits of slots.
+    levels : (rows, columns) uint32, bits of heights; seen : (3, rows, columns, words) uint64, bits of slots.
     """
     rows, many = levels.shape
+    words = seen.shape[3]
     for k in range(x.size):
         i, j = math.floor((y[k] - origin[1]) * per_m), math.floor((x[k] - origin[0]) * per_m)
         if i < 0 or j < 0 or i >= rows or j >= many:
             continue
         if on_ground[k]:
-            seen[GROUND, i, j] |= np.uint64(1) << np.uint64(slot[k])
+            slot = (epoch[k] // slot_ns) % (64 * words)
+            seen[GROUND, i, j, slot // 64] |= np.uint64(1) << np.uint64(slot % 64)
             continue
         h = above[k]
         if h >= 0.0 and h < LEVELS * level_m:
             levels[i, j] |= np.uint32(1) << np.uint32(int(h / level_m))
             if band[0] <= h <= band[2]:
-                seen[THINGS if h <= band[1] else HIGH, i, j] |= np.uint64(1) << np.uint64(slot[k])
+                slot = (epoch[k] // slot_ns) % (64 * words)
+                seen[THINGS if h <= band[1] else HIGH, i, j, slot // 64] |= np.uint64(1) << np.uint64(slot % 64)
 
 
 @kernel

@@ -12,7 +12,7 @@ import pyarrow as pa
 import shapely
 from pydantic import Field
 
-from roadscan.assets.edges.along_drive import EDGE_COLUMNS, road_edges
+from roadscan.assets.edges.along_drive import EDGE_COLUMNS, FARTHEST_M, road_edges
 from roadscan.assets.edges.line_pieces import Line, joined_lines, line_schema, pieces_table
 from roadscan.assets.edges.raster import raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
@@ -34,6 +34,8 @@ class RoadEdge(AssetKind):
     title: ClassVar[str] = "edges of the carriageway: kerbs, verges, barriers"
     curve: ClassVar[str] = "edges"
     options: ClassVar[type[Strict]] = RoadEdgeOptions
+    reach_m: ClassVar[float] = FARTHEST_M
+    """An edge is sought from the drive, this far away at the most."""
     piece_schema: ClassVar[pa.Schema] = line_schema(EDGE_COLUMNS)
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:

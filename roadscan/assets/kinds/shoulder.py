@@ -13,7 +13,7 @@ import scipy.ndimage
 import shapely
 from pydantic import Field
 
-from roadscan.assets.edges.along_drive import road_edges
+from roadscan.assets.edges.along_drive import FARTHEST_M, road_edges
 from roadscan.assets.edges.line_pieces import dense
 from roadscan.assets.edges.strips import ribbon
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, KindOptions
@@ -47,6 +47,8 @@ class Shoulder(AssetKind):
     """It is the product of the stated probabilities of its edge and of its line."""
     options: ClassVar[type[KindOptions]] = ShoulderOptions
     after: ClassVar[Sequence[str]] = ("lane_line", "road_edge")
+    reach_m: ClassVar[float] = FARTHEST_M
+    """An edge is sought from the drive, this far away at the most."""
     piece_schema: ClassVar[pa.Schema] = pa.schema(
         [pa.field(name, pa.float64(), nullable=False) for name in ("easting_m", "northing_m")]
     )

@@ -13,16 +13,18 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.assets.files.bare_earth import within, write_bare_earth
+from roadscan.assets.files.bare_earth import write_bare_earth
 from roadscan.assets.files.classified_points import classified_points, write_classified
+from roadscan.assets.ground.bare_earth import within
 from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.intensity import calibrated_scene
 from roadscan.assets.kind import AssetKind, Evidence, Marked, asset_kinds
-from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.screens import screens_of
-from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_squares
+from roadscan.assets.statistics import Statistics
+from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_squares, scene_of
 from roadscan.assets.tasks.plan import AssetPlan
+from roadscan.assets.tasks.shared import Shared
 from roadscan.assets.visibility import CELL_M, passes_in_sight
 from roadscan.core.errors import SchemaError
 from roadscan.core.ids import TileId
@@ -30,7 +32,7 @@ from roadscan.core.strict import Strict
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
@@ -75,8 +77,8 @@ class EvidenceTask:
     kinds: tuple[tuple[str, Strict], ...]
     """All kinds of the survey with their settings: the classes of points come from all of them."""
     ground: GroundSettings
-    gains: OutputRecord | None
-    """Table by which intensities are calibrated; None where they are used as recorded."""
+    shared: Shared | None
+    """Gains of the intensity, and statistics of the survey."""
     context: ProductContext
 
     @property
@@ -91,12 +93,12 @@ class EvidenceTask:
 
 
 def due_squares(
-    plan: AssetPlan, manifest: Manifest, gains: OutputRecord | None, forced: Sequence[TileId] = ()
+    plan: AssetPlan, manifest: Manifest, shared: Shared | None, forced: Sequence[TileId] = ()
 ) -> list[SquareWork]:
     """Returns the missing or stale outputs of each square, and all of those that are forced."""
-    calibrated = "" if gains is None else gains.digest
-    kind_keys = {one.name: key_of(one.evidence_key(), calibrated) for one in plan.kinds}
-    code = code_digest("roadscan.assets.tasks.evidence:find_evidence")
+    told = "" if shared is None else shared.key
+    kind_keys = {one.name: key_of(one.evidence_key(), told) for one in plan.kinds}
+    code = key_of(code_digest("roadscan.assets.tasks.evidence:find_evidence"), told)
     anew = set(forced)
     found: list[SquareWork] = []
     for square, key in plan.keys.items():
@@ -118,26 +120,26 @@ def due_squares(
 
 
 def evidence_tasks(
-    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, workers: int = 1
+    plan: AssetPlan, due: Sequence[SquareWork], shared: Shared | None, workers: int = 1
 ) -> list[EvidenceTask]:
     """Returns tasks over the squares of which anything is due."""
-    return [_task(plan, due, gains, squares) for squares in plan.blocks([one.square for one in due], workers)]
+    return [_task(plan, due, shared, squares) for squares in plan.blocks([one.square for one in due], workers)]
 
 
 def singly(
-    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, squares: Sequence[TileId]
+    plan: AssetPlan, due: Sequence[SquareWork], shared: Shared | None, squares: Sequence[TileId]
 ) -> list[EvidenceTask]:
     """Returns a task for each square."""
-    return [_task(plan, due, gains, (square,)) for square in squares]
+    return [_task(plan, due, shared, (square,)) for square in squares]
 
 
 def _task(
-    plan: AssetPlan, due: Sequence[SquareWork], gains: OutputRecord | None, squares: tuple[TileId, ...]
+    plan: AssetPlan, due: Sequence[SquareWork], shared: Shared | None, squares: tuple[TileId, ...]
 ) -> EvidenceTask:
     chosen = set(squares)
     return EvidenceTask(
         plan.load(squares), tuple(one for one in due if one.square in chosen),
-        tuple((one.name, one.options) for one in plan.kinds), plan.config.ground, gains, plan.context,
+        tuple((one.name, one.options) for one in plan.kinds), plan.config.ground, shared, plan.context,
     )  # fmt: skip
 
 
@@ -146,15 +148,14 @@ def find_evidence(task: EvidenceTask) -> TaskResult:
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     due = {one.square: one for one in task.work}
-    store, gains = task.store, None
-    search: _Search | None = None
-    if task.gains is not None:
-        gains = store.parse_table(read_recorded(store, task.gains), task.gains.path)
+    store, search = task.store, None
+    gains = None if task.shared is None else task.shared.read_gains(store)
+    statistics = Statistics() if task.shared is None else task.shared.read_statistics(store)
     with store.scratch() as folder:
         for loaded in load_squares(task.load):
             work = due[loaded.square]
             try:
-                search = _Search(task, work, loaded, folder, gains)
+                search = _Search(task, work, loaded, folder, (gains, statistics))
                 records += search.records()
                 failures += search.failures
             except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
@@ -167,9 +168,11 @@ class _Search:
     """One square during its search, from returns to files."""
 
     def __init__(
-        self, task: EvidenceTask, work: SquareWork, loaded: LoadedSquare, folder: Path, gains: pa.Table | None
-    ) -> None:
-        self._task, self._work, self._loaded, self._folder, self._gains = task, work, loaded, folder, gains
+        self, task: EvidenceTask, work: SquareWork, loaded: LoadedSquare, folder: Path,
+        shared: tuple[pa.Table | None, Statistics],
+    ) -> None:  # fmt: skip
+        self._task, self._work, self._loaded, self._folder = task, work, loaded, folder
+        self._gains, self._statistics = shared
         self.failures: list[tuple[str, str]] = []
 
     def records(self) -> Iterator[OutputRecord]:
@@ -177,10 +180,7 @@ class _Search:
         if not len(self._loaded.returns):
             yield from self._nothing()
             return
-        grid = self._task.load.grid
-        scene = make_scene(
-            self._loaded.returns, grid.own_box, grid.window_box, self._loaded.drive_xyh_m, self._task.ground
-        )
+        scene = scene_of(self._task.load.grid, self._loaded, self._task.ground, self._statistics)
         seen = scene if self._gains is None else calibrated_scene(scene, self._gains)
         keys = dict(self._work.kinds)
         marked: list[Marked] = []
@@ -227,12 +227,12 @@ class _Search:
 
     def _write_bare_earth(self, scene: Scene, key: str) -> OutputRecord:
         grid, square = self._task.load.grid, self._work.square
-        model = within(scene.ground, grid.own_box)
+        model = within(scene.ground, grid.own_box(square))
         known = 0 if model is None else int(np.count_nonzero(~np.isnan(model.height_m)))
         if model is None or not known:
             return OutputRecord(BARE_EARTH, str(square), key, "", 0, "", _told(0))
         path = self._folder / "bare_earth.tif"
-        write_bare_earth(path, model, grid.corner_m(square), self._task.context)
+        write_bare_earth(path, model, grid.origin_m(square), self._task.context)
         detail = json.dumps({"cells": known, "seen": int(np.count_nonzero(model.seen))})
         target = f"products/{BARE_EARTH}/{square}.tif"
         return publish_file(self._task.store, path, target, BARE_EARTH, str(square), key, detail)
@@ -256,7 +256,7 @@ class _Search:
         if not own.size:
             return OutputRecord(CLASSIFIED, str(square), key, "", 0, "", _told(0))
         classes = marked_classes(scene, marked)
-        points = classified_points(scene.returns.at(own), classes[own], square)
+        points = classified_points(scene.returns.at(own), classes[own], square, scene.tile)
         path = self._folder / "points.laz"
         write_classified(path, points, self._task.load.grid.squares, self._task.context)
         target = f"products/{CLASSIFIED}/{square}.laz"

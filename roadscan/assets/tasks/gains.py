@@ -1,8 +1,9 @@
-"""Gains of the intensity: samples of some squares make one small table, by which evidence is calibrated."""
+"""What the search of all squares shares: samples of the map make tables of the intensity's gains and of statistics."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -11,11 +12,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.assets.edges.raster import raster_of
 from roadscan.assets.ground.settings import GroundSettings
-from roadscan.assets.intensity import IntensitySample, gains_of, intensity_sample
-from roadscan.assets.make_scene import make_scene
-from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_squares
-from roadscan.assets.tasks.plan import AssetPlan
+from roadscan.assets.intensity import GAINS_SCHEMA, IntensitySample, gains_of, intensity_sample, light_of
+from roadscan.assets.scene import Scene
+from roadscan.assets.statistics import Measured, Statistics, together
+from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_squares, scene_of
+from roadscan.assets.tasks.plan import AssetPlan, grid_of, readings_of, square_key
+from roadscan.assets.tasks.shared import Shared
+from roadscan.assets.tiling import AssetGrid, Halos
+from roadscan.assets.upright.grown import roughness_of_road_m
 from roadscan.core.ids import TileId
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of
@@ -24,15 +30,22 @@ from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import bytes_digest
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.blocks import Block
+from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.tasks.tile_files import publish_file
 from roadscan.tiles.tasks.tiles import TaskResult
 
 SAMPLES: Final = "intensity_samples"
 GAINS: Final = "intensity_gains"
 _UNIT: Final = "all"
+STATISTICS: Final = "scene_statistics"
+_EDGE_M: Final = 40.0
+"""Edge of the sampled squares (m). They are the same however the survey is cut for its search."""
+_HALOS: Final = Halos(2.0, 6.0, 24.0)
+"""Halos of the samples (m): medians over them do not depend on what few returns near their borders are taken for."""
 _MOST_SQUARES: Final = 24
 """Number of sampled squares; a digest of their place selects them."""
+_BLOCK_SQUARES: Final = 4
+"""Edge of the largest block of squares of one task: neighbours read the same row groups."""
 _LEAST_RETURNS: Final = 20_000  # Squares with fewer returns are sampled only if no square has more.
 _COLUMNS: Final = ("place", "sensor", "laser", "range_m", "incidence_deg", "intensity", "returns")
 
@@ -57,6 +70,13 @@ class GainsPlan:
 
     samples: tuple[tuple[TileId, str], ...]
     """Sampled squares, with the key of each sample."""
+    calibrated: bool = True
+    """Whether gains are wanted beside the statistics."""
+
+    @property
+    def tables(self) -> tuple[str, ...]:
+        """Returns the tables that are made of the samples."""
+        return (GAINS, STATISTICS) if self.calibrated else (STATISTICS,)
 
     def due(self, manifest: Manifest) -> list[tuple[TileId, str]]:
         """Returns samples that are missing or stale."""
@@ -67,31 +87,40 @@ class GainsPlan:
         return {str(square) for square, _ in self.samples}
 
     def key(self, manifest: Manifest) -> str:
-        """Returns the key of the table, once all samples exist."""
+        """Returns the key of the tables, once all samples exist."""
         held = manifest.of(SAMPLES)
         read = [(unit, held[unit].digest) for unit in sorted(self.units()) if unit in held]
         return key_of(code_digest("roadscan.assets.tasks.gains:write_gains"), read)
 
 
 def plan_gains(plan: AssetPlan) -> GainsPlan:
-    """Returns the sampled squares: of those with many returns some, by a digest of their place; none where the
-    survey asks for raw intensities.
-    """
-    if plan.config.intensity == "raw":
-        return GainsPlan(())
-    many = [square for square in plan.keys if plan.readings[square] >= _LEAST_RETURNS] or list(plan.keys)
+    """Returns the sampled squares: of those with many returns some, by a digest of their place."""
+    grid, tiles = _grid(plan), plan.tiles.tiles
+    readings = readings_of(grid, tiles)
+    many = [square for square in readings if readings[square] >= _LEAST_RETURNS] or list(readings)
     chosen = sorted(many, key=lambda s: hashlib.blake2b(str(s).encode(), digest_size=8).digest())[:_MOST_SQUARES]
     code = code_digest("roadscan.assets.tasks.gains:find_samples")
     ordered = sorted(chosen, key=lambda s: (s.row, s.column))
-    return GainsPlan(tuple((square, key_of(code, plan.keys[square])) for square in ordered))
+    keys = [key_of(code, square_key(plan.common, grid, square, tiles)) for square in ordered]
+    return GainsPlan(tuple(zip(ordered, keys, strict=True)), plan.config.intensity == "calibrated")
+
+
+def _grid(plan: AssetPlan) -> AssetGrid:
+    return grid_of(plan.survey.survey, _EDGE_M, _HALOS)
 
 
 def sample_tasks(
     plan: AssetPlan, due: Sequence[tuple[TileId, str]], squares: Sequence[TileId] = ()
 ) -> list[SampleTask]:
-    """Returns a task for each sample that is due, or for some of them."""
-    wanted = set(squares) or {square for square, _ in due}
-    return [SampleTask(plan.load((square,)), (key,), plan.config.ground) for square, key in due if square in wanted]
+    """Returns tasks over neighbouring samples that are due, or a task for each of some of them."""
+    if squares:  # those of a task that failed, one by one
+        blocks: list[tuple[TileId, ...]] = [(square,) for square in squares]
+    else:
+        readings = readings_of(_grid(plan), plan.tiles.tiles)
+        wanted = {square: readings[square] for square, _ in due}
+        blocks = [b.tiles for b in cut_blocks(wanted, _BLOCK_SQUARES, plan.config.max_block_returns)]
+    keys, grid = dict(due), _grid(plan)
+    return [SampleTask(plan.load(own, grid), tuple(keys[s] for s in own), plan.config.ground) for own in blocks]
 
 
 def find_samples(task: SampleTask) -> TaskResult:
@@ -108,26 +137,58 @@ def find_samples(task: SampleTask) -> TaskResult:
 
 
 def _sampled(task: SampleTask, loaded: LoadedSquare, key: str) -> OutputRecord:
-    grid, unit = task.load.grid, str(loaded.square)
+    unit = str(loaded.square)
     if not len(loaded.returns):
         return OutputRecord(SAMPLES, unit, key, "", 0, "")
-    scene = make_scene(loaded.returns, grid.own_box, grid.window_box, loaded.drive_xyh_m, task.ground)
-    sample = intensity_sample(scene)
+    scene = scene_of(task.load.grid, loaded, task.ground, Statistics())
+    sample, detail = intensity_sample(scene), json.dumps(measured(scene))
     known = np.isfinite(sample.range_m) & np.isfinite(sample.incidence_deg)  # the place of a sensor may be unknown
     if not known.any():
-        return OutputRecord(SAMPLES, unit, key, "", 0, "")
+        return OutputRecord(SAMPLES, unit, key, "", 0, "", detail)
     rows = pa.table({name: getattr(sample, name)[known] for name in _COLUMNS})
     rows = rows.append_column("unit", pa.array(np.full(rows.num_rows, sample.unit)))
     store = task.load.readings.store
     with store.scratch() as folder:
         path = folder / "sample.parquet"
         pq.write_table(rows, path, compression="zstd", write_page_checksum=True, version="2.6")
-        return publish_file(store, path, f"tables/{SAMPLES}/{unit}.parquet", SAMPLES, unit, key)
+        return publish_file(store, path, f"tables/{SAMPLES}/{unit}.parquet", SAMPLES, unit, key, detail)
 
 
-def write_gains(gains: GainsPlan, manifest: Manifest, plan: AssetPlan, key: str) -> OutputRecord:
-    """Write the gains that explain all samples best."""
-    held, store = manifest.of(SAMPLES), plan.survey.store
+def measured(scene: Scene) -> dict[str, Measured]:
+    """Returns the statistics of a scene."""
+    raster_of(scene)
+    roughness_of_road_m(scene)
+    return scene.statistics.measured
+
+
+def write_gains(gains: GainsPlan, manifest: Manifest, plan: AssetPlan, key: str) -> list[OutputRecord]:
+    """Write the gains that explain all samples best, and the medians of their statistics."""
+    samples = _samples(gains, manifest, plan)
+    held = manifest.of(SAMPLES)
+    parsed = [held[unit].figures() for unit in sorted(gains.units())]
+    told = together({name: Measured(*values) for name, values in one.items()} for one in parsed)
+    table = gains_of(samples) if gains.calibrated else GAINS_SCHEMA.empty_table()
+    light = light_of(samples, table)
+    if light is not None:
+        told["ground_light"] = (light, len(samples))
+    columns = {
+        "statistic": list(told),
+        "value": [v for v, _ in told.values()],
+        "samples": [n for _, n in told.values()],
+    }
+    tables = {GAINS: table, STATISTICS: pa.table(columns, table_schema(STATISTICS).arrow()).sort_by("statistic")}
+    return [_written(plan, name, tables[name], key) for name in gains.tables]
+
+
+def _written(plan: AssetPlan, name: str, rows: pa.Table, key: str) -> OutputRecord:
+    schema = table_schema(name)
+    content, target = parquet_bytes(rows.cast(schema.arrow()), schema), f"{schema.location}/{name}.parquet"
+    plan.survey.store.write_bytes(target, content)
+    return OutputRecord(name, _UNIT, key, target, len(content), bytes_digest(content))
+
+
+def _samples(gains: GainsPlan, manifest: Manifest, plan: AssetPlan) -> list[IntensitySample]:
+    held, store, grid = manifest.of(SAMPLES), plan.survey.store, _grid(plan)
     samples = []
     for square, _ in gains.samples:
         record = held.get(str(square))
@@ -135,17 +196,16 @@ def write_gains(gains: GainsPlan, manifest: Manifest, plan: AssetPlan, key: str)
             rows = store.parse_table(read_recorded(store, record), record.path)
             columns = {name: rows[name].to_numpy() for name in _COLUMNS}
             unit = float(rows["unit"][0].as_py())
-            samples.append(IntensitySample(plan.grid.corner_m(square), plan.sensors, **columns, unit=unit))
-    schema = table_schema(GAINS)
-    content = parquet_bytes(gains_of(samples).cast(schema.arrow()), schema)
-    target = f"{schema.location}/{GAINS}.parquet"
-    store.write_bytes(target, content)
-    return OutputRecord(GAINS, _UNIT, key, target, len(content), bytes_digest(content))
+            samples.append(IntensitySample(grid.corner_m(square), plan.sensors, **columns, unit=unit))
+    return samples
 
 
-def current_gains(plan: GainsPlan, manifest: Manifest) -> OutputRecord | None:
-    """Returns the table of gains; None where it is missing or stale, or the survey asks for none."""
+def current_gains(plan: GainsPlan, manifest: Manifest) -> Shared | None:
+    """Returns the tables of gains and statistics; None where one is missing or stale."""
     if not plan.samples or plan.due(manifest):
         return None
-    record = manifest.get(GAINS, _UNIT)
-    return record if record is not None and manifest.is_current(GAINS, _UNIT, plan.key(manifest)) else None
+    key = plan.key(manifest)
+    if not all(manifest.is_current(name, _UNIT, key) for name in plan.tables):
+        return None
+    records = manifest.get(STATISTICS, _UNIT), manifest.get(GAINS, _UNIT) if plan.calibrated else None
+    return None if records[0] is None else Shared(records[0], records[1])

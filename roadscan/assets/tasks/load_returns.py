@@ -10,9 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.assets.bins import distinct_steps
-from roadscan.assets.kernels.buckets import rows_within
+from roadscan.assets.bins import distinct_steps, in_bins
+from roadscan.assets.ground.settings import GroundSettings
+from roadscan.assets.kernels.buckets import rows_within, sort_groups
+from roadscan.assets.make_scene import make_scene
 from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Scene
+from roadscan.assets.statistics import Statistics
 from roadscan.assets.tiling import AssetGrid
 from roadscan.core.grid import QUANTA_PER_M, QUANTUM_M
 from roadscan.core.ids import TileId
@@ -58,12 +62,13 @@ class ReturnsTask:
 
 @dataclass(frozen=True, eq=False)
 class LoadedSquare:
-    """What was seen in a square and its halo."""
+    """What was seen in a square and its halos."""
 
     square: TileId
     returns: Returns
+    """Those of the window of the ground."""
     drive_xyh_m: Float64
-    """(p, 4) drives through the window, as :class:`roadscan.assets.scene.Scene` has them."""
+    """(p, 4) drives through the window of its classes, as :class:`roadscan.assets.scene.Scene` has them."""
 
 
 def load_squares(task: ReturnsTask) -> Iterator[LoadedSquare]:
@@ -71,6 +76,17 @@ def load_squares(task: ReturnsTask) -> Iterator[LoadedSquare]:
     block = _Block(task)
     for square in task.squares:
         yield block.square(square)
+
+
+def scene_of(grid: AssetGrid, loaded: LoadedSquare, ground: GroundSettings, statistics: Statistics) -> Scene:
+    """Returns the scene of a square."""
+    square, drive = loaded.square, loaded.drive_xyh_m
+    own, window, around = (
+        grid.own_box(square),
+        grid.scene_box(square),
+        (grid.classes_box(square), grid.ground_box(square)),
+    )
+    return make_scene(loaded.returns, own, window, drive, ground, around, statistics)
 
 
 class _Columns(NamedTuple):
@@ -110,15 +126,14 @@ class _Block:
         self._trajectories = [self._trajectory(source) for source in self._sources]
 
     def square(self, square: TileId) -> LoadedSquare:
-        """Returns the returns of a square and its halo, and the drives through it."""
+        """Returns the returns of a square and its halos, and the drives through it."""
         grid, size = self._task.grid, self._ground.grid.size_quanta
-        west, south = ((n * grid.per_edge - first) * size for n, first in zip(square, self._corner, strict=True))
-        halo, edge = round(grid.halo_m * QUANTA_PER_M), grid.per_edge * size
+        corner = grid.origin_m(square)
+        west, south = (round(at * QUANTA_PER_M) - first * size for at, first in zip(corner, self._corner, strict=True))
         c = self._columns
-        ends = np.array([west - halo, south - halo, west + edge + halo, south + edge + halo], np.int64)
+        ends = np.array([west, south, west, south]) + np.round(np.array(grid.ground_box(square)) * QUANTA_PER_M)
         rows = np.empty(c.x.size, np.int64)
-        rows = rows[: rows_within(c.x, c.y, ends, rows)]
-        corner = grid.corner_m(square)
+        rows = rows[: rows_within(c.x, c.y, ends.astype(np.int64), rows)]
         x, y = _metres(c.x[rows] - np.int32(west)), _metres(c.y[rows] - np.int32(south))
         if self._centre is not None:
             w = grid.window(square)
@@ -234,8 +249,8 @@ class _Block:
                 epochs = own.epoch_gps_ns[rows]
                 tick = distinct_steps(epochs if len(held) == 1 else epochs[ids == one], _DRIVE_TICK_NS)
                 places = self._places(number, tick * _DRIVE_TICK_NS + _DRIVE_TICK_NS // 2)
-                places[:, :2] -= grid.corner_m(square)
-                places = places[grid.window_box.holds(places[:, 0], places[:, 1])]
+                places[:, :2] -= grid.origin_m(square)
+                places = places[grid.classes_box(square).holds(places[:, 0], places[:, 1])]
                 if len(places):
                     seen.add(one)
                     found.append(np.column_stack([thinned(places), np.full(len(thinned(places)), float(one))]))
@@ -287,7 +302,7 @@ def in_order(c: _Columns) -> _Columns:
     Logs are sorted so, but for repeats, so usually little is moved.
     """
     if _falls(c).any():
-        c = c.at(np.lexsort((c.laser, c.epoch_gps_ns, c.source)))
+        c = c.at(_by_laser(c))
     same = (c.source[1:] == c.source[:-1]) & (c.epoch_gps_ns[1:] == c.epoch_gps_ns[:-1]) & (c.laser[1:] == c.laser[:-1])
     if not same.any():
         return c
@@ -295,14 +310,46 @@ def in_order(c: _Columns) -> _Columns:
     tied[1:] |= same
     tied[:-1] |= same
     rows = np.flatnonzero(tied)
-    group = np.concatenate([[0], np.cumsum(~same)])[rows]
+    group = np.append(0, np.cumsum(~same))[rows]
     t = c.at(rows)
-    order = np.lexsort((t.number_of_returns, t.return_number, t.intensity, t.height, t.y, t.x, group))
+    order = _by_place(t, group)
     if (order == np.arange(order.size)).all():
         return c
     moved = np.arange(c.x.size)
     moved[rows] = rows[order]
     return c.at(moved)
+
+
+def _by_laser(c: _Columns) -> Int64:
+    """Returns the order (n,) by source, epoch and laser: that of the runs of one epoch first, which are few."""
+    new = np.append(True, (np.diff(c.source) != 0) | (np.diff(c.epoch_gps_ns) != 0))
+    first, lasers = np.flatnonzero(new), int(c.laser.max()) + 1
+    if first.size * lasers > c.x.size:
+        return np.lexsort((c.laser, c.epoch_gps_ns, c.source))
+    source, epoch = c.source[first], c.epoch_gps_ns[first]
+    order = np.lexsort((epoch, source))
+    other = np.append(False, (np.diff(source[order]) != 0) | (np.diff(epoch[order]) != 0))
+    rank = np.empty(first.size, np.int64)
+    rank[order] = np.cumsum(other)
+    bins = np.repeat(rank, np.diff(np.append(first, c.x.size))) * lasers + c.laser
+    return in_bins(bins, (int(rank.max()) + 1) * lasers)[1]
+
+
+def _by_place(t: _Columns, group: Int64) -> Int64:
+    """Returns the order (n,) of returns by group, which does not fall, place, intensity and number."""
+    order = np.arange(group.size)
+    place = ((t.x.astype(np.int64) << 32) + t.y) if group.size else group
+    sort_groups(place, np.flatnonzero(np.append(np.append(True, np.diff(group) != 0), True)), order)
+    same = (np.diff(group[order]) == 0) & (np.diff(place[order]) == 0)
+    if not same.any():
+        return order
+    tied = np.append(same, False) | np.append(False, same)
+    rows = order[tied]
+    again = np.lexsort((
+        t.number_of_returns[rows], t.return_number[rows], t.intensity[rows], t.height[rows], place[rows], group[rows],
+    ))  # fmt: skip
+    order[tied] = rows[again]
+    return order
 
 
 def _falls(c: _Columns) -> Bool:

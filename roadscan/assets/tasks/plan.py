@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from roadscan.assets.make_scene import CLASSES_REACH_M
 from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.kinds import WantedKind, wanted_kinds
 from roadscan.assets.tasks.load_returns import ReturnsTask
 from roadscan.assets.tasks.picture_rule import picture_rule
 from roadscan.assets.tasks.recognition import check_recognition
-from roadscan.assets.tiling import AssetGrid
+from roadscan.assets.tiling import AssetGrid, Halos
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
@@ -27,7 +29,7 @@ from roadscan.store.store import bytes_digest
 from roadscan.surface.tasks.pictures import rule_cameras
 from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.tile_plan import TilePlan, plan_tiles
+from roadscan.tiles.tasks.tile_plan import PlannedTiles, TilePlan, plan_tiles
 from roadscan.tiles.tasks.wanted_products import product_context
 
 _BLOCK_SQUARES: Final = 16
@@ -47,6 +49,8 @@ class AssetPlan:
     sensors: tuple[str, ...]
     ways: tuple[tuple[str, TrajectorySource], ...]
     kinds: tuple[WantedKind, ...]
+    common: str
+    """Key of what all squares share."""
     keys: Mapping[TileId, str]
     """Key of what was seen in each square, by row and column."""
     readings: Mapping[TileId, int]
@@ -74,13 +78,13 @@ class AssetPlan:
             blocks = cut_blocks(readings, edge, self.config.max_block_returns)
         return [b.tiles for b in blocks]
 
-    def load(self, squares: tuple[TileId, ...]) -> ReturnsTask:
-        """Returns the sources of the returns of some squares."""
-        known = self.tiles.tiles.number
-        under = dict.fromkeys(t for square in squares for t in self.grid.tiles_under(square) if t in known)
+    def load(self, squares: tuple[TileId, ...], grid: AssetGrid | None = None) -> ReturnsTask:
+        """Returns the sources of the returns of some squares, of another grid where one is given."""
+        grid, known = grid or self.grid, self.tiles.tiles.number
+        under = dict.fromkeys(t for square in squares for t in grid.tiles_under(square) if t in known)
         own = tuple(sorted(under, key=lambda t: (t.row, t.column)))
         widths = _divergences(self.survey.survey, self.sensors)
-        return ReturnsTask(self.grid, squares, self.tiles.task(Block(own)), self.sensors, widths, self.ways)
+        return ReturnsTask(grid, squares, self.tiles.task(Block(own)), self.sensors, widths, self.ways)
 
     def near(self, chosen: Sequence[TileId]) -> set[TileId]:
         """Returns squares that see one of some of the survey's tiles, in themselves or in their halo."""
@@ -103,28 +107,52 @@ def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
     chosen = sorted({source.sensor for source, _ in plan.sources if is_looked_at(source, config)})
     ways = _ways(plan, config)
     common = key_of(
-        grid, chosen, config.ground.model_dump(mode="json"), None if plan.centre_lines is None else
+        chosen, config.ground.model_dump(mode="json"), None if plan.centre_lines is None else
         plan.centre_lines.key(), [[w.world, [f.digest for f in w.files], _corrections(plan, run)] for run, w in ways],
         [str(width) for width in _divergences(plan.survey, chosen)],
     )  # fmt: skip
     own = _looked_at(footprints, config)
     tiles = plan_tiles(own, replace(plan, tile_key=common))
     held = TilePlan(plan, own, tiles, (), product_context(plan))
-    keys: dict[TileId, str] = {}
-    readings: dict[TileId, int] = {}
-    squares = {grid.of_tile(tile) for tile in tiles.ids}
-    for square in sorted(squares, key=lambda t: (t.row, t.column)):
-        under = [t for t in grid.tiles_under(square) if t in tiles.number]
-        keys[square] = key_of(common, [(str(t), tiles.keys[tiles.number[t]]) for t in under])
-        readings[square] = sum(int(tiles.readings[tiles.number[t]]) for t in under if grid.of_tile(t) == square)
-    return AssetPlan(plan, config, grid, held, tuple(chosen), ways, wanted_kinds(config), keys, readings)
+    readings = readings_of(grid, tiles)
+    keys = {square: square_key(common, grid, square, tiles) for square in readings}
+    return AssetPlan(plan, config, grid, held, tuple(chosen), ways, wanted_kinds(config), common, keys, readings)
+
+
+def readings_of(grid: AssetGrid, tiles: PlannedTiles) -> dict[TileId, int]:
+    """Returns the approximate number of returns in each square that holds any, by row and column."""
+    found: dict[TileId, int] = {}
+    for tile, count in zip(tiles.ids, tiles.readings, strict=True):
+        square = grid.of_tile(tile)
+        found[square] = found.get(square, 0) + int(count)
+    return dict(sorted(found.items(), key=lambda one: (one[0].row, one[0].column)))
+
+
+def square_key(common: str, grid: AssetGrid, square: TileId, tiles: PlannedTiles) -> str:
+    """Returns the key of what was seen in a square and its halos."""
+    under = [t for t in grid.tiles_under(square) if t in tiles.number]
+    return key_of(common, grid, [(str(t), tiles.keys[tiles.number[t]]) for t in under])
 
 
 def asset_grid(survey: Survey, config: AssetsConfig) -> AssetGrid:
     """Returns the squares of a survey."""
+    return grid_of(survey, config.tile_m, halos_of(config))
+
+
+def grid_of(survey: Survey, edge_m: float, halos: Halos) -> AssetGrid:
+    """Returns squares whose edge is the least multiple of the survey's tiles that is no shorter than `edge_m`."""
     tiles = survey.config.tiles
-    edge_m = config.edge_m(tiles.size_m)
-    return AssetGrid(TileGrid(tiles.size_m, tiles.cell_m), round(edge_m / tiles.size_m), config.halo_m)
+    per_edge = max(1, math.ceil(edge_m / tiles.size_m - 1e-9))
+    return AssetGrid(TileGrid(tiles.size_m, tiles.cell_m), per_edge, halos)
+
+
+def halos_of(config: AssetsConfig) -> Halos:
+    """Returns how far a search looks beyond its square: what a kind reads depends on what is around, and that on bare
+    earth, which depends on the ground around.
+    """
+    scene_m = max((one.kind.reach_m for one in wanted_kinds(config)), default=0.0)
+    classes_m = scene_m + CLASSES_REACH_M
+    return Halos(scene_m, classes_m, classes_m + config.ground.depends_on_m)
 
 
 def is_looked_at(source: ReadingSource, config: AssetsConfig) -> bool:

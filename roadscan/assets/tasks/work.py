@@ -15,7 +15,7 @@ from roadscan.assets.tasks.evidence import (
     due_squares,
     evidence_unit,
 )
-from roadscan.assets.tasks.gains import GAINS, SAMPLES, GainsPlan, current_gains, plan_gains
+from roadscan.assets.tasks.gains import GAINS, SAMPLES, STATISTICS, GainsPlan, current_gains, plan_gains
 from roadscan.assets.tasks.objects import OBJECTS, Cluster, JoinTask, plan_joins
 from roadscan.assets.tasks.picture_work import CUT_OUTS, SEEN
 from roadscan.assets.tasks.plan import AssetPlan, plan_assets
@@ -30,7 +30,8 @@ from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_plan import tiles_of
 
 MADE = (
-    SAMPLES, GAINS, EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, VISIBILITY, OBJECTS, SEEN, CUT_OUTS, TABLES, SECTIONS,
+    SAMPLES, GAINS, STATISTICS, EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, VISIBILITY, OBJECTS, SEEN, CUT_OUTS, TABLES,
+    SECTIONS,
 )  # fmt: skip
 """Names of all outputs in the manifest."""
 
@@ -85,7 +86,7 @@ def _gone(plan: AssetPlan, gains: GainsPlan, manifest: Manifest) -> list[OutputR
     objects = {unit for unit in manifest.of(OBJECTS) if unit.partition("/")[0] in kinds}
     return [
         *manifest.beside({SAMPLES}, gains.units()),
-        *manifest.beside({GAINS} if not gains.samples else set(), ()),
+        *manifest.beside({GAINS, STATISTICS} - set(gains.tables if gains.samples else ()), ()),
         *manifest.beside({EVIDENCE}, evidence),
         *manifest.beside({CLASSIFIED}, units if config.classified else ()),
         *manifest.beside({BARE_EARTH}, units if config.bare_earth else ()),

@@ -67,15 +67,13 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
     inner = tuple(round((high - low) / CELL_M) for low, high in
                   ((tile.y_min_m, tile.y_max_m), (tile.x_min_m, tile.x_max_m)))  # fmt: skip
     shape = (inner[0] + 2 * margin, inner[1] + 2 * margin)
-    sums = _sums(scene, corner, shape)
-    pooled = np.stack([cv2.boxFilter(s, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-                       for s in np.moveaxis(sums, -1, 0)])  # fmt: skip
-    counted, n = pooled[0] >= _LEAST_RETURNS, np.maximum(pooled[0], 1.0)
-    rough = np.sqrt(np.maximum(pooled[2] / n - (pooled[1] / n) ** 2, 1e-8))
+    sums = _sums(scene, _flat_ones(scene), corner, shape)
+    counted, rough = _roughness(sums)
     road = _cells_with(scene, classes.ROAD, corner, shape) & counted
-    if not road.any():
+    even = road_roughness_m(scene, rough, road)
+    if even is None:
         return PIECE_SCHEMA.empty_table()
-    ratio = rough / float(np.median(rough[road]))
+    ratio = rough / even
     chosen = (counted & (ratio >= options.rough_ratio)).astype(np.uint8)
     walls = _cells_with(scene, classes.BUILDING, corner, shape).view(np.uint8)
     chosen[cv2.dilate(walls, _POOLED, iterations=2) > 0] = 0
@@ -86,14 +84,46 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
     return _table(scene, grown & edge, ratio / options.rough_ratio, corner)
 
 
-def _sums(scene: Scene, corner: Float64, shape: tuple[int, int]) -> Float64:
-    returns = scene.returns
+def roughness_of_road_m(scene: Scene) -> float | None:
+    """Returns the median scatter of the road's heights in pooled cells of a scene (m); None where it has no road."""
+    box = scene.extent
+    corner = np.array([box.x_min_m, box.y_min_m])
+    shape = round((box.y_max_m - box.y_min_m) / CELL_M), round((box.x_max_m - box.x_min_m) / CELL_M)
+    counted, rough = _roughness(_sums(scene, _low_ones(scene), corner, shape))
+    return road_roughness_m(scene, rough, _cells_with(scene, classes.ROAD, corner, shape) & counted)
+
+
+def road_roughness_m(scene: Scene, rough_m: Float64, road: Bools) -> float | None:
+    """Returns the scatter of the heights of the survey's road (m), from cells (rows, columns) where it is not known."""
+    return scene.statistics.of("road_roughness_m", 0.5, lambda: rough_m[road])
+
+
+def _roughness(sums: Float64) -> tuple[Bools, Float64]:
+    """Returns which cells (rows, columns) have enough returns around them, and how these scatter (m)."""
+    pooled = [cv2.boxFilter(s, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+              for s in np.moveaxis(sums[..., :3], -1, 0)]  # fmt: skip
+    n = np.maximum(pooled[0], 1.0)
+    return pooled[0] >= _LEAST_RETURNS, np.sqrt(np.maximum(pooled[2] / n - (pooled[1] / n) ** 2, 1e-8))
+
+
+def _low_ones(scene: Scene) -> Bools:
+    """Returns a mask (n,) of the returns that are plants or ground."""
     low = np.zeros(256, np.bool_)
     low[list(_LOW)] = True
-    counted = low[scene.classes]
+    return np.asarray(low[scene.classes])
+
+
+def _flat_ones(scene: Scene) -> Bools:
+    """Returns a mask (n,) of those that lie on no long upright surface."""
+    counted = _low_ones(scene)
     for panel in panels_of(scene):
         if float(np.hypot(*np.diff(panel.xy_m, axis=0).T).sum()) > _LONG_M:
             counted[panel.rows] = False
+    return counted
+
+
+def _sums(scene: Scene, counted: Bools, corner: Float64, shape: tuple[int, int]) -> Float64:
+    returns = scene.returns
     sums = np.zeros((*shape, 4))
     limits = np.array(_LOW_M)
     low_moments(

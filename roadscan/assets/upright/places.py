@@ -68,6 +68,9 @@ def places_of(scene: Scene) -> Places:
 
 @once_a_scene
 def ground_light(scene: Scene) -> float:
-    """Returns the median intensity of the ground; infinite where there is none."""
+    """Returns the median intensity of the ground of the survey; infinite where there is none."""
+    light = scene.statistics.known("ground_light")
+    if light is not None:
+        return light
     ground = (scene.classes == classes.GROUND) | (scene.classes == classes.ROAD)
     return float(np.median(scene.returns.intensity[ground])) if ground.any() else float("inf")

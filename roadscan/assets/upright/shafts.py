@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.kernels.shafts import longest_run, near_axis, widths_of_levels
 from roadscan.assets.kernels.slices import slices_above_one_another
 from roadscan.assets.memory import once_a_scene
-from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.axis import Axis, fit_axis
 from roadscan.assets.upright.slices import CELL_M, LOWEST_M, SLICE_M, Slices, around, slices_of
@@ -32,6 +32,8 @@ _HIGHEST_FOOT_M: Final = 2.0
 _FOOT_SLICES: Final = round((_HIGHEST_FOOT_M - LOWEST_M) / SLICE_M) + 1  # Slices in which the foot of a shaft may lie.
 _MOST_FITTED: Final = 3000  # Returns used for the axis, at most.
 _RING_M: Final = 0.6  # Outer radius of the ring that must be free (m).
+_AROUND_TILE_M: Final = 6.0
+"""Shafts farther from the tile (m) are not measured: no crown, arm or plate of it reaches them."""
 ALONE_M: Final = 0.6  # Radius of the space about a shaft (m).
 _LEAST_ALONE: Final = 0.25
 """Least share of the returns around that belong to a shaft: clumps of leaves and pieces of façades have less."""
@@ -66,7 +68,7 @@ class Shaft:
 
 @once_a_scene
 def shafts_of(scene: Scene) -> list[Shaft]:
-    """Returns all shafts of a scene with its halo, those with most slices first."""
+    """Returns all shafts in and near a scene's tile, those with most slices first."""
     slices = slices_of(scene)
     if slices.level.size == 0:
         return []
@@ -84,6 +86,8 @@ def shafts_of(scene: Scene) -> list[Shaft]:
         if members.size == 0:
             continue
         used[members] = True
+        if not _reads(scene, slices, members):
+            continue
         if LOWEST_M + SLICE_M * float(slices.level[members].min()) > _HIGHEST_FOOT_M:
             continue
         rows = np.sort(np.concatenate([order[starts[m] : starts[m + 1]] for m in members.tolist()]))
@@ -93,14 +97,25 @@ def shafts_of(scene: Scene) -> list[Shaft]:
     return [shaft for shaft in found if shaft is not None]
 
 
+def _reads(scene: Scene, slices: Slices, members: Int64) -> bool:
+    """Returns whether what stands in the tile may be judged by a shaft."""
+    return scene.tile.comes_near(np.column_stack([slices.x_m[members], slices.y_m[members]]), _AROUND_TILE_M)
+
+
 def _alone(slices: Slices, members: Int64, returns: int) -> float:
     """Returns the share of the returns about some components, in their slices, that belong to them."""
     levels = np.unique(slices.level[members])
     x, y = float(np.median(slices.x_m[members])), float(np.median(slices.y_m[members]))
     near = around(slices, x, y, ALONE_M)[levels]
-    dy, dx = np.indices(near.shape[1:]) - np.array(near.shape[1:])[:, None, None] // 2
-    inside = np.hypot(dx, dy) * CELL_M <= ALONE_M
+    inside = _disc(*near.shape[1:])
     return min(returns / max(int(near[:, inside].sum(dtype=np.int64)), 1), 1.0)
+
+
+@functools.cache
+def _disc(rows: int, columns: int) -> npt.NDArray[np.bool_]:
+    """Returns a mask (rows, columns) of the cells within the space about the middle one."""
+    dy, dx = np.indices((rows, columns)) - np.array([rows, columns])[:, None, None] // 2
+    return np.asarray(np.hypot(dx, dy) * CELL_M <= ALONE_M)
 
 
 class _Neighbours:
@@ -141,35 +156,11 @@ def _scores(slices: Slices) -> Int64:
 def _members(slices: Slices, near: Int64, seed: int, used: npt.NDArray[np.bool_]) -> Int64:
     """Components of a shaft about a seed: near a straight axis, in slices without long gaps; none if too few."""
     near = near[~used[near]]
-    x, y, level = slices.x_m[near], slices.y_m[near], slices.level[near].astype(np.float64)
-    ax, ay, bx, by = float(slices.x_m[seed]), float(slices.y_m[seed]), 0.0, 0.0
-    kept = np.ones(near.size, np.bool_)
-    for reach in (0.3, 0.2, 0.15):
-        own = level[kept]
-        middle = float(np.add.reduce(own) / own.size) if own.size else 0.0
-        if len(set(own.tolist())) >= 4:
-            bx, by = (_slope(own - middle, v[kept]) for v in (x, y))
-            bx, by = (min(max(b, -_MOST_LEAN * SLICE_M), _MOST_LEAN * SLICE_M) for b in (bx, by))
-        ax, ay = median(x[kept] - bx * (own - middle)), median(y[kept] - by * (own - middle))
-        kept = np.hypot(x - ax - bx * (level - middle), y - ay - by * (level - middle)) <= reach
-        if not kept.any():
-            return near[:0]
-    members = near[kept]
-    members = members[_longest_run(slices.level[members])]
-    return members if len(set(slices.level[members].tolist())) >= _LEAST_SLICES else members[:0]
-
-
-def _slope(t: Float64, v: Float64) -> float:
-    return float(np.add.reduce(t * (v - np.add.reduce(v) / v.size)) / max(float(np.add.reduce(t * t)), 1e-9))
-
-
-def _longest_run(level: Int64) -> npt.NDArray[np.bool_]:
-    """Returns a mask of the run of levels with the most members, gaps within limits; the lower run where equal."""
-    distinct = sorted(set(level.tolist()))
-    breaks = [k for k in range(1, len(distinct)) if distinct[k] - distinct[k - 1] > _GAP_SLICES + 1]
-    runs = [(first, end) for first, end in pairwise([0, *breaks, len(distinct)])]
-    first, end = max(runs, key=lambda run: run[1] - run[0])
-    return np.asarray((level >= distinct[first]) & (level <= distinct[end - 1]))
+    kept = np.empty(near.size, np.bool_)
+    place = float(slices.x_m[seed]), float(slices.y_m[seed])
+    near_axis(slices.x_m[near], slices.y_m[near], slices.level[near], place, _MOST_LEAN * SLICE_M, kept)
+    longest_run(slices.level[near], _GAP_SLICES + 1, _LEAST_SLICES, kept)
+    return near[kept]
 
 
 def _measured(scene: Scene, slices: Slices, members: Int64, rows: Int64, alone: float) -> Shaft | None:
@@ -198,10 +189,7 @@ def _narrow(xyh: Float64) -> npt.NDArray[np.bool_]:
     level = np.floor(xyh[:, 2] / SLICE_M).astype(np.int64)
     level -= int(level.min())
     widths = np.full(int(level.max()) + 1, np.nan)
-    for k in np.unique(level).tolist():
-        one = xyh[level == k, :2]
-        if len(one) >= 4:
-            widths[k] = float(np.hypot(*np.ptp(np.quantile(one, [0.05, 0.95], axis=0), axis=0)))
+    widths_of_levels(xyh, level, 4, (0.05, 0.95), widths)
     if np.isfinite(widths).sum() < 3:
         return np.ones(len(xyh), np.bool_)
     limit = 1.4 * float(np.nanquantile(widths, 0.3)) + 0.06
@@ -214,12 +202,17 @@ def _space(slices: Slices, axis: Axis, levels: Int64, foot: tuple[Float64, Float
     near = around(slices, axis.x_m, axis.y_m, 1.0)
     if near.shape[1] < 21 or near.shape[2] < 21:
         near = np.zeros((near.shape[0], 21, 21), near.dtype)
-    dy, dx = np.mgrid[-10:11, -10:11] * CELL_M
-    away = np.hypot(dx, dy)
+    away, sector = _surroundings()
     inner = axis.radius_m + 0.16
     ring = (away > inner) & (away <= max(_RING_M, inner + 0.25))
     free = float(np.mean((near[levels][:, ring] > 0).sum(axis=1) == 0))
-    sector = (np.floor(np.arctan2(dy, dx) / (np.pi / 4)).astype(int) + 8) % 8
     top = near[int(levels[-1]) - 2 : int(levels[-1]) + 8].sum(axis=0)
     held = [bool((top[(sector == s) & (away > inner) & (away <= 0.7)] > 0).any()) for s in range(8)]
     return free, float(np.mean(held))
+
+
+@functools.cache
+def _surroundings() -> tuple[Float64, Int64]:
+    """Returns the distance (21, 21) of cells from the middle one (m), up to a metre, and their direction of eight."""
+    dy, dx = np.mgrid[-10:11, -10:11] * CELL_M
+    return np.hypot(dx, dy), (np.floor(np.arctan2(dy, dx) / (np.pi / 4)).astype(np.int64) + 8) % 8

@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from roadscan.assets.ground.settings import GroundSettings
+from roadscan.assets.kind import asset_kinds
+from roadscan.assets.make_scene import CLASSES_REACH_M
 from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.along_roads import along_roads
 from roadscan.assets.tasks.load_returns import _Columns, in_order
 from roadscan.assets.tasks.objects import clustered
-from roadscan.assets.tiling import AssetGrid
+from roadscan.assets.tasks.plan import halos_of
+from roadscan.assets.tiling import AssetGrid, Halos
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.tasks.lines import Roads
 from roadscan.core.crs import MapFrame
+from roadscan.core.errors import ConfigError
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.rig import Mounting, Mountings
@@ -21,15 +26,39 @@ from roadscan.georeference.sensor_places import sensor_places
 from roadscan.poses.trajectory import Trajectory
 
 
-def test_squares_are_whole_tiles() -> None:
-    assert AssetsConfig().edge_m(10.0) == 40.0
-    assert AssetsConfig().edge_m(7.0) == 42.0
-    assert AssetsConfig().edge_m(50.0) == 50.0
-    grid = AssetGrid(TileGrid(10.0, 0.1), 4, 8.0)
+def grid_of(per_edge: int) -> AssetGrid:
+    return AssetGrid(TileGrid(10.0, 0.1), per_edge, Halos(14.0, 22.0, 68.0))
+
+
+def test_squares_are_whole_tiles_and_look_as_far_as_their_halos() -> None:
+    grid = grid_of(4)
     assert grid.of_tile(TileId(-1, 7)) == TileId(-1, 1)
-    under = grid.tiles_under(TileId(0, 0))
-    assert (under[0], under[-1], len(under)) == (TileId(-1, -1), TileId(4, 4), 36)
-    assert grid.window_box == (-8.0, -8.0, 48.0, 48.0)
+    assert grid.own_box(TileId(1, 0)) == (40.0, 0.0, 80.0, 40.0)
+    assert grid.scene_box(TileId(1, 0)) == (24.0, -15.0, 96.0, 54.0)
+    assert grid.classes_box(TileId(1, 0)) == (18.0, -24.0, 102.0, 63.0)
+    assert grid.ground_box(TileId(1, 0)) == (-48.0, -72.0, 168.0, 120.0)
+    under = grid.tiles_under(TileId(1, 0))
+    assert (under[0], under[-1]) == (TileId(-5, -8), TileId(16, 11))
+
+
+def test_a_place_has_the_same_coordinates_in_squares_of_any_edge() -> None:
+    tile = TileId(23, -150)
+    origins = {grid.origin_m(grid.of_tile(tile)) for grid in map(grid_of, (4, 6, 8, 12))}
+    assert origins == {(0.0, -1920.0)}
+    for grid in map(grid_of, (4, 6, 8, 12)):
+        assert grid.own_box(grid.of_tile(tile)).holds(235.0, 1920.0 - 1495.0)
+
+
+def test_halos_follow_from_what_reads_them() -> None:
+    halos = halos_of(AssetsConfig())
+    kinds = asset_kinds().values()
+    assert halos.scene_m == max(kind.reach_m for kind in kinds) >= 14.0
+    assert halos.classes_m == halos.scene_m + CLASSES_REACH_M
+    assert halos.ground_m >= halos.classes_m + 2.0 * GroundSettings().largest_object_m
+    wider = AssetsConfig.parse({"ground": {"largest_object_m": 30.0}})
+    assert halos_of(wider).ground_m == halos.ground_m + 24.0
+    with pytest.raises(ConfigError, match="remove this line"):
+        AssetsConfig.parse({"halo_m": 8.0})
 
 
 def test_squares_that_touch_are_one_cluster() -> None:

@@ -1,0 +1,76 @@
+"""Squares of any size give the same assets: what a run wrote of the labelled street, with only the cut changed."""
+
+from __future__ import annotations
+
+import tarfile
+from pathlib import Path
+
+import geopandas
+import laspy
+import numpy as np
+import pytest
+import shapely
+
+from roadscan.core.survey import Survey
+from roadscan.run.engine.compute import Inline
+from roadscan.run.session import Session
+from roadscan.run.stage import stage_named
+from roadscan.store.store import Store
+from roadscan.survey.run import run_stages
+from tests.surveys import changed
+from tests.viewer import recorded_street
+
+WHOLE_M = 200.0
+"""Four squares of this edge hold the street, each with all that it reads."""
+CLASSES_DIFFER = 5e-4
+"""Share of the returns whose class a cut may change: surfaces and tracks of any length end where a scene does."""
+POINTS = ("poles", "trees", "signals", "lighting", "delineators", "road_signs")
+AREAS = ("landscape_areas", "lane_lines", "road_markings")
+
+
+def street(source: Path, folder: Path) -> Path:
+    """The survey file of the recorded sweeps, without their pictures."""
+    (folder / "poses.csv").write_bytes((source / "poses.csv").read_bytes())
+    with tarfile.open(source / "sweeps.tar.xz") as archive:
+        archive.extractall(folder / "sweeps", filter="data")
+    rows = [line.split(",")[:2] for line in (source / "poses.csv").read_text().splitlines()[1:]]
+    held = [(f, s) for f, s in rows if (folder / f"sweeps/velodyne_points/data/{int(f):010d}.bin").is_file()]
+    (folder / "stamps.csv").write_text("frame,unix_utc_s\n" + "".join(f"{f},{s}\n" for f, s in held))
+    (folder / "rig.toml").write_text(recorded_street.rig_text())
+    text, _, _ = recorded_street.SURVEY.rpartition("[[runs.logs]]")
+    (folder / "SURVEY.toml").write_text(text + "[assets]\n")
+    return folder / "SURVEY.toml"
+
+
+def cut(file: Path, tile_m: float) -> tuple[np.ndarray, dict[str, geopandas.GeoDataFrame]]:
+    """Place (mm) and class of all returns, and objects by table, as a run with squares of this edge writes them."""
+    survey = changed(Survey.load(file), {"assets__tile_m": tile_m})
+    store = Store(str(file.parent / f"store{tile_m:g}"), survey.config.id)
+    run_stages(Session(survey, store, Inline()), [stage_named(n) for n in ("ingest", "footprints", "assets")])
+    read = [laspy.read(store.path(path)) for path in store.files("products/classified_points")]
+    rows = [np.column_stack([*(np.rint(1e3 * np.asarray(v)) for v in (r.x, r.y, r.z)), r.classification]) for r in read]
+    joined = np.concatenate(rows).astype(np.int64)
+    tables = {Path(p).stem: p for p in store.files("products/assets") if p.endswith(".parquet")}
+    return joined[np.lexsort(joined.T[::-1])], {n: geopandas.read_parquet(store.path(p)) for n, p in tables.items()}
+
+
+def twins(one: geopandas.GeoDataFrame, other: geopandas.GeoDataFrame) -> int:
+    """How many objects of a table the other one has within 1 mm."""
+    away = [min((shapely.hausdorff_distance(g, h) for h in other.geometry), default=9.0) for g in one.geometry]
+    return int(np.count_nonzero(np.array(away) <= 1e-3))
+
+
+@pytest.mark.nightly
+def test_squares_of_any_edge_find_the_same_on_the_labelled_street(recordings: Path, tmp_path: Path) -> None:
+    file = street(recordings / "semantic_kitti_00", tmp_path)
+    whole, objects = cut(file, WHOLE_M)
+    for tile_m in (40.0, 60.0, 80.0, 120.0):
+        classes, found = cut(file, tile_m)
+        np.testing.assert_array_equal(classes[:, :3], whole[:, :3])
+        assert np.mean(classes[:, 3] != whole[:, 3]) <= CLASSES_DIFFER, tile_m
+        for table in AREAS:
+            assert len(found[table]) == len(objects[table]) == twins(objects[table], found[table]), (tile_m, table)
+        for table in POINTS:
+            one, other = objects[table], found[table]
+            assert len(one) - twins(one, other) <= 1 + 0.2 * len(one), (tile_m, table)
+            assert abs(len(one) - len(other)) <= 2, (tile_m, table)

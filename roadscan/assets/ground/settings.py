@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 from pydantic import Field
 
 from roadscan.core.strict import Strict
+
+_LARGEST_HOLE_M: Final = 10.0
+"""Across holes that reach farther from seen ground (m), heights depend little on ground that lies farther away."""
 
 
 class GroundSettings(Strict):
@@ -23,3 +26,12 @@ class GroundSettings(Strict):
     """Greatest half-width of an object that stands on the ground (m)."""
     reach_m: float = Field(default=10.0, ge=0.0, le=1000.0)
     """How far from ground that was seen its height is interpolated; beyond, it is not known (m)."""
+
+    @property
+    def depends_on_m(self) -> float:
+        """Returns how far away a return can change the ground at a place (m).
+
+        An opening looks at disks that hold the place, and at all of each: twice the half-width of the largest object.
+        The height of a hole depends on ground that was seen around it.
+        """
+        return 2.0 * self.largest_object_m + min(self.reach_m, _LARGEST_HOLE_M)

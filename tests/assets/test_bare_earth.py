@@ -17,24 +17,18 @@ from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.ground.surface import Place, is_dense
 from roadscan.assets.ground.undersides import undersides
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
 from roadscan.simulate import Scene as Street
+from tests.assets.airborne import airborne
 from tests.assets.edges.streets import returns_of
 from tests.assets.isprs import SAMPLES, isprs_sample
+from tests.assets.isprs_run import classified
 from tests.assets.scenes import GROUND_LABELS, NOT_JUDGED, semantic_kitti_returns, semantic_kitti_scene
 from tests.assets.streets import street
 
 NO_DRIVE = np.zeros((0, 4))
-
-
-def airborne(points: np.ndarray) -> Returns:
-    """Points (n, 3) as returns of a sensor that stood nowhere known."""
-    n = len(points)
-    none, ones = np.full(n, np.nan), np.ones(n, np.uint8)
-    x, y, z = (np.ascontiguousarray(c) for c in points.T)
-    light, epoch, laser = np.zeros(n, np.float32), np.zeros(n, np.int64), np.zeros(n, np.uint16)
-    return Returns((0.0, 0.0), x, y, z, light, epoch, laser, ones, laser, ones, ones, none, none, none)
+HALO = f"halo_m = {GroundSettings().depends_on_m}\n"
+"""Squares look as far as the filter does."""
 
 
 def total_errors(recordings: Path, method: str) -> dict[str, float]:
@@ -50,10 +44,65 @@ def total_errors(recordings: Path, method: str) -> dict[str, float]:
 
 
 def test_airborne_samples_of_the_filter_test(recordings: Path) -> None:
-    # A plain simple morphological filter has 4.1 % in the mean and 9.0 % on sample 11.
+    # A plain simple morphological filter has 4.0 % in the mean, each sample left out of the choice of its setting.
     wrong = total_errors(recordings, "morphological")
-    assert np.mean(list(wrong.values())) <= 3.9
-    assert wrong["11"] <= 8.5
+    assert np.mean(list(wrong.values())) <= 3.7
+    assert max(wrong.values()) <= 8.5
+
+
+def test_squares_with_the_halo_of_the_filter_find_what_the_whole_sample_does(recordings: Path) -> None:
+    points, on_ground = isprs_sample(recordings, "41")
+    x, y = points[:, :2].T
+    settings = GroundSettings()
+    reach, edge = settings.depends_on_m, 40.0
+    found = np.zeros(len(points), np.bool_)
+    for east in np.arange(-17.0, x.max(), edge):
+        for north in np.arange(-11.0, y.max(), edge):
+            own = Box(east, north, east + edge, north + edge).holds(x, y)
+            window = Box(east - reach, north - reach, east + edge + reach, north + edge + reach)
+            near = window.holds(x, y)
+            found[own] = ground_returns(Place(airborne(points[near]), window, settings)).on_ground[own[near]]
+    whole = Box(0.0, 0.0, np.floor(x.max()) + 1.0, np.floor(y.max()) + 1.0)
+    at_once = ground_returns(Place(airborne(points), whole, settings)).on_ground
+    assert np.mean(found != at_once) <= 0.01  # with a halo of 8 m: 0.07
+    assert np.mean(found != on_ground) <= 0.035
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(7200)
+def test_the_samples_through_the_command_line(recordings: Path, tmp_path: Path) -> None:
+    wrong = []
+    for sample in SAMPLES:
+        points, on_ground = isprs_sample(recordings, sample)
+        folder = tmp_path / sample
+        folder.mkdir()
+        found = np.isin(classified(points, folder, HALO), (classes.GROUND, classes.ROAD))
+        wrong.append(100.0 * float(np.mean(found != on_ground)))
+    assert np.mean(wrong) <= 3.7
+
+
+def terraces(draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3), one a square metre, on four terraces of 30 m by 4 m with houses, a hedge and a bridge over a cut,
+    and which of them lie on the ground.
+    """
+    x, y = draw.uniform(0.0, 120.0, (2, 14_400))
+    ground = 4.0 * np.floor(x / 30.0) + 0.05 * y
+    cut = np.abs(y - 60.0) < 8.0
+    ground[cut] -= 6.0
+    above = np.zeros(x.size)
+    for east, north in ((8.0, 20.0), (40.0, 90.0), (69.0, 25.0), (98.0, 95.0)):
+        above[(np.abs(x - east - 6.0) < 6.0) & (np.abs(y - north) < 8.0)] = 6.0
+    above[(np.abs(y - 40.0) < 0.8) & (x > 62.0)] = 1.5
+    deck = cut & (np.abs(x - 75.0) < 3.0)
+    above[deck] = 6.0
+    return np.column_stack([x, y, ground + above + draw.normal(0.0, 0.05, x.size)]), above == 0.0
+
+
+def test_terraces_are_ground_and_houses_on_them_and_a_bridge_are_not() -> None:
+    points, on_ground = terraces(np.random.default_rng(37))
+    found = ground_returns(Place(airborne(points), Box(0.0, 0.0, 120.0, 120.0), GroundSettings())).on_ground
+    assert np.mean(found[on_ground]) >= 0.977  # without the crests of breaks: 0.974
+    assert np.mean(found[~on_ground]) <= 0.05
 
 
 def iou(found: np.ndarray, true: np.ndarray, labels: np.ndarray) -> float:
@@ -64,7 +113,7 @@ def iou(found: np.ndarray, true: np.ndarray, labels: np.ndarray) -> float:
 def test_a_street_labelled_by_hand() -> None:
     scene, labels = semantic_kitti_scene()
     ground = np.isin(scene.classes, (classes.GROUND, classes.ROAD))
-    assert iou(ground, np.isin(labels, GROUND_LABELS), labels) >= 0.93
+    assert iou(ground, np.isin(labels, GROUND_LABELS), labels) >= 0.965
     for label in (40, 48):
         assert ground[labels == label].mean() >= 0.99
     assert np.isin(labels[scene.classes == classes.ROAD], (40, 44, 60)).mean() >= 0.99

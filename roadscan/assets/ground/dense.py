@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from roadscan.assets.ground.filling import filled
 from roadscan.assets.ground.grid import Grid, grid_over
-from roadscan.assets.ground.morphological import bare_cells
+from roadscan.assets.ground.morphological import bare_cells, without_pits
 from roadscan.assets.ground.surface import Found, Place, Surface
 from roadscan.assets.ground.undersides import undersides
 from roadscan.assets.kernels.ground_cells import on_ground, scatter
@@ -29,6 +29,9 @@ _NEAR_M, _CLOSE_M = (-0.25, 0.40), 0.20
 _ROUGH_M, _EVEN_M, _REACH_M = 0.03, 0.02, 0.03
 """Beyond the noise of the data: scatter from which a place is rough, up to which a cell is even, and how far a return
 may lie from an even cell's height."""
+_UPRIGHT: Final = 2.0
+"""A cell that scatters by so many times the limit is rough whatever is around it: the foot of a hedge or a wall, of
+which one face is seen. A kerb of 120 mm through the middle of a cell scatters by 60 mm."""
 _NOISIEST_M: Final = 0.04
 """Noise of the data is no more than this (m)."""
 _AROUND: Final = 5
@@ -59,7 +62,8 @@ def dense_ground(place: Place) -> Found:
     grid = grid_over(place.window, LOWEST_CELL_M)
     lowest = np.full(grid.shape, np.inf, np.float32)
     lowest_returns(x, y, z, grid.origin, 1.0 / grid.cell_m, lowest)
-    known = bare_cells(lowest, grid.cell_m, _PIT_M, place.settings)
+    surface, known = without_pits(lowest, _PIT_M)
+    known &= bare_cells(surface, grid.cell_m, place.settings)
     base = Surface(grid, filled(lowest, known))
     below = undersides(returns, grid, lowest, base.height_m) & known
     if below.any():
@@ -87,6 +91,7 @@ def judged(sums: npt.NDArray[np.float64], statistics: Statistics) -> Cells:
     noise = statistics.of("ground_noise_m", 0.25, lambda: scattered[several])
     noise = min(noise or 0.0, _NOISIEST_M)
     rough = around(several & (scattered > _ROUGH_M + noise)) * 2 > around(several)
+    rough |= several & (scattered > _UPRIGHT * _ROUGH_M + noise)
     even = several & ~rough & (scattered <= _EVEN_M + noise) & (close > 0)
     height = np.full(count.shape, np.nan, np.float32)
     height[even] = close_total[even] / close[even]

@@ -63,8 +63,8 @@ def objects(surface: Float32, cell_m: float, steepest: float, largest_m: float) 
     return found[margin:-margin, margin:-margin]
 
 
-def bare_cells(lowest_m: Float32, cell_m: float, pit_m: float, settings: GroundSettings) -> Bools:
-    """Returns a mask (rows, columns) of the cells whose lowest return lies on the ground.
+def without_pits(lowest_m: Float32, pit_m: float) -> tuple[Float32, Bools]:
+    """Returns the whole surface of the lowest returns without those in pits, and a mask of the cells that it has.
 
     lowest_m : (rows, columns), inf where a cell has no return.
     pit_m : a lowest return is noise where it lies below the surface around by more.
@@ -75,4 +75,9 @@ def bare_cells(lowest_m: Float32, cell_m: float, pit_m: float, settings: GroundS
     if (pits & known).any():
         known &= ~pits
         surface = filled(lowest_m, known)
-    return known & ~objects(surface, cell_m, settings.steepest, settings.largest_object_m)
+    return surface, known
+
+
+def bare_cells(surface: Float32, cell_m: float, settings: GroundSettings) -> Bools:
+    """Returns a mask of the cells of a whole surface (rows, columns) that do not stand on the ground."""
+    return ~objects(surface, cell_m, settings.steepest, settings.largest_object_m)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Final
+import math
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.ground.breaks import with_crests
 from roadscan.assets.ground.filling import filled
 from roadscan.assets.ground.grid import grid_over
-from roadscan.assets.ground.morphological import bare_cells
+from roadscan.assets.ground.morphological import bare_cells, without_pits
 from roadscan.assets.ground.surface import Found, Place, Surface
 from roadscan.assets.kernels.ground_cells import cell_heights
 from roadscan.assets.kernels.heights import heights_above
 from roadscan.assets.kernels.lowest import lowest_returns
+from roadscan.assets.scene import Box
 from roadscan.core.extras import cv2
 
 Float32 = npt.NDArray[np.float32]
@@ -23,26 +26,58 @@ _PIT_M: Final = 8.0
 """A lowest return farther below its surroundings (m) is noise: gaps in crowns are no deeper."""
 _SMOOTH: Final = 0.7
 """Standard deviation (cells) of the Gaussian that smooths the ground before returns are compared with it."""
-_TOLERANCE_M, _TOLERANCE_SLOPE = 0.5, 1.25
-"""Tolerance of returns about the ground (m), and per slope (m) (section 2.4, table 3)."""
+_TOLERANCE_M: Final = 0.5
+"""Tolerance of returns about level ground (m) (Pingel, Clarke, McBride 2013, section 2.4, table 3)."""
 _CLOSE: Final = 0.5
-"""Share of that tolerance within which returns define the ground anew."""
+"""Share of the tolerance within which returns define the ground anew."""
 
 
-def sparse_ground(place: Place) -> Found:
-    """Returns a mask of returns near the surface of the cells that remain after opening.
+class SparseRules(NamedTuple):
+    """What `python -m benchmarks bare_earth` chose from the samples of the filter test."""
+
+    tolerance_slope_m: float = 1.5
+    """Tolerance of returns about the ground for each unit of its slope (m)."""
+    drop_m: float = 0.8
+    """Drop on both sides from which a crest is a bridge, a wall or a roof (m)."""
+
+
+RULES: Final = SparseRules()
+
+
+def sparse_ground(place: Place, rules: SparseRules = RULES) -> Found:
+    """Returns a mask of returns near the surface of the cells that remain after opening, with the crests of breaks.
 
     The surface of lowest returns leans to the lowest place of each cell, so it is made anew from the returns that lie
     close to it.
     """
     returns = place.returns
     x, y, z = returns.x_m, returns.y_m, returns.height_m
-    grid = grid_over(place.window, CELL_M)
+    grid = grid_over(seen_part(place), CELL_M)
     lowest = np.full(grid.shape, np.inf, np.float32)
     lowest_returns(x, y, z, grid.origin, 1.0 / grid.cell_m, lowest)
-    known = bare_cells(lowest, grid.cell_m, _PIT_M, place.settings)
-    first = near(place, smoothed(Surface(grid, filled(lowest, known))), _CLOSE)
-    return near(place, smoothed(remade(place, first)), 1.0)
+    surface, known = without_pits(lowest, _PIT_M)
+    known &= bare_cells(surface, grid.cell_m, place.settings)
+    first = near(place, smoothed(Surface(grid, filled(lowest, known))), rules, _CLOSE)
+    found = near(place, smoothed(remade(place, first)), rules, 1.0)
+    sure = found.on_ground & (np.abs(found.above_m) <= _TOLERANCE_M)
+    wider = with_crests(place, grid, surface, sure, rules.drop_m)
+    return found._replace(on_ground=found.on_ground | wider)
+
+
+def seen_part(place: Place) -> Box:
+    """Returns the cells of the window from the first that has a return to the last, in both directions.
+
+    Openings reflect the surface at its edges; where a window goes beyond the survey, these are the edges of the data.
+    """
+    window, returns = place.window, place.returns
+    if not len(returns):
+        return window
+    ends = []
+    for low, high, at in ((window.x_min_m, window.x_max_m, returns.x_m), (window.y_min_m, window.y_max_m, returns.y_m)):
+        first, last = (math.floor((at.min() - low) / CELL_M), math.floor((at.max() - low) / CELL_M) + 1)
+        ends.append((max(low + first * CELL_M, low), min(low + last * CELL_M, high)))
+    (x_min, x_max), (y_min, y_max) = ends
+    return Box(x_min, y_min, x_max, y_max)
 
 
 def smoothed(surface: Surface) -> Surface:
@@ -51,13 +86,13 @@ def smoothed(surface: Surface) -> Surface:
     return Surface(surface.grid, np.asarray(z))
 
 
-def near(place: Place, base: Surface, share: float) -> Found:
+def near(place: Place, base: Surface, rules: SparseRules, share: float) -> Found:
     """Returns a mask of returns near a surface: within a share of the tolerance."""
     x, y, z = place.returns.x_m, place.returns.y_m, place.returns.height_m
     grid = base.grid
     above, tolerance = np.empty(x.size, np.float32), np.empty(x.size, np.float32)
     heights_above(x, y, z, grid.origin, 1.0 / grid.cell_m, base.height_m, above)
-    limit = -(_TOLERANCE_M + _TOLERANCE_SLOPE * base.slope())
+    limit = -(_TOLERANCE_M + rules.tolerance_slope_m * base.slope()).astype(np.float32)
     heights_above(x, y, np.zeros(x.size), grid.origin, 1.0 / grid.cell_m, limit, tolerance)
     return Found(base, above, np.abs(above) <= np.float32(share) * tolerance)
 

@@ -195,6 +195,33 @@ def test_every_record_is_read_or_rejected(turned: Readings, drive: Path) -> None
     assert np.unique(turned["sweep"]).tolist() == list(range(0, 154, 3))
 
 
+def test_sweeps_tell_the_laser_of_each_return(turned: Readings) -> None:
+    """The lasers of an HDL-64E point 2° up to 24.8° down (its manual), from places 0.1 m apart: ± 1.2° at 5 m."""
+    middles = []
+    for number in range(0, 151, 30):
+        rows = sweep_of(turned, number)
+        x, y, z = positions(rows).T
+        laser, elevation = rows.column("laser").to_numpy(), np.degrees(np.arctan2(z, np.hypot(x, y)))
+        middles.append([np.median(elevation[laser == k]) for k in range(64)])
+    assert np.ptp(middles, axis=0).max() < 0.6
+    assert np.median(middles, axis=0)[[0, 63]] == pytest.approx([2.0, -24.8], abs=1.2)
+    # One sweep of this drive, its last, ends after 53 turns.
+    assert [one.witness for one in turned.findings] == ["kitti_lasers"]
+    assert turned.findings[0].text.startswith("1 sweeps, such as velodyne_points/data/0000000153.bin,")
+    assert set(sweep_of(turned, 153).column("laser").to_numpy()) == {0}
+
+
+@pytest.mark.witness("kitti_lasers")
+@pytest.mark.parametrize(("order", "told"), [(1, True), (-1, False)])
+def test_lasers_that_rise_get_no_number(tmp_path: Path, order: int, told: bool) -> None:
+    azimuth, down = np.radians(np.arange(0.5, 360.0, 2.0)), np.radians(np.linspace(-2.0, 24.0, 64))[::order]
+    flat = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    turns = [np.column_stack([20.0 * flat, np.full((180, 1), -20.0 * np.tan(a)), np.zeros((180, 1))]) for a in down]
+    log = read("kitti", log_folder(tmp_path, {0: np.concatenate(turns).astype("<f4").tobytes()}, STAMPS))
+    assert np.array_equal(log["laser"], np.repeat(np.arange(64), 180) if told else np.zeros(64 * 180))
+    assert bool(log.findings) is not told
+
+
 def test_labelled_boxes_hold_returns(turned: Readings, recordings: Path) -> None:
     """The recording's README: 98 % of boxes within 40 m hold more than 20 returns, median 334 (every 15th scan)."""
     boxes = np.genfromtxt(

@@ -2,8 +2,11 @@
 
 ``velodyne_points/data/NNNNNNNNNN.bin`` holds little-endian float32 x (forward), y (left), z (up) in
 metres and intensity 0–1, 16 bytes a return (Geiger et al. 2013, section 3). The axes are ``flu``; a
-record of 0, 0, 0 is no return. Intensity is scaled to 16 bits: 1.0 becomes 65,535. The rows carry no
-laser number.
+record of 0, 0, 0 is no return. Intensity is scaled to 16 bits: 1.0 becomes 65,535.
+
+Records carry no laser number, but an HDL-64E's file lists laser after laser, the uppermost first, each over a
+counter-clockwise turn that begins straight ahead. So the number of turns before a return is its laser. It is stated
+where the sweep bears it out: 64 turns, each lower than the one before. Other sweeps get laser 0.
 
 A sweep's stamp is the instant at which the head faces forward, the middle of a turn that begins and
 ends behind. KITTI raw sweeps are *not* compensated for motion during the turn. Measured on drive
@@ -35,6 +38,7 @@ from pydantic import Field
 from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
 from roadscan.core.strict import Strict
+from roadscan.core.witness import Finding, Witness
 from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import Sieve, options_of
@@ -44,11 +48,22 @@ _CHUNK_RETURNS: Final = 1 << 18  # returns of a chunk
 _FARTHEST_M: Final = 10_000.0  # farther positions count as damage
 _SHORTEST_TURN_S: Final = 0.01  # shorter turns are refused
 _LONGEST_TURN_S: Final = 1.0  # longer turns are refused
+_LASERS: Final = 64  # lasers of an HDL-64E
+_LEAST_TURN: Final = 8  # a run of fewer returns is a stray and no turn of a laser
+_SECTORS: Final = 36  # parts of a turn in which neighbouring lasers are compared: they meet the same things there
 _SWEEP: Final = re.compile(r"^\d{6,10}\.bin$")
 _CALENDAR: Final = re.compile(r"^(\d{4}-\d\d-\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?\s*$")
 _LARGEST_STAMPS_BYTES: Final = 256 << 20  # larger files of stamps are refused
 _MOST_DAYS: Final = 100_000  # 273 years: near the limit of int64 nanoseconds
 _LONGEST_LOG_NS: Final = 30 * 86_400 * NS_PER_S  # stamps farther than this from the middle one are unlikely
+
+LASERS: Final = Witness(
+    "kitti_lasers", "lidar",
+    fault="sweeps are not listed laser after laser, so that the number of a laser does not follow from the order",
+    asks="the number of turns in a sweep, and whether each lies lower than the one before",
+    does="gives the returns of such sweeps laser 0: their intensities share one gain",
+    told=("findings",),
+)  # fmt: skip
 
 
 class KittiOptions(Strict):
@@ -121,13 +136,21 @@ class Kitti(LogFormat):
         epochs = _stamps(source, options)
         period_ns = float(header.attributes.get("period_ns", 0.0))
         turn_ns = period_ns if options.rotation == "counterclockwise" else -period_ns
+        without: list[str] = []
         for file in sorted(_sweeps(source.path)):
             name = file.relative_to(source.path).as_posix()
             sweep = _Sweep(file, name, int(file.stem))
             if sweep.number not in epochs:
                 yield Reject("the sweep has no stamp", 0, 0, max(1, file.stat().st_size // RECORD_BYTES), name)
                 continue
-            yield from sweep.items(epochs[sweep.number], turn_ns)
+            laser = sweep.lasers()
+            without += [name] if laser is None else []
+            yield from sweep.items(epochs[sweep.number], turn_ns, laser)
+        if without:
+            yield LASERS.finds(
+                "", f"{len(without)} sweeps, such as {without[0]}, are not listed laser after laser as those of an "
+                f"HDL-64E ({_LASERS} turns, each lower than the one before); their returns have no laser number.",
+            )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -136,18 +159,30 @@ class _Sweep:
     name: str
     number: int
 
-    def items(self, stamp_gps_ns: int, turn_ns: float) -> Iterator[Item]:
+    def lasers(self) -> npt.NDArray[np.uint8] | None:
+        """Return the laser (n,) of each record; None where the order of the records does not tell it."""
+        whole = self.file.stat().st_size // RECORD_BYTES
+        if whole > _CHUNK_RETURNS:  # twice what an HDL-64E sees in a turn
+            return None
+        xyz = np.fromfile(self.file, "<f4", 4 * whole).reshape(-1, 4)
+        return lasers_of(xyz[:, :3], _sieve(xyz).good)
+
+    def items(self, stamp_gps_ns: int, turn_ns: float, laser: npt.NDArray[np.uint8] | None) -> Iterator[Item]:
         """Yield rows and rejects; `turn_ns` is the signed duration of a counter-clockwise turn, 0 if compensated."""
         size = self.file.stat().st_size
         whole = size // RECORD_BYTES
         for first in range(0, whole, _CHUNK_RETURNS):
             count = min(_CHUNK_RETURNS, whole - first)
             xyzi = np.fromfile(self.file, "<f4", 4 * count, offset=first * RECORD_BYTES)
-            yield from self._chunk(xyzi.reshape(-1, 4), stamp_gps_ns, turn_ns, first)
+            own = np.zeros(count, np.uint8) if laser is None else laser[first : first + count]
+            yield from self._chunk(xyzi.reshape(-1, 4), stamp_gps_ns, turn_ns, first, own)
         if size % RECORD_BYTES:
             yield Reject("the record is cut off", whole, whole * RECORD_BYTES, 1, self.name)
 
-    def _chunk(self, xyzi: npt.NDArray[np.float32], stamp_gps_ns: int, turn_ns: float, first: int) -> Iterator[Item]:
+    def _chunk(
+        self, xyzi: npt.NDArray[np.float32], stamp_gps_ns: int, turn_ns: float, first: int,
+        laser: npt.NDArray[np.uint8],
+    ) -> Iterator[Item]:  # fmt: skip
         sieve = _sieve(xyzi)
         records = first + np.arange(len(xyzi))
         for reject in sieve.rejects(records, records * RECORD_BYTES):
@@ -165,12 +200,40 @@ class _Sweep:
             epochs,
             (x, y, z),
             np.rint(intensity * np.float32(65_535)).astype(np.uint16),
-            np.zeros(len(kept), dtype=np.uint8),
+            laser[sieve.kept],
             np.full(len(kept), self.number, dtype=np.int32),
             pose_epochs,
         )
         start = int(records[np.argmax(sieve.good)])
         yield Rows("returns", batch, self.name, start, start * RECORD_BYTES, RECORD_BYTES)
+
+
+def lasers_of(xyz: npt.NDArray[np.float32], good: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8] | None:
+    """Return the laser (n,) of records that list laser after laser, 0 the uppermost; None where they do not.
+
+    xyz : (n, 3), x forward, y left, z up. good : (n,) mask of the records that are returns.
+    """
+    x, y, z = xyz[good].astype(np.float64).T
+    azimuth = np.arctan2(y, x) % (2 * np.pi)
+    steps = np.diff(azimuth, prepend=azimuth[:1])
+    # A beam that points straight ahead may come before and after the end of a turn: back over it is one turn less.
+    turn = np.cumsum(steps < -np.pi) - np.cumsum(steps > np.pi)
+    turn -= turn.min(initial=0)
+    size = np.bincount(turn)
+    if np.count_nonzero(size >= _LEAST_TURN) != _LASERS:
+        return None
+    laser = (np.cumsum(size >= _LEAST_TURN) - (size >= _LEAST_TURN))[turn].clip(max=_LASERS - 1)
+    elevation = np.arctan2(z, np.hypot(x, y))
+    sector = (azimuth * (_SECTORS / (2 * np.pi))).astype(np.int64).clip(max=_SECTORS - 1) + _SECTORS * laser
+    count = np.bincount(sector, minlength=_SECTORS * _LASERS).astype(np.float64)
+    count[count == 0.0] = np.nan
+    mean = (np.bincount(sector, elevation, minlength=count.size) / count).reshape(_LASERS, _SECTORS)
+    falls = -np.diff(mean, axis=0)
+    if not all(np.median(one[np.isfinite(one)]) > 0.0 if np.isfinite(one).any() else False for one in falls):
+        return None
+    out = np.zeros(len(xyz), np.uint8)
+    out[good] = laser
+    return out
 
 
 def _sieve(xyzi: npt.NDArray[np.float32]) -> Sieve:

@@ -30,7 +30,6 @@ class Curve(NamedTuple):
 
 
 CURVES: Final = {
-    "signs": Curve(0.36, 1.45),
     "shafts": Curve(1.15, 0.46),
     "trees": Curve(-0.29, 0.52),
     "surfaces": Curve(-0.07, 0.48),

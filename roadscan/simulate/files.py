@@ -21,8 +21,8 @@ from roadscan.simulate.scene import Camera, Mount, Scene
 from roadscan.simulate.sensors import sick
 from roadscan.simulate.sensors.gnss import antenna_mount
 from roadscan.simulate.sensors.imu import AT_BODY, head_imus
-from roadscan.simulate.sensors.lidar import beam_width_deg
 from roadscan.simulate.sensors.lens import Lens
+from roadscan.simulate.sensors.lidar import beam_width_deg
 from roadscan.simulate.sensors.profiler import Head, heads
 from roadscan.simulate.surface import Surface
 

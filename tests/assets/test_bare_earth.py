@@ -27,8 +27,6 @@ from tests.assets.scenes import GROUND_LABELS, NOT_JUDGED, semantic_kitti_return
 from tests.assets.streets import street
 
 NO_DRIVE = np.zeros((0, 4))
-HALO = f"halo_m = {GroundSettings().depends_on_m}\n"
-"""Squares look as far as the filter does."""
 
 
 def total_errors(recordings: Path, method: str) -> dict[str, float]:
@@ -76,7 +74,7 @@ def test_the_samples_through_the_command_line(recordings: Path, tmp_path: Path) 
         points, on_ground = isprs_sample(recordings, sample)
         folder = tmp_path / sample
         folder.mkdir()
-        found = np.isin(classified(points, folder, HALO), (classes.GROUND, classes.ROAD))
+        found = np.isin(classified(points, folder), (classes.GROUND, classes.ROAD))
         wrong.append(100.0 * float(np.mean(found != on_ground)))
     assert np.mean(wrong) <= 3.7
 

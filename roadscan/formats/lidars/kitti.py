@@ -222,7 +222,8 @@ def lasers_of(xyz: npt.NDArray[np.float32], good: npt.NDArray[np.bool_]) -> npt.
     size = np.bincount(turn)
     if np.count_nonzero(size >= _LEAST_TURN) != _LASERS:
         return None
-    laser = (np.cumsum(size >= _LEAST_TURN) - (size >= _LEAST_TURN))[turn].clip(max=_LASERS - 1)
+    listed: npt.NDArray[np.int64] = np.cumsum(size >= _LEAST_TURN)
+    laser = (listed - (size >= _LEAST_TURN))[turn].clip(max=_LASERS - 1)
     elevation = np.arctan2(z, np.hypot(x, y))
     sector = (azimuth * (_SECTORS / (2 * np.pi))).astype(np.int64).clip(max=_SECTORS - 1) + _SECTORS * laser
     count = np.bincount(sector, minlength=_SECTORS * _LASERS).astype(np.float64)

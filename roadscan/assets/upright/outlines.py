@@ -50,7 +50,7 @@ class Spot(NamedTuple):
     """1 σ of how far beyond a side the middle of a beam lies that the plate just stops (m)."""
 
 
-NO_SPOT: Final = Spot(0.0, 0.0)
+NO_SPOT: Final = Spot(0.0, 0.0)  # Beams are lines (m).
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import binned_statistic_2d
 
 from roadscan.assets.kernels import voxels
-from roadscan.assets.kernels.columns import columns, distinct, marked, slots, tops
+from roadscan.assets.kernels.columns import columns, distinct, marked, tops
 from roadscan.assets.kernels.filling import begin, halved, relax
 from roadscan.assets.kernels.ground_cells import cell_heights, on_ground, scatter
 from roadscan.assets.kernels.heights import heights_above
@@ -107,15 +107,12 @@ def test_holes_are_filled_from_the_means_of_two_by_two_and_relax_to_a_harmonic_s
     np.testing.assert_allclose(found, saddle, atol=1e-4)
 
 
-def test_slots_of_time_follow_one_another_without_the_pauses() -> None:
+def test_steps_of_time_that_differ_from_the_one_before() -> None:
     epoch = np.array([0, 10, 25, 1000, 1012, 5], np.int64)
     found = np.empty(10, np.int64)
     count = distinct(epoch, np.int64(10), found)
     assert found[:count].tolist() == [0, 1, 2, 100, 101, 0]
     assert distinct(epoch, np.int64(10), found[:2]) == 6
-    slot = np.empty(6, np.uint8)
-    slots(epoch, np.int64(10), np.unique(found[:6]), 2, slot)
-    assert slot.tolist() == [0, 0, 1, 1, 2, 0]
 
 
 def test_columns_and_their_tops() -> None:
@@ -123,12 +120,14 @@ def test_columns_and_their_tops() -> None:
     x = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 9.0])
     ground = np.array([True, False, False, False, False, False])
     levels = np.zeros((1, 1), np.uint32)
-    seen = np.zeros((3, 1, 1), np.uint64)
-    slot = np.array([0, 1, 1, 2, 3, 4], np.uint8)
+    seen = np.zeros((3, 1, 1, 2), np.uint64)
+    epoch = np.array([5, 10, 19, 20, 30, 40], np.int64) + 128 * 10 * 7  # two words of slots begin anew each 128
     band = np.array([0.4, 2.5, 4.4])
-    columns(x, np.full(6, 0.5), above, ground, slot, np.zeros(2), 1.0, 0.2, band, levels, seen)
+    columns(x, np.full(6, 0.5), above, ground, epoch, 10, np.zeros(2), 1.0, 0.2, band, levels, seen)
     assert int(levels[0, 0]) == (1 << 1) | (1 << 2) | (1 << 7) | (1 << 15)
-    assert seen[:, 0, 0].tolist() == [0b110, 0b1, 0b1000]
+    assert seen[:, 0, 0, 0].tolist() == [0b110, 0b1, 0b1000] and not seen[..., 1].any()
+    columns(x, np.full(6, 0.5), above, ground, epoch + 640, 10, np.zeros(2), 1.0, 0.2, band, levels, seen)
+    assert seen[:, 0, 0, 1].tolist() == [0b110, 0b1, 0b1000]
     top = np.empty((1, 1), np.int32)
     for first, start, gap, expected in [(1, 5, 2, 2), (1, 5, 4, 7), (1, 5, 7, 15), (3, 5, 2, -1), (3, 8, 2, 7)]:
         tops(levels, first, start, gap, top)

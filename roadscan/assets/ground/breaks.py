@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from roadscan.assets.bins import cells_of
 from roadscan.assets.ground.grid import Grid
+from roadscan.assets.ground.kernels.breaks import drops_on_both_sides, grow
 from roadscan.assets.ground.surface import Place
-from roadscan.assets.kernels.breaks import drops_on_both_sides, grow
 
 Bools = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]

@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.kernels.boosted_trees import tree_sums
+from roadscan.assets.judgement.kernels.boosted_trees import tree_sums
 from roadscan.core.errors import RoadscanError
 
 Float64 = npt.NDArray[np.float64]
@@ -32,7 +32,7 @@ _MOST_ODDS: Final = 9.2
 
 
 class Trees(NamedTuple):
-    """Nodes (m,) of all trees, as :func:`roadscan.assets.kernels.boosted_trees.tree_sums` reads them."""
+    """Nodes (m,) of all trees, as :func:`roadscan.assets.judgement.kernels.boosted_trees.tree_sums` reads them."""
 
     starts: npt.NDArray[np.int32]
     feature: npt.NDArray[np.int32]

@@ -9,11 +9,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.kernels.shafts import longest_run, near_axis, widths_of_levels
 from roadscan.assets.kernels.slices import slices_above_one_another
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.axis import Axis, fit_axis
+from roadscan.assets.upright.kernels.shafts import longest_run, near_axis, widths_of_levels
 from roadscan.assets.upright.slices import CELL_M, LOWEST_M, SLICE_M, Slices, around, slices_of
 
 Float64 = npt.NDArray[np.float64]

@@ -45,7 +45,8 @@ class Judged(NamedTuple):
 
     kind: str
     probability: float
-    is_right: bool
+    is_right: float
+    """1 or 0; of a line or an area its share that is right."""
 
 
 # --- what is true ------------------------------------------------------------------------------------
@@ -532,8 +533,11 @@ def ground_figures(street: Street) -> Iterator[Figure]:
 
 def calibration_error(objects: list[Judged], bins: int = 10) -> float:
     """Expected calibration error: mean distance of stated probability and share that is right, over even bins."""
-    stated = np.array([o.probability for o in objects])
-    right = np.array([o.is_right for o in objects])
+    return error_of_stated(np.array([o.probability for o in objects]), np.array([o.is_right for o in objects]), bins)
+
+
+def error_of_stated(stated: Float64, right: npt.NDArray[Any], bins: int = 10) -> float:
+    """The same of stated probabilities (n,) and what is right of each (n,)."""
     number = np.minimum((stated * bins).astype(int), bins - 1)
     bins_held = [number == b for b in np.unique(number)]
     return float(sum(abs(stated[b].mean() - right[b].mean()) * b.mean() for b in bins_held))

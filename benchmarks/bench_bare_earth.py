@@ -3,7 +3,7 @@
 Each method has a few settings. "Given" is the setting with the least mean total error of the ten samples. "Left out"
 scores each sample with the setting that is best on the other nine. A harder copy of each sample, whose returns were
 moved onto drawn terraces, is scored alone: it chooses nothing. Ours keeps slope and window of Pingel, Clarke, McBride
-(2013), who chose them from all fifteen samples of the test; its :class:`~roadscan.assets.ground.sparse.SparseRules` are
+(2013); its :class:`~roadscan.assets.ground.sparse.SparseRules` are
 what the ten choose. "All chosen" chooses slope and window too.
 """
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks import street_scores as scores
+from benchmarks.asset_scores import calibration_error
 from benchmarks.labelled_street import LabelledStreet, labelled_street, recording_folder
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
@@ -49,5 +50,5 @@ def of_street(name: str, street: LabelledStreet) -> Iterator[Figure]:
     fences = scores.iou_of_class(street, scores.FENCE, classes.FENCE)
     yield Figure(f"{name}: fences, IoU", fences, "", 0.4, "the bar")
     judged = scores.judged_objects(street)
-    error = scores.calibration_error(judged)
+    error = calibration_error(judged)
     yield Figure(f"{name}: calibration error of {len(judged)} objects", error, "", 0.08, "the bar")

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.optimize
 
+from benchmarks.asset_scores import error_of_stated
 from benchmarks.settings import bench_folder
 from roadscan.assets.judgement.judge import FOLDER
 
@@ -117,13 +118,11 @@ def platt(sums: Float64, true: npt.NDArray[np.bool_], weight: Float64) -> tuple[
 def _figures(odds: Float64, true: npt.NDArray[np.bool_]) -> dict[str, float]:
     stated = 1.0 / (1.0 + np.exp(-odds))
     found = stated >= 0.5
-    number = np.minimum((stated * 10).astype(int), 9)
-    error = sum(abs(stated[number == k].sum() - true[number == k].sum()) for k in range(10))
     return {
         "segments": len(true), "true": int(true.sum()),
         "recall": round(float((found & true).sum() / max(int(true.sum()), 1)), 4),
         "precision": round(float((found & true).sum() / max(int(found.sum()), 1)), 4),
-        "calibration error": round(float(error / max(len(true), 1)), 4),
+        "calibration error": round(error_of_stated(stated, true), 4),
     }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -34,8 +34,8 @@ RECORDING: Final = "semantic_kitti_00"
 _SAME_M: Final = 0.003
 """A point of a product is the return that lies so near (m): products round to 1 mm in each direction."""
 
-_SURVEY: Final = """
-id = "labelled_street"
+SURVEY: Final = """
+id = "semantic_kitti_00"
 rig = "rig.toml"
 store = "store"
 [map.local]
@@ -44,7 +44,6 @@ name = "Velodyne axes at sweep 0"
 cell_m = 0.2
 [adjust]
 on = false
-[assets]
 [[runs]]
 id = "drive"
 [[runs.logs]]
@@ -104,7 +103,7 @@ def laid_out(recording: Path, folder: Path, sweeps: Iterable[int]) -> Path:
     with (folder / "stamps.csv").open("w", newline="") as file:
         csv.writer(file).writerows([["frame", "unix_utc_s"], *stamps])
     (folder / "rig.toml").write_text(_RIG)
-    (folder / "SURVEY.toml").write_text(_SURVEY)
+    (folder / "SURVEY.toml").write_text(f"{SURVEY}[assets]\n")
     return folder / "SURVEY.toml"
 
 
@@ -140,7 +139,7 @@ def read_street(folder: Path) -> LabelledStreet:
     """The products in a folder that was run, with the labels of its returns."""
     survey = Survey.load(folder / "SURVEY.toml")
     store = Store(survey.store_url, survey.config.id)
-    places, labels = _labelled_returns(folder)
+    places, labels = (np.concatenate(parts) for parts in zip(*labelled_sweeps(folder), strict=True))
     clouds = sorted(Path(store.path("products/classified_points")).glob("*.laz"))
     read = [laspy.read(cloud) for cloud in clouds]
     points = np.concatenate([np.asarray(one.xyz) for one in read])
@@ -155,17 +154,15 @@ def read_street(folder: Path) -> LabelledStreet:
     return LabelledStreet(folder, places, labels, points, found.astype(np.uint8), own, tables)
 
 
-def _labelled_returns(folder: Path) -> tuple[Float64, npt.NDArray[np.uint8]]:
-    """All returns (n, 3) of the sweeps in a folder in the frame of sweep 0, and their labels (n,)."""
+def labelled_sweeps(folder: Path) -> Iterator[tuple[Float64, npt.NDArray[np.uint8]]]:
+    """Returns (n, 3) of each sweep in a folder in the frame of sweep 0, and their labels (n,)."""
     table = np.loadtxt(folder / "poses.csv", delimiter=",", skiprows=1)
     poses = {int(row[0]): row[2:14].reshape(3, 4) for row in table}
-    places, labels = [], []
     for file in sorted((folder / "sweeps" / "velodyne_points" / "data").glob("*.bin")):
         pose = poses[int(file.stem)]
         sweep = np.fromfile(file, "<f4").reshape(-1, 4).astype(np.float64)
-        places.append(sweep[:, :3] @ pose[:, :3].T + pose[:, 3])
-        labels.append(np.fromfile(folder / "sweeps" / "labels" / f"{file.stem}.label", np.uint8))
-    return np.concatenate(places), np.concatenate(labels)
+        label = np.fromfile(folder / "sweeps" / "labels" / f"{file.stem}.label", np.uint8)
+        yield sweep[:, :3] @ pose[:, :3].T + pose[:, 3], label
 
 
 def recording_folder(name: str = RECORDING) -> Path:

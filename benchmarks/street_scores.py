@@ -15,6 +15,7 @@ import shapely
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from benchmarks.asset_scores import Judged
 from benchmarks.labelled_street import LabelledStreet
 from roadscan.assets import classes
 
@@ -42,7 +43,6 @@ _EDGE_NEAR_M: Final = 0.3
 _PAINT_CELL_M: Final = 0.1
 _PAINT_HALF_M: Final = 40.0
 """Paint is judged this far about the first pose (m)."""
-_BINS: Final = 10
 
 
 class Found(NamedTuple):
@@ -52,14 +52,6 @@ class Found(NamedTuple):
     precision: float
     wanted: int
     judged: int
-
-
-class Judged(NamedTuple):
-    """An object, its stated probability, and the share of it that is right."""
-
-    kind: str
-    probability: float
-    right: float
 
 
 def ground_iou(street: LabelledStreet) -> float:
@@ -81,25 +73,25 @@ def iou_of_class(street: LabelledStreet, label: int, *codes: int) -> float:
     return float((found & true).sum() / max(int((found | true).sum()), 1))
 
 
-def things(street: LabelledStreet, label: int, least: int | None = None) -> list[npt.NDArray[np.int64]]:
-    """Rows of the labelled returns of each thing with enough of them."""
-    rows = np.flatnonzero(street.labels == label)
+def things(places_m: Float64, labels: npt.NDArray[np.uint8], label: int) -> list[npt.NDArray[np.int64]]:
+    """Rows of the labelled returns (n, 3) of each thing with enough of them."""
+    rows = np.flatnonzero(labels == label)
     if not rows.size:
         return []
-    tree = cKDTree(street.places_m[rows])
+    tree = cKDTree(places_m[rows])
     near = tree.sparse_distance_matrix(tree, _CLUSTER_M, output_type="coo_matrix")
     _, number = connected_components(near, directed=False)
-    held = np.bincount(number) >= (LEAST[label] if least is None else least)
+    held = np.bincount(number) >= LEAST[label]
     return [rows[number == k] for k in np.flatnonzero(held)]
 
 
 def poles_and_trunks(street: LabelledStreet) -> Found:
     """Poles and trunks that have an object of their own, and objects that stand at one (or at a sign's post)."""
-    wanted = [_axis(street, rows) for label in (POLE, TRUNK) for rows in things(street, label)]
+    wanted = [_axis(street, rows) for label in (POLE, TRUNK) for rows in things(street.places_m, street.labels, label)]
     objects = street.objects(*UPRIGHT_KINDS)
     places = objects[["easting_m", "northing_m"]].to_numpy(float) if len(objects) else np.zeros((0, 2))
     found = sum(1 for _ in _pairs(np.array(wanted).reshape(-1, 2), places, _NEAR_M))
-    right = [one.right for one in judged_uprights(street)]
+    right = [one.is_right for one in judged_uprights(street)]
     return Found(found / max(len(wanted), 1), float(np.mean(right)) if right else 1.0, len(wanted), len(right))
 
 
@@ -109,7 +101,7 @@ def missed(street: LabelledStreet) -> list[tuple[str, float, float, int]]:
     places = objects[["easting_m", "northing_m"]].to_numpy(float)
     out = []
     for name, label in (("pole", POLE), ("trunk", TRUNK)):
-        rows = things(street, label)
+        rows = things(street.places_m, street.labels, label)
         axes = np.array([_axis(street, one) for one in rows]).reshape(-1, 2)
         held = {i for i, _ in _pairs(axes, places, _NEAR_M)}
         out += [(name, *axes[k].round(2), one.size) for k, one in enumerate(rows) if k not in held]
@@ -159,7 +151,7 @@ def _pairs(wanted: Float64, places: Float64, reach_m: float) -> Iterator[tuple[i
 
 def signs(street: LabelledStreet) -> tuple[int, int, int]:
     """Strong signs that were found, strong signs, and judged objects that are no sign."""
-    table, wanted = street.objects("sign"), things(street, SIGN)
+    table, wanted = street.objects("sign"), things(street.places_m, street.labels, SIGN)
     found = 0
     for rows in wanted:
         middle = street.places_m[rows].mean(axis=0)
@@ -181,11 +173,13 @@ class LabelledEdges(NamedTuple):
     step_m: Float64
 
 
-def labelled_edges(street: LabelledStreet, beyond: tuple[int, ...] = (SIDEWALK,)) -> LabelledEdges:
-    """Edges at most one cell wide between cells of 0.2 m of road and of what lies beyond it."""
-    road, walk = np.isin(street.labels, (ROAD, PARKING, MARKING)), np.isin(street.labels, beyond)
+def labelled_edges(
+    places_m: Float64, labels: npt.NDArray[np.uint8], beyond: tuple[int, ...] = (SIDEWALK,)
+) -> LabelledEdges:
+    """Edges of returns (n, 3), at most one cell wide, between cells of 0.2 m of road and of what lies beyond it."""
+    road, walk = np.isin(labels, (ROAD, PARKING, MARKING)), np.isin(labels, beyond)
     keep = road | walk
-    places = street.places_m[keep]
+    places = places_m[keep]
     cells, inverse = np.unique(np.floor(places[:, :2] / _EDGE_CELL_M).astype(int), axis=0, return_inverse=True)
     count = np.bincount(inverse.ravel())
     height = np.bincount(inverse.ravel(), places[:, 2]) / count
@@ -206,7 +200,7 @@ def kerbs(street: LabelledStreet) -> Found:
 
     Judged is the part of the street 40 m behind, 60 m ahead of and 30 m beside the first pose.
     """
-    table, edges = street.objects("kerb"), labelled_edges(street)
+    table, edges = street.objects("kerb"), labelled_edges(street.places_m, street.labels)
     part = shapely.box(-40.0, -30.0, 60.0, 30.0)
     inside = shapely.contains_xy(part, edges.places)
     wanted = edges.places[inside & (edges.step_m >= _HIGH_M)]
@@ -247,7 +241,7 @@ def markings_f1(street: LabelledStreet) -> float:
 def judged_objects(street: LabelledStreet) -> list[Judged]:
     """All objects that labels can judge: what stands upright, signs, kerbs, façades, fences and walls, paint."""
     out = list(judged_uprights(street))
-    edges = labelled_edges(street, (SIDEWALK, TERRAIN)).places
+    edges = labelled_edges(street.places_m, street.labels, (SIDEWALK, TERRAIN)).places
     out += [
         Judged("kerb", one.probability, share_within(points_along([one.geometry]), edges))
         for one in street.objects("kerb").itertuples()
@@ -292,15 +286,6 @@ def _share_on_paint(street: LabelledStreet, shape: Any) -> float | None:
     rows = np.flatnonzero(near & ~np.isin(street.labels, NOT_JUDGED))
     rows = rows[shapely.contains_xy(area, street.places_m[rows, :2])]
     return float((street.labels[rows] == MARKING).mean()) if rows.size >= 5 else None
-
-
-def calibration_error(objects: list[Judged]) -> float:
-    """Mean distance of stated probability and share that is right over ten bins (expected calibration error)."""
-    stated = np.array([one.probability for one in objects])
-    right = np.array([one.right for one in objects])
-    number = np.minimum((stated * _BINS).astype(int), _BINS - 1)
-    error = sum(abs(stated[number == k].sum() - right[number == k].sum()) for k in range(_BINS))
-    return float(error / max(len(objects), 1))
 
 
 def apart_in_sigmas(one: LabelledStreet, other: LabelledStreet) -> dict[str, float]:

@@ -14,7 +14,7 @@ range and incidence could both explain) is set to the smallest gains.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
@@ -23,6 +23,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.assets.kernels.beams import log_gains, meet_ground
+from roadscan.assets.quantiles import weighted_quantile
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import GroundModel, Scene
 from roadscan.compute.kernel_options import read_only
@@ -164,26 +165,35 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
 
 def light_of(samples: Sequence[IntensitySample], gains: pa.Table) -> float | None:
     """Returns the median calibrated intensity of the returns of the samples; None of none."""
-    names, terms = (gains[name].to_numpy(zero_copy_only=False) for name in ("sensor", "term"))
-    nodes, logs = gains["node"].to_numpy(), np.log(gains["gain"].to_numpy())
+    nodes_of = log_gains_by_node(gains)
     light, weight = [np.zeros(0)], [np.zeros(0)]
     for sample in samples:
         log_gain = np.zeros(sample.place.size)
         for number, name in enumerate(sample.sensors):
             mine = sample.sensor == number
             for term, at in (("laser", sample.laser), ("range", sample.range_m), ("incidence", sample.incidence_deg)):
-                rows = np.flatnonzero((names == name) & (terms == term))
-                if rows.size and mine.any():
-                    rows = rows[np.argsort(nodes[rows])]
-                    log_gain[mine] += np.interp(at[mine], nodes[rows], logs[rows])
+                nodes, logs = nodes_of(name, term)
+                if nodes.size and mine.any():
+                    log_gain[mine] += np.interp(at[mine], nodes, logs)
         light.append(sample.intensity * np.exp(log_gain))
         weight.append(sample.returns.astype(np.float64))
     values, weights = np.concatenate(light), np.concatenate(weight)
     if not values.size:
         return None
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, total[-1] / 2.0)])
+    return weighted_quantile(values, weights, 0.5)
+
+
+def log_gains_by_node(gains: pa.Table) -> Callable[[str, str], tuple[Float64, Float64]]:
+    """Returns a function of a sensor and a term: its nodes (k,), ascending, and the logarithms of their gains."""
+    sensors, terms = (gains[name].to_numpy(zero_copy_only=False) for name in ("sensor", "term"))
+    nodes, logs = gains["node"].to_numpy(), np.log(gains["gain"].to_numpy())
+
+    def of(sensor: str, term: str) -> tuple[Float64, Float64]:
+        rows = np.flatnonzero((sensors == sensor) & (terms == term))
+        rows = rows[np.argsort(nodes[rows])]
+        return nodes[rows], logs[rows]
+
+    return of
 
 
 def _place_means(rows: IntensitySample, response: Float64, weights: Float64) -> Float64:
@@ -204,24 +214,17 @@ def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Return
     log_gain, of_lasers = np.zeros(len(returns)), np.zeros(len(returns))
     on_ground = np.abs(returns.height_m - ground.height_at(returns.x_m, returns.y_m)) <= 3 * ON_GROUND_M
     range_m, incidence = _beams(returns, ground, on_ground)
-    sensors = gains["sensor"].to_numpy(zero_copy_only=False)
-    kinds = gains["term"].to_numpy(zero_copy_only=False)
-    nodes, logs = gains["node"].to_numpy(), np.log(gains["gain"].to_numpy())
+    nodes_of = log_gains_by_node(gains)
     for number, name in enumerate(returns.sensors):
         mine = returns.sensor == number
-        if not mine.any() or not (sensors == name).any():
+        lasers, of_laser = nodes_of(name, "laser")
+        if not mine.any() or not lasers.size:
             continue
-
-        def of(term: str, name: str = name) -> tuple[Float64, Float64]:
-            rows = np.flatnonzero((sensors == name) & (kinds == term))
-            rows = rows[np.argsort(nodes[rows])]
-            return nodes[rows], logs[rows]
-
-        lasers, of_laser = of("laser")
         by_laser = np.zeros(int(np.iinfo(np.uint16).max) + 1)
         by_laser[lasers.astype(np.int64)] = of_laser
         of_lasers[mine] = by_laser[returns.laser[mine]] - float(np.median(of_laser))
-        log_gains(mine, returns.laser, range_m, incidence, on_ground, by_laser, of("range"), of("incidence"), log_gain)
+        log_gains(mine, returns.laser, range_m, incidence, on_ground, by_laser,
+                  nodes_of(name, "range"), nodes_of(name, "incidence"), log_gain)  # fmt: skip
     log_gain[np.isnan(log_gain)] = 0.0  # the sensor's place is not known
     intensity = (returns.intensity * np.exp(log_gain)).astype(np.float32)
     evened = (returns.intensity * np.exp(of_lasers)).astype(np.float32)

@@ -8,6 +8,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.quantiles import weighted_quantile
+
 Values = npt.NDArray[np.floating[Any]]
 
 _NODES: Final = 65
@@ -67,6 +69,4 @@ def together(measured: Iterable[Mapping[str, Measured]]) -> dict[str, tuple[floa
 def _quantile(some: list[Measured]) -> float:
     values = np.concatenate([one.quantiles for one in some])
     weights = np.repeat([one.number for one in some], _NODES)
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, some[0].share * total[-1])])
+    return weighted_quantile(values, weights, some[0].share)

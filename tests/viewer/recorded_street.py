@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import shutil
-import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -12,6 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.labelled_street import SURVEY, labelled_sweeps, laid_out
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
@@ -40,30 +40,7 @@ TRUNK: Final = 71
 _BODY_FROM_VELODYNE: Final = np.diag([1.0, -1.0, -1.0])
 _SENSOR_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
-SURVEY: Final = """
-id = "semantic_kitti_00"
-rig = "rig.toml"
-store = "store"
-[map.local]
-name = "Velodyne axes at sweep 0"
-[tiles]
-cell_m = 0.2
-[adjust]
-on = false
-[[runs]]
-id = "drive"
-[[runs.logs]]
-path = "poses.csv"
-format = "pose_matrices"
-crs = "local"
-clock = { system = "unix_utc" }
-options = { axes = "flu" }
-[[runs.logs]]
-path = "sweeps"
-format = "kitti"
-sensor = "velodyne"
-clock = { system = "unix_utc" }
-options = { stamps = "../stamps.csv", stamp_column = "unix_utc_s", turn = "compensated" }
+_PICTURES: Final = """
 [[runs.logs]]
 path = "image_0"
 format = "images"
@@ -116,41 +93,28 @@ class RecordedStreet:
 
 def recorded_street(recording: Path, folder: Path) -> RecordedStreet:
     """Run and publish the recording as a survey below a folder."""
-    table = np.loadtxt(recording / "poses.csv", delimiter=",", skiprows=1)
-    (folder / "poses.csv").write_bytes((recording / "poses.csv").read_bytes())
+    laid_out(recording, folder, range(8))
     shutil.copytree(recording / "image_0", folder / "image_0")
-    with tarfile.open(recording / "sweeps.tar.xz") as archive:
-        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # from Python 3.11.4
-        archive.extractall(folder / "sweeps")
-    stamps = (recording / "poses.csv").read_text().splitlines()
-    frames = [(line.split(",")[0], line.split(",")[1]) for line in stamps[1:]]
-    swept = [one for one in frames if (folder / f"sweeps/velodyne_points/data/{int(one[0]):010d}.bin").is_file()]
-    _write_csv(folder / "stamps.csv", ["frame", "unix_utc_s"], swept)
+    frames = [line.split(",")[:2] for line in (recording / "poses.csv").read_text().splitlines()[1:]]
     names = [(f"{int(frame):06d}.png", stamp) for frame, stamp in frames]
-    _write_csv(
-        folder / "pictures.csv", ["file", "time"], [n for n in names if (recording / "image_0" / n[0]).is_file()]
-    )
-    (folder / "rig.toml").write_text(rig_text())
-    (folder / "SURVEY.toml").write_text(SURVEY)
+    with (folder / "pictures.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([("file", "time"), *(n for n in names if (recording / "image_0" / n[0]).is_file())])
+    (folder / "rig.toml").write_text(_rig())
+    (folder / "SURVEY.toml").write_text(SURVEY + _PICTURES)
     survey = Survey.load(folder / "SURVEY.toml")
     session = Session(survey, Store(survey.store_url, survey.config.id), Inline())
     run_stages(session, [stage_named(name) for name in ("ingest", "footprints", "tiles", "products")])
     session = Session(survey, Store(survey.store_url, survey.config.id), Inline())
     publish(Material(session, Wishes()), folder / "site")
-    poses = table[:, 2:14].reshape(-1, 3, 4)
-    places, labels = [], []
-    for frame, _ in swept:
-        sweep = np.fromfile(folder / f"sweeps/velodyne_points/data/{int(frame):010d}.bin", "<f4").reshape(-1, 4)
-        pose = poses[int(frame)]
-        places.append(sweep[:, :3].astype(np.float64) @ pose[:, :3].T + pose[:, 3])
-        labels.append(np.fromfile(folder / f"sweeps/labels/{int(frame):010d}.label", np.uint8))
+    poses = np.loadtxt(recording / "poses.csv", delimiter=",", skiprows=1)[:, 2:14].reshape(-1, 3, 4)
+    places, labels = zip(*labelled_sweeps(folder), strict=True)
     first = np.cumsum([0, *map(len, places)])
     return RecordedStreet(
         folder / "site", recording / "image_0", np.concatenate(places), np.concatenate(labels), poses, first
     )
 
 
-def rig_text() -> str:
+def _rig() -> str:
     turn = _BODY_FROM_VELODYNE @ CAMERA_FROM_VELODYNE.T @ _SENSOR_FROM_CAMERA.T
     arm_m = _BODY_FROM_VELODYNE @ (-CAMERA_FROM_VELODYNE.T @ CAMERA_FROM_VELODYNE_M)
     return f"""
@@ -169,8 +133,3 @@ height_px = 376
 focal_px = [{FOCAL_PX}, {FOCAL_PX}]
 principal_px = [{PRINCIPAL_PX[0]}, {PRINCIPAL_PX[1]}]
 """
-
-
-def _write_csv(path: Path, names: list[str], rows: list[tuple[str, str]]) -> None:
-    with path.open("w", newline="") as file:
-        csv.writer(file).writerows([names, *rows])

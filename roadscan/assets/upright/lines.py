@@ -93,14 +93,6 @@ class Chain:
         return float(length @ through) / float(length.sum()) if told.any() else 0.0
 
     @property
-    def sigma_passing(self) -> float:
-        """Returns 1 σ of `passing`: of its scatter over the stretches, and of the number of lines."""
-        passed, lines = self.values["passed"], np.maximum(self.values["passed"] + self.values["stopped"], 1.0)
-        p, total = self.passing, float(lines.sum())
-        spread = float(np.sqrt(np.sum((passed - p * lines) ** 2))) / total
-        return max(spread, math.sqrt((p * (1.0 - p) + 1.0 / total) / total))
-
-    @property
     def hovering(self) -> float:
         """Returns the share of the sight lines at it and below it that pass below it."""
         under, stopped = float(self.values["under"].sum()), float(self.values["stopped"].sum())

@@ -189,6 +189,23 @@ def meet_slope(
 
 
 @inlined
+def into_tube(c0: float, c1: float, a: float, b: float, c: float) -> float:
+    """Return the range at which a beam meets a tube with both of its ends; NaN: it does not.
+
+    c0, c1 : ranges between which it is between the ends. a r² + 2 b r + c : square of its distance from the axis at the
+    range r, less that of the radius.
+    """
+    if a < 1e-18:
+        return c0 if c <= 0.0 and 0.0 < c0 <= c1 else np.nan
+    root = b * b - a * c
+    if root < 0.0:
+        return np.nan
+    root = math.sqrt(root)
+    begin = max(c0, (-b - root) / a)
+    return begin if 0.0 < begin <= min(c1, (-b + root) / a) else np.nan
+
+
+@inlined
 def meet_rod(
     rows: Float64, i: int, ahead: float, right: float, oz: float, ahead_per_m: float, right_per_m: float, dz: float
 ) -> float:
@@ -203,14 +220,7 @@ def meet_rod(
     a = aside_per_m * aside_per_m + right_per_m * right_per_m
     b = aside * aside_per_m + right * right_per_m
     c = aside * aside + right * right - radius * radius
-    if a < 1e-18:
-        return c0 if c <= 0.0 and 0.0 < c0 <= c1 else np.nan
-    root = b * b - a * c
-    if root < 0.0:
-        return np.nan
-    root = math.sqrt(root)
-    begin = max(c0, (-b - root) / a)
-    return begin if 0.0 < begin <= min(c1, (-b + root) / a) else np.nan
+    return into_tube(c0, c1, a, b, c)
 
 
 @inlined
@@ -267,14 +277,7 @@ def meet_cylinder(
     a = dx * dx + dy * dy
     b = x * dx + y * dy
     c = x * x + y * y - radius * radius
-    if a < 1e-18:
-        return c0 if c <= 0.0 and 0.0 < c0 <= c1 else np.nan
-    root = b * b - a * c
-    if root < 0.0:
-        return np.nan
-    root = math.sqrt(root)
-    begin = max(c0, (-b - root) / a)
-    return begin if 0.0 < begin <= min(c1, (-b + root) / a) else np.nan
+    return into_tube(c0, c1, a, b, c)
 
 
 @inlined

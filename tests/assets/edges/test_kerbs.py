@@ -10,6 +10,7 @@ import pytest
 import shapely
 from scipy.spatial import cKDTree
 
+from benchmarks.street_scores import SIDEWALK, TERRAIN, labelled_edges, points_along, share_within
 from roadscan.assets import classes
 from roadscan.assets.edges.find import edges_of_raster
 from roadscan.assets.edges.raster import of_cells
@@ -17,12 +18,10 @@ from roadscan.assets.kind import AssetObject
 from roadscan.assets.kinds.kerb import Kerb, KerbOptions
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box, Scene
-from tests.assets.edges.labelled_edges import SIDEWALK, labelled_edges, points_along, share_within
 from tests.assets.edges.simulated import SimulatedStreet, town_street
 from tests.assets.edges.streets import amsterdam_street, returns_of
 from tests.assets.scenes import recordings_folder, semantic_kitti_returns
 
-TERRAIN = 72
 FACE_OFFSET_M = 5.26
 """Middle of the kerb's face in `urban_street`: 5.25 m of lanes and shoulder, and a face of 2 cm."""
 
@@ -32,8 +31,8 @@ def kerbs_of(scene: Scene) -> list[AssetObject]:
     return list(kind.objects(kind.evidence(scene, KerbOptions()).pieces, KerbOptions(), {}))
 
 
-def lines_of(kerbs: list[AssetObject]) -> list[np.ndarray[Any, Any]]:
-    return [np.array(k.geometry.coords) for k in kerbs]
+def lines_of(kerbs: list[AssetObject]) -> list[shapely.Geometry]:
+    return [k.geometry for k in kerbs]
 
 
 def test_kerbs_of_a_labelled_street() -> None:
@@ -44,7 +43,8 @@ def test_kerbs_of_a_labelled_street() -> None:
     returns, labels = returns.at(inside), labels[inside]
     kerbs = kerbs_of(make_scene(returns, box, box, drive))
     found = points_along(lines_of(kerbs))
-    edges = labelled_edges(returns, labels)
+    places = np.column_stack([returns.x_m, returns.y_m, returns.height_m])
+    edges = labelled_edges(places, labels)
     high = edges.places[edges.step_m >= 0.05]
     assert len(high) > 500
     assert share_within(high, found, 0.3) >= 0.82  # 0.86; the bar is 0.80
@@ -53,7 +53,7 @@ def test_kerbs_of_a_labelled_street() -> None:
     # Kerbs of 5 cm or more against the edge of the sidewalk, 0.82, and all edges of the road that labels know, 0.87.
     marked = points_along(lines_of([k for k in kerbs if k.attributes.get("step_m", 0.0) >= 0.05]))
     assert share_within(marked, edges.places, 0.3) >= 0.80
-    around = labelled_edges(returns, labels, (SIDEWALK, TERRAIN)).places
+    around = labelled_edges(places, labels, (SIDEWALK, TERRAIN)).places
     assert share_within(marked, around, 0.3) >= 0.84
 
 
@@ -156,7 +156,7 @@ def test_cells_alone_are_enough(street: SimulatedStreet) -> None:
     height += np.random.default_rng(1).normal(0.0, 0.005, height.shape)
     count = np.where(np.isfinite(height), 5, 0).astype(np.int32)
     raster = of_cells(x0, y0, 0.1, count, np.nan_to_num(height), np.full(height.shape, 0.01))
-    lines = [np.column_stack([e.nodes.x_m, e.nodes.y_m]) for e in edges_of_raster(raster)]
+    lines = [shapely.LineString(np.column_stack([e.nodes.x_m, e.nodes.y_m])) for e in edges_of_raster(raster)]
     found = points_along(lines, 0.02)
     for side in (-1.0, 1.0):
         assert share_within(truth_line(street, side, FACE_OFFSET_M, np.arange(4.0, 24.0, 0.1)), found, 0.05) >= 0.97

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tarfile
 from pathlib import Path
 
 import geopandas
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
+from benchmarks.labelled_street import laid_out
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
@@ -18,7 +18,6 @@ from roadscan.run.stage import stage_named
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from tests.surveys import changed
-from tests.viewer import recorded_street
 
 WHOLE_M = 200.0
 """Four squares of this edge hold the street, each with all that it reads."""
@@ -26,20 +25,6 @@ CLASSES_DIFFER = 5e-4
 """Share of the returns whose class a cut may change: surfaces and tracks of any length end where a scene does."""
 POINTS = ("poles", "trees", "signals", "lighting", "delineators", "road_signs")
 AREAS = ("landscape_areas", "lane_lines", "road_markings")
-
-
-def street(source: Path, folder: Path) -> Path:
-    """The survey file of the recorded sweeps, without their pictures."""
-    (folder / "poses.csv").write_bytes((source / "poses.csv").read_bytes())
-    with tarfile.open(source / "sweeps.tar.xz") as archive:
-        archive.extractall(folder / "sweeps", filter="data")
-    rows = [line.split(",")[:2] for line in (source / "poses.csv").read_text().splitlines()[1:]]
-    held = [(f, s) for f, s in rows if (folder / f"sweeps/velodyne_points/data/{int(f):010d}.bin").is_file()]
-    (folder / "stamps.csv").write_text("frame,unix_utc_s\n" + "".join(f"{f},{s}\n" for f, s in held))
-    (folder / "rig.toml").write_text(recorded_street.rig_text())
-    text, _, _ = recorded_street.SURVEY.rpartition("[[runs.logs]]")
-    (folder / "SURVEY.toml").write_text(text + "[assets]\n")
-    return folder / "SURVEY.toml"
 
 
 def cut(file: Path, tile_m: float) -> tuple[np.ndarray, dict[str, geopandas.GeoDataFrame]]:
@@ -62,7 +47,7 @@ def twins(one: geopandas.GeoDataFrame, other: geopandas.GeoDataFrame) -> int:
 
 @pytest.mark.nightly
 def test_squares_of_any_edge_find_the_same_on_the_labelled_street(recordings: Path, tmp_path: Path) -> None:
-    file = street(recordings / "semantic_kitti_00", tmp_path)
+    file = laid_out(recordings / "semantic_kitti_00", tmp_path, range(8))
     whole, objects = cut(file, WHOLE_M)
     for tile_m in (40.0, 60.0, 80.0, 120.0):
         classes, found = cut(file, tile_m)

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
+from benchmarks.street_scores import BUILDING, POLE, SIGN, TRUNK, things
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.upright.plates import SignOptions, plates_of
 from roadscan.assets.upright.standing import Upright, uprights_of
 from tests.assets.scenes import NOT_JUDGED, semantic_kitti_scene
 
-BUILDING, TRUNK, POLE, SIGN = 50, 71, 80, 81
 
-
-def clusters(label: int, least: int) -> list[np.ndarray]:
-    """Returns of a label in clusters of 0.5 m, with so many returns or more."""
+def clusters(label: int) -> list[np.ndarray]:
+    """Returns of a label in clusters of 0.5 m, with as many returns as make one that has to be found."""
     scene, labels = semantic_kitti_scene()
     returns = scene.returns
-    rows = np.flatnonzero(labels == label)
-    tree = cKDTree(np.column_stack([returns.x_m, returns.y_m, returns.height_m])[rows])
-    _, number = connected_components(tree.sparse_distance_matrix(tree, 0.5, output_type="coo_matrix"), directed=False)
-    return [rows[number == k] for k in range(number.max() + 1) if (number == k).sum() >= least]
+    return things(np.column_stack([returns.x_m, returns.y_m, returns.height_m]), labels, label)
 
 
 def tall() -> list[Upright]:
@@ -34,7 +28,7 @@ def test_poles_and_trunks_are_found_where_they_stand() -> None:
     """The surface that returns of a shaft show lies π/4 of its radius before its axis, on the mean."""
     scene, _ = semantic_kitti_scene()
     returns = scene.returns
-    truth = clusters(POLE, 30) + clusters(TRUNK, 60)
+    truth = clusters(POLE) + clusters(TRUNK)
     found, errors = 0, []
     for rows in truth:
         best = max(tall(), key=lambda u: np.isin(u.shaft.rows, rows).sum())
@@ -55,7 +49,7 @@ def test_poles_and_trunks_are_found_where_they_stand() -> None:
 def test_hardly_anything_else_is_taken_for_a_pole_or_a_trunk() -> None:
     """A shaft is right that shows a labelled pole or trunk; what was not judged by those who labelled is left out."""
     _, labels = semantic_kitti_scene()
-    known = clusters(POLE, 30) + clusters(TRUNK, 60)
+    known = clusters(POLE) + clusters(TRUNK)
     right, wrong = 0, 0
     for one in tall():
         seen = labels[one.shaft.rows]
@@ -70,7 +64,7 @@ def test_hardly_anything_else_is_taken_for_a_pole_or_a_trunk() -> None:
 def test_the_two_strong_signs_are_found_and_what_is_no_sign_is_not() -> None:
     scene, labels = semantic_kitti_scene()
     plates = [p for p in plates_of(scene, SignOptions()) if p.probability >= 0.5]
-    wanted = clusters(SIGN, 100)
+    wanted = clusters(SIGN)
     judged = [p for p in plates if not np.isin(labels[p.rows], NOT_JUDGED).mean() > 0.5]
     assert len(wanted) == 2 and len(judged) >= 2
     assert all((labels[p.rows] == SIGN).mean() > 0.5 for p in judged)  # a third one has 24 labelled returns

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.calibration import Curve
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.object_table import reference_point
 from roadscan.assets.pictures.colour_classes import colour_of
@@ -50,7 +50,8 @@ class SignReader(CutOutReader):
         told: dict[str, Any] = {}
         shape, probability = shape_of(cut_outs, one.attributes.get("shape") or "other", *_size(one).tolist())
         told |= {"shape": shape, "shape_probability": probability}
-        told["probability"] = _with_odds(one.probability, plate_odds(cut_outs, shape))
+        confirmed = Curve(plate_odds(cut_outs, shape), 1.0).stated(one.probability)
+        told["probability"] = min(confirmed, _MOST)
         colour = colour_of([_within_shape(c) for c in cut_outs])
         if colour is not None:
             told |= {"colour": colour[0], "colour_probability": colour[1]}
@@ -60,12 +61,6 @@ class SignReader(CutOutReader):
                 words, probability = max(read, key=lambda r: r[1])
                 told |= {column: words, f"{column}_probability": probability}
         return told
-
-
-def _with_odds(probability: float, added: float) -> float:
-    """Returns a probability with so much added to the logarithm of its odds."""
-    odds = math.log(probability / max(1.0 - probability, 1e-4)) + added
-    return min(1.0 / (1.0 + math.exp(-odds)), _MOST)
 
 
 def _within_shape(one: CutOut) -> CutOut:

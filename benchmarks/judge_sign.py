@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.drawn_streets import street_of_signs
+from benchmarks.drawn_streets import drawn_street, street_of_signs
 from benchmarks.hard_streets import hard_street
 from benchmarks.judgement import Segments
 from benchmarks.labelled_returns import CLASSES, labelled_returns
@@ -26,8 +26,10 @@ from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.plates import Plate, SignOptions, candidates_of
 from roadscan.simulate import Scene as Street
 
-HARD: Final = (700, 701, 702, 703, 712, 713, 714, 715)
+HARD: Final = (*range(700, 708), *range(712, 716))
 SIGNS: Final = range(80, 85)
+DRAWN: Final = range(200, 208)
+"""Seeds of hard streets, of streets of signs, and of plain ones, whose parked cars are no signs either."""
 SPOT_DEG: Final = 0.17
 _RECORDED_WEIGHT: Final = 4.0
 """A segment of the recording counts as much as so many of simulated streets."""
@@ -42,10 +44,13 @@ FIT: Final = {
 
 def segments(folder: Path) -> Iterator[Segments]:
     """Candidates of each street, and of each square of the recording."""
-    for seed in HARD:
-        yield of_street(f"hard {seed}", hard_street(seed))
-    for seed in SIGNS:
-        yield of_street(f"signs {seed}", street_of_signs(seed, divergence_deg=SPOT_DEG))
+    streets = [(f"hard {seed}", hard_street(seed)) for seed in HARD]
+    streets += [(f"signs {seed}", street_of_signs(seed, divergence_deg=SPOT_DEG)) for seed in SIGNS]
+    streets += [(f"drawn {seed}", drawn_street(seed)) for seed in DRAWN]
+    for name, street in streets:
+        found = of_street(name, street)
+        if len(found.true):
+            yield found
     for number, (scene, labels) in enumerate(labelled_scenes(recording_folder(), folder / "sign-0-3", range(4))):
         yield from of_recording(f"square {number}", scene, labels)
 

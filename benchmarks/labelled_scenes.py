@@ -11,15 +11,14 @@ from scipy.spatial import cKDTree
 
 from benchmarks.labelled_street import labelled_street
 from roadscan.assets.intensity import calibrated_scene
-from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Scene
+from roadscan.assets.statistics import Statistics
 from roadscan.assets.tasks.gains import current_gains, plan_gains
-from roadscan.assets.tasks.load_returns import load_squares
+from roadscan.assets.tasks.load_returns import load_squares, scene_of
 from roadscan.assets.tasks.plan import plan_assets
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
-from roadscan.store.manifest import read_recorded
 
 _SAME_M = 0.003  # A return of a scene is the recorded one that lies so near (m): the store rounds to 1 mm.
 
@@ -31,17 +30,16 @@ def labelled_scenes(
     street = labelled_street(recording, folder, sweeps)
     session = Session.open(folder / "SURVEY.toml")
     plan = plan_assets(plan_of(session), footprints_of(session))
-    record, store = current_gains(plan_gains(plan), session.manifest), plan.survey.store
+    shared, store = current_gains(plan_gains(plan), session.manifest), plan.survey.store
+    gains = None if shared is None else shared.read_gains(store)
+    statistics = Statistics() if shared is None else shared.read_statistics(store)
     tree = cKDTree(street.places_m)
     for squares in plan.blocks(list(plan.keys)):
         for one in load_squares(plan.load(squares)):
             if not len(one.returns):
                 continue
-            scene = make_scene(
-                one.returns, plan.grid.own_box, plan.grid.window_box, one.drive_xyh_m, plan.config.ground
-            )
-            if record is not None:
-                scene = calibrated_scene(scene, store.parse_table(read_recorded(store, record), record.path))
+            scene = scene_of(plan.grid, one, plan.config.ground, statistics)
+            scene = scene if gains is None else calibrated_scene(scene, gains)
             r = scene.returns
             places = np.column_stack([r.x_m + r.corner_m[0], r.y_m + r.corner_m[1], r.height_m])
             away, at = tree.query(places, distance_upper_bound=_SAME_M)

@@ -29,9 +29,10 @@ from roadscan.run.engine.compute import Compute
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session, found_once
 from roadscan.run.stage import StageState
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
 
 PRODUCT = "footprints"

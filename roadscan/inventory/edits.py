@@ -16,8 +16,8 @@ import pyarrow as pa
 
 from roadscan.inventory.values import encoded
 from roadscan.store.asset_truth import AssetTruth, Commit
+from roadscan.store.digest import bytes_digest
 from roadscan.store.schema import table_schema
-from roadscan.store.store import bytes_digest
 
 REJECTED: Final = encoded("rejected")
 """The status of a rejected asset, as edits encode it."""

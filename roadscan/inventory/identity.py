@@ -18,8 +18,8 @@ import shapely
 
 from roadscan.inventory.settings import Matching
 from roadscan.store.asset_schema import asset_schema
+from roadscan.store.digest import bytes_digest
 from roadscan.store.inventory_schema import GEOMETRY
-from roadscan.store.store import bytes_digest
 
 _SIGMAS: Final = 4.0
 """Gate of a match, in σ of the difference of two positions."""

@@ -31,8 +31,8 @@ from roadscan.inventory.recording import Found, Rules, record
 from roadscan.inventory.state import State, commit_at, live_commits, state_at
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from roadscan.store.asset_truth import AssetTruth, Commit, Draft
+from roadscan.store.digest import bytes_digest
 from roadscan.store.inventory_schema import asset_table
-from roadscan.store.store import bytes_digest
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -28,8 +28,9 @@ from roadscan.inventory.visibility import Unknown, Visibility, VisibilityOfSquar
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from roadscan.store.asset_truth import AssetTruth
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import read_recorded
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.store import Store
 
 FOUND: Final = "products/assets"
 """Folder of the tables of found assets, one a kind."""

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from roadscan.core.errors import ConfigError
 from roadscan.site.document import Ask, Document
-from roadscan.store.store import file_digest
+from roadscan.store.digest import file_digest
 
 HOW_TO_BUILD: Final = "build it with `make viewer` (it needs Node), or install roadscan from a wheel, which holds it"
 PAGE: Final = "index.html"

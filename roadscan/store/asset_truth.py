@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
-import io
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -21,12 +20,13 @@ from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, StoreError
+from roadscan.store.digest import bytes_digest, bytes_hold
 from roadscan.store.inventory_schema import evidence_table
 from roadscan.store.schema import table_schema
-from roadscan.store.store import Store, bytes_digest, bytes_hold
+from roadscan.store.seal import sealed_parquet
+from roadscan.store.store import Store
 
 try:
     import fcntl
@@ -201,7 +201,7 @@ class AssetTruth:
             stamped = rows.set_column(
                 rows.schema.get_field_index("commit"), "commit", pa.array([number] * rows.num_rows, pa.int32())
             )
-            content = parquet_bytes(stamped.select(schema.names).cast(schema))
+            content = _content(stamped.select(schema.names).cast(schema))
             digest = bytes_digest(content)
             file = f"{_ROWS[draft.kind]}/{number:08d}-{digest.rpartition(':')[2][:12]}.parquet"
             self.store.write_bytes(file, content)
@@ -214,7 +214,7 @@ class AssetTruth:
             raise StoreError(
                 "another program appended to the inventory", change="try again", file=self.store.path(name)
             )
-        self.store.write_bytes(name, parquet_bytes(pa.Table.from_pylist([asdict(commit)], schema)))
+        self.store.write_bytes(name, _content(pa.Table.from_pylist([asdict(commit)], schema)))
         self._commits = (*self.commits, commit)
         return commit
 
@@ -233,7 +233,7 @@ class AssetTruth:
 
     def keep_published(self, token: str, rows: pa.Table) -> None:
         """Store the rows of an inventory file under the token that it carries."""
-        self.store.write_bytes(f"{_PUBLISHED}/{token}.parquet", parquet_bytes(rows))
+        self.store.write_bytes(f"{_PUBLISHED}/{token}.parquet", _content(rows))
 
     def published(self, token: str) -> pa.Table | None:
         """Return the rows of an inventory file as published or last read; None where this inventory did not make it."""
@@ -248,11 +248,8 @@ def _schema_of(kind: CommitKind) -> pa.Schema:
     return evidence_table() if kind == "found" else table_schema("asset_edits").arrow()
 
 
-def parquet_bytes(table: pa.Table) -> bytes:
-    """Return a table as the content of a Parquet file with checksums; equal rows give equal bytes."""
-    out = io.BytesIO()
-    pq.write_table(table, out, compression="zstd", row_group_size=65_536, write_page_checksum=True, version="2.6")
-    return out.getvalue()
+def _content(table: pa.Table) -> bytes:
+    return sealed_parquet(table, compression="zstd", row_group_size=65_536, version="2.6")
 
 
 def _take(opened: int, file: Path, until: float) -> None:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Any, Final
 
-from roadscan.store.store import bytes_digest
+from roadscan.store.digest import bytes_digest
 
 _SEAL: Final = b',\n "checksum": "%b"'
 _END: Final = b"\n}"

@@ -12,8 +12,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.core.errors import DamagedError, StoreError
+from roadscan.store.checked_json import checked_json, parse_checked
+from roadscan.store.digest import bytes_hold
 from roadscan.store.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, sound_rows, table_of, unpacked
-from roadscan.store.store import MADE_AGAIN, Store, bytes_hold
+from roadscan.store.store import MADE_AGAIN, Store
 
 __all__ = ["Manifest", "OutputRecord", "begin_changes", "end_changes", "read_failures", "write_failures"]
 
@@ -343,7 +345,7 @@ def _changed_ns(store: Store, path: str) -> int:
 
 def write_failures(store: Store, failures: list[dict[str, str]]) -> None:
     """Store what failed in the last run, for `roadscan status`."""
-    store.write_bytes(_FAILURES, json.dumps(failures, indent=1).encode(), lasting=False)
+    store.write_bytes(_FAILURES, checked_json({"failures": failures}), lasting=False)
 
 
 def read_failures(store: Store) -> list[dict[str, str]]:
@@ -351,9 +353,9 @@ def read_failures(store: Store) -> list[dict[str, str]]:
     if not store.exists(_FAILURES):
         return []
     try:
-        return [
-            {name: str(told[name]) for name in ("stage", "unit", "reason")}
-            for told in json.loads(store.read_bytes(_FAILURES))
-        ]
+        content = store.read_bytes(_FAILURES)
+        # older versions wrote a list without a checksum
+        listed = json.loads(content) if content.startswith(b"[") else parse_checked(content)["failures"]
+        return [{name: str(told[name]) for name in ("stage", "unit", "reason")} for told in listed]
     except (StoreError, ValueError, KeyError, TypeError) as error:
         return [{"stage": "the list of failures", "unit": _FAILURES, "reason": f"it is damaged ({error}); run again"}]

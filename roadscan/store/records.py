@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +13,8 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+
+from roadscan.store.seal import check_seal, sealed_parquet, without_seal
 
 RECORDS: Final = pa.schema(
     [
@@ -79,12 +80,11 @@ class Packed:
     @classmethod
     def of(cls, table: pa.Table, compression: str = "none") -> Packed:
         """Return a packed table of records; compression, for long storage, takes twice the time."""
-        buffer = io.BytesIO()
-        pq.write_table(
-            table, buffer, row_group_size=_GROUP_ROWS, compression=compression, use_dictionary=["product"],
-            write_statistics=False, write_page_checksum=True,
+        content = sealed_parquet(
+            table, row_group_size=_GROUP_ROWS, compression=compression, use_dictionary=["product"],
+            write_statistics=False,
         )  # fmt: skip
-        return cls(buffer.getvalue(), table.num_rows)
+        return cls(content, table.num_rows)
 
     def table(self) -> pa.Table:
         """Return the records."""
@@ -92,8 +92,15 @@ class Packed:
 
 
 def unpacked(content: bytes) -> pa.Table:
-    """Return the records of such a file; read by this thread alone, as :meth:`Store.read_table` does."""
-    return _opened(content).read(use_threads=False)
+    """Return the records of such a file; read by this thread alone, as :meth:`Store.read_table` does.
+
+    Raises
+    ------
+    ValueError
+        where its seal does not hold.
+    """
+    check_seal(content)
+    return without_seal(_opened(content).read(use_threads=False))
 
 
 def sound_rows(content: bytes) -> tuple[pa.Table, str]:

@@ -15,10 +15,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.core.errors import DamagedError
+from roadscan.store.digest import digest_holds
 from roadscan.store.logs import copy_path, log_keys, parse_log_record, record_path
 from roadscan.store.manifest import ReadPart, begin_changes, part_path, read_parts
 from roadscan.store.records import OutputRecord, Packed, latest, rows_of, table_of
-from roadscan.store.store import Store, digest_holds
+from roadscan.store.store import Store
 
 Report = Callable[[str], None]
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import os
 import shutil
 import socket
@@ -29,10 +28,10 @@ from typing import Any, Final, TypeVar
 import fsspec
 import pyarrow as pa
 import pyarrow.parquet as pq
-from blake3 import blake3
 
 from roadscan.core.errors import DamagedError, FullDiskError, RoadscanError, StoreError
 from roadscan.core.extras import need
+from roadscan.store.seal import check_seal, without_seal
 
 try:
     import fcntl
@@ -40,8 +39,6 @@ except ImportError:  # systems without such locks
     fcntl = None  # type: ignore[assignment]
 
 _STAGING: Final = ".staging"
-_CHUNK: Final = 1 << 18  # fits into a core's cache between reading and hashing
-_ALGORITHM: Final = "blake3:"
 
 _NO_ROOM_BYTES: Final = 8 << 20
 """A writer that fails without a reason while less is free (bytes) is taken to have filled the disk: GDAL and others
@@ -54,43 +51,6 @@ MADE_AGAIN: Final = "run `roadscan verify`, which finds all such files; the next
 """How a damaged product is repaired."""
 
 _T = TypeVar("_T")
-
-
-def file_digest(path: Path) -> str:
-    """Return the BLAKE3-128 of a file's bytes: ``blake3:`` and 32 hexadecimal digits."""
-    return f"{_ALGORITHM}{_hashed(path, blake3()).digest(length=16).hex()}"
-
-
-def bytes_digest(content: bytes) -> str:
-    """Return the same digest for a file's future bytes."""
-    return f"{_ALGORITHM}{blake3(content).digest(length=16).hex()}"
-
-
-def digest_holds(path: Path, digest: str) -> bool:
-    """Return True if a file still has the content of `digest`.
-
-    A digest without a prefix is BLAKE2b-128, as stores of older versions hold them: such files stay sound.
-    """
-    if ":" in digest:
-        return file_digest(path) == digest
-    return bool(_hashed(path, hashlib.blake2b(digest_size=16)).hexdigest() == digest)
-
-
-def bytes_hold(content: bytes, digest: str) -> bool:
-    """Return the same for a file's content."""
-    if ":" in digest:
-        return bytes_digest(content) == digest
-    return hashlib.blake2b(content, digest_size=16).hexdigest() == digest
-
-
-def _hashed(path: Path, state: Any) -> Any:
-    # Read, not mapped: an unreadable sector then raises OSError, instead of a signal that ends the process.
-    buffer = bytearray(_CHUNK)
-    view = memoryview(buffer)
-    with path.open("rb", buffering=0) as stream:
-        while count := stream.readinto(buffer):
-            state.update(view[:count])
-    return state
 
 
 class Store:
@@ -152,7 +112,7 @@ class Store:
             ) from error
 
     def read_table(self, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN) -> pa.Table:
-        """Return a small Parquet file with verified page checksums; `change` says how to repair it.
+        """Return a small Parquet file, its seal and its page checksums verified; `change` says how to repair it.
 
         Read by this thread alone: a thread of Arrow's that still releases the bytes when the interpreter ends would
         end the process with SIGABRT (`pq.read_table` hands them to such threads).
@@ -164,9 +124,10 @@ class Store:
     ) -> pa.Table:
         """Return the same of content that was read from there."""
         try:
+            check_seal(content)
             file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
-            return file.read(None if columns is None else list(columns), use_threads=False)
-        except (pa.ArrowException, OSError) as error:
+            return without_seal(file.read(None if columns is None else list(columns), use_threads=False))
+        except (pa.ArrowException, OSError, ValueError) as error:
             raise DamagedError(f"the file is damaged: {error}", change=change, file=self.path(relative)) from error
 
     def write_bytes(self, relative: str, content: bytes, *, lasting: bool = True) -> None:

@@ -20,11 +20,12 @@ from roadscan.core.witness import Finding
 from roadscan.store.codecs.parquet.list_table import is_list_table, write_list_table
 from roadscan.store.codecs.parquet.number_table import is_number_table, write_number_table
 from roadscan.store.derived import with_derived
+from roadscan.store.digest import file_digest
 from roadscan.store.logs import DataFile, log_folder
 from roadscan.store.merge import merged
 from roadscan.store.row_order import sorted_batch, sorted_rows
 from roadscan.store.schema import TableSchema, table_schema
-from roadscan.store.store import Store, file_digest
+from roadscan.store.store import Store
 
 BUDGET_BYTES: Final = 128 << 20
 """Bytes of rows in memory before the fullest partitions are written."""

@@ -35,10 +35,10 @@ from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.code_reach import name_of
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.sql import query
-from roadscan.store.store import bytes_digest
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells

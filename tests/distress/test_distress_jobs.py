@@ -18,8 +18,9 @@ from roadscan.run.code_reach import name_of, reached_code
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.simulate.truth import load
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.tiles.drives import Drives
 from roadscan.tiles.mosaics import products

@@ -20,8 +20,9 @@ from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingest
 from roadscan.run.engine.compute import Compute, Done, Inline, R, T
 from roadscan.run.session import Session
+from roadscan.store.digest import digest_holds, file_digest
 from roadscan.store.logs import read_log_records
-from roadscan.store.store import Store, digest_holds, file_digest
+from roadscan.store.store import Store
 from roadscan.survey.status import survey_status, verify_store
 
 GEOMETRY = {"kind": "cartesian", "readings": 8, "first": 0.0, "step": 0.001, "range_offset_m": 1.5,

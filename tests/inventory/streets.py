@@ -19,7 +19,8 @@ from roadscan.inventory.settings import Matching
 from roadscan.inventory.visibility import Unknown, Visibility
 from roadscan.store.asset_schema import asset_schema
 from roadscan.store.asset_truth import AssetTruth
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.digest import bytes_digest
+from roadscan.store.store import Store
 
 CRS = "EPSG:32632"
 EAST, NORTH = 691_000.0, 5_334_000.0

@@ -26,9 +26,11 @@ from roadscan.inventory.of_survey import FOUND
 from roadscan.inventory.state import state_at
 from roadscan.report.section import Material, sections
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
-from roadscan.store.asset_truth import AssetTruth, parquet_bytes
+from roadscan.store.asset_truth import AssetTruth
+from roadscan.store.digest import bytes_digest
 from roadscan.store.inventory_schema import asset_columns
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.seal import sealed_parquet
+from roadscan.store.store import Store
 from tests.inventory import qgis_edits as person
 from tests.inventory.streets import AUTUMN, EAST, NORTH, Everywhere, asset, found, inventory, poles
 
@@ -230,11 +232,25 @@ def test_verify_names_each_damaged_file_of_the_inventory(survey_file: Path) -> N
     assert told.exit_code == 1 and "3 files are not whole" in told.output
 
 
+def test_a_renamed_column_of_what_was_published_is_no_edit(survey_file: Path) -> None:
+    survey = roadscan.open_survey(survey_file)
+    survey.inventory.publish()
+    [kept] = Path(survey.inventory.truth.store.path("inventory/published")).glob("*.parquet")
+    content = kept.read_bytes()
+    assert content.count(b"status") >= 1
+    kept.write_bytes(content.replace(b"status", b"statur"))
+    assert any(str(kept) in one for one in survey.verify())
+    commits = len(survey.inventory.truth.commits)
+    with pytest.raises(DamagedError, match="its digest differs"):
+        survey.inventory.pull()
+    assert len(survey.inventory.truth.commits) == commits
+
+
 def test_rows_of_an_older_version_lack_columns_and_hold_for_all_that(tmp_path: Path) -> None:
     street = inventory(tmp_path, Everywhere())
     street.record(found(poles()))
     commit = street.truth.commits[0]
-    content = parquet_bytes(street.truth.rows(commit).drop_columns(["probability", "message"]))
+    content = sealed_parquet(street.truth.rows(commit).drop_columns(["probability", "message"]), compression="zstd")
     street.truth.store.write_bytes(commit.file, content)
     street.truth._commits = (replace(commit, digest=bytes_digest(content)),)
     assert state_at(street.truth).assets["pole"].rows["probability"].null_count == 6

@@ -20,9 +20,9 @@ from roadscan.run.session import Session
 from roadscan.simulate.truth import load
 from roadscan.site.material import Material
 from roadscan.site.parts.vectors import site_layers
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.schema import table_schema
-from roadscan.store.store import bytes_digest
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.wanted_products import product_context
 from tests.surveys import Simulated

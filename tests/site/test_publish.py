@@ -51,8 +51,8 @@ from roadscan.site.single import write_single
 from roadscan.site.site import KEYS, Published, entry, publish
 from roadscan.site.site_rasters import Place, Raster, coarser_picture
 from roadscan.site.thumbnail import thumbnail
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord
-from roadscan.store.store import bytes_digest
 from roadscan.survey.run import run_stages
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells

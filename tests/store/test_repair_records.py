@@ -12,6 +12,7 @@ import pytest
 
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.store import manifest as manifest_module
+from roadscan.store.digest import bytes_digest
 from roadscan.store.logs import (
     DataFile,
     LogRecord,
@@ -25,7 +26,7 @@ from roadscan.store.logs import (
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.records import Packed, sound_rows, table_of
 from roadscan.store.repair_records import repair_records
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.store import Store
 
 
 @pytest.fixture(params=["folder", "memory"])

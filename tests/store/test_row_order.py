@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.store import row_order
+from roadscan.store.digest import bytes_digest
 from roadscan.store.row_order import in_order, ordered, sorted_batch, sorted_rows
 from roadscan.store.schema import table_schema
-from roadscan.store.store import bytes_digest
 from roadscan.store.writer import LogWriter
 from tests.store.readings.test_returns import SCHEMA
 

@@ -69,8 +69,8 @@ from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session
+from roadscan.store.digest import file_digest
 from roadscan.store.manifest import CHANGED, DAMAGED, MISSING, Manifest, OutputRecord
-from roadscan.store.store import file_digest
 
 Float64 = npt.NDArray[np.float64]
 

@@ -28,10 +28,11 @@ from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import MapSettings
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
 
 SIGHTINGS: Final = "control_sightings"

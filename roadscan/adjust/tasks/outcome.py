@@ -18,9 +18,10 @@ from roadscan.core.witness import Finding
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN, keep_file
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.codecs.grey_picture import write_png
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
 
 ADJUSTMENT: Final = "adjustment"

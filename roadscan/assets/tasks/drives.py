@@ -17,8 +17,8 @@ from roadscan.georeference.sensor_places import sensor_places
 from roadscan.navigation.tasks.pose_sigma import pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import bytes_digest
 from roadscan.store.small_tables import small_path
-from roadscan.store.store import bytes_digest
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

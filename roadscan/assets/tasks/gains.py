@@ -26,9 +26,9 @@ from roadscan.core.ids import TileId
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
-from roadscan.store.store import bytes_digest
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.tasks.tile_files import publish_file

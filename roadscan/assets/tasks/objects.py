@@ -21,8 +21,9 @@ from roadscan.core.strict import Strict
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.asset_schema import asset_schema
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.store import Store
 from roadscan.tiles.tasks.tiles import TaskResult
 
 OBJECTS: Final = "asset_objects"

@@ -24,8 +24,9 @@ from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import bytes_digest, file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
-from roadscan.store.store import Store, bytes_digest, file_digest
+from roadscan.store.store import Store
 from roadscan.surface.tasks.pictures import Pictures, plan_pictures
 
 SEEN: Final = "asset_pictures"

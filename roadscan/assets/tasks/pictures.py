@@ -23,8 +23,8 @@ from roadscan.assets.tasks.sights import best_sights, named
 from roadscan.core.extras import cv2
 from roadscan.core.grid import Bounds
 from roadscan.run.engine.compute import reason_of
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord, read_recorded
-from roadscan.store.store import bytes_digest
 from roadscan.surface.tasks.picture_colours import ColourSource, world_places
 from roadscan.surface.tasks.pictures import Pictures
 from roadscan.surface.views import NO_VIEW, WIDTH, Sights, best_views

@@ -14,7 +14,7 @@ from roadscan.assets.pictures.reader import CutOut, Recognition
 from roadscan.assets.pictures.settings import AssetPicturesSettings
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import cv2, need, needed
-from roadscan.store.store import file_digest
+from roadscan.store.digest import file_digest
 
 Float32 = npt.NDArray[np.float32]
 

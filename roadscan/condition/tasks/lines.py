@@ -29,10 +29,11 @@ from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
-from roadscan.store.store import Store, file_digest
+from roadscan.store.store import Store
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
 from roadscan.tiles.tasks.wanted_products import product_context

@@ -21,9 +21,10 @@ from roadscan.condition.tasks.values import VALUES, Group, GroupTask, load_lane
 from roadscan.core.extras import can_draw
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
-from roadscan.store.store import Store, file_digest
+from roadscan.store.store import Store
 
 PICTURES: Final = "condition_pictures"
 STRIP: Final = "strip"

@@ -22,9 +22,9 @@ from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
-from roadscan.store.store import file_digest
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.tiles import TaskResult
 

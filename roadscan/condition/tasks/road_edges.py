@@ -37,9 +37,9 @@ from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import bytes_digest, file_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
-from roadscan.store.store import bytes_digest, file_digest
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells

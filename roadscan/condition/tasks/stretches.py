@@ -27,9 +27,10 @@ from roadscan.core.ids import TileId
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import ProductContext

@@ -38,9 +38,10 @@ from roadscan.core.witness import Finding
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
-from roadscan.store.store import Store, bytes_digest
+from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table

@@ -24,7 +24,7 @@ from roadscan.formats.vectors.road_lines import (
 )
 from roadscan.georeference.centre_line import CentreLineBuffer
 from roadscan.ingest.reading.format import Reject
-from roadscan.store.store import file_digest
+from roadscan.store.digest import file_digest
 
 BUFFER: Final = "buffer"
 CLASS: Final = "class"

@@ -20,7 +20,7 @@ from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem
 from roadscan.core.survey import ClockConfig, LogConfig, Survey
 from roadscan.ingest.clocks.pairs import PairFit, Pairs, clock_from_arrivals, clock_from_pairs
 from roadscan.ingest.reading.stamps import CALENDAR_SCALES, parse_calendar
-from roadscan.store.store import file_digest
+from roadscan.store.digest import file_digest
 
 Int64 = npt.NDArray[np.int64]
 

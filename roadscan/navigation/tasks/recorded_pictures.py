@@ -12,8 +12,9 @@ from typing import Final
 
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord
-from roadscan.store.store import Store, file_digest
+from roadscan.store.store import Store
 
 NAVIGATION_PICTURE: Final = "navigation_picture"
 CLOCK_PICTURE: Final = "clock_picture"

@@ -18,7 +18,7 @@ from roadscan.site.layer import SiteLayer
 from roadscan.site.material import Material
 from roadscan.site.part import SitePart
 from roadscan.site.parts.vectors import site_layers
-from roadscan.store.store import bytes_digest
+from roadscan.store.digest import bytes_digest
 
 _MULTI: Final = {
     "Point": shapely.multipoints, "LineString": shapely.multilinestrings, "Polygon": shapely.multipolygons,

@@ -27,10 +27,11 @@ from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.compute import Compute
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import file_digest
 from roadscan.store.logs import DataFile
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
-from roadscan.store.store import Store, file_digest
+from roadscan.store.store import Store
 from roadscan.surface.coarse import CoarseSettings, Stretch, coarse_model
 from roadscan.surface.region_settings import RegionSettings
 from roadscan.surface.regions import Region, find_regions

@@ -12,8 +12,9 @@ from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.compute import Compute
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
-from roadscan.store.store import Store, file_digest
+from roadscan.store.store import Store
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.drives import Drives
 from roadscan.tiles.lane_direction import LaneDirections

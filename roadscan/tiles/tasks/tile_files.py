@@ -9,8 +9,9 @@ from pathlib import Path
 
 from roadscan.core.strict import Strict
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.digest import file_digest
 from roadscan.store.manifest import OutputRecord
-from roadscan.store.store import Store, file_digest
+from roadscan.store.store import Store
 from roadscan.tiles.product import ProductContext, SurfaceProduct, Tile, TileFiles, TileProduct, products
 
 

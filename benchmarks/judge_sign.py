@@ -1,7 +1,8 @@
 """Whether a small upright plane is the plate of a sign: segments of simulated streets, and of a labelled recording.
 
 Hard streets hold what looks like one (windows, doors of vans, shop signs, boxes, boards); streets of signs hold signs
-of all sizes. Of the recording only sweeps 0 to 3 are shown.
+of all sizes. A whole drive sees each of them from near; parts of a drive, each about as long as a sweep or some, see
+most of them from afar, and their backs. Of the recording only sweeps 0 to 3 are shown.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from benchmarks.drawn_streets import drawn_street, street_of_signs
 from benchmarks.hard_streets import hard_street
 from benchmarks.judgement import Segments
-from benchmarks.labelled_returns import CLASSES, labelled_returns
+from benchmarks.labelled_returns import CLASSES, LabelledReturns, labelled_returns
 from benchmarks.labelled_scenes import labelled_scenes
 from benchmarks.labelled_street import recording_folder
 from benchmarks.street_scores import NOT_JUDGED, SIGN
@@ -26,15 +27,17 @@ from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.plates import Plate, SignOptions, candidates_of
 from roadscan.simulate import Scene as Street
 
-HARD: Final = (*range(700, 708), *range(712, 716))
+HARD: Final = (*range(12), *range(700, 704))
 SIGNS: Final = range(80, 85)
 DRAWN: Final = range(200, 208)
 """Seeds of hard streets, of streets of signs, and of plain ones, whose parked cars are no signs either."""
 SPOT_DEG: Final = 0.17
 _RECORDED_WEIGHT: Final = 4.0
 """A segment of the recording counts as much as so many of simulated streets."""
-_AROUND_M, _STEP_M = 30.0, 10.0
-"""Margin around the drive, and the step of the square's corners (m)."""
+_AROUND_M, _FAR_M, _STEP_M = 30.0, 75.0, 10.0
+"""Margin around a whole drive and around parts of one, and the step of the square's corners (m)."""
+_PART_S, _PARTS = 0.6, 3
+"""Duration (s) and number of the parts of a drive that are also shown by themselves."""
 FIT: Final = {
     "rounds": 80, "num_leaves": 5, "min_data_in_leaf": 6,
     "increasing": ("bright_median", "bright_high", "filled"),
@@ -48,27 +51,40 @@ def segments(folder: Path) -> Iterator[Segments]:
     streets += [(f"signs {seed}", street_of_signs(seed, divergence_deg=SPOT_DEG)) for seed in SIGNS]
     streets += [(f"drawn {seed}", drawn_street(seed)) for seed in DRAWN]
     for name, street in streets:
-        found = of_street(name, street)
-        if len(found.true):
-            yield found
+        yield from (one for one in of_street(name, street) if len(one.true))
     for number, (scene, labels) in enumerate(labelled_scenes(recording_folder(), folder / "sign-0-3", range(4))):
         yield from of_recording(f"square {number}", scene, labels)
 
 
-def of_street(name: str, street: Street) -> Segments:
-    """Candidates of a simulated street: true are those most of whose returns met a plate."""
+def of_street(name: str, street: Street) -> Iterator[Segments]:
+    """Candidates of a simulated street, as the whole drive sees it and as parts of it do."""
     seen = labelled_returns(street)
-    way = seen.drive_xyh_m[:, :2]
-    corners = np.concatenate([np.floor((way.min(axis=0) - _AROUND_M) / _STEP_M),
-                              np.ceil((way.max(axis=0) + _AROUND_M) / _STEP_M)]) * _STEP_M  # fmt: skip
+    epochs = seen.returns.epoch_gps_ns
+    yield _of_part(name, seen, np.arange(epochs.size), _AROUND_M)
+    first, last = int(epochs.min()), int(epochs.max())
+    for k in range(_PARTS):
+        begin = first + (last - first) * (2 * k + 1) // (2 * _PARTS)
+        part = np.flatnonzero((epochs >= begin) & (epochs < begin + int(_PART_S * 1e9)))
+        if part.size:
+            yield _of_part(name, seen, part, _FAR_M)
+
+
+def _of_part(name: str, seen: LabelledReturns, rows: npt.NDArray[np.int64], around_m: float) -> Segments:
+    """Candidates of some returns of a street."""
+    own = seen.returns.at(rows)
+    way = np.column_stack([own.sensor_x_m, own.sensor_y_m])
+    corners = np.concatenate([np.floor((way.min(axis=0) - around_m) / _STEP_M),
+                              np.ceil((way.max(axis=0) + around_m) / _STEP_M)]) * _STEP_M  # fmt: skip
     box = Box(*corners.tolist())
-    kept = np.flatnonzero(box.holds(seen.returns.x_m, seen.returns.y_m))
-    scene = make_scene(seen.returns.at(kept), box, box, seen.drive_xyh_m)
-    return of_simulated(name, calibrated_scene(scene, gains_of([intensity_sample(scene)])), seen.class_id[kept])
+    kept = np.flatnonzero(box.holds(own.x_m, own.y_m))
+    drive = seen.drive_xyh_m
+    passed = ((drive[:, :2] > way.min(axis=0) - 1.0) & (drive[:, :2] < way.max(axis=0) + 1.0)).all(axis=1)
+    scene = make_scene(own.at(kept), box, box, drive[passed])
+    return of_simulated(name, calibrated_scene(scene, gains_of([intensity_sample(scene)])), seen.class_id[rows[kept]])
 
 
 def of_simulated(name: str, scene: Scene, class_id: npt.NDArray[Any]) -> Segments:
-    """Candidates of a simulated scene with the class of each return."""
+    """Candidates of a simulated scene with classes of its returns: true are those of whose returns most met a plate."""
     found = candidates_of(scene, SignOptions())
     share = np.array([np.mean(class_id[one.rows] == CLASSES.index("sign")) for one in found])
     return _together(name, "simulated", found, share > 0.5, np.where(np.abs(share - 0.35) < 0.15, 0.0, 1.0))

@@ -55,11 +55,12 @@ class Returns:
     @property
     def range_m(self) -> Float64:
         """Returns the distance (n,) from the sensor to the return (m)."""
-        return np.sqrt(
-            (self.x_m - self.sensor_x_m) ** 2
-            + (self.y_m - self.sensor_y_m) ** 2
-            + (self.height_m - self.sensor_height_m) ** 2
-        )
+        return self.ranges_m(slice(None))
+
+    def ranges_m(self, rows: npt.NDArray[np.integer[Any]] | slice) -> Float64:
+        """Returns the distance (k,) from the sensor to some returns (m)."""
+        away = self.x_m[rows] - self.sensor_x_m[rows], self.y_m[rows] - self.sensor_y_m[rows]
+        return np.sqrt(away[0] ** 2 + away[1] ** 2 + (self.height_m[rows] - self.sensor_height_m[rows]) ** 2)
 
     @property
     def light(self) -> Float32:

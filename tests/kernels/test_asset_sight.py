@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.assets.kernels.sight import Places, Rays, follow_rays
+from roadscan.assets.kernels.sight import Places, Rays, follow_rays, rays_near
 
 CELL_M = 0.5
 BANDS_M = np.array([-0.3, 0.5, 1.5, 3.0])
@@ -54,3 +54,32 @@ def test_a_level_ray_passes_each_cell_of_a_row_once_until_it_hits() -> None:
     passed, hidden = followed(np.array([[-3.0, 3.25, 101.0, 1.0, 3.25, 101.0]]), places(4, 20), 9.0, 0.0)
     assert passed[2, :8, 1].tolist() == [1] * 8 and passed.sum() == 8
     assert hidden[2, 8:18, 1].tolist() == [1] * 10 and hidden.sum() == 10
+
+
+def test_rays_near_a_place_are_those_that_numpy_finds_and_those_sent_at_the_moment() -> None:
+    random = np.random.default_rng(5)
+    starts, ends = random.uniform(-2, 2, (600, 3)), random.uniform(-30, 30, (600, 3))
+    ends[9] = starts[9]
+    starts[10] = np.nan
+    epochs, lasers = np.arange(600) * 10, random.integers(0, 8, 600).astype(np.uint16)
+    spans, middles = np.array([[0, 250], [240, 599]]), np.array([1000, 4000])
+    place, reach_m, wide, late = np.array([12.0, -5.0, 3.0]), 3.0, 0.2, 25.0
+    rows, spanned, answered = np.empty(700, np.int64), np.empty(700, np.int64), np.zeros((2, 8), np.bool_)
+    count = rays_near(
+        Rays(*np.ascontiguousarray(np.hstack([starts, ends]).T)), epochs, lasers, spans, place, reach_m, wide, middles,
+        late, rows, spanned, answered,
+    )  # fmt: skip
+
+    way = ends - starts
+    with np.errstate(invalid="ignore"):
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        to = place - starts
+        beside = np.linalg.norm(np.cross(way, to), axis=1)
+        near = ((way * to).sum(axis=1) > 0.0) & (beside < reach_m + wide * np.linalg.norm(to, axis=1))
+    wanted = [(k, s) for s, (a, b) in enumerate(spans) for k in range(a, b + 1)
+              if near[k] or abs(epochs[k] - middles[s]) < late]  # fmt: skip
+    assert 30 < len(wanted) < 300 and not near[9] and not near[10]
+    assert list(zip(rows[:count].tolist(), spanned[:count].tolist(), strict=True)) == wanted
+    assert {(s, int(lasers[k])) for k, s in wanted} == set(
+        zip(*map(np.ndarray.tolist, np.nonzero(answered)), strict=True)
+    )

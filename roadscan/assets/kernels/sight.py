@@ -85,3 +85,35 @@ def follow_rays(rays, places, reach_m, hit_m, passed, hidden):
                 passed[row, column, band] += 1
             else:
                 hidden[row, column, band] += 1
+
+
+@kernel
+def rays_near(rays, epochs, lasers, spans, place, reach_m, wide, middles, late, rows, spanned, answered):
+    """Write the rows, within spans of them, of the rays that pass near a place, or that were sent at a moment.
+
+    Returns their number. A null ray, and one whose beginning is not known, passes nowhere.
+
+    Parameters
+    ----------
+    rays : Rays. epochs : (n,) when each was sent. lasers : (n,) which sent it.
+    spans : (s, 2) first and last row of each span.
+    place : (3,) x, y, height (m). reach_m, wide : a ray is near within reach_m and `wide` times the place's distance.
+    middles, late : (s,) moment of each span; rays that were sent less than `late` before or after it count, of 0 none.
+    rows, spanned : (m,) int64, filled with the rows, ascending in each span, and the number of their span.
+    answered : (s, lasers) bool, set where a laser sent one of these rays of a span.
+    """
+    count = 0
+    for span in range(len(spans)):
+        for k in range(spans[span, 0], spans[span, 1] + 1):
+            way_x, way_y = rays.to_x[k] - rays.from_x[k], rays.to_y[k] - rays.from_y[k]
+            way_z = rays.to_height[k] - rays.from_height[k]
+            x, y, z = place[0] - rays.from_x[k], place[1] - rays.from_y[k], place[2] - rays.from_height[k]
+            away = x * x + y * y + z * z
+            along = x * way_x + y * way_y + z * way_z
+            limit = reach_m + wide * np.sqrt(away)
+            near = along > 0.0 and away - along * along / (way_x**2 + way_y**2 + way_z**2) < limit * limit
+            if near or abs(epochs[k] - middles[span]) < late:
+                rows[count], spanned[count] = k, span
+                answered[span, lasers[k]] = True
+                count += 1
+    return count

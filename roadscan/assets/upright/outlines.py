@@ -150,7 +150,7 @@ def _parting(shape: str, first: Float64, beams: Beams, doubt_m: float) -> tuple[
 
     solution, value = first, 0.0
     for blur in _BLURS_M:
-        found = minimize(loss, solution, (blur,), method="BFGS", jac=True, options={"maxiter": 60, "gtol": 1e-4})
+        found = minimize(loss, solution, (blur,), method="L-BFGS-B", jac=True, options={"maxiter": 60, "gtol": 1e-4})
         solution, value = found.x, float(found.fun)
     if shape == "rectangle":
         reach = columns @ solution

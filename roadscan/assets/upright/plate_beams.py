@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.kernels.sight import Rays, rays_near
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
@@ -26,6 +29,11 @@ _BEHIND_M: Final = 0.15
 """Returns this far behind the plane (m) passed it."""
 _LEAST_OF_LINE, _STRAIGHT_M = 4, 0.04
 """Lines of so many returns are looked at; they are straight within this standard deviation (m)."""
+_WIDE: Final = 0.035
+"""What lies beside a plate within this share of its distance is kept: one and a half firings of slow scanners (rad)."""
+_AT_ONCE: Final = 2.0  # Lasers fire together that fire within this number of firings of a laser.
+_OF_A_FIRING: Final = 2
+"""A laser has this many returns of one stamp at the most where stamps are those of firings."""
 _LEAST_GAP: Final = 1e-4
 """Lasers nearer to one another (rad) draw the same line."""
 
@@ -77,7 +85,15 @@ class _Fan(NamedTuple):
     line: Int64
     """Number of sweep and laser."""
     step: Float64
-    """Epoch, in firings of a laser."""
+    """When a beam was sent, in firings of a laser."""
+    late: Float64
+    """Time from the middle of the longest line of its sweep, in firings of a laser."""
+    across: Float64
+    """(sweeps, 3) unit vectors across the longest lines, and across the beams."""
+    lasers: Int64
+    """(l,) lasers that answered, ascending."""
+    answered: Bool
+    """(sweeps, l) where a laser answered during the sweep."""
 
 
 def beams_of(scene: Scene, edge: Int64, rows: Int64, middle: Float64, axes: tuple[Float64, Float64]) -> Beams | None:
@@ -145,26 +161,123 @@ def _fan(scene: Scene, rows: Int64, normal: Float64) -> _Fan | None:
         return sensor, way / np.where(length > 0.0, length, np.nan)[:, None], length  # a null return has no direction
 
     rows = rows[np.abs(beam(rows)[1] @ normal) > _LEAST_COSINE]
+    order = _order_of(scene, rows)
+    if order is None:
+        return None
+    laser = returns.laser[rows].astype(np.int64)
+    first, last = rows[_longest_lines(np.cumsum(order.starts) - 1, laser, order.moments(rows))].T
+    about, sweep, answered = _around(scene, rows, order, (first, last))
+    laser, moment = returns.laser[about].astype(np.int64), order.moments(about)
+    sorted_ = np.lexsort((moment, laser, sweep))
+    about, sweep, laser, moment = about[sorted_], sweep[sorted_], laser[sorted_], moment[sorted_]
+    line = np.cumsum(np.append(0, (np.diff(sweep) != 0) | (np.diff(laser) != 0)))
+    begun, ended = beam(first)[1], beam(last)[1]
+    across = np.cross(begun + ended, ended - begun)
+    length = np.sqrt((across**2).sum(axis=1))
+    across /= np.where(length > 0.0, length, np.nan)[:, None]
+    middle = (order.moments(first) + order.moments(last)) / 2.0
+    lasers = np.flatnonzero(answered.any(axis=0))
+    return _Fan(
+        about, *beam(about), returns.half_beam_rad(about), np.isin(about, rows), sweep, laser, line,
+        moment / order.period, np.abs(moment - middle[sweep]) / order.period, across, lasers, answered[:, lasers],
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Order:
+    """How the beams over a plate follow one another: in time, or, where all returns of a sweep bear one stamp, as their
+    lines run over the plate.
+    """
+
+    scene: Scene
+    begin: int
+    """First of the rows on the plate."""
+    starts: Bool
+    """Mask of the rows with which a sweep begins."""
+    timed: bool
+    period: float = math.nan
+    """From a firing of a laser to its next one (ns, or rad as seen from the sensor)."""
+
+    def moments(self, rows: Int64) -> Float64:
+        """Returns when beams were sent (n,), from the first on the plate (ns), or how far right of it they go (rad)."""
+        r = self.scene.returns
+        if self.timed:
+            return (r.epoch_gps_ns[rows] - r.epoch_gps_ns[self.begin]).astype(np.float64)
+        east, north = r.x_m[rows] - r.sensor_x_m[rows], r.y_m[rows] - r.sensor_y_m[rows]
+        x, y = (own[self.begin] - at[self.begin] for own, at in ((r.x_m, r.sensor_x_m), (r.y_m, r.sensor_y_m)))
+        return np.asarray(np.arctan2(east * y - north * x, east * x + north * y))
+
+
+@once_a_scene
+def _ends_of_stamps(scene: Scene) -> Int64:
+    """Returns the last row (k,) of each run of rows with one stamp, ascending."""
+    epochs = scene.returns.epoch_gps_ns
+    return np.flatnonzero(np.diff(epochs, append=epochs[-1:] + 1))
+
+
+def _order_of(scene: Scene, rows: Int64) -> _Order | None:
+    """Returns how the beams to some rows follow one another; None where no laser met two of them in one sweep."""
+    if not rows.size:
+        return None
+    returns, ends = scene.returns, _ends_of_stamps(scene)
     epoch, laser = returns.epoch_gps_ns[rows], returns.laser[rows].astype(np.int64)
     device = returns.pass_id[rows].astype(np.int64) * 256 + returns.sensor[rows]
-    by_laser = np.lexsort((epoch, laser, device))
-    same = (np.diff(device[by_laser]) == 0) & (np.diff(laser[by_laser]) == 0)
-    apart = np.diff(epoch[by_laser])[same]
+    together = np.diff(ends, prepend=-1)[np.searchsorted(ends, rows)]
+    timed = bool(np.median(together) <= _OF_A_FIRING * (1 + int(returns.laser.max())))
+    begun, later = np.diff(device, prepend=-1) != 0, np.abs(np.diff(epoch, prepend=epoch[:1]))
+    order = _Order(scene, int(rows[0]), begun | (later > 0), timed)
+    sweep = device if timed else np.cumsum(order.starts)
+    moment = order.moments(rows)
+    by_laser = np.lexsort((moment, laser, sweep))
+    same = (np.diff(sweep[by_laser]) == 0) & (np.diff(laser[by_laser]) == 0)
+    apart = np.diff(moment[by_laser])[same]
     if not (apart > 0).any():
         return None
     period = float(np.quantile(apart[apart > 0], 0.1))
-    starts = np.flatnonzero(np.append(True, (np.diff(device) != 0) | (np.abs(np.diff(epoch)) > _SWEEP * period)))
-    first = np.maximum(rows[starts] - _AROUND, 0)
-    last = np.minimum(rows[np.append(starts[1:], rows.size) - 1] + _AROUND, len(returns) - 1)
-    sweep = np.repeat(np.arange(starts.size), last - first + 1)
-    about = np.concatenate([np.arange(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True)])
-    laser, epoch = returns.laser[about].astype(np.int64), returns.epoch_gps_ns[about]
-    order = np.lexsort((epoch, laser, sweep))
-    about, sweep, laser = about[order], sweep[order], laser[order]
-    line = np.cumsum(np.append(0, (np.diff(sweep) != 0) | (np.diff(laser) != 0)))
-    step = (epoch[order] - epoch[order[0]]) / period
-    half_rad = returns.half_beam_rad(about)
-    return _Fan(about, *beam(about), half_rad, np.isin(about, rows), sweep, laser, line, step)
+    return replace(order, starts=begun | (later > (_SWEEP * period if timed else 0)), period=period)
+
+
+def _longest_lines(sweep: Int64, laser: Int64, moment: Float64) -> Int64:
+    """Returns the first and the last (sweeps, 2) of the returns that the busiest laser of each sweep has on a plate."""
+    order = np.lexsort((moment, laser, sweep))
+    starts = np.flatnonzero(np.append(True, (np.diff(sweep[order]) != 0) | (np.diff(laser[order]) != 0)))
+    ends = np.append(starts[1:], order.size) - 1
+    longest = np.lexsort((starts - ends, sweep[order[starts]]))
+    longest = longest[np.append(True, np.diff(sweep[order[starts[longest]]]) != 0)]
+    return np.column_stack([order[starts[longest]], order[ends[longest]]])
+
+
+def _around(
+    scene: Scene, rows: Int64, order: _Order, longest: tuple[Int64, Int64]
+) -> tuple[Int64, Int64, Bool]:  # fmt: skip
+    """Rows (k,) of the beams near a plate or sent with its longest lines, their sweeps; who answered (sweeps, lasers).
+
+    longest : the first and the last return (sweeps,) of the longest line of each sweep.
+    """
+    returns = scene.returns
+    starts = np.flatnonzero(order.starts)
+    first, last = rows[starts], rows[np.append(starts[1:], rows.size) - 1]
+    if order.timed:
+        first, last = np.maximum(first - _AROUND, 0), np.minimum(last + _AROUND, len(returns) - 1)
+    else:  # the rows of a sweep have the order of their places: it is looked at as a whole
+        ends = _ends_of_stamps(scene)
+        sweep = np.searchsorted(ends, first)
+        first, last = np.append(-1, ends)[sweep] + 1, ends[sweep]
+    spans = np.column_stack([first, last])
+    middles = returns.epoch_gps_ns[longest[0]] + np.diff(returns.epoch_gps_ns[np.array(longest)], axis=0)[0] // 2
+    late_ns = _AT_ONCE * order.period if order.timed else 0.0
+    ends = [np.array([c[rows].min(), c[rows].max()]) for c in (returns.x_m, returns.y_m, returns.height_m)]
+    middle = np.array([end.mean() for end in ends])
+    reach_m = 0.5 * math.sqrt(sum(float(np.ptp(end)) ** 2 for end in ends)) + 2.0 * _ABOUT_M
+    rays = Rays(returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m,
+                returns.x_m, returns.y_m, returns.height_m)  # fmt: skip
+    about, sweep = (np.empty(int((last - first + 1).sum()), np.int64) for _ in range(2))
+    answered = np.zeros((len(spans), int(returns.laser.max()) + 1), np.bool_)
+    count = rays_near(
+        rays, returns.epoch_gps_ns, returns.laser, spans, middle, reach_m, _WIDE, middles, late_ns, about, sweep,
+        answered,
+    )  # fmt: skip
+    return about[:count], sweep[:count], answered
 
 
 def _beside_lines(fan: _Fan) -> tuple[Float64, Float64, Float64]:
@@ -190,29 +303,17 @@ def _beside_lasers(fan: _Fan) -> tuple[Float64, Float64, Float64]:
 
     The angles between lasers are those of sweeps in which both saw something, on the plate or elsewhere.
     """
-    lasers, laser = np.unique(fan.laser, return_inverse=True)
-    on = np.flatnonzero(fan.on)
-    starts = np.flatnonzero(np.append(True, np.diff(fan.line[on]) != 0))
-    ends = np.append(starts[1:], on.size) - 1
-    longest = np.lexsort((starts - ends, fan.sweep[on[starts]]))
-    longest = longest[np.append(True, np.diff(fan.sweep[on[starts[longest]]]) != 0)]
-    first, last = on[starts[longest]], on[ends[longest]]
-    drawn = fan.way[last] - fan.way[first]
-    across = np.cross(fan.way[first] + fan.way[last], drawn)
-    length = np.sqrt((across**2).sum(axis=1))
-    across /= np.where(length > 0.0, length, np.nan)[:, None]
-    late = np.abs(fan.step - (fan.step[first] + fan.step[last])[fan.sweep] / 2)
-    near = np.lexsort((late, fan.line))
+    laser, on = np.searchsorted(fan.lasers, fan.laser), np.flatnonzero(fan.on)
+    near = np.lexsort((fan.late, fan.line))
     near = near[np.append(True, np.diff(fan.line[near]) != 0)]
-    near = near[late[near] < 2.0]
-    angle = np.full((first.size, lasers.size), np.nan)
-    angle[fan.sweep[near], laser[near]] = np.arcsin((fan.way[near] * across[fan.sweep[near]]).sum(axis=1))
+    near = near[fan.late[near] < _AT_ONCE]
+    angle = np.full(fan.answered.shape, np.nan)
+    angle[fan.sweep[near], laser[near]] = np.arcsin((fan.way[near] * fan.across[fan.sweep[near]]).sum(axis=1))
     between = angle[:, None, :] - angle[:, :, None]
     known = np.isfinite(between)
     gaps = np.where(known, between, 0.0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
-    met, answered = np.zeros(angle.shape, np.bool_), np.zeros(angle.shape, np.bool_)
+    met = np.zeros(angle.shape, np.bool_)
     met[fan.sweep[on], laser[on]] = True
-    answered[fan.sweep, laser] = True
     sweeps = np.arange(len(angle))
     sensor, way, half = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
     for side in (1.0, -1.0):
@@ -220,9 +321,9 @@ def _beside_lasers(fan: _Fan) -> tuple[Float64, Float64, Float64]:
         apart = np.where(side * gaps > _LEAST_GAP, side * gaps, np.inf)[outermost]
         following = apart.argmin(axis=1)
         gap = apart[sweeps, following]
-        void = np.isfinite(gap) & ~answered[sweeps, following] & np.isfinite(angle[sweeps, outermost])
+        void = np.isfinite(gap) & ~fan.answered[sweeps, following] & np.isfinite(angle[sweeps, outermost])
         line = on[void[fan.sweep[on]] & (laser[on] == outermost[fan.sweep[on]])]
-        axis, turn = across[fan.sweep[line]], gap[fan.sweep[line]][:, None]
+        axis, turn = fan.across[fan.sweep[line]], gap[fan.sweep[line]][:, None]
         aside = axis - (fan.way[line] * axis).sum(axis=1)[:, None] * fan.way[line]
         aside *= side / np.sqrt((aside**2).sum(axis=1))[:, None]
         sensor.append(fan.sensor[line])

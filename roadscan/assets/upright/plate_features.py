@@ -34,6 +34,10 @@ _LONG_M: Final = 2.5
 """Surfaces from this length (m) are large."""
 _CELLS: Final = 5
 """Cells along each side of the outline, of which some are filled."""
+_SWEEP_NS: Final = 20_000_000
+"""A gap of this length (ns) between two returns lies between two sweeps: lidars turn in 50 ms or more."""
+_LEAST_OF_SWEEP: Final = 3
+"""So many returns of a sweep on a plate tell how far the poses moved it."""
 _VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 
 
@@ -51,8 +55,7 @@ class PlaneOfPlate(NamedTuple):
 
 
 def features_of(
-    scene: Scene, plane: PlaneOfPlate, outline: Outline, beams: Beams | None, residual_m: float, beside: float,
-    above_m: float,
+    scene: Scene, plane: PlaneOfPlate, outline: Outline, beams: Beams | None, beside: float, above_m: float
 ) -> dict[str, float]:  # fmt: skip
     """Returns the features of a plate by name; NaN where one is not known.
 
@@ -60,7 +63,9 @@ def features_of(
     """
     returns, near = scene.returns, plane.near
     past = np.column_stack([returns.x_m[near], returns.y_m[near], returns.height_m[near]]) - plane.middle
-    u, v, away = past @ plane.right, past @ plane.up, np.abs(past @ plane.normal)
+    on = np.isin(near, plane.rows)
+    u, v, off = past @ plane.right, past @ plane.up, _off_its_sweep(scene, near, on, past @ plane.normal)
+    away = np.abs(off)
     wide, tall = outline.width_m / 2, outline.height_m / 2
     inside = (np.abs(u) < wide) & (np.abs(v) < tall)
     column = (np.abs(u) < wide + 0.1) & (away < 0.25)
@@ -72,9 +77,9 @@ def features_of(
     light = brightness(scene)[plane.rows]
     green = np.isin(scene.classes[near[around]], _VEGETATION)
     return {
-        "returns": math.log(number), "range_m": float(np.median(returns.range_m[plane.rows])),
+        "returns": math.log(number), "range_m": float(np.median(returns.ranges_m(plane.rows))),
         "bright_median": float(np.median(light)), "bright_high": float(np.quantile(light, 0.9)),
-        "residual_m": residual_m, "beside": beside,
+        "residual_m": float(np.sqrt(np.mean(off[on] ** 2))), "beside": beside,
         "behind": float((inside & (away > _THIN_M) & (away < _BEHIND_M)).sum()) / number,
         "around": float(around.sum()) / number, "on_top": float(on_top.sum()) / number,
         "below": float(below.sum()) / number,
@@ -87,6 +92,23 @@ def features_of(
         "passed": _passed(beams, outline), "vehicle": _vehicles(scene, plane.middle) / number,
         "wall_m": _to_wall(scene, plane),
     }  # fmt: skip
+
+
+def _off_its_sweep(scene: Scene, rows: Int64, on: npt.NDArray[np.bool_], off_m: Float64) -> Float64:
+    """Returns how far returns lie off the plane (n,), where their own sweep saw it (m).
+
+    Poses step from sweep to sweep: what lies behind a plate by less than that was seen by another sweep.
+    """
+    returns = scene.returns
+    device = returns.pass_id[rows].astype(np.int64) * 256 + returns.sensor[rows]
+    later = np.diff(returns.epoch_gps_ns[rows]) > _SWEEP_NS
+    sweep = np.append(0, np.cumsum(later | (np.diff(device) != 0)))
+    out = off_m.copy()
+    for own in range(int(sweep[-1]) + 1):
+        of_sweep = sweep == own
+        if np.count_nonzero(of_sweep & on) >= _LEAST_OF_SWEEP:
+            out[of_sweep] -= np.median(off_m[of_sweep & on])
+    return out
 
 
 def _filled(u: Float64, v: Float64, on: npt.NDArray[np.bool_], wide: float, tall: float) -> float:
@@ -123,8 +145,10 @@ def _tree_of_vehicles(scene: Scene) -> cKDTree | None:
 
 def _to_wall(scene: Scene, plane: PlaneOfPlate) -> float:
     """Returns the distance from a plate to the nearest large surface that it is not itself (m), at most 2."""
-    away = _WALL_M
+    least = _WALL_M
     for region in regions_of(scene):
-        if region.length_m > _LONG_M and np.isin(plane.rows, region.rows).mean() < 0.5:
-            away = min(away, region.distance_m(float(plane.middle[0]), float(plane.middle[1]), 0.3))
-    return away
+        if region.length_m > _LONG_M:
+            away = region.distance_m(float(plane.middle[0]), float(plane.middle[1]), 0.3)
+            if away < least and np.isin(plane.rows, region.rows).mean() < 0.5:
+                least = away
+    return least

@@ -1,4 +1,4 @@
-"""Features of shafts, as their judges ask for them: how they are built, and what is about them."""
+"""Features of shafts, as their judge asks for them: how they are built, and what is about them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy.typing as npt
 from roadscan.assets import classes
 from roadscan.assets.moving import SLOT_NS
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.attachments import About, crown_share
 from roadscan.assets.upright.places import places_of
 from roadscan.assets.upright.regions import Region, regions_of
 from roadscan.assets.upright.shafts import Shaft
@@ -33,10 +32,6 @@ _FAR_M: Final = 3.0
 """Surfaces are sought up to this distance (m)."""
 _SECTORS: Final = 8
 """Directions about a shaft."""
-_OF_TRUNKS: Final = ("radius_m", "more_lean_deg", "residual_m", "rough", "slender", "widths_m", "flat", "own_leaves")
-"""Features of the shaft itself that tell trunks from poles."""
-_CROWN_M: Final = 1.5
-"""Returns within this distance of the axis (m) show a crown."""
 _LEAST_OF_SLICE: Final = 4
 """Slices with fewer returns show no middle and no width."""
 
@@ -55,35 +50,6 @@ def features_of(scene: Scene, shafts: list[Shaft]) -> dict[str, Float64]:
         for k, shaft in enumerate(shafts)
     ]
     return {name: np.array([row[name] for row in rows], np.float64) for name in (rows[0] if rows else ())}
-
-
-def trunk_features(scene: Scene, shafts: list[Shaft], near: list[About]) -> dict[str, Float64]:
-    """Returns the features (n,) by which trunks are told from poles: of the shaft, and of what is about its upper part.
-
-    near : what is about each shaft.
-    """
-    own = features_of(scene, shafts)
-    crowns = [_crown(scene, shaft, one) for shaft, one in zip(shafts, near, strict=True)]
-    names = crowns[0] if crowns else ()
-    return {name: own[name] for name in _OF_TRUNKS if own} | {
-        name: np.array([row[name] for row in crowns], np.float64) for name in names
-    }
-
-
-def _crown(scene: Scene, shaft: Shaft, near: About) -> dict[str, float]:
-    close = near.away_m < _CROWN_M
-    kind, above = scene.classes[near.rows[close]], near.above_m[close]
-    top_m = max(float(np.quantile(above, 0.98)), shaft.top_above_m) if kind.size else shaft.top_above_m
-    return {
-        "crown": crown_share(near, shaft), "crown_over_m": top_m - shaft.top_above_m, "crown_top_m": top_m,
-        "crown_leaves": float(np.mean(_are_leaves(kind))) if kind.size else math.nan,
-        "crown_returns": math.log((kind.size + 1.0) / shaft.rows.size),
-        "crown_away_m": float(np.mean(near.away_m[close])) if kind.size else math.nan,
-    }  # fmt: skip
-
-
-def _are_leaves(kind: npt.NDArray[np.uint8]) -> Bools:
-    return np.asarray((kind >= classes.LOW_VEGETATION) & (kind <= classes.HIGH_VEGETATION))
 
 
 def _own(shaft: Shaft) -> dict[str, float]:
@@ -133,7 +99,8 @@ def _about(scene: Scene, shaft: Shaft) -> dict[str, float]:
     out["sides_taken"] = float(np.mean(held))
     out["opposite"] = float(np.max(held & np.roll(held, _SECTORS // 2)))
     kind = scene.classes[near]
-    for name, one in (("leaves", _are_leaves(kind)), ("building", kind == classes.BUILDING)):
+    leaves = (kind >= classes.LOW_VEGETATION) & (kind <= classes.HIGH_VEGETATION)
+    for name, one in (("leaves", leaves), ("building", kind == classes.BUILDING)):
         out[name], out[f"own_{name}"] = _share(beside & one, beside), _share(own & one, own)
     slots = np.unique(returns.epoch_gps_ns[near[own]] // SLOT_NS)
     later = np.setdiff1d(returns.epoch_gps_ns[near[higher | others]] // SLOT_NS, slots)

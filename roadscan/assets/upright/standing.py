@@ -22,7 +22,7 @@ from roadscan.assets.upright.shafts import ALONE_M, Shaft, shafts_of
 Int64 = npt.NDArray[np.int64]
 Standing = Literal["pole", "lighting", "signal", "tree", "delineator"]
 
-POST: Final = Judge("post", "6e94d3f3eb052be6")
+POST: Final = Judge("post", "feb5bafecf6e42d0")
 """Does a shaft stand by itself, as poles, posts and trunks do?"""
 LEAST: Final = 0.5
 """Less probable shafts are left out."""

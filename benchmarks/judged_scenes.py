@@ -100,8 +100,8 @@ def simulated(street: Street, source: str, weight: float) -> JudgedScene:
     place = np.stack([returns.x_m[inside], returns.y_m[inside]])
     window = Box(*(np.floor(place.min(axis=1) / 3.0) * 3.0 - 3.0), *(np.ceil(place.max(axis=1) / 3.0) * 3.0 + 3.0))
     table = np.full(len(CLASSES), OTHER, np.uint8)
-    for name, what in _OF_CLASS.items():
-        table[CLASSES.index(name)] = what
+    for name, number in _OF_CLASS.items():
+        table[CLASSES.index(name)] = number
     what = table[seen.class_id[inside]]
     for kind in set(_OF_KIND) & set(seen.kinds):
         what[seen.kind[inside] == seen.kinds.index(kind)] = _OF_KIND[kind]

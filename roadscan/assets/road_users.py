@@ -87,20 +87,20 @@ def road_users(
     returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bools, cubes: Cubes, window: Box
 ) -> Users:
     """Returns masks of vehicles and people among the returns that do not lie on the ground."""
-    held = columns_of(returns, above_m, on_ground, window)
-    moving = moving_cells(held)
-    vehicle, person = tracks(held, moving)
-    parked = parked_cells(held, moving, Bodies(returns, above_m, on_ground, cubes))
+    raster = columns_of(returns, above_m, on_ground, window)
+    moving = moving_cells(raster)
+    vehicle, person = tracks(raster, moving)
+    parked = parked_cells(raster, moving, Bodies(returns, above_m, on_ground, cubes))
     return Users(
-        returns_of(np.where(parked > 0, parked, vehicle), held, returns, above_m) & ~on_ground,
-        returns_of(person, held, returns, above_m) & ~on_ground,
+        returns_of(np.where(parked > 0, parked, vehicle), raster, returns, above_m) & ~on_ground,
+        returns_of(person, raster, returns, above_m) & ~on_ground,
     )
 
 
-def parked_cells(held: Columns, moving: Bools, bodies: Bodies) -> Int32:
+def parked_cells(raster: Columns, moving: Bools, bodies: Bodies) -> Int32:
     """Returns the level of parked vehicles, in their cells (rows, columns); 0 elsewhere."""
-    groups = groups_of(held, moving, bodies)
-    found = np.zeros(held.top.shape, np.int32)
+    groups = groups_of(raster, moving, bodies)
+    found = np.zeros(raster.top.shape, np.int32)
     if not groups.number.size:
         return found
     is_bush = (groups.features["scattering"] > _LEAFY) & (groups.features["length_m"] > _BUSH_M)
@@ -111,27 +111,29 @@ def parked_cells(held: Columns, moving: Bools, bodies: Bodies) -> Int32:
         inside = label == groups.number[k]
         wider = cv2.dilate(inside.view(np.uint8), np.ones((5, 5), np.uint8)) > 0
         wider &= (label == 0) | inside
-        wider &= held.top[part] <= reached + 1  # what is taller stands beside it
+        wider &= raster.top[part] <= reached + 1  # what is taller stands beside it
         found[part][wider] = np.maximum(found[part][wider], reached + 1)
     return found
 
 
-def groups_of(held: Columns, moving: Bools, bodies: Bodies) -> Groups:
+def groups_of(raster: Columns, moving: Bools, bodies: Bodies) -> Groups:
     """Returns the groups of a window, with their features: lengths in metres, shares of cells and of returns.
 
     None of them counts returns, so that they mean the same for any scanner and any number of passes.
     """
-    low = (held.top >= 1) & (held.top < TALL) & ~moving
-    body = low & ((held.levels & np.uint32(_BODY)) > 0)
+    low = (raster.top >= 1) & (raster.top < TALL) & ~moving
+    body = low & ((raster.levels & np.uint32(_BODY)) > 0)
     count, label, boxes, _ = cv2.connectedComponentsWithStats(body.view(np.uint8), connectivity=8)
     number = 1 + np.flatnonzero(boxes[1:count, cv2.CC_STAT_AREA] >= _LEAST_CELLS)
-    tall = (held.top >= TALL) & ~moving
+    tall = (raster.top >= TALL) & ~moving
     beside = cv2.dilate(tall.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    plan = [_plan_of(held, label, int(k), _part(boxes[k], 3)) for k in number]
+    plan = [_plan_of(raster, label, int(k), _part(boxes[k], 3)) for k in number]
     features = {name: np.array([one[name] for one in plan]) for name in (plan[0] if plan else ())}
     area = boxes[number, cv2.CC_STAT_AREA].astype(np.float64)
     features["tall_beside"] = np.bincount(label[beside], minlength=count)[number] / area
-    features |= {name: values[number] for name, values in _scatter(label.astype(np.int32), held, bodies, count).items()}
+    features |= {
+        name: values[number] for name, values in _scatter(label.astype(np.int32), raster, bodies, count).items()
+    }
     reached = features.pop("reached", np.zeros(0)).astype(np.int32)
     return Groups(label, number, boxes[number, :4], reached, features)
 
@@ -142,18 +144,18 @@ def _part(box: npt.NDArray[np.int32], more: int) -> tuple[slice, slice]:
     return slice(max(lower - more, 0), lower + height + more), slice(max(left - more, 0), left + width + more)
 
 
-def _plan_of(held: Columns, label: Int32, number: int, part: tuple[slice, slice]) -> dict[str, float]:
+def _plan_of(raster: Columns, label: Int32, number: int, part: tuple[slice, slice]) -> dict[str, float]:
     """Returns the features of a group that its cells show."""
     inside = label[part] == number
-    levels, top = held.levels[part][inside], held.top[part][inside]
-    cells, grounds = float(levels.size), np.asarray(held.grounds[part].any(axis=-1))
+    levels, top = raster.levels[part][inside], raster.top[part][inside]
+    cells, grounds = float(levels.size), np.asarray(raster.grounds[part].any(axis=-1))
     length_m, width_m = sides_m(inside)
     seen = [(levels & np.uint32((1 << last) - (1 << first))) > 0 for first, last in _BANDS]
     at_body, at_windows = seen[1] | seen[2], seen[4] | seen[5]
     in_column = np.bitwise_count(levels & np.uint32((1 << TALL) - 2)) >= _COLUMN_LEVELS
-    own = np.zeros(inside.shape, np.bool_)
-    own[inside] = at_windows
-    upper_m = sides_m(own) if own.any() else (0.0, 0.0)
+    at_top = np.zeros(inside.shape, np.bool_)
+    at_top[inside] = at_windows
+    upper_m = sides_m(at_top) if at_top.any() else (0.0, 0.0)
     quantiles = np.quantile(top, [0.1, 0.5, 0.9, 1.0])
     low, middle, high, highest = (float(q + 1.0) * LEVEL_M for q in quantiles)
     return {
@@ -182,7 +184,7 @@ def ground_around(inside: Bools, ground: Bools) -> float:
     return float(np.count_nonzero(ground & ring)) / float(max(int(np.count_nonzero(ring)), 1))
 
 
-def _scatter(label: Int32, held: Columns, bodies: Bodies, count: int) -> dict[str, Float64]:
+def _scatter(label: Int32, raster: Columns, bodies: Bodies, count: int) -> dict[str, Float64]:
     """Returns means (count,) over the cubes of each group: of their scatter, and of what shows the way surfaces face.
 
     A cube counts once, however many returns it has.
@@ -190,7 +192,7 @@ def _scatter(label: Int32, held: Columns, bodies: Bodies, count: int) -> dict[st
     at = np.empty(len(bodies.returns), np.int32)
     lowest, highest = np.full(count, LEVEL_M), np.full(count, TALL * LEVEL_M)
     x, y = bodies.returns.x_m, bodies.returns.y_m
-    columns.marked(x, y, bodies.above_m, held.grid.origin, 1.0 / CELL_M, label, lowest, highest, at)
+    columns.marked(x, y, bodies.above_m, raster.grid.origin, 1.0 / CELL_M, label, lowest, highest, at)
     number = bodies.cubes.number
     chosen = (at > 0) & ~bodies.on_ground & (number >= 0)
     pairs = np.unique(at[chosen].astype(np.int64) * (1 << 32) + number[chosen])

@@ -21,7 +21,7 @@ Int64 = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 _SKIN_M: Final = 0.1
-"""Returns so near to a shaft's surface (m) may be its own: noise of ranges, bark, and steps of poses."""
+"""Returns so near to a shaft's surface (m) may lie on it: noise of ranges, bark, and steps of poses."""
 _RINGS_M: Final = (0.35, 0.6, 1.2)
 """Outer edges of the rings about a shaft's surface (m); what lies farther off does not tell what it is."""
 _COMPANY_M: Final = (1.0, 3.0)
@@ -46,13 +46,13 @@ def features_of(scene: Scene, shafts: list[Shaft]) -> dict[str, Float64]:
     low = [r for r in long if r.top_above_m <= _LOW_M]
     places = np.array([s.foot_xy_m for s in shafts]).reshape(-1, 2)
     rows = [
-        _own(shaft) | _about(scene, shaft) | _company(places, k) | _surfaces(shaft, tall, low)
+        _itself(shaft) | _about(scene, shaft) | _company(places, k) | _surfaces(shaft, tall, low)
         for k, shaft in enumerate(shafts)
     ]
     return {name: np.array([row[name] for row in rows], np.float64) for name in (rows[0] if rows else ())}
 
 
-def _own(shaft: Shaft) -> dict[str, float]:
+def _itself(shaft: Shaft) -> dict[str, float]:
     """Returns features of the shaft itself."""
     axis, seen_m = shaft.axis, max(shaft.top_above_m - shaft.low_above_m, SLICE_M)
     # On a thick shaft, the middle of the visible side varies by half a radius from height to height.
@@ -77,8 +77,8 @@ def _about(scene: Scene, shaft: Shaft) -> dict[str, float]:
     right, ahead = returns.x_m[near] - x, returns.y_m[near] - y
     away = np.hypot(right, ahead) - axis.radius_m
     beside = (above >= shaft.low_above_m) & (above <= shaft.top_above_m)
-    own, others = beside & (away <= _SKIN_M), beside & (away > _SKIN_M)
-    many = max(int(np.count_nonzero(own)), 1)
+    on_it, others = beside & (away <= _SKIN_M), beside & (away > _SKIN_M)
+    many = max(int(np.count_nonzero(on_it)), 1)
 
     def odds(some: Bools) -> float:
         return math.log((int(np.count_nonzero(some)) + 1.0) / many)
@@ -90,22 +90,22 @@ def _about(scene: Scene, shaft: Shaft) -> dict[str, float]:
     close, higher = away <= _RINGS_M[1], above > shaft.top_above_m
     middle = 0.5 * (shaft.low_above_m + shaft.top_above_m)
     for name, part in (("lower", above < middle), ("upper", above >= middle)):
-        out[f"alone_{name}"] = _share(own & part, (own | (others & close)) & part)
+        out[f"alone_{name}"] = _share(on_it & part, (on_it | (others & close)) & part)
     out["below"] = odds((above > 0.1) & (above < shaft.low_above_m) & close)
     out["over"] = odds(higher & close)
     out["goes_on"] = odds(higher & (away <= _SKIN_M) & (above < shaft.top_above_m + 1.0))
     sector = np.floor(np.arctan2(ahead, right) / (2 * math.pi / _SECTORS)).astype(np.int64) % _SECTORS
-    held = np.bincount(sector[others], minlength=_SECTORS) > 0.02 * many
-    out["sides_taken"] = float(np.mean(held))
-    out["opposite"] = float(np.max(held & np.roll(held, _SECTORS // 2)))
+    taken = np.bincount(sector[others], minlength=_SECTORS) > 0.02 * many
+    out["sides_taken"] = float(np.mean(taken))
+    out["opposite"] = float(np.max(taken & np.roll(taken, _SECTORS // 2)))
     kind = scene.classes[near]
     leaves = (kind >= classes.LOW_VEGETATION) & (kind <= classes.HIGH_VEGETATION)
     for name, one in (("leaves", leaves), ("building", kind == classes.BUILDING)):
-        out[name], out[f"own_{name}"] = _share(beside & one, beside), _share(own & one, own)
-    slots = np.unique(returns.epoch_gps_ns[near[own]] // SLOT_NS)
+        out[name], out[f"own_{name}"] = _share(beside & one, beside), _share(on_it & one, on_it)
+    slots = np.unique(returns.epoch_gps_ns[near[on_it]] // SLOT_NS)
     later = np.setdiff1d(returns.epoch_gps_ns[near[higher | others]] // SLOT_NS, slots)
     out["stays"] = slots.size / max(slots.size + later.size, 1)
-    return out | _build(right[own], ahead[own], above[own])
+    return out | _build(right[on_it], ahead[on_it], above[on_it])
 
 
 def _share(some: Bools, of: Bools) -> float:

@@ -45,8 +45,8 @@ _DIGITS: Final = 6
 class Segments:
     """Segments of one street, or of one part of a recorded street."""
 
-    group: str
-    """Streets of one group are held out together."""
+    group: str | npt.NDArray[np.str_]
+    """Segments of one group are held out together: that of the street, or of each segment (n,)."""
     source: str
     """Such as "simulated" or the recording's name."""
     features: dict[str, Float64]
@@ -67,7 +67,7 @@ def fit(segments: Iterable[Segments], *, increasing: Sequence[str] = (), decreas
     names = list(held[0].features)
     rows = np.concatenate([np.column_stack([one.features[n] for n in names]) for one in held])
     true, weight = (np.concatenate([getattr(one, k) for one in held]) for k in ("true", "weight"))
-    group = np.repeat([one.group for one in held], [len(one.true) for one in held])
+    group = np.concatenate([np.broadcast_to(one.group, len(one.true)) for one in held])
     source = np.repeat([one.source for one in held], [len(one.true) for one in held])
     signs = [(n in increasing) - (n in decreasing) for n in names]
     settings = {**_TREES, "monotone_constraints": signs, **changed}

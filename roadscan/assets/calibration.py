@@ -30,8 +30,6 @@ class Curve(NamedTuple):
 
 
 CURVES: Final = {
-    "shafts": Curve(1.15, 0.46),
-    "trees": Curve(-0.29, 0.52),
     "surfaces": Curve(-0.07, 0.48),
     "edges": Curve(-1.56, 1.11),
     "paint": Curve(-0.08, 0.52),

@@ -15,8 +15,8 @@ from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.ground.surface import Place
 from roadscan.assets.kernels.columns import marked
 from roadscan.assets.moving import REACH_M as ROAD_USERS_M
-from roadscan.assets.moving import road_users
 from roadscan.assets.returns import Returns
+from roadscan.assets.road_users import road_users
 from roadscan.assets.scene import Box, GroundModel, Scene, extent_of
 from roadscan.assets.statistics import Statistics
 from roadscan.assets.surroundings import REACH_M as SURROUNDINGS_M

@@ -12,6 +12,5 @@ class Delineator(ShaftKind):
 
     name = "delineator"
     title = "Delineators"
-    curve = "shafts"
     code = classes.POLE
     piece_schema = schema_of(["asset_height_m"], ["type"])

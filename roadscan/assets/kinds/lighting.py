@@ -12,6 +12,5 @@ class Lighting(ShaftKind):
 
     name = "lighting"
     title = "Lighting"
-    curve = "shafts"
     code = classes.POLE
     piece_schema = schema_of(["asset_height_m", "diameter_m", "lean_deg", "arm_m", "lamp_height_m"], ["type"])

@@ -12,6 +12,5 @@ class Pole(ShaftKind):
 
     name = "pole"
     title = "Pole"
-    curve = "shafts"
     code = classes.POLE
     piece_schema = schema_of(["asset_height_m", "diameter_m", "lean_deg"])

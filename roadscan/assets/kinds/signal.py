@@ -12,6 +12,5 @@ class Signal(ShaftKind):
 
     name = "signal"
     title = "Signal"
-    curve = "shafts"
     code = classes.POLE
     piece_schema = schema_of(["asset_height_m", "diameter_m", "lean_deg", "arm_m"])

@@ -17,7 +17,6 @@ class Tree(ShaftKind):
 
     name = "tree"
     title = "Tree"
-    curve = "trees"
     code = classes.HIGH_VEGETATION
     piece_schema = schema_of(["asset_height_m", "trunk_diameter_m", "crown_diameter_m", "lean_deg"])
 

@@ -29,8 +29,6 @@ class Axis:
     radius_m: float
     residual_m: float
     """Root mean square distance of the returns from the cylinder."""
-    sigma_m: float
-    """Standard deviation of the axis in x and y, each."""
 
     @property
     def lean_deg(self) -> float:
@@ -60,7 +58,6 @@ def fit_axis(xyh: Float64, sensor_xy: Float64, *, lean: bool = True) -> Axis:
     order = np.argsort(sector, kind="stable")
     table = np.ascontiguousarray(np.column_stack([xyh[:, :2], xyh[:, 2] - middle, sight])[order])
     state = np.array([float(np.median(xyh[:, 0])), float(np.median(xyh[:, 1])), 0.0, 0.0, 0.03])
-    residual, kept = fit_cylinder(table, sector[order], lean, state, np.empty((len(table), 4)))
-    sigma = math.hypot(max(residual, 0.01) / math.sqrt(max(kept, 1)), 0.003)
+    residual, _ = fit_cylinder(table, sector[order], lean, state, np.empty((len(table), 4)))
     x, y, slope_x, slope_y, radius = map(float, state)
-    return Axis(x, y, middle, slope_x, slope_y, radius, float(residual), sigma)
+    return Axis(x, y, middle, slope_x, slope_y, radius, float(residual))

@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
+from roadscan.assets.upright.axis_sigma import sigma_of
 from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of
 from roadscan.assets.upright.standing import Upright, uprights_of
 
@@ -25,7 +26,7 @@ class ShaftKind(AssetKind):
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns shafts of this kind whose foot lies in the tile."""
         own = [u for u in uprights_of(scene) if u.kind == self.name]
-        pieces = pieces_of(scene, [_place(u) for u in own], self.piece_schema)
+        pieces = pieces_of(scene, [_place(scene, u) for u in own], self.piece_schema)
         return Evidence(pieces, tuple(Marked(rows, code) for u in own for rows, code in self.marks(scene, u)))
 
     def marks(self, scene: Scene, upright: Upright) -> Iterable[tuple[Any, int]]:
@@ -39,10 +40,10 @@ class ShaftKind(AssetKind):
         return objects_at_places(pieces, _APART_M)
 
 
-def _place(upright: Upright) -> Place:
-    shaft = upright.shaft
+def _place(scene: Scene, upright: Upright) -> Place:
+    shaft, sigma = upright.shaft, sigma_of(scene, upright.shaft)
     x, y = shaft.foot_xy_m
     return Place(
-        x, y, shaft.ground_m, shaft.axis.sigma_m, _GROUND_SIGMA_M, upright.probability, upright.rows,
-        upright.attributes, 2.0 * shaft.axis.sigma_m,
+        x, y, shaft.ground_m, sigma.place_m, _GROUND_SIGMA_M, upright.probability, upright.rows, upright.attributes,
+        2.0 * sigma.radius_m,
     )  # fmt: skip

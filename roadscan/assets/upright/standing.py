@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Literal
@@ -10,17 +9,21 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.attachments import About, about, arms, crown, crown_share, is_head_alone, signal_head
 from roadscan.assets.upright.places import places_of
 from roadscan.assets.upright.probability import logistic
-from roadscan.assets.upright.regions import Region, regions_of
+from roadscan.assets.upright.regions import regions_of
+from roadscan.assets.upright.shaft_features import features_of
 from roadscan.assets.upright.shafts import ALONE_M, Shaft, shafts_of
 
 Int64 = npt.NDArray[np.int64]
 Standing = Literal["pole", "lighting", "signal", "tree", "delineator"]
 
+POST: Final = Judge("post", "feb5bafecf6e42d0")
+"""Does a shaft stand by itself, as poles, posts and trunks do?"""
 LEAST: Final = 0.5
 """Less probable shafts are left out."""
 _LOW_M: Final = 1.35
@@ -50,10 +53,9 @@ class Upright:
 @once_a_scene
 def uprights_of(scene: Scene) -> list[Upright]:
     """Returns all thin uprights in a scene with its halo that have a probability of 0.5 or more."""
-    planes = [r for r in regions_of(scene) if r.length_m > 2.5 and r.top_above_m > 1.6]
-    shafts = _beside_surfaces(scene, shafts_of(scene))
-    judged = [(shaft, probability_of(shaft, in_plane(shaft, planes))) for shaft in shafts]
-    probable = _apart([(s, p) for s, p in judged if p >= LEAST])
+    shafts = candidates_of(scene)
+    stated = POST.probability(features_of(scene, shafts)).tolist() if shafts else []
+    probable = _apart([(s, p) for s, p in zip(shafts, stated, strict=True) if p >= LEAST])
     near = [about(scene, shaft) for shaft, _ in probable]
     crowns = [
         0.0 if is_head_alone(scene, a) else tree_probability(shaft, crown_share(a, shaft))
@@ -66,14 +68,14 @@ def uprights_of(scene: Scene) -> list[Upright]:
     ]
 
 
-def _beside_surfaces(scene: Scene, shafts: list[Shaft]) -> list[Shaft]:
-    """Shafts; long low surfaces beside low ones, such as guard rails, do not count as their surroundings."""
+def candidates_of(scene: Scene) -> list[Shaft]:
+    """Returns the shafts of a scene; long low surfaces beside low ones, such as guard rails, are not about these."""
     surfaces = [r for r in regions_of(scene) if r.length_m > _LONG_M and r.top_above_m <= _LOW_M]
     on_surface = np.zeros(len(scene.returns), np.bool_)
     for one in surfaces:
         on_surface[one.rows] = True
     out = []
-    for shaft in shafts:
+    for shaft in shafts_of(scene):
         x, y = shaft.axis.x_m, shaft.axis.y_m
         away = [one.distance_m(x, y, 0.5) for one in surfaces] if shaft.top_above_m <= _LOW_M else []
         if any(_IN_PLANE_M <= a <= _BESIDE_M for a in away) and not any(a < _IN_PLANE_M for a in away):
@@ -85,38 +87,6 @@ def _beside_surfaces(scene: Scene, shafts: list[Shaft]) -> list[Shaft]:
         else:
             out.append(shaft)
     return out
-
-
-def in_plane(shaft: Shaft, planes: list[Region]) -> bool:
-    """Returns whether the shaft lies in an upright surface and is probably a piece of it."""
-    x, y = shaft.axis.x_m, shaft.axis.y_m
-    return any(r.low_above_m <= shaft.top_above_m and r.distance_m(x, y, 0.5) < _IN_PLANE_M for r in planes)
-
-
-def probability_of(shaft: Shaft, inside_plane: bool) -> float:
-    """Returns the probability that a shaft stands by itself: a logistic function of its measures.
-
-    Measures: slices that show it, the share of them from its foot up, the share of the returns about it that are its
-    own, the share of slices free around, the height of its hidden foot, its lean, its roughness, its returns where they
-    are few.
-    """
-    lean = shaft.axis.lean_deg
-    # On a thick shaft, the middle of the visible side varies by half a radius from height to height.
-    wander = math.degrees(math.atan2(0.5 * shaft.axis.radius_m, max(shaft.top_above_m - shaft.low_above_m, 0.2)))
-    if shaft.top_above_m <= _LOW_M:
-        low = [
-            (1.0, min(shaft.slices, 4)), (6.0, shaft.alone), (2.5, shaft.free), (-3.0, shaft.covered),
-            (-25.0, max(shaft.axis.radius_m - 0.13, 0.0)), (-3.0, max(shaft.low_above_m - 0.3, 0.0)), (-0.3, lean),
-            (-0.1, max(25 - shaft.rows.size, 0)), (-6.0, float(inside_plane)),
-        ]  # fmt: skip
-        return logistic(-9.0, low)
-    rough = shaft.axis.residual_m / (0.05 + 0.2 * shaft.axis.radius_m)
-    high = [
-        (0.8, min(shaft.slices, 12)), (3.0, shaft.filled), (5.0, shaft.alone), (1.5, shaft.free),
-        (-1.6, max(rough - 1.0, 0.0)), (-2.0, max(shaft.low_above_m - 0.8, 0.0)),
-        (-0.35, max(lean - 5.0 - wander, 0.0)), (-5.0, float(inside_plane)), (-0.1, max(40 - shaft.rows.size, 0)),
-    ]  # fmt: skip
-    return logistic(-12.5, high)
 
 
 def tree_probability(shaft: Shaft, filled_directions: float) -> float:
@@ -146,7 +116,7 @@ def _told(
     diameter, lean = round(2.0 * shaft.axis.radius_m, 4), round(shaft.axis.lean_deg, 3)
     values: dict[str, float | str | None] = {"asset_height_m": shaft.top_above_m, "diameter_m": diameter}
     if tree >= 0.5:
-        return _tree(shaft, probability * tree, near, trunks)
+        return _tree(shaft, probability, near, trunks)
     if shaft.top_above_m <= _LOW_M:
         values["type"] = "bollard" if diameter > _BOLLARD_M else "post"
         return Upright("delineator", shaft, probability, shaft.rows, values)

@@ -8,6 +8,7 @@ most of them from afar, and their backs. Of the recording only sweeps 0 to 3 are
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,8 +30,10 @@ from roadscan.simulate import Scene as Street
 
 HARD: Final = (*range(12), *range(700, 704))
 SIGNS: Final = range(80, 85)
+AFAR: Final = range(90, 96)
 DRAWN: Final = range(200, 208)
-"""Seeds of hard streets, of streets of signs, and of plain ones, whose parked cars are no signs either."""
+"""Seeds of hard streets, of streets of signs, of such that an HDL-64E sees 80 m far, and of plain ones, whose parked
+cars are no signs either."""
 SPOT_DEG: Final = 0.17
 _RECORDED_WEIGHT: Final = 4.0
 """A segment of the recording counts as much as so many of simulated streets."""
@@ -38,6 +41,9 @@ _AROUND_M, _FAR_M, _STEP_M = 30.0, 75.0, 10.0
 """Margin around a whole drive and around parts of one, and the step of the square's corners (m)."""
 _PART_S, _PARTS = 0.6, 3
 """Duration (s) and number of the parts of a drive that are also shown by themselves."""
+_DARK: Final = 0.1
+"""In parts of a drive every other plate is as dark as this share of its light: the simulator's backs are brighter than
+those of real signs, of which some lidars record no light at all beyond 50 m."""
 FIT: Final = {
     "rounds": 80, "num_leaves": 5, "min_data_in_leaf": 6,
     "increasing": ("bright_median", "bright_high", "filled"),
@@ -49,11 +55,16 @@ def segments(folder: Path) -> Iterator[Segments]:
     """Candidates of each street, and of each square of the recording."""
     streets = [(f"hard {seed}", hard_street(seed)) for seed in HARD]
     streets += [(f"signs {seed}", street_of_signs(seed, divergence_deg=SPOT_DEG)) for seed in SIGNS]
+    streets += [(f"afar {seed}", _from_afar(street_of_signs(seed, divergence_deg=SPOT_DEG))) for seed in AFAR]
     streets += [(f"drawn {seed}", drawn_street(seed)) for seed in DRAWN]
     for name, street in streets:
         yield from (one for one in of_street(name, street) if len(one.true))
     for number, (scene, labels) in enumerate(labelled_scenes(recording_folder(), folder / "sign-0-3", range(4))):
         yield from of_recording(f"square {number}", scene, labels)
+
+
+def _from_afar(street: Street) -> Street:
+    return street.changed(lidar={"model": "HDL-64E", "range_max_m": 80.0}, bag={"on": True})
 
 
 def of_street(name: str, street: Street) -> Iterator[Segments]:
@@ -72,6 +83,9 @@ def of_street(name: str, street: Street) -> Iterator[Segments]:
 def _of_part(name: str, seen: LabelledReturns, rows: npt.NDArray[np.int64], around_m: float) -> Segments:
     """Candidates of some returns of a street."""
     own = seen.returns.at(rows)
+    if around_m == _FAR_M:
+        dark = (seen.class_id[rows] == CLASSES.index("sign")) & (seen.object_id[rows] % 2 == 1)
+        own = replace(own, intensity=np.where(dark, np.float32(_DARK) * own.intensity, own.intensity))
     way = np.column_stack([own.sensor_x_m, own.sensor_y_m])
     corners = np.concatenate([np.floor((way.min(axis=0) - around_m) / _STEP_M),
                               np.ceil((way.max(axis=0) + around_m) / _STEP_M)]) * _STEP_M  # fmt: skip

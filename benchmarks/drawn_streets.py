@@ -70,6 +70,29 @@ def street_of_signs(seed: int, *, divergence_deg: float = 0.0) -> Scene:
     )  # fmt: skip
 
 
+FURNITURE: Final = (
+    "cabinet", "bin", "litter_bin", "bench", "hydrant", "bus_shelter", "planter", "letter_box", "parking_meter",
+    "sandwich_board", "bollard", "advertising_column",
+)  # fmt: skip
+
+
+def street_of_furniture(seed: int) -> Scene:
+    """A drawn street with 16 pieces of furniture beside it, seen by one of three lidars."""
+    random = np.random.default_rng([seed, 41])
+    street = drawn_street(seed)
+    near = street.road.paved_m + 0.6
+    pieces = [
+        {"what": str(random.choice(FURNITURE)), "station_m": float(station + random.uniform(-0.7, 0.7)),
+         "offset_m": float(side * (near + random.uniform(0.2, 2.4))), "scale": float(random.uniform(0.75, 1.3)),
+         "heading_deg": float(random.choice([0.0, 90.0, 180.0]) + random.uniform(-10, 10)),
+         "shade": float(random.uniform(25, 255))}
+        for station in np.arange(2.5, LENGTH_M - 1.0, 4.4) for side in (-1.0, 1.0)
+    ]  # fmt: skip
+    held = street.roadside.model_dump() | {"furniture": pieces, "signs": [], "boxes": []}
+    lidar = street.lidar.model_dump() | {"model": str(random.choice(["HDL-32E", "VLP-16", "HDL-64E"]))}
+    return street.changed(id=f"furniture-{seed}", roadside=held, lidar=lidar, bag={"on": True})
+
+
 def _large_or_small(random: np.random.Generator, station_m: float) -> dict[str, Any]:
     shape = str(random.choice(["rectangle", "rectangle", "rectangle", "round", "octagon", "diamond", "triangle"]))
     wide = tall = float(np.exp(random.uniform(np.log(0.5), np.log(1.5))))

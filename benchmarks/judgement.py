@@ -2,7 +2,8 @@
 
 A question is a file beside this one, `judge_<name>.py`, with a function `segments(folder)` that yields the segments of
 each street with what they are. ``python -m benchmarks.judgement NAME`` fits the trees, writes
-`roadscan/assets/judgement/models/NAME.json` and prints the digest that the code has to name. Streets are the groups:
+`roadscan/assets/judgement/models/NAME.json` and prints the digest that the code has to name. A file with `TYPES` yields
+the type of each segment instead, and a judge is fitted to each of these. Streets are the groups:
 figures of the record are those of streets, and of parts of a recorded street, that the trees had not seen.
 """
 
@@ -14,7 +15,7 @@ import importlib
 import json
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,8 +52,8 @@ class Segments:
     """Such as "simulated" or the recording's name."""
     features: dict[str, Float64]
     """(n,) by name."""
-    true: npt.NDArray[np.bool_]
-    """(n,) what they are."""
+    true: npt.NDArray[Any]
+    """(n,) what they are: whether the answer is yes, or a type."""
     weight: Float64
     """(n,) how much each counts."""
 
@@ -175,9 +176,12 @@ def main() -> None:
     name = parser.parse_args().name
     question = importlib.import_module(f"benchmarks.judge_{name}")
     with tempfile.TemporaryDirectory() as scratch:
-        content = fit(question.segments(bench_folder(Path(scratch))), **getattr(question, "FIT", {}))
-    print(json.dumps(content["record"], indent=1, ensure_ascii=False))
-    print(f'Judge("{name}", "{written(name, content)}")')
+        segments = list(question.segments(bench_folder(Path(scratch))))
+    for one in getattr(question, "TYPES", (name,)):
+        asked = [replace(s, true=s.true == one) if hasattr(question, "TYPES") else s for s in segments]
+        content = fit(asked, **getattr(question, "FIT", {}))
+        print(json.dumps(content["record"], indent=1, ensure_ascii=False))
+        print(f'Judge("{one}", "{written(one, content)}")')
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ VEHICLE: Final = 69  # user-defined
 PERSON: Final = 70  # user-defined
 FENCE: Final = 71  # user-defined
 SIDEWALK: Final = 72  # user-defined
+FURNITURE: Final = 73  # user-defined
 
 CLASS_NAMES: Final = {
     NEVER_CLASSIFIED: "never classified",
@@ -50,5 +51,6 @@ CLASS_NAMES: Final = {
     PERSON: "person",
     FENCE: "fence",
     SIDEWALK: "sidewalk",
+    FURNITURE: "street furniture",
 }
 """Codes up to 19 are those of the ASPRS LAS 1.4 R15 table 17; those from 64 on are left to users by that table."""

@@ -1,0 +1,71 @@
+"""Street furniture: cabinets, bins, benches, hydrants and bus shelters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from roadscan.assets import classes
+from roadscan.assets.judgement.judge import Judge
+from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
+from roadscan.assets.scene import Scene
+from roadscan.assets.upright.compact import Compact, compact_things
+from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of, schema_of
+
+JUDGES: Final = {
+    "cabinet": Judge("cabinet", "83982056314b5c03"), "bin": Judge("bin", "a8377469b6372dfc"), "bench": Judge("bench", "c5ad2187d5715c29"),
+    "hydrant": Judge("hydrant", "2f8f26481b621716"), "bus_shelter": Judge("bus_shelter", "a76bf7ee3f3485e6"),
+}  # fmt: skip
+"""Who is asked whether a compact thing is of a type."""
+_LEAST: Final = 0.5
+"""Less probable things are left out."""
+_APART_M: Final = 0.5  # Things nearer to one another (m) are one.
+_GROUND_SIGMA_M: Final = 0.03  # 1 σ of the height of the ground at a foot (m).
+_EDGE_SIGMA_M: Final = 0.05
+"""1 σ of where the end of a thing lies beyond its outermost returns (m): a third of the cells that part things."""
+
+
+class StreetFurniture(AssetKind):
+    """Street furniture, from compact things (:mod:`roadscan.assets.upright.compact`)."""
+
+    name = "street_furniture"
+    title = "Street furniture"
+    piece_schema = schema_of(["asset_height_m", "length_m", "width_m", "heading_deg"], ["type"])
+
+    def evidence(self, scene: Scene, options: Any) -> Evidence:
+        """Returns what is probably furniture and whose middle lies in the tile."""
+        told = told_apart(compact_things(scene))
+        pieces = pieces_of(scene, [_place(scene, *one) for one in told], self.piece_schema)
+        return Evidence(pieces, tuple(Marked(thing.rows, classes.FURNITURE) for thing, _, _ in told))
+
+    def objects(
+        self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
+    ) -> Iterable[AssetObject]:
+        """Returns an object for each thing."""
+        return objects_at_places(pieces, _APART_M)
+
+
+def told_apart(things: list[Compact]) -> list[tuple[Compact, str, float]]:
+    """Returns the things that are probably furniture, each with its most probable type and that probability."""
+    if not things:
+        return []
+    features = {name: np.array([one.features[name] for one in things]) for name in things[0].features}
+    stated = np.column_stack([judge.probability(features) for judge in JUDGES.values()])
+    best, types = stated.argmax(axis=1).tolist(), list(JUDGES)
+    told = [(one, types[k], float(p[k])) for one, k, p in zip(things, best, stated, strict=True)]
+    return [one for one in told if one[2] >= _LEAST]
+
+
+def _place(scene: Scene, thing: Compact, kind: str, probability: float) -> Place:
+    ground = float(scene.ground.height_at(thing.x_m, thing.y_m))
+    values = {
+        "asset_height_m": thing.height_m, "length_m": thing.length_m, "width_m": thing.width_m,
+        "heading_deg": thing.heading_deg, "type": kind,
+    }  # fmt: skip
+    return Place(
+        thing.x_m, thing.y_m, ground, _EDGE_SIGMA_M, _GROUND_SIGMA_M, probability, thing.rows, values,
+        float(np.hypot(_EDGE_SIGMA_M, _EDGE_SIGMA_M)),
+    )  # fmt: skip

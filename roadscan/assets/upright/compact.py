@@ -78,7 +78,8 @@ def _labelled(scene: Scene) -> tuple[Int64, npt.NDArray[np.int32], int]:
     """Returns rows (n,) that stand on the ground, the number of the component of each, and the number of components."""
     returns, window = scene.returns, scene.window
     above = scene.above_ground_m
-    held = usable(scene) & (above > _LOWEST_M) & (above < _HIGHEST_M)
+    stands = usable(scene) | (scene.classes == classes.VEHICLE)  # who tells vehicles takes some bins for small ones
+    held = stands & (above > _LOWEST_M) & (above < _HIGHEST_M)
     for region in regions_of(scene):
         if region.length_m > _FRONT_M:
             held[region.rows] = False
@@ -157,6 +158,7 @@ def _measured(scene: Scene, rows: Int64, form: Float64) -> Compact | None:
         "upright_planes": float(np.mean(flat & (form[:, 3] < 0.3))),
         "light": float(np.median(light)), "light_spread": float(np.std(light)),
         "green": float(np.isin(scene.classes[rows], _VEGETATION).mean()),
+        "vehicle": float(np.mean(scene.classes[rows] == classes.VEHICLE)),
         "drive_m": _to_drive(scene, x, y), "wall_m": _to_wall(scene, x, y),
     }  # fmt: skip
     heading = math.degrees(math.atan2(way[0], way[1])) % 180.0

@@ -1,4 +1,4 @@
-"""Fences: surfaces that let sight lines through."""
+"""Fences: boundaries that let beams through."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ class Fence(SurfaceKind):
 
     name = "fence"
     title = "Fencing"
-    curve = "surfaces"
+    curve = "products"
     code = classes.FENCE

@@ -11,5 +11,5 @@ class Guardrail(SurfaceKind):
 
     name = "guardrail"
     title = "Guard Rail"
-    curve = "surfaces"
+    curve = "products"
     code = classes.BARRIER

@@ -11,5 +11,5 @@ class Wall(SurfaceKind):
 
     name = "wall"
     title = "Wall"
-    curve = "surfaces"
+    curve = "products"
     code = classes.BARRIER

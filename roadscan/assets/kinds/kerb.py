@@ -55,6 +55,7 @@ class Kerb(AssetKind):
 
     name: ClassVar[str] = "kerb"
     title: ClassVar[str] = "kerbs: steps beside the road"
+    curve: ClassVar[str] = "products"
     options: ClassVar[type[Strict]] = KerbOptions
     piece_schema: ClassVar[pa.Schema] = LINE_PIECES
 

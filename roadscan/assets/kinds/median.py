@@ -37,6 +37,7 @@ class Median(AssetKind):
 
     name: ClassVar[str] = "median"
     title: ClassVar[str] = "medians: raised strips between two kerbs"
+    curve: ClassVar[str] = "products"
     options: ClassVar[type[Strict]] = MedianOptions
     piece_schema: ClassVar[pa.Schema] = BESIDE_PIECES
 

@@ -36,6 +36,7 @@ class Sidewalk(AssetKind):
 
     name: ClassVar[str] = "sidewalk"
     title: ClassVar[str] = "sidewalks: walkways behind a kerb"
+    curve: ClassVar[str] = "products"
     options: ClassVar[type[Strict]] = SidewalkOptions
     piece_schema: ClassVar[pa.Schema] = BESIDE_PIECES
 

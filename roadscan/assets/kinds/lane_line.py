@@ -31,7 +31,7 @@ class LaneLine(AssetKind):
 
     name = "lane_line"
     title = "lane lines"
-    curve = "products"
+    curve = "paint"
     options = LaneLineOptions
     piece_schema: ClassVar[pa.Schema] = LINE_PIECES
 

@@ -115,4 +115,4 @@ def _outward(scene: Scene, place: Float64) -> Float64:
         return np.full(len(place), np.nan)
     away, at = scipy.spatial.cKDTree(drive[:, :2]).query(place[:, :2])
     x, y, ux, uy = place.T
-    return ((x - drive[at, 0]) * uy - (y - drive[at, 1]) * ux) / np.maximum(away, 1e-9)
+    return np.asarray(((x - drive[at, 0]) * uy - (y - drive[at, 1]) * ux) / np.maximum(away, 1e-9))

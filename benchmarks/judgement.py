@@ -14,7 +14,7 @@ import hashlib
 import importlib
 import json
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -56,6 +56,14 @@ class Segments:
     """(n,) what they are: whether the answer is yes, or a type."""
     weight: Float64
     """(n,) how much each counts."""
+
+
+def with_unknown(segments: Iterable[Segments], names: Sequence[str], share: float = 0.3) -> Iterator[Segments]:
+    """Segments, and each again with a share of its weight and without some features: not all data tell them."""
+    for one in segments:
+        unknown = {name: np.full(len(one.true), np.nan) for name in names}
+        yield one
+        yield replace(one, features=one.features | unknown, weight=share * one.weight)
 
 
 def fit(segments: Iterable[Segments], *, increasing: Sequence[str] = (), decreasing: Sequence[str] = (),

@@ -11,7 +11,7 @@ import scipy.ndimage
 import scipy.spatial
 
 from roadscan.assets.edges.beside import Beside, beside_of
-from roadscan.assets.edges.find import edges_of
+from roadscan.assets.edges.free import free_edges
 from roadscan.assets.edges.line_pieces import NODE_COLUMNS, CutEdge, columns_of, cut_at, dense
 from roadscan.assets.edges.profiles import smooth_line
 from roadscan.assets.edges.raster import HeightRaster, raster_of
@@ -80,7 +80,7 @@ def road_edges(scene: Scene) -> list[CutEdge]:
     raster = raster_of(scene)
     if len(scene.drive_xyh_m) < 2 or not (raster.count > 0).any():
         return []
-    kerbs = [columns_of(edge) for edge in edges_of(scene)]
+    kerbs = [columns_of(edge) for edge in free_edges(scene)]
     beside = beside_of(scene)
     parts: list[CutEdge] = []
     for track in tracks_of(scene.drive_xyh_m):

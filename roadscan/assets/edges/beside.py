@@ -9,7 +9,6 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.assets import classes
-from roadscan.assets.edges.find import edges_of
 from roadscan.assets.edges.free import free_edges
 from roadscan.assets.edges.line_pieces import NODE_COLUMNS, columns_of, cut_at, dense, line_schema, pieces_table
 from roadscan.assets.edges.raster import HeightRaster, raster_of
@@ -68,7 +67,7 @@ def beside_of(scene: Scene) -> Beside:
     rest = np.where(known, np.square(np.where(known, raster.height_m, 0.0) - np.nan_to_num(height)), 0.0)
     rough = np.sqrt(np.nan_to_num(smooth(rest, known, 3.0)))
     edge_x, edge_y = np.zeros(known.shape), np.zeros(known.shape)
-    for edge in edges_of(scene):
+    for edge in free_edges(scene):
         x, y = dense(columns_of(edge)[:, :2], raster.cell_m / 2)
         ux, uy = np.gradient(x), np.gradient(y)
         length = np.maximum(np.hypot(ux, uy), 1e-9)

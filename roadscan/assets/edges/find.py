@@ -22,23 +22,23 @@ Mask = npt.NDArray[np.bool_]
 
 
 class EdgeSettings(NamedTuple):
-    """What makes a path of steps an edge. One setting for all data."""
+    """What makes a path of steps an edge. One setting for all data; a judge tells which edges are kerbs."""
 
     least_step_m: float = 0.015
     greatest_step_m: float = 0.28
     """Higher steps are walls."""
-    seen_low: float = 0.75
+    seen_low: float = 0.6
     """Least share of the lower side that is seen: elsewhere, rings of a lidar look like steps."""
     seen_high_m: float = 0.25
-    covered: float = 0.5
+    covered: float = 0.35
     """Least share of a node's window along the edge that is seen on both sides."""
-    ratio: float = 4.0
+    ratio: float = 2.5
     """Least ratio of a step to the scatter of its sides."""
     least_part_m: float = 1.0
     """Shorter parts of a path are left out."""
-    least_length_m: float = 2.0
+    least_length_m: float = 1.5
     """Least seen length of an edge, all its parts together."""
-    least_evidence: float = 8.0
+    least_evidence: float = 5.0
     """Least evidence (σ · m) of all parts of an edge."""
     bridge_m: float = 7.0
     """Longest gap between two edges in one line: a car, a driveway."""
@@ -55,6 +55,8 @@ class Edge(NamedTuple):
     """(n,) nodes whose step was measured; the others bridge hidden parts."""
     evidence: float
     """Evidence (σ · m) of its places."""
+    probability: Float64 | None = None
+    """(n,) of a kerb at each node; None where it was not judged."""
 
 
 DEFAULT: Final = EdgeSettings()

@@ -1,4 +1,4 @@
-"""Edges that may be kerbs: steps also occur along a fence, a rut under the vehicle, and plants."""
+"""Edges that are kerbs: steps also occur along walls, hedges, ruts and beds, at rings of a lidar and between sweeps."""
 
 from __future__ import annotations
 
@@ -6,25 +6,33 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+import scipy.ndimage
 
 from roadscan.assets import classes
 from roadscan.assets.edges.find import Edge, edges_of
-from roadscan.assets.edges.line_pieces import columns_of
-from roadscan.assets.edges.raster import HeightRaster, raster_of
+from roadscan.assets.edges.node_features import node_features
+from roadscan.assets.edges.profiles import NODE_M
+from roadscan.assets.edges.raster import raster_of
+from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels.corridors import mark_corridor
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.core.extras import cv2
 
+Float64 = npt.NDArray[np.float64]
+
+KERB: Final = Judge("kerb", "9d7feef1eaa382a5")
+"""Whether a node of an edge lies at a kerb."""
+LEAST: Final = 0.5
+"""An edge is cut where it is less probable (smoothed) that it is a kerb."""
+_SMOOTH_NODES: Final = 7  # Probabilities are means over this many nodes (3 m).
+_HOLE_NODES: Final = 4  # A shorter run of doubtful nodes (2 m) does not cut an edge.
+_SHORTEST_M: Final = 1.5  # Shorter parts are left out (m).
 _FENCE_M: Final = (0.35, 1.2)
 """Heights above the ground at which every fence and wall is seen (m)."""
 _LEAST_RETURNS: Final = 2  # An object has at least this many returns in a cell.
 _MOST: Final = 0.5  # Share of an edge from which it counts as taken.
 _VEHICLE_M: Final = 0.9  # Half of a vehicle's width (m).
-_BEHIND_M: Final = (0.1, 0.2, 0.3, 0.4)
-"""Distances (m) behind a kerb's face at which its upper side is seen."""
-_SCATTER_M: Final = 0.015
-"""Excess scatter (m) of heights in a cell with plants, beyond the noise of the data: even ground has less."""
 _OTHERS: Final = (
     classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
     classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
@@ -34,40 +42,23 @@ _OTHERS: Final = (
 
 @once_a_scene
 def free_edges(scene: Scene) -> list[Edge]:
-    """Scene's edges without those that lie, at most of their nodes, at an object, on a drive, or before plants
-    on the higher side.
-    """
-    raster, taken = raster_of(scene), _standing(scene) | _driven(scene)
-    plants = _plants(scene)
-    kept = []
-    for edge in edges_of(scene):
-        nodes = columns_of(edge)
-        is_free = np.mean(taken[raster.cells_of(nodes[:, 0], nodes[:, 1])]) <= _MOST
-        if is_free and not _is_grown_over(edge, plants, raster):
-            kept.append(edge)
-    return kept
+    """Returns the parts of the scene's edges that are kerbs, with the probability at each node."""
+    edges = open_edges(scene)
+    if not edges:
+        return []
+    stated = KERB.probability(node_features(scene, edges))
+    ends = np.cumsum([len(edge.seen) for edge in edges])
+    return [part for edge, end in zip(edges, ends, strict=True)
+            for part in kerb_parts(edge, stated[end - len(edge.seen) : end])]  # fmt: skip
 
 
-def _plants(scene: Scene) -> npt.NDArray[np.int64]:
-    """Returns the number of returns of low plants among the ground returns in each cell (rows, columns)."""
-    raster = raster_of(scene)
-    cells = raster.cell[raster.used & (scene.classes == classes.LOW_VEGETATION)]
-    return np.bincount(cells, minlength=raster.count.size).reshape(raster.count.shape)
-
-
-def _is_grown_over(edge: Edge, plants: npt.NDArray[np.int64], raster: HeightRaster) -> bool:
-    """Returns whether plants are seen close behind most of an edge, on its higher side: by class or by scatter."""
-    nodes = edge.nodes.at(edge.seen)
-    x = nodes.x_m[:, None] + np.array(_BEHIND_M) * nodes.heading_y[:, None]
-    y = nodes.y_m[:, None] - np.array(_BEHIND_M) * nodes.heading_x[:, None]
-    cells = raster.cells_of(x, y)
-    every = raster.count[cells].sum(axis=1)
-    held = every > 0
-    if not held.any():
-        return False
-    scatter = np.sqrt((raster.count[cells] * raster.spread_m[cells] ** 2).sum(axis=1)[held] / every[held])
-    share = plants[cells].sum(axis=1)[held] / every[held]
-    return float(np.median(share)) > _MOST or float(np.median(scatter)) > raster.noise_m + _SCATTER_M
+def open_edges(scene: Scene) -> list[Edge]:
+    """Returns the scene's edges without those at whose foot mostly something stands, and those under a drive."""
+    raster, edges = raster_of(scene), edges_of(scene)
+    if not edges:
+        return []
+    taken = _standing(scene) | _driven(scene)
+    return [e for e in edges if np.mean(taken[raster.cells_of(e.nodes.x_m, e.nodes.y_m)]) <= _MOST]
 
 
 def _driven(scene: Scene) -> npt.NDArray[np.bool_]:
@@ -90,3 +81,23 @@ def _standing(scene: Scene) -> npt.NDArray[np.bool_]:
     number = np.bincount(raster.cell[stands], minlength=raster.count.size).reshape(raster.count.shape)
     wider = cv2.dilate((number >= _LEAST_RETURNS).astype(np.uint8), np.ones((3, 3), np.uint8))
     return np.asarray(wider > 0)
+
+
+def kerb_parts(edge: Edge, probability: Float64) -> list[Edge]:
+    """Returns the runs of an edge's nodes that are more probably a kerb than not; probability : (n,) of each node.
+
+    Nodes whose step is hidden are as probable as the seen ones around them.
+    """
+    at = np.arange(len(probability))
+    told = np.interp(at, at[edge.seen], probability[edge.seen])
+    smooth = scipy.ndimage.uniform_filter1d(told, _SMOOTH_NODES, mode="nearest")
+    good = np.pad(smooth >= LEAST, _HOLE_NODES)
+    whole = scipy.ndimage.binary_closing(good, np.ones(_HOLE_NODES + 1))[_HOLE_NODES:-_HOLE_NODES]
+    number, count = scipy.ndimage.label(whole)
+    parts = []
+    for k in range(1, count + 1):
+        rows = np.flatnonzero(number == k)
+        if (len(rows) - 1) * NODE_M >= _SHORTEST_M and edge.seen[rows].any():
+            share = len(rows) / len(edge.seen)
+            parts.append(Edge(edge.nodes.at(rows), edge.seen[rows], edge.evidence * share, smooth[rows]))
+    return parts

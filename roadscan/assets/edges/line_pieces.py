@@ -22,7 +22,7 @@ Int64 = npt.NDArray[np.int64]
 
 NODE_COLUMNS: Final = (
     "easting_m", "northing_m", "height_m", "step_m", "sigma_step_m", "face_m", "scatter_m", "sigma_m", "seen_low",
-    "seen_high_m", "seen",
+    "seen_high_m", "seen", "probability",
 )  # fmt: skip
 
 
@@ -43,7 +43,7 @@ def line_schema(columns: Sequence[str]) -> pa.Schema:
 
 LINE_PIECES: Final = line_schema(NODE_COLUMNS)
 """Columns of a piece: a value a node in the direction of the line (higher side to the right), what saw it, and whether
-its ends lie on the tile's border. `seen` is 1 for nodes whose step was measured."""
+its ends lie on the tile's border. `seen` is 1 for nodes whose step was measured; `probability` is that of a kerb."""
 JOIN_M: Final = 0.5
 """Greatest distance (m) between the ends of two tiles' lines on their border."""
 NEAR_M: Final = 0.25
@@ -82,6 +82,11 @@ class Line(NamedTuple):
         return np.asarray(self.nodes[:, self.names.index(name)])
 
     @property
+    def probability(self) -> float:
+        """Returns the probability that a node of it lies at a kerb: the mean, which is the share that is expected."""
+        return float(np.nanmean(self.column("probability")))
+
+    @property
     def length_m(self) -> float:
         """Returns its length in the map (m)."""
         return float(np.hypot(*np.diff(self.nodes[:, :2], axis=0).T).sum())
@@ -100,7 +105,7 @@ def columns_of(edge: Edge) -> Float64:
     n: Nodes = edge.nodes
     return np.column_stack([
         n.x_m, n.y_m, n.top_m, n.step_m, n.sigma_step_m, n.face_m, n.scatter_m, n.sigma_m, n.seen_low, n.seen_high_m,
-        edge.seen.astype(np.float64),
+        edge.seen.astype(np.float64), np.full(len(edge.seen), np.nan) if edge.probability is None else edge.probability,
     ])  # fmt: skip
 
 

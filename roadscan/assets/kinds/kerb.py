@@ -18,10 +18,10 @@ from pydantic import Field
 from roadscan.assets import classes
 from roadscan.assets.edges.free import free_edges
 from roadscan.assets.edges.line_pieces import LINE_PIECES, Line, columns_of, cut_at, dense, joined_lines, pieces_table
-from roadscan.assets.edges.probability import kerb_probability
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
+from roadscan.compute.robust import scatter_about
 from roadscan.compute.ways import way_along
 from roadscan.core.extras import cv2
 from roadscan.core.strict import Strict
@@ -31,6 +31,10 @@ Float64 = npt.NDArray[np.float64]
 SLOPED_FACE_M = 0.12
 """A kerb with a wider face (m) is sloped."""
 _FACE_NODES, _LEAST_NODES = 31, 4  # Nodes of the median of faces; least nodes of a run of one type.
+_ALIKE_M = 3.0
+"""Steps this far apart (m) differ independently: the length of two kerbstones and their settlement."""
+_COMMON_M = 0.004
+"""1 σ (m) of a step that its sides do not show: unevenness as long as its window."""
 FACE_REACH_M = 0.15
 """Returns this near to the line (m), between the foot and the top of the step, belong to the kerb."""
 
@@ -39,7 +43,7 @@ class KerbOptions(Strict):
     """Settings of kerbs."""
 
     least_probability: float = Field(default=0.5, ge=0.0, le=1.0)
-    """Lines whose evidence says less than this are left out, before the curve of the probability."""
+    """Less probable lines are left out; parts of an edge that are rather none than a kerb are cut off in any case."""
     least_length_m: float = Field(default=2.0, ge=0.5)
     """Shorter lines are left out (m)."""
     dropped_m: float = Field(default=0.05, gt=0.0, le=0.2)
@@ -51,7 +55,7 @@ class Kerb(AssetKind):
 
     name: ClassVar[str] = "kerb"
     title: ClassVar[str] = "kerbs: steps beside the road"
-    curve: ClassVar[str] = "edges"
+    curve: ClassVar[str] = "products"
     options: ClassVar[type[Strict]] = KerbOptions
     piece_schema: ClassVar[pa.Schema] = LINE_PIECES
 
@@ -67,15 +71,14 @@ class Kerb(AssetKind):
         """Yields lines joined across tiles, a kerb for each run of one type."""
         settings: KerbOptions = options
         for line in joined_lines(pieces):
-            probability = kerb_probability(line)
-            if line.length_m < settings.least_length_m or probability < settings.least_probability:
+            if line.length_m < settings.least_length_m or line.probability < settings.least_probability:
                 continue
             types = types_along(line, settings.dropped_m)
             begin = 0
             for name, run in itertools.groupby(types):
                 end = begin + sum(1 for _ in run)
                 # Runs share the node between them, so that the kerb has no gap.
-                yield _kerb(line, slice(begin, min(end + 1, len(types))), str(name), probability)
+                yield _kerb(line, slice(begin, min(end + 1, len(types))), str(name))
                 begin = end
 
 
@@ -102,7 +105,7 @@ def types_along(line: Line, dropped_m: float) -> list[str]:
     return types
 
 
-def _kerb(line: Line, rows: slice, name: str, probability: float) -> AssetObject:
+def _kerb(line: Line, rows: slice, name: str) -> AssetObject:
     """Returns a kerb of one type; returns and epochs are the share and the span of its line's."""
     nodes = Line(line.nodes[rows], line.seen_by, line.names)
     step, sigma = nodes.column("step_m"), nodes.column("sigma_step_m")
@@ -111,12 +114,12 @@ def _kerb(line: Line, rows: slice, name: str, probability: float) -> AssetObject
     attributes: dict[str, Any] = {"type": name, "length_m": nodes.length_m}
     if known.any():
         attributes["step_m"] = float(np.median(step[known]))
-    sigma_height = math.hypot(float(np.nanmedian(sigma[known])), 0.004) if known.any() else 0.05
+    sigma_height = _sigma_step_m(step[known], sigma[known], nodes.length_m) if known.any() else 0.05
     return AssetObject(
         geometry=shapely.LineString(nodes.nodes[:, :3]),
         sigma_horizontal_m=float(np.median(nodes.column("sigma_m"))),
         sigma_height_m=sigma_height,
-        probability=probability,
+        probability=nodes.probability,
         returns=round(line.seen_by.returns * share),
         passes=len(line.seen_by.passes),
         first_epoch_gps_ns=line.seen_by.first_epoch_gps_ns,
@@ -124,6 +127,14 @@ def _kerb(line: Line, rows: slice, name: str, probability: float) -> AssetObject
         attributes=attributes,
         sigma_size_m=sigma_height if known.any() else None,
     )
+
+
+def _sigma_step_m(step_m: Float64, sigma_m: Float64, length_m: float) -> float:
+    """Returns 1 σ (m) of the median step of a kerb: that of its nodes, whose errors are common to neighbours, and what
+    the steps differ along it: another survey sees other parts of it.
+    """
+    differs = 1.25 * scatter_about(step_m, float(np.median(step_m))) / math.sqrt(max(length_m / _ALIKE_M, 1.0))
+    return math.hypot(float(np.nanmedian(sigma_m)), _COMMON_M, differs)
 
 
 def _marked(parts: Sequence[Float64], scene: Scene, raster: HeightRaster) -> tuple[Marked, ...]:

@@ -12,7 +12,6 @@ from pydantic import Field
 
 from roadscan.assets.edges.beside import BESIDE_PIECES, pieces_beside
 from roadscan.assets.edges.line_pieces import joined_lines
-from roadscan.assets.edges.probability import kerb_probability
 from roadscan.assets.edges.strips import Strip, polygon_of, sigma_width_m, strips_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene
@@ -38,7 +37,7 @@ class Median(AssetKind):
 
     name: ClassVar[str] = "median"
     title: ClassVar[str] = "medians: raised strips between two kerbs"
-    curve: ClassVar[str] = "edges"
+    curve: ClassVar[str] = "products"
     options: ClassVar[type[Strict]] = MedianOptions
     piece_schema: ClassVar[pa.Schema] = BESIDE_PIECES
 
@@ -53,7 +52,7 @@ class Median(AssetKind):
         settings: MedianOptions = options
         found: list[shapely.Polygon] = []
         for line in joined_lines(pieces):
-            probability = kerb_probability(line)
+            probability = line.probability
             if probability < settings.least_probability:
                 continue
             usable = line.column("ends_down") > 0.5

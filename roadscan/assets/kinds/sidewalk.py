@@ -11,7 +11,6 @@ from pydantic import Field
 
 from roadscan.assets.edges.beside import BESIDE_PIECES, pieces_beside
 from roadscan.assets.edges.line_pieces import joined_lines
-from roadscan.assets.edges.probability import kerb_probability
 from roadscan.assets.edges.strips import Strip, polygon_of, running_slope, sigma_width_m, strips_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.kinds.kerb import types_along
@@ -37,7 +36,7 @@ class Sidewalk(AssetKind):
 
     name: ClassVar[str] = "sidewalk"
     title: ClassVar[str] = "sidewalks: walkways behind a kerb"
-    curve: ClassVar[str] = "edges"
+    curve: ClassVar[str] = "products"
     options: ClassVar[type[Strict]] = SidewalkOptions
     piece_schema: ClassVar[pa.Schema] = BESIDE_PIECES
 
@@ -51,7 +50,7 @@ class Sidewalk(AssetKind):
         """Yields runs of a joined line with a surface behind it that does not end at an edge down."""
         settings: SidewalkOptions = options
         for line in joined_lines(pieces):
-            probability = kerb_probability(line)
+            probability = line.probability
             if probability < settings.least_probability:
                 continue
             usable = line.column("ends_down") < 0.5

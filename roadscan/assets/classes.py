@@ -51,6 +51,6 @@ CLASS_NAMES: Final = {
     PERSON: "person",
     FENCE: "fence",
     SIDEWALK: "sidewalk",
-    FURNITURE: "street furniture",
+    FURNITURE: "furniture",
 }
 """Codes up to 19 are those of the ASPRS LAS 1.4 R15 table 17; those from 64 on are left to users by that table."""

@@ -31,11 +31,11 @@ _HIGHEST_M: Final = 4.5
 _TOP_M: Final = 3.6  # Greatest height of a thing (m): advertising columns are this high.
 _FOOT_M: Final = 0.7  # Greatest height of the lowest return of a thing (m): parked cars hide feet.
 _LONGEST_M: Final = 5.5  # Greatest extent seen from above (m): that of a bus shelter.
-_LEAST_RETURNS: Final = 15
+_LEAST_RETURNS: Final = 15  # Fewer returns show no form.
 _FRONT_M: Final = 4.5
 """Upright surfaces longer than this (m), walls and fronts of houses, join nothing that stands at their foot."""
 _VOXEL_M: Final = 0.25  # Edge of the cubes in which the form of a surface is measured (m).
-_LEAST_OF_VOXEL: Final = 5
+_LEAST_OF_VOXEL: Final = 5  # Least number of returns of a cube whose form counts.
 _TRIMMED: Final = 0.02
 """Share of the returns beyond each end of an extent."""
 _WALL_M: Final = 3.0  # Surfaces farther off than this (m) do not matter.

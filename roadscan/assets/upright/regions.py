@@ -41,6 +41,7 @@ class _Layers:
     """Whether returns that were taken for vehicles and people are among them."""
 
 
+# For surfaces of all kinds: low walls and hedges on them are one.
 _COARSE: Final = _Layers(LAYER_M, LAYERS, 1, np.array([6.0, 0.12, 0.06, 0.35]), False)
 _FINE: Final = _Layers(LAYER_M / 2, 2 * LAYERS, 2, np.array([5.0, 0.12, 0.085, 0.42]), True)
 """For boundaries: the face of a low wall is a layer of its own, below its top and the hedge on it. A fence that poses

@@ -16,11 +16,11 @@ from roadscan.assets.upright.compact import Compact, compact_things
 from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of, schema_of
 
 JUDGES: Final = {
-    "cabinet": Judge("cabinet", "8850e8aa40e6bbc1"),
-    "bin": Judge("bin", "ceb59bdf4b1f5f86"),
-    "bench": Judge("bench", "5eb6f0621a02c44f"),
-    "hydrant": Judge("hydrant", "eefe32e8832279c1"),
-    "bus_shelter": Judge("bus_shelter", "342e0914990d9a27"),
+    "cabinet": Judge("cabinet", "f29535a576659f13"),
+    "bin": Judge("bin", "ed8aba39493cdb10"),
+    "bench": Judge("bench", "3d81bf431eefd225"),
+    "hydrant": Judge("hydrant", "dd52d58273b44ab2"),
+    "bus_shelter": Judge("bus_shelter", "aa20f2c467b5fd5f"),
 }
 """Who is asked whether a compact thing is of a type."""
 _LEAST: Final = 0.5

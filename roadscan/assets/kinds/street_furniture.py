@@ -64,7 +64,7 @@ def told_apart(things: list[Compact]) -> list[tuple[Compact, str, float]]:
 
 def _place(scene: Scene, thing: Compact, kind: str, probability: float) -> Place:
     ground = float(scene.ground.height_at(thing.x_m, thing.y_m))
-    values = {
+    values: dict[str, float | str | None] = {
         "asset_height_m": thing.height_m, "length_m": thing.length_m, "width_m": thing.width_m,
         "heading_deg": thing.heading_deg, "type": kind,
     }  # fmt: skip

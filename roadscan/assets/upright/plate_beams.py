@@ -202,7 +202,7 @@ class _Order:
         """Returns when beams were sent (n,), from the first on the plate (ns), or how far right of it they go (rad)."""
         r = self.scene.returns
         if self.timed:
-            return (r.epoch_gps_ns[rows] - r.epoch_gps_ns[self.begin]).astype(np.float64)
+            return np.asarray(r.epoch_gps_ns[rows] - r.epoch_gps_ns[self.begin], np.float64)
         east, north = r.x_m[rows] - r.sensor_x_m[rows], r.y_m[rows] - r.sensor_y_m[rows]
         x, y = (own[self.begin] - at[self.begin] for own, at in ((r.x_m, r.sensor_x_m), (r.y_m, r.sensor_y_m)))
         return np.asarray(np.arctan2(east * y - north * x, east * x + north * y))
@@ -266,9 +266,9 @@ def _around(
     spans = np.column_stack([first, last])
     middles = returns.epoch_gps_ns[longest[0]] + np.diff(returns.epoch_gps_ns[np.array(longest)], axis=0)[0] // 2
     late_ns = _AT_ONCE * order.period if order.timed else 0.0
-    ends = [np.array([c[rows].min(), c[rows].max()]) for c in (returns.x_m, returns.y_m, returns.height_m)]
-    middle = np.array([end.mean() for end in ends])
-    reach_m = 0.5 * math.sqrt(sum(float(np.ptp(end)) ** 2 for end in ends)) + 2.0 * _ABOUT_M
+    places = np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]])
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
+    reach_m = 0.5 * float(np.linalg.norm(np.ptp(places, axis=0))) + 2.0 * _ABOUT_M
     rays = Rays(returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m,
                 returns.x_m, returns.y_m, returns.height_m)  # fmt: skip
     about, sweep = (np.empty(int((last - first + 1).sum()), np.int64) for _ in range(2))

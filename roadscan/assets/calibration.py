@@ -32,7 +32,6 @@ class Curve(NamedTuple):
 CURVES: Final = {
     "surfaces": Curve(-0.07, 0.48),
     "edges": Curve(-1.56, 1.11),
-    "paint": Curve(-0.08, 0.52),
     "areas": Curve(-0.04, 0.73),
     "clearances": Curve(0.08, 1.11),
     "products": Curve(0.0, 1.0),

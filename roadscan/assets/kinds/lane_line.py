@@ -31,7 +31,7 @@ class LaneLine(AssetKind):
 
     name = "lane_line"
     title = "lane lines"
-    curve = "paint"
+    curve = "products"
     options = LaneLineOptions
     piece_schema: ClassVar[pa.Schema] = LINE_PIECES
 

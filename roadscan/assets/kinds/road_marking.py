@@ -39,7 +39,7 @@ class RoadMarking(AssetKind):
 
     name = "road_marking"
     title = "road markings"
-    curve = "paint"
+    curve = "products"
     piece_schema: ClassVar[pa.Schema] = PATCH_PIECES
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:

@@ -16,23 +16,19 @@ from roadscan.assets.paint.contrast import CELL_M, Contrast
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-SEED_CONTRAST: Final = 0.55  # Paint starts at cells of this contrast (share of the surface's brightness) …
-SEED_SIGMAS: Final = 4.0
-"""… that is also at least this many σ of the noise."""
+SEED_CONTRAST: Final = 0.30  # Paint may start at cells of this contrast (share of the surface's brightness) …
+SEED_SIGMAS: Final = 3.5
+"""… that is also at least this many σ of the noise. Worn and thin paint has no more; what is paint is judged later."""
 _EDGE_SHARE: Final = 0.4
 """Paint extends to where the contrast is this share of the greatest near it."""
-_MEAN_SHARE: Final = 2.0 / 3.0
-"""Least mean contrast of all of a component's returns, as a share of `SEED_CONTRAST`: a kerb's border or a worn
-surface holds bright specks, paint is bright everywhere. On the labelled street and on simulated paint that is worn,
-what is paint has 0.40 or more, what is none mostly less than 0.36."""
 _NEAR_M: Final = 0.2  # Distance within which that greatest contrast is sought (m).
 _LEAST_CONTRAST: Final = 0.10  # Least contrast of paint.
 _AROUND_M: Final = 0.3
 """Returns within this distance of its cells (m) belong to a component's surroundings."""
 FEWEST_RETURNS: Final = 8  # A component needs this many returns …
 FEWEST_LINES: Final = 3  # … on this many scan lines.
-EVIDENCE_SIGMAS: Final = 5.0
-"""Least mean contrast of a component, in units of its standard deviation on a bare surface."""
+EVIDENCE_SIGMAS: Final = 3.0
+"""Least mean contrast of a component, in units of its standard deviation on a bare surface: less is chance."""
 _LINE_SIGMA: Final = 0.15
 """1 σ of the contrast of a whole scan line on a bare surface: errors of its gain."""
 
@@ -51,12 +47,14 @@ class Component:
     inside: npt.NDArray[np.bool_]
     """(n,) mask of those that lie in the cells."""
     evidence_sigma: float
+    probability: float = np.nan
+    """That it is paint; NaN where it was not judged."""
 
     def part(self, cells: npt.NDArray[np.bool_], returns: npt.NDArray[np.bool_]) -> Component:
         """Returns the component of some of its cells (c,) and returns (n,)."""
         return Component(
             self.cell[cells], self.cell_x_m[cells], self.cell_y_m[cells], self.near[returns], self.inside[returns],
-            self.evidence_sigma,
+            self.evidence_sigma, self.probability,
         )  # fmt: skip
 
 
@@ -74,10 +72,9 @@ def components_of(found: Contrast) -> list[Component]:
     with_seed[0] = False
     label = np.where(with_seed[label], label, 0)
     own = label.ravel()[found.cell]
-    evidence, mean, lines = _evidence(found, own, count)
+    evidence, lines = _evidence(found, own, count)
     enough = (
         (evidence >= EVIDENCE_SIGMAS)
-        & (mean >= _MEAN_SHARE * SEED_CONTRAST)
         & (lines >= FEWEST_LINES)
         & (np.bincount(own, minlength=count + 1) >= FEWEST_RETURNS)
     )
@@ -115,15 +112,15 @@ def _painted(found: Contrast) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.boo
     return np.asarray(mask), np.asarray(mask & seeds)
 
 
-def _evidence(found: Contrast, own: Int64, count: int) -> tuple[Float64, Float64, Int64]:
-    """Mean contrast of each label's returns, in units of its standard deviation and as it is; scan lines."""
+def _evidence(found: Contrast, own: Int64, count: int) -> tuple[Float64, Int64]:
+    """Mean contrast of each label's returns, in units of its standard deviation; scan lines."""
     returns = np.maximum(np.bincount(own, minlength=count + 1), 1)
     mean = np.bincount(own, weights=found.contrast, minlength=count + 1) / returns
     variance = np.bincount(own, weights=found.noise**2, minlength=count + 1) / returns**2
     lines = np.empty(count + 1, np.int64)
     distinct_in_groups(*in_bins(np.where(own > 0, own, -1), count + 1), found.line, lines)
     out: Float64 = mean / np.sqrt(variance + _LINE_SIGMA**2 / np.maximum(lines, 1))
-    return out, mean, lines
+    return out, lines
 
 
 def _nearest(label: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.classes import PERSON, VEHICLE
+from roadscan.assets.edges.raster import raster_of
 from roadscan.assets.kernels.paint_levels import contrasts, paint_levels, paint_sums, scan_lines, seen_on_ground
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
@@ -29,7 +30,10 @@ _USUAL_STEP, _USUAL_SIZE = 3, 9
 """The usual brightness is a median over 13 m, of every third cell."""
 _DARKEST: Final = 0.9
 """Surroundings darker than this share of the usual brightness (fresh bitumen, water) count as this bright."""
-ROUGHEST_M: Final = 0.03  # Ground that scatters more (m) is not searched for paint.
+ROUGHEST_M: Final = 0.03  # Ground that scatters more (m) is not searched for paint …
+ROUGHEST_NOISES: Final = 2.5
+"""… unless heights of the survey do anyway: more than so many times their noise. Ranges, and passes that differ in
+height, scatter all ground alike, plants and gravel only some."""
 _ROUGH_M: Final = 0.12
 """Weights of the height's scatter about its mean fall within this distance (m)."""
 SMOOTH_M: Final = 0.06
@@ -70,7 +74,7 @@ class Contrast:
     dense_cells: int = 0
     """Number of cells in which enough returns lie on the ground."""
     rough_cells: int = 0
-    """Those of them that scatter by more than `ROUGHEST_M`: no paint is sought there."""
+    """Those of them that scatter by too much: no paint is sought there."""
 
     def cell_of(self, x_m: Float64, y_m: Float64) -> Int64:
         """Returns the cell of points (n,) within the window."""
@@ -91,7 +95,8 @@ def contrast_of(scene: Scene) -> Contrast:
     contrasts(x, y, intensity, grid, *_levels(x, y, intensity, window), (*_CLIP, _LEAST_NOISE), contrast, noise)
     shape = round((window.y_max_m - window.y_min_m) / CELL_M), round((window.x_max_m - window.x_min_m) / CELL_M)
     cell = np.maximum(cells_of(x, y, (grid[0], grid[1], CELL_M), shape), 0).astype(np.int64)
-    mean, sigma, counts = _means(cell, contrast, noise, scene.above_ground_m[rows], shape)
+    roughest_m = max(ROUGHEST_M, ROUGHEST_NOISES * raster_of(scene).noise_m)
+    mean, sigma, counts = _means(cell, contrast, noise, scene.above_ground_m[rows], shape, roughest_m)
     heights = found.height_m[rows]
     return Contrast(rows, x, y, heights, contrast, noise, _lines(found, rows), cell, window, mean, sigma, *counts)
 
@@ -139,9 +144,9 @@ def _levels(x: Float64, y: Float64, intensity: Float64, window: Box) -> tuple[Fl
 
 
 def _means(
-    cell: Int64, contrast: Float64, noise: Float64, height: Float32, shape: tuple[int, int]
+    cell: Int64, contrast: Float64, noise: Float64, height: Float32, shape: tuple[int, int], roughest_m: float
 ) -> tuple[Float32, Float32, tuple[int, int]]:
-    """Returns the weighted mean of the contrast around each cell, and its standard deviation; none where it is rough.
+    """Returns the weighted mean of the contrast around each cell, and its standard deviation; none where it is rougher.
 
     The last are the numbers of cells with enough returns, and of rough ones among them.
     """
@@ -162,7 +167,7 @@ def _means(
     dense = int(np.count_nonzero(known))
     near = np.maximum(raster(number, _ROUGH_M), 1e-9)
     middle = raster(high, _ROUGH_M) / near
-    known &= raster(squares, _ROUGH_M) / near - middle**2 <= ROUGHEST_M**2
+    known &= raster(squares, _ROUGH_M) / near - middle**2 <= roughest_m**2
     mean = np.where(known, raster(contrasted, SMOOTH_M) / np.maximum(weight, 1e-9), 0.0)
     variance = raster(noisy, SMOOTH_M / np.sqrt(2.0)) / area / np.maximum(weight, 1e-9) ** 2
     sigma = np.where(known, np.sqrt(variance), np.inf).astype(np.float32)

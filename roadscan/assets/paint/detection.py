@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.memory import once_a_scene
+from roadscan.assets.paint.component_features import component_features
 from roadscan.assets.paint.components import Component, components_of
 from roadscan.assets.paint.contrast import CELL_M, Contrast, contrast_of
 from roadscan.assets.paint.crosswalks import Bar, crosswalk_bars, is_round
 from roadscan.assets.paint.road_direction import RoadDirection
-from roadscan.assets.paint.stripes import AROUND_M, Stripe, lies_flat, stripes_of
+from roadscan.assets.paint.stripes import AROUND_M, Stripe, stripes_of
 from roadscan.assets.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
+PAINT: Final = Judge("paint", "ecf3c4e578b6955e")
+"""Whether a component is paint."""
+LEAST: Final = 0.5  # Less probable components are left out.
 ACROSS_DEG: Final = 55.0
 """Bands at this angle to the road or more (degrees) lie across it."""
 WIDEST_LINE_M: Final = 0.42  # Widest line (m).
@@ -45,7 +50,7 @@ class Patch:
     road_rad: float
     """Direction of the road there, anticlockwise from x; NaN where no drive is near."""
     contrast: float
-    evidence_sigma: float
+    probability: float
     returns: Int64
     """Indices of the contrast's returns within it."""
     around: Int64
@@ -68,7 +73,7 @@ def paint_of(scene: Scene) -> Paint:
     road = RoadDirection(scene)
     bands: list[Stripe] = []
     others: list[Component] = []
-    for component in components_of(found):
+    for component in judged(scene, found, components_of(found)):
         stripes = stripes_of(found, component, scene.returns.corner_m, road)
         if stripes is None:
             others.append(component)
@@ -85,10 +90,18 @@ def paint_of(scene: Scene) -> Paint:
             lines.append(stripe)
     rest = zip(others, bars[len(bands) :], in_crosswalk[len(bands) :], strict=True)
     for component, bar, crossed in rest:
-        if component.cell.size * CELL_M**2 >= _LEAST_AREA_M2 and not is_round(bar) and lies_flat(found, component):
+        if component.cell.size * CELL_M**2 >= _LEAST_AREA_M2 and not is_round(bar):
             direction = road.at(float(component.cell_x_m.mean()), float(component.cell_y_m.mean()))
             patches.append(_of_cells(found, component, bool(crossed), direction))
     return Paint(found, tuple(lines), tuple(patches))
+
+
+def judged(scene: Scene, found: Contrast, components: Sequence[Component]) -> list[Component]:
+    """Returns the components that are probably paint, with their probability."""
+    if not components:
+        return []
+    stated = PAINT.probability(component_features(scene, found, components))
+    return [replace(one, probability=float(p)) for one, p in zip(components, stated, strict=True) if p >= LEAST]
 
 
 def rows_of_paint(found: Contrast, shapes: Sequence[Stripe | Patch]) -> Int64:
@@ -125,7 +138,7 @@ def _of_stripe(stripe: Stripe, crossed: bool, road_rad: float) -> Patch:
     aside = stripe.width_m / 2 * np.array([-stripe.along[1], stripe.along[0]])
     begin, end = stripe.at(stripe.begin_m), stripe.at(stripe.end_m)
     shape = shapely.Polygon([begin - aside, end - aside, end + aside, begin + aside])
-    return Patch(shape, True, crossed, road_rad, stripe.contrast, stripe.evidence_sigma, stripe.returns, stripe.around)
+    return Patch(shape, True, crossed, road_rad, stripe.contrast, stripe.probability, stripe.returns, stripe.around)
 
 
 def _of_cells(found: Contrast, component: Component, crossed: bool, road_rad: float) -> Patch:
@@ -139,4 +152,4 @@ def _of_cells(found: Contrast, component: Component, crossed: bool, road_rad: fl
         np.stack([found.x_m[outside], found.y_m[outside]], axis=1), distance_upper_bound=AROUND_M
     )
     level = float(np.mean(found.contrast[inside])) if inside.size else 0.0
-    return Patch(shape, False, crossed, road_rad, level, component.evidence_sigma, inside, outside[np.isfinite(away)])
+    return Patch(shape, False, crossed, road_rad, level, component.probability, inside, outside[np.isfinite(away)])

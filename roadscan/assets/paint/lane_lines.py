@@ -16,7 +16,6 @@ from roadscan.assets.kind import AssetObject
 from roadscan.assets.paint.chains import Bands, Run, joined
 from roadscan.assets.paint.double_lines import paired
 from roadscan.assets.paint.patterns import Stretch, patterned
-from roadscan.assets.paint.probability import probability
 
 Float64 = npt.NDArray[np.float64]
 
@@ -104,7 +103,6 @@ def _object(pieces: _Pieces, group: tuple[str | None, list[Stretch]]) -> AssetOb
     line = shapely.LineString(np.concatenate([s.line for s in stretches]))
     dashes = np.array([s.length_m for s in stretches])
     gaps = [float(np.hypot(*(b.line[0, :2] - a.line[-1, :2]))) for a, b in pairwise(stretches)]
-    evidence = float(pieces.numbers("evidence_sigma")[numbers].max())
     dashed = kind == "dashed"
     whole = dashes[[s.seen == (True, True) for s in stretches]]
     attributes = {
@@ -120,7 +118,7 @@ def _object(pieces: _Pieces, group: tuple[str | None, list[Stretch]]) -> AssetOb
         geometry=line,
         sigma_horizontal_m=_middle(pieces.numbers("sigma_across_m")[numbers], weight),
         sigma_height_m=_middle(pieces.numbers("sigma_height_m")[numbers], weight),
-        probability=probability(evidence, float(dashes.sum()), len(stretches)),
+        probability=float(np.average(pieces.numbers("probability")[numbers], weights=weight)),
         returns=int(pieces.numbers("returns")[numbers].sum()),
         passes=len({p for k in numbers for p in pieces.table["passes"][k].as_py()}),
         first_epoch_gps_ns=min(pieces.table["first_epoch_gps_ns"][k].as_py() for k in numbers),

@@ -12,7 +12,6 @@ import shapely
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.paint.contrast import CELL_M
 from roadscan.assets.paint.marking_types import type_of
-from roadscan.assets.paint.probability import probability
 
 Float64 = npt.NDArray[np.float64]
 
@@ -61,12 +60,11 @@ def _object(shapes: npt.NDArray[Any], table: pa.Table) -> AssetObject:
         outline = painted = bar
     along, across = _extent(outline, road)
     returns = np.maximum(table["returns"].to_numpy(), 1)
-    evidence = float(table["evidence_sigma"].to_numpy().max())
     return AssetObject(
         geometry=_with_heights(outline, shapes, table),
         sigma_horizontal_m=float(CELL_M / np.sqrt(12.0)),
         sigma_height_m=float(np.average(table["sigma_height_m"].to_numpy(), weights=returns)),
-        probability=probability(evidence, float(np.sqrt(painted.area)), len(shapes) if crosswalk else 1),
+        probability=float(np.average(table["probability"].to_numpy(), weights=returns)),
         returns=int(table["returns"].to_numpy().sum()),
         passes=len({p for row in table["passes"].to_pylist() for p in row}),
         first_epoch_gps_ns=int(table["first_epoch_gps_ns"].to_numpy().min()),

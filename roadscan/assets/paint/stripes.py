@@ -11,7 +11,6 @@ import numpy.typing as npt
 from roadscan.assets.paint.components import SEED_CONTRAST, Component
 from roadscan.assets.paint.contrast import CELL_M, Contrast
 from roadscan.assets.paint.road_direction import RoadDirection
-from roadscan.compute.robust import scatter_about
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -34,7 +33,6 @@ _BEND_M: Final = 0.02
 _UNEVEN: Final = 0.5
 """Paint lies on one surface: its sides differ by less than this share of its contrast to them, or it is as bright as
 paint against the brighter one too, as where fresh bitumen lies along a line."""
-_FLAT_M: Final = 0.02  # Greatest scatter of flat ground about its plane (m).
 _STEEPEST: Final = 0.15  # Steepest ground (m/m).
 _STEP_M: Final = 0.04  # Greatest step between a band and one side (m).
 _TWO_SHORTEST_M: Final = 1.0  # Shortest band that may be a double line (m).
@@ -74,7 +72,7 @@ class Stripe:
     begin_seen: bool
     end_seen: bool
     """True where unpainted ground was seen beyond the end."""
-    evidence_sigma: float
+    probability: float
 
     @property
     def length_m(self) -> float:
@@ -113,7 +111,7 @@ def stripes_of(
         return None
     start = Stripe(
         middle, along, -length / 2, length / 2, width, 0.0, component.near, component.near,
-        0.0, False, False, component.evidence_sigma,
+        0.0, False, False, component.probability,
     )  # fmt: skip
     stripe = fitted(found, start)
     if stripe is not None and _is_an_edge(found, component, stripe):
@@ -203,17 +201,6 @@ def fitted(found: Contrast, start: Stripe) -> Stripe | None:
     around = near[reach & (np.abs(across) <= stripe.width_m / 2 + AROUND_M) & ~inside]
     stripe = replace(stripe, begin_seen=seen[0], end_seen=seen[1])
     return replace(stripe, returns=near[inside], around=around, sigma_across_m=sigma)
-
-
-def lies_flat(found: Contrast, component: Component) -> bool:
-    """Returns True where the ground on and around a component is a plane, and not steep."""
-    near = component.near
-    x, y = found.x_m[near] - component.cell_x_m.mean(), found.y_m[near] - component.cell_y_m.mean()
-    design = np.stack([x, y, np.ones(x.size)], axis=1)
-    height = found.height_m[near] - np.median(found.height_m[near])
-    plane, *_ = np.linalg.lstsq(design, height, rcond=None)
-    scatter = scatter_about(height, design @ plane)
-    return bool(scatter <= _FLAT_M and np.hypot(plane[0], plane[1]) <= _STEEPEST)
 
 
 def _is_an_edge(found: Contrast, component: Component, stripe: Stripe) -> bool:

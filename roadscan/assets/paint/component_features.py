@@ -1,0 +1,68 @@
+"""What a component of bright cells looks like, in figures that depend on no scanner: the features of a judge of paint.
+
+Bright patches, covers, faces of kerbs, slabs and gravel are bright, too. Noise, density, scan lines, drives and edges
+tell streets apart, not paint; without them it judges unseen ones better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from roadscan.assets.classes import ROAD
+from roadscan.assets.paint.components import Component
+from roadscan.assets.paint.contrast import CELL_M, Contrast
+from roadscan.assets.paint.crosswalks import Bar
+from roadscan.assets.scene import Scene
+
+Float64 = npt.NDArray[np.float64]
+
+_ALIKE: Final = 2.5
+"""Components whose areas differ by less than this factor are alike: dashes, bars, arrows come in rows …"""
+_ROW_M: Final = 8.0  # … in which they follow within this distance (m).
+_BRIGHT: Final = 0.3  # A return of this contrast is bright.
+
+
+def component_features(scene: Scene, found: Contrast, components: Sequence[Component]) -> dict[str, Float64]:
+    """Returns features (n,) by name of some components of a scene; NaN where one is not known."""
+    rows = [_of_component(scene, found, one) for one in components]
+    out = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    middle = np.array([[one.cell_x_m.mean(), one.cell_y_m.mean()] for one in components])
+    return out | {"alike": _alike(middle, out["area_m2"])}
+
+
+def _of_component(scene: Scene, found: Contrast, one: Component) -> dict[str, float]:
+    inside, around = one.near[one.inside], one.near[~one.inside]
+    bar = Bar.of_cells(one.cell_x_m, one.cell_y_m)
+    contrast, beside = found.contrast[inside], found.contrast[around]
+    height = found.height_m[one.near] - found.height_m[one.near].mean()
+    plane = np.column_stack([found.x_m[one.near] - bar.x_m, found.y_m[one.near] - bar.y_m, np.ones(one.near.size)])
+    rest = height - plane @ np.linalg.lstsq(plane, height, rcond=None)[0]
+    unknown = dict.fromkeys(("beside", "beside_spread", "road_beside"), np.nan)
+    return {
+        "contrast": float(contrast.mean()), "bright": float(np.mean(contrast > _BRIGHT)),
+        "least": float(np.percentile(contrast, 20)), "evidence": one.evidence_sigma,
+        "area_m2": one.cell.size * CELL_M**2, "length_m": bar.length_m, "width_m": bar.width_m,
+        "filled": bar.filled, "slim": bar.length_m / bar.width_m,
+        "scatter_m": float(np.std(rest)), "above_m": float(rest[one.inside].mean()),
+        "tilt": float(np.ptp(height)) / max(bar.length_m, 0.2), "road": _share_of_road(scene, found, inside),
+        **(unknown if not around.size else {
+            "beside": float(beside.mean()), "beside_spread": float(np.std(beside)),
+            "road_beside": _share_of_road(scene, found, around),
+        }),
+    }  # fmt: skip
+
+
+def _share_of_road(scene: Scene, found: Contrast, own: npt.NDArray[np.int64]) -> float:
+    return float(np.mean(scene.classes[found.rows[own]] == ROAD))
+
+
+def _alike(middle: Float64, area: Float64) -> Float64:
+    """Returns how many others of a like size lie within a row's distance (n,)."""
+    near = cKDTree(middle).query_ball_point(middle, _ROW_M)
+    return np.array([sum(1 / _ALIKE < area[j] / area[i] < _ALIKE for j in some) - 1 for i, some in enumerate(near)],
+                    np.float64)  # fmt: skip

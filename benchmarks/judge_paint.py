@@ -31,7 +31,10 @@ def segments(folder: Path) -> Iterator[Segments]:
 
 
 def of_scene(one: JudgedScene) -> Iterator[Segments]:
-    """Components of one scene within its tile, by group. A component counts as the square root of its area."""
+    """Components of one scene within its tile, by group.
+
+    A component counts as the square root of its area, a long one as its pieces do on average.
+    """
     found = contrast_of(one.scene)
     components = components_of(found)
     if not components:

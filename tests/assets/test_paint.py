@@ -60,6 +60,11 @@ def highway() -> SimulatedStreet:
     return street("highway_three_lanes", 60.0)
 
 
+def bend() -> SimulatedStreet:
+    """Lines of 100 m that bend with the road and rise with its superelevation."""
+    return street("highway_three_lanes", 160.0, 100.0)
+
+
 def town() -> SimulatedStreet:
     return street("urban_street", 100.0, 20.0)
 
@@ -68,6 +73,13 @@ def test_markings_of_the_labelled_street() -> None:
     scene, labels = semantic_kitti_scene(40.0)
     score = f1_of_cells(calibrated(scene), labels == 60, ~np.isin(labels, NOT_JUDGED))
     assert score >= 0.70  # 0.705
+
+
+@pytest.mark.nightly
+def test_markings_of_a_long_bend() -> None:
+    known = bend()
+    scene = calibrated(known.scene)
+    assert f1_of_cells(scene, known.on_paint, on_ground(scene)) >= 0.95  # 0.89 where lines are judged as a whole
 
 
 @pytest.mark.parametrize("one", [highway, pytest.param(town, marks=pytest.mark.nightly)])

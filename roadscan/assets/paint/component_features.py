@@ -6,6 +6,7 @@ tell streets apart, not paint; without them it judges unseen ones better.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -21,6 +22,8 @@ from roadscan.assets.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
 
+PIECE_M: Final = 7.0
+"""Shape and flatness of longer components (m) are those of their pieces: a line bends with its road."""
 _ALIKE: Final = 2.5
 """Components whose areas differ by less than this factor are alike: dashes, bars, arrows come in rows …"""
 _ROW_M: Final = 8.0  # … in which they follow within this distance (m).
@@ -38,22 +41,50 @@ def component_features(scene: Scene, found: Contrast, components: Sequence[Compo
 def _of_component(scene: Scene, found: Contrast, one: Component) -> dict[str, float]:
     inside, around = one.near[one.inside], one.near[~one.inside]
     bar = Bar.of_cells(one.cell_x_m, one.cell_y_m)
+    pieces, weight = _pieces(found, one, bar)
+    rows = [_of_piece(found, piece) for piece in pieces]
+    local = {name: float(np.average([row[name] for row in rows], weights=weight)) for name in rows[0]}
     contrast, beside = found.contrast[inside], found.contrast[around]
-    height = found.height_m[one.near] - found.height_m[one.near].mean()
-    plane = np.column_stack([found.x_m[one.near] - bar.x_m, found.y_m[one.near] - bar.y_m, np.ones(one.near.size)])
-    rest = height - plane @ np.linalg.lstsq(plane, height, rcond=None)[0]
     unknown = dict.fromkeys(("beside", "beside_spread", "road_beside"), np.nan)
     return {
         "contrast": float(contrast.mean()), "bright": float(np.mean(contrast > _BRIGHT)),
         "least": float(np.percentile(contrast, 20)), "evidence": one.evidence_sigma,
-        "area_m2": one.cell.size * CELL_M**2, "length_m": bar.length_m, "width_m": bar.width_m,
-        "filled": bar.filled, "slim": bar.length_m / bar.width_m,
-        "scatter_m": float(np.std(rest)), "above_m": float(rest[one.inside].mean()),
-        "tilt": float(np.ptp(height)) / max(bar.length_m, 0.2), "road": _share_of_road(scene, found, inside),
+        **local, "length_m": bar.length_m, "slim": bar.length_m / local["width_m"],
+        "road": _share_of_road(scene, found, inside),
         **(unknown if not around.size else {
             "beside": float(beside.mean()), "beside_spread": float(np.std(beside)),
             "road_beside": _share_of_road(scene, found, around),
         }),
+    }  # fmt: skip
+
+
+def _pieces(found: Contrast, one: Component, bar: Bar) -> tuple[list[Component], list[int]]:
+    """Returns a component cut across its axis into equal pieces, and the number of the returns of each."""
+    count = math.ceil(bar.length_m / PIECE_M)
+    if count == 1:
+        return [one], [1]
+    along = np.cos(bar.angle_rad), np.sin(bar.angle_rad)
+    of_cells, of_returns = (
+        np.clip(((x - bar.x_m) * along[0] + (y - bar.y_m) * along[1]) / bar.length_m * count + count / 2, 0, count - 1)
+        .astype(np.int64)
+        for x, y in ((one.cell_x_m, one.cell_y_m), (found.x_m[one.near], found.y_m[one.near]))
+    )  # fmt: skip
+    parts = [one.part(of_cells == k, of_returns == k) for k in range(count)]
+    held = [part for part in parts if part.inside.any()]
+    return held, [int(np.count_nonzero(part.inside)) for part in held]
+
+
+def _of_piece(found: Contrast, piece: Component) -> dict[str, float]:
+    """Returns what is told of places that lie together: their shape, and the ground under and around them."""
+    bar = Bar.of_cells(piece.cell_x_m, piece.cell_y_m)
+    height = found.height_m[piece.near] - found.height_m[piece.near].mean()
+    x, y = found.x_m[piece.near] - bar.x_m, found.y_m[piece.near] - bar.y_m
+    plane = np.column_stack([x, y, np.ones(x.size)])
+    rest = height - plane @ np.linalg.lstsq(plane, height, rcond=None)[0]
+    return {
+        "area_m2": piece.cell.size * CELL_M**2, "width_m": bar.width_m, "filled": bar.filled,
+        "scatter_m": float(np.std(rest)), "above_m": float(rest[piece.inside].mean()),
+        "tilt": float(np.ptp(height)) / max(bar.length_m, 0.2),
     }  # fmt: skip
 
 

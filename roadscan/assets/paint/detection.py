@@ -23,7 +23,7 @@ from roadscan.assets.scene import Scene
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-PAINT: Final = Judge("paint", "ecf3c4e578b6955e")
+PAINT: Final = Judge("paint", "07f605e84c1e9659")
 """Whether a component is paint."""
 LEAST: Final = 0.5  # Less probable components are left out.
 ACROSS_DEG: Final = 55.0

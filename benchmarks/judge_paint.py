@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from benchmarks.judged_scenes import JudgedScene, judged_scenes
+from benchmarks.edge_scenes import JudgedScene, judged_scenes
 from benchmarks.judgement import Segments
 from roadscan.assets.paint.component_features import component_features
 from roadscan.assets.paint.components import components_of

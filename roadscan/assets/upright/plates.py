@@ -61,7 +61,7 @@ _SPOT_SHARE: Final = 0.25
 """1 σ of where within its spot the middle of a beam lies that a plate just stops, as a share of half the spot."""
 _USUAL_HALF_RAD: Final = math.radians(0.17 / 2.0)
 """Half the angle of a beam whose width is not known (rad): that of common spinning lidars."""
-JUDGE: Final = Judge("sign", "e3588b49c1eed7e2")
+JUDGE: Final = Judge("sign", "e1492785e75b7463")
 
 
 class SignOptions(KindOptions):

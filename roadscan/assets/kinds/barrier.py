@@ -1,4 +1,4 @@
-"""Barriers: solid boundaries up to 1.25 m."""
+"""Barriers: solid surfaces from the ground to 0.5–1.25 m."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ class Barrier(SurfaceKind):
 
     name = "barrier"
     title = "Barrier"
-    curve = "products"
+    curve = "surfaces"
     code = classes.BARRIER

@@ -28,7 +28,7 @@ class Facade(SurfaceKind):
         """Returns the returns on the surface, in its recesses and on its balconies."""
         return beside(scene, rows)
 
-    def made(self, chain: Chain, probability: float) -> AssetObject:
+    def made(self, chain: Chain) -> AssetObject:
         """Returns the object of a chain: its outline, upright."""
         polygon = outline(chain)
         shown = np.isfinite(chain.values["high_m"])
@@ -43,4 +43,4 @@ class Facade(SurfaceKind):
             "area_m2": float(chain.values["length_m"][shown] @ heights),
             "facing_deg": math.degrees(math.atan2(float(normal[0]), float(normal[1]))) % 360.0,
         }
-        return as_object(chain, shapely.Polygon(polygon), values, probability)
+        return as_object(chain, shapely.Polygon(polygon), values)

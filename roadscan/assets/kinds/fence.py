@@ -1,4 +1,4 @@
-"""Fences: boundaries that let beams through."""
+"""Fences: surfaces that let sight lines through."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ class Fence(SurfaceKind):
 
     name = "fence"
     title = "Fencing"
-    curve = "products"
+    curve = "surfaces"
     code = classes.FENCE

@@ -11,5 +11,5 @@ class Guardrail(SurfaceKind):
 
     name = "guardrail"
     title = "Guard Rail"
-    curve = "products"
+    curve = "surfaces"
     code = classes.BARRIER

@@ -11,5 +11,5 @@ class Wall(SurfaceKind):
 
     name = "wall"
     title = "Wall"
-    curve = "products"
+    curve = "surfaces"
     code = classes.BARRIER

@@ -14,7 +14,7 @@ from roadscan.assets.kernels.upright_voxels import gather_moments, grow_regions,
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.quantiles import quantiles
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.slices import standing_above_m, usable_above_m
+from roadscan.assets.upright.slices import usable_above_m
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -24,28 +24,8 @@ LAYER_M: Final = 0.5  # Height of a voxel (m).
 LOWEST_M: Final = 0.15  # Height above the ground at which voxels start (m).
 LAYERS: Final = 40
 """Number of layers: up to 20 m above the ground."""
-
-
-@dataclass(frozen=True)
-class _Layers:
-    """How voxels lie above one another."""
-
-    height_m: float
-    """Height of a voxel."""
-    count: int
-    reach: int
-    """Voxels of one plane may be so many layers apart."""
-    limits: Float64
-    """Limits of an element: returns, spread along and across its plane (m), ratio of both."""
-    with_users: bool
-    """Whether returns that were taken for vehicles and people are among them."""
-
-
-# For surfaces of all kinds: low walls and hedges on them are one.
-_COARSE: Final = _Layers(LAYER_M, LAYERS, 1, np.array([6.0, 0.12, 0.06, 0.35]), False)
-_FINE: Final = _Layers(LAYER_M / 2, 2 * LAYERS, 2, np.array([5.0, 0.12, 0.085, 0.42]), True)
-"""For boundaries: the face of a low wall is a layer of its own, below its top and the hedge on it. A fence that poses
-smear, or beside which somebody walks, may have been taken for road users; cars have no such surface for long."""
+_LIMITS: Final = np.array([6.0, 0.12, 0.06, 0.35])
+"""Limits of an element: returns, spread along and across its plane (m), ratio of both."""
 _TURN_DEG: Final = 20.0  # Greatest angle between neighbouring elements of one plane (degrees).
 _APART_M: Final = 0.12
 """Neighbouring elements lie on one plane if each is this near to the other's (m)."""
@@ -102,22 +82,18 @@ class _Voxels:
 
 @once_a_scene
 def _voxels(scene: Scene) -> _Voxels:
-    return _voxels_in(scene, _COARSE)
-
-
-def _voxels_in(scene: Scene, layers: _Layers) -> _Voxels:
     window, returns = scene.extent, scene.returns
     columns = int(np.ceil((window.x_max_m - window.x_min_m) / SIDE_M - 1e-9))
     rows = int(np.ceil((window.y_max_m - window.y_min_m) / SIDE_M - 1e-9))
-    index = np.full((layers.count, rows, columns), -1, np.int32)
-    above = standing_above_m(scene) if layers.with_users else usable_above_m(scene)
+    index = np.full((LAYERS, rows, columns), -1, np.int32)
+    above = usable_above_m(scene)
     most = min(int(np.count_nonzero(np.isfinite(above))), int(index.size))
     moments, voxel = np.empty((max(most, 1), 10)), np.empty(len(returns), np.int32)
     corner = np.array([window.x_min_m, window.y_min_m, LOWEST_M])
-    sizes = np.array([SIDE_M, layers.height_m])
+    sizes = np.array([SIDE_M, LAYER_M])
     found = gather_moments(returns.x_m, returns.y_m, above, corner, sizes, index, moments, voxel)
     elements = np.zeros((max(found, 1), 6))
-    thin_elements(index, moments, SIDE_M, layers.limits, elements)
+    thin_elements(index, moments, SIDE_M, _LIMITS, elements)
     return _Voxels(index, elements, voxel, corner, found)
 
 
@@ -130,21 +106,12 @@ def on_thin(scene: Scene) -> npt.NDArray[np.bool_]:
 @once_a_scene
 def regions_of(scene: Scene) -> list[Region]:
     """Returns upright surfaces at least 0.7 m long, with pieces on one plane joined over gaps of 1.6 m."""
-    return _regions(scene, _voxels(scene), _COARSE)
-
-
-@once_a_scene
-def fine_regions_of(scene: Scene) -> list[Region]:
-    """Returns such surfaces from voxels half as high, also of what was taken for vehicles and people."""
-    return _regions(scene, _voxels_in(scene, _FINE), _FINE)
-
-
-def _regions(scene: Scene, seen: _Voxels, layers: _Layers) -> list[Region]:
+    seen = _voxels(scene)
     index, elements, found = seen.index, seen.elements.copy(), seen.found
     region = np.zeros(max(found, 1), np.int32)
     turn = math.cos(math.radians(_TURN_DEG))
     count = grow_regions(
-        index, elements, turn, _APART_M, np.array([layers.reach, 1]), region, np.empty((max(found, 1), 3), np.int32)
+        index, elements, turn, _APART_M, np.array([1, 1]), region, np.empty((max(found, 1), 3), np.int32)
     )
     members, starts = np.empty(region.size, np.int64), np.empty(count + 2, np.int64)
     region_ranges(region, members, starts)

@@ -30,7 +30,6 @@ SET_APART: Final = (
     classes.HIGH_NOISE, classes.VEHICLE, classes.PERSON,
 )  # fmt: skip
 """Classes of which nothing upright consists."""
-_ROAD_USERS: Final = (classes.VEHICLE, classes.PERSON)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +66,6 @@ def usable(scene: Scene) -> npt.NDArray[np.bool_]:
 def usable_above_m(scene: Scene) -> npt.NDArray[np.float32]:
     """Height (n,) above the ground of the returns that may belong to something upright; NaN of all others."""
     return np.where(usable(scene), scene.above_ground_m, np.float32(np.nan))
-
-
-def standing_above_m(scene: Scene) -> npt.NDArray[np.float32]:
-    """Height (n,) above the ground of the returns that are neither ground nor noise; NaN of those."""
-    lookup = np.ones(256, np.bool_)
-    lookup[[code for code in SET_APART if code not in _ROAD_USERS]] = False
-    return np.where(lookup[scene.classes], scene.above_ground_m, np.float32(np.nan))
 
 
 @once_a_scene

@@ -2,127 +2,60 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.boundaries import judged
-from roadscan.assets.upright.lines import PIECE_SCHEMA, Chain, chain_of_panel, chains_of, pieces_of_panels
+from roadscan.assets.upright.lines import PIECE_SCHEMA, Chain, chains_of, pieces_of_panels
 from roadscan.assets.upright.panels import panels_of
 from roadscan.assets.upright.probability import logistic
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Surface = Literal["facade", "wall", "barrier", "guardrail", "fence"]
 
 _SIMPLE_M: Final = 0.03  # Tolerance of the simplified line (m).
 _GROUND_SIGMA_M: Final = 0.03  # 1 σ of the height of the ground at a surface (m).
-_LEAST_FENCE_M: Final = 1.2
-"""Least length of a fence, as of a gate for people (m) …"""
-_LEAST_WALL_M, _LEAST_BARRIER_M, _LEAST_RAIL_M = 2.5, 3.0, 4.0
-"""… of a wall, a barrier, and a guardrail (m): shorter ones are boxes and fronts of other things."""
-_WALL_M, _LEAST_HIGH_M = 1.25, 0.25
-"""Walls are higher than this, barriers lower; what is lower than the second is a kerb or the edge of a bed (m)."""
-_FACADE_M: Final = 3.0
-"""Fronts of houses are higher than this (m)."""
-_MOST_OTHERS: Final = 0.5  # Façades have no larger share of returns on vegetation, vehicles and people.
-_LOW_M: Final = 1.5
-"""What is lower than this in line with the front of a house is no part of it, such as a hedge (m)."""
-_LOW, _HIGH, _SOLID, _POROUS = range(4)
-"""What stretches are: no boundary, low or high; a boundary that is solid, or that beams pass."""
+_POROUS: Final = 0.5
+"""A surface is a fence where more than this share of its length lets sight lines through."""
+_HOVERS: Final = 0.05
+"""A surface that begins high above the ground hovers where this share of the sight lines passes below it; elsewhere
+something stands before its foot."""
+_LEAST_FENCE_M: Final = 2.5  # Least length of a fence or a wall (m).
+_MOST_VEGETATION: Final = 0.5  # Surfaces with a larger share of vegetation are none.
 
 
-@dataclass(frozen=True)
-class Part:
-    """Stretches of a chain that are of one kind."""
+def told(chain: Chain) -> Surface | None:
+    """Returns the kind of an upright surface; None where it is none of these.
 
-    kind: Surface
-    first: int
-    end: int
-    """The stretch before which it ends."""
-    probability: float
-
-
-def parts_of(chain: Chain) -> list[Part]:
-    """Returns the parts of an upright surface of which a kind is known.
-
-    Each stretch is judged (:mod:`roadscan.assets.upright.boundaries`): a boundary that lets beams through is a fence;
-    one that does not is a guardrail where it has free space below its rail, else a wall, or a barrier up to 1.25 m. The
-    rest is a façade where it is solid and rises to 3 m or above what scanners saw. Hedges, vehicles, crowns and boards
-    are none.
+    A façade is solid and rises to 3 m or above what scanners saw; a wall ends lower, a barrier at 1.25 m at the most; a
+    guardrail has free space below its rail; a fence lets sight lines through all along. What begins 2 m above the
+    ground or higher (crowns, boards, roofs), and hedges, are none.
     """
-    boundary, fence = judged(chain)
-    top = _above(chain, "high_m")
-    made = (boundary >= 0.5) & ~(top > _FACADE_M)
-    low = (top <= _LOW_M) & (chain.values["open_top"] == 0.0)
-    code = np.where(made, np.where(fence >= 0.5, _POROUS, _SOLID), np.where(low, _LOW, _HIGH))
-    code = without_short(code, chain.values["length_m"])
-    out = []
-    for first, end in _runs(code):
-        part = chain.between(first, end)
-        kind = _told(part, int(code[first]))
-        if kind is not None:
-            sure = boundary[first:end] * np.where(kind == "fence", fence[first:end], 1.0 - fence[first:end])
-            stated = (
-                probability_of(part) if kind == "facade" else float(np.average(sure, weights=part.values["length_m"]))
-            )
-            out.append(Part(kind, first, end, stated))
-    return out
-
-
-def _told(part: Chain, code: int) -> Surface | None:
-    """Returns the kind of stretches that are all high, solid or porous; None of low ones, and where it is none."""
-    top, low, bulk, length = part.median("high_m"), part.median("low_m"), part.median("bulk_m"), part.length_m
-    if code == _LOW or not np.isfinite(top):
+    top, low, bulk = chain.median("high_m"), chain.median("low_m"), chain.median("bulk_m")
+    if not np.isfinite(top) or chain.vegetation > _MOST_VEGETATION or low > 2.0 or chain.length_m < 1.5:
         return None
-    if code == _HIGH:
-        is_high = top > _FACADE_M or (top > 1.4 and part.open_top > 0.4)
-        solid = part.passing < 0.4 and part.vegetation + part.users <= _MOST_OTHERS and low <= 2.0
-        return "facade" if is_high and solid and length >= 2.0 else None
-    if top < _LEAST_HIGH_M:
+    if top > 3.0 or (top > 1.4 and chain.open_top > 0.4):
+        return "facade" if chain.passing < 0.4 and chain.length_m >= 2.0 else None
+    if low > 0.6 and (low > 1.2 or (chain.hovering > _HOVERS and chain.porous < _POROUS)):
         return None
-    if code == _POROUS:
-        return "fence" if length >= _LEAST_FENCE_M else None
     if bulk > 0.36 and 0.5 <= top <= 1.15 and top - bulk < 0.5:
-        return "guardrail" if length >= _LEAST_RAIL_M else None
-    if top > _WALL_M:
-        return "wall" if length >= _LEAST_WALL_M else None
-    return "barrier" if length >= _LEAST_BARRIER_M else None
-
-
-def _above(chain: Chain, name: str) -> Float64:
-    """Returns a height (k,) above the ground; NaN where none is known."""
-    return np.asarray(chain.values[name] - chain.values["ground_m"])
-
-
-def without_short(code: Int64, length_m: Float64, least_m: float = 1.2) -> Int64:
-    """Returns kinds (k,) in which a run shorter than this between two of one kind has their kind."""
-    out = code.copy()
-    runs = _runs(code)
-    for (_, before), (first, end), (after, _) in zip(runs[:-2], runs[1:-1], runs[2:], strict=True):
-        if length_m[first:end].sum() < least_m and out[before - 1] == out[after]:
-            out[first:end] = out[after]
-    return out
-
-
-def _runs(code: Int64) -> list[tuple[int, int]]:
-    """Returns first and end of each run of equal values."""
-    ends = [*(np.flatnonzero(np.diff(code)) + 1).tolist(), code.size]
-    return list(itertools.pairwise([0, *ends])) if code.size else []
+        return "guardrail" if chain.length_m >= 4.0 else None
+    if chain.porous >= _POROUS:
+        return "fence" if top >= 0.6 and chain.length_m >= _LEAST_FENCE_M else None
+    if top > 1.25:
+        return "wall" if chain.length_m >= _LEAST_FENCE_M else None
+    return "barrier" if top >= 0.5 and chain.length_m >= 3.0 else None
 
 
 def probability_of(chain: Chain) -> float:
-    """Returns the probability of a façade: a logistic function of its length, covered share, returns and thickness."""
+    """Returns the probability of a surface: a logistic function of its length, covered share, returns and thickness."""
     return logistic(
         -1.5,
         [(0.5, min(chain.length_m, 10.0)), (2.0, chain.covered), (0.02, min(chain.seen, 100)),
@@ -131,15 +64,13 @@ def probability_of(chain: Chain) -> float:
 
 
 @once_a_scene
-def _rows_of_panels(scene: Scene) -> list[tuple[Surface, Int64]]:
-    """Returns kind and returns of the parts of each panel that comes near the tile."""
-    out = []
-    for panel in panels_of(scene):
-        if panel.comes_near(scene.tile):
-            for part in parts_of(chain_of_panel(panel)):
-                own = (panel.stretch >= part.first) & (panel.stretch < part.end)
-                out.append((part.kind, panel.rows[own]))
-    return out
+def _names_of_panels(scene: Scene) -> list[set[Surface | None]]:
+    """Returns the likely kinds of the chains of each panel; none where it does not come near the tile."""
+    whole = replace(scene, tile=scene.window)
+    return [
+        {told(c) for c in chains_of(pieces_of_panels(whole, [panel]))} if panel.comes_near(scene.tile) else set()
+        for panel in panels_of(scene)
+    ]
 
 
 @once_a_scene
@@ -156,8 +87,11 @@ class SurfaceKind(AssetKind):
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Pieces of all upright surfaces in the tile; marked are the returns of those that look like this kind."""
-        rows = [own for kind, own in _rows_of_panels(scene) if kind == self.name and own.size]
-        marked = [Marked(self.marks(scene, own), self.code) for own in rows]
+        marked = [
+            Marked(self.marks(scene, panel.rows), self.code)
+            for panel, names in zip(panels_of(scene), _names_of_panels(scene), strict=True)
+            if self.name in names
+        ]
         return Evidence(_pieces_of_all(scene), tuple(marked))
 
     def marks(self, scene: Scene, rows: Any) -> Any:
@@ -168,33 +102,24 @@ class SurfaceKind(AssetKind):
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
         """Returns an object for each chain of this kind."""
-        return [
-            self.made(chain.between(part.first, part.end), part.probability)
-            for chain in chains_of(pieces)
-            for part in parts_of(chain)
-            if part.kind == self.name
-        ]
+        return [self.made(chain) for chain in chains_of(pieces) if told(chain) == self.name]
 
-    def made(self, chain: Chain, probability: float) -> AssetObject:
+    def made(self, chain: Chain) -> AssetObject:
         """Returns the object of a chain: its line along the ground."""
         ground = chain.values["ground_m"]
         height = np.concatenate([ground[:1], (ground[:-1] + ground[1:]) / 2, ground[-1:]])
         line = shapely.LineString(np.column_stack([chain.xy_m, height])).simplify(_SIMPLE_M)
         values = {"asset_height_m": chain.median("high_m"), "length_m": chain.length_m}
-        return as_object(chain, line, values, probability, math.hypot(_GROUND_SIGMA_M, chain.sigma_median_m("high_m")))
+        return as_object(chain, line, values, math.hypot(_GROUND_SIGMA_M, chain.sigma_median_m("high_m")))
 
 
 def as_object(
-    chain: Chain,
-    geometry: shapely.Geometry,
-    values: Mapping[str, Any],
-    probability: float,
-    sigma_size_m: float | None = None,
+    chain: Chain, geometry: shapely.Geometry, values: Mapping[str, Any], sigma_size_m: float | None = None
 ) -> AssetObject:
     """Returns an object of a chain."""
     sigma = max(0.005, chain.across_m / np.sqrt(max(chain.seen / max(chain.length_m, 1.0), 1.0)))
     passes = len(chain.passes)
     return AssetObject(
-        geometry, float(sigma), _GROUND_SIGMA_M, probability, chain.seen, passes, *chain.epochs_gps_ns,
+        geometry, float(sigma), _GROUND_SIGMA_M, probability_of(chain), chain.seen, passes, *chain.epochs_gps_ns,
         values, sigma_size_m,
     )  # fmt: skip

@@ -1,14 +1,12 @@
 """Whether a small upright plane is the plate of a sign: segments of simulated streets, and of a labelled recording.
 
 Hard streets hold what looks like one (windows, doors of vans, shop signs, boxes, boards); streets of signs hold signs
-of all sizes. A whole drive sees each of them from near; parts of a drive, each about as long as a sweep or some, see
-most of them from afar, and their backs. Of the recording only sweeps 0 to 3 are shown.
+of all sizes. Of the recording only sweeps 0 to 3 are shown.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +16,7 @@ import numpy.typing as npt
 from benchmarks.drawn_streets import drawn_street, street_of_signs
 from benchmarks.hard_streets import hard_street
 from benchmarks.judgement import Segments
-from benchmarks.labelled_returns import CLASSES, LabelledReturns, labelled_returns
+from benchmarks.labelled_returns import CLASSES, labelled_returns
 from benchmarks.labelled_scenes import labelled_scenes
 from benchmarks.labelled_street import recording_folder
 from benchmarks.street_scores import NOT_JUDGED, SIGN
@@ -28,22 +26,15 @@ from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.plates import Plate, SignOptions, candidates_of
 from roadscan.simulate import Scene as Street
 
-HARD: Final = (*range(12), *range(700, 704))
+HARD: Final = (*range(700, 708), *range(712, 716))
 SIGNS: Final = range(80, 85)
-AFAR: Final = range(90, 96)
 DRAWN: Final = range(200, 208)
-"""Seeds of hard streets, of streets of signs, of such that an HDL-64E sees 80 m far, and of plain ones, whose parked
-cars are no signs either."""
+"""Seeds of hard streets, of streets of signs, and of plain ones, whose parked cars are no signs either."""
 SPOT_DEG: Final = 0.17
 _RECORDED_WEIGHT: Final = 4.0
 """A segment of the recording counts as much as so many of simulated streets."""
-_AROUND_M, _FAR_M, _STEP_M = 30.0, 75.0, 10.0
-"""Margin around a whole drive and around parts of one, and the step of the square's corners (m)."""
-_PART_S, _PARTS = 0.6, 3
-"""Duration (s) and number of the parts of a drive that are also shown by themselves."""
-_DARK: Final = 0.1
-"""In parts of a drive every other plate is as dark as this share of its light: the simulator's backs are brighter than
-those of real signs, of which some lidars record no light at all beyond 50 m."""
+_AROUND_M, _STEP_M = 30.0, 10.0
+"""Margin around the drive, and the step of the square's corners (m)."""
 FIT: Final = {
     "rounds": 80, "num_leaves": 5, "min_data_in_leaf": 6,
     "increasing": ("bright_median", "bright_high", "filled"),
@@ -55,50 +46,29 @@ def segments(folder: Path) -> Iterator[Segments]:
     """Candidates of each street, and of each square of the recording."""
     streets = [(f"hard {seed}", hard_street(seed)) for seed in HARD]
     streets += [(f"signs {seed}", street_of_signs(seed, divergence_deg=SPOT_DEG)) for seed in SIGNS]
-    streets += [(f"afar {seed}", _from_afar(street_of_signs(seed, divergence_deg=SPOT_DEG))) for seed in AFAR]
     streets += [(f"drawn {seed}", drawn_street(seed)) for seed in DRAWN]
     for name, street in streets:
-        yield from (one for one in of_street(name, street) if len(one.true))
+        found = of_street(name, street)
+        if len(found.true):
+            yield found
     for number, (scene, labels) in enumerate(labelled_scenes(recording_folder(), folder / "sign-0-3", range(4))):
         yield from of_recording(f"square {number}", scene, labels)
 
 
-def _from_afar(street: Street) -> Street:
-    return street.changed(lidar={"model": "HDL-64E", "range_max_m": 80.0}, bag={"on": True})
-
-
-def of_street(name: str, street: Street) -> Iterator[Segments]:
-    """Candidates of a simulated street, as the whole drive sees it and as parts of it do."""
+def of_street(name: str, street: Street) -> Segments:
+    """Candidates of a simulated street: true are those most of whose returns met a plate."""
     seen = labelled_returns(street)
-    epochs = seen.returns.epoch_gps_ns
-    yield _of_part(name, seen, np.arange(epochs.size), _AROUND_M)
-    first, last = int(epochs.min()), int(epochs.max())
-    for k in range(_PARTS):
-        begin = first + (last - first) * (2 * k + 1) // (2 * _PARTS)
-        part = np.flatnonzero((epochs >= begin) & (epochs < begin + int(_PART_S * 1e9)))
-        if part.size:
-            yield _of_part(name, seen, part, _FAR_M)
-
-
-def _of_part(name: str, seen: LabelledReturns, rows: npt.NDArray[np.int64], around_m: float) -> Segments:
-    """Candidates of some returns of a street."""
-    own = seen.returns.at(rows)
-    if around_m == _FAR_M:
-        dark = (seen.class_id[rows] == CLASSES.index("sign")) & (seen.object_id[rows] % 2 == 1)
-        own = replace(own, intensity=np.where(dark, np.float32(_DARK) * own.intensity, own.intensity))
-    way = np.column_stack([own.sensor_x_m, own.sensor_y_m])
-    corners = np.concatenate([np.floor((way.min(axis=0) - around_m) / _STEP_M),
-                              np.ceil((way.max(axis=0) + around_m) / _STEP_M)]) * _STEP_M  # fmt: skip
+    way = seen.drive_xyh_m[:, :2]
+    corners = np.concatenate([np.floor((way.min(axis=0) - _AROUND_M) / _STEP_M),
+                              np.ceil((way.max(axis=0) + _AROUND_M) / _STEP_M)]) * _STEP_M  # fmt: skip
     box = Box(*corners.tolist())
-    kept = np.flatnonzero(box.holds(own.x_m, own.y_m))
-    drive = seen.drive_xyh_m
-    passed = ((drive[:, :2] > way.min(axis=0) - 1.0) & (drive[:, :2] < way.max(axis=0) + 1.0)).all(axis=1)
-    scene = make_scene(own.at(kept), box, box, drive[passed])
-    return of_simulated(name, calibrated_scene(scene, gains_of([intensity_sample(scene)])), seen.class_id[rows[kept]])
+    kept = np.flatnonzero(box.holds(seen.returns.x_m, seen.returns.y_m))
+    scene = make_scene(seen.returns.at(kept), box, box, seen.drive_xyh_m)
+    return of_simulated(name, calibrated_scene(scene, gains_of([intensity_sample(scene)])), seen.class_id[kept])
 
 
 def of_simulated(name: str, scene: Scene, class_id: npt.NDArray[Any]) -> Segments:
-    """Candidates of a simulated scene with classes of its returns: true are those of whose returns most met a plate."""
+    """Candidates of a simulated scene with the class of each return."""
     found = candidates_of(scene, SignOptions())
     share = np.array([np.mean(class_id[one.rows] == CLASSES.index("sign")) for one in found])
     return _together(name, "simulated", found, share > 0.5, np.where(np.abs(share - 0.35) < 0.15, 0.0, 1.0))

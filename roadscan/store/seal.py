@@ -19,6 +19,8 @@ _BLANK: Final = "0" * len(bytes_digest(b""))
 """Stands in the place of the digest while that is taken."""
 _HEAD_BYTES: Final = 2
 """Between the key and its value: type and length of a text in Thrift's compact protocol."""
+_END_BYTES: Final = 8
+"""Length of the footer and the mark of the format, which end a file."""
 
 
 def sealed_parquet(table: pa.Table, **settings: Any) -> bytes:
@@ -57,7 +59,9 @@ def without_seal(table: pa.Table) -> pa.Table:
 
 def _place(content: bytes) -> slice:
     """Return where the digest of a file stands; a negative beginning where it bears none."""
-    key = content.rfind(_KEY.encode())
+    end = len(content) - _END_BYTES
+    footer = max(end - int.from_bytes(content[end : end + 4], "little"), 0)
+    key = content.rfind(_KEY.encode(), footer)
     start = key + len(_KEY) + _HEAD_BYTES
     return slice(-1, -1) if key < 0 else slice(start, start + len(_BLANK))
 

@@ -34,10 +34,6 @@ _LONG_M: Final = 2.5
 """Surfaces from this length (m) are large."""
 _CELLS: Final = 5
 """Cells along each side of the outline, of which some are filled."""
-_SWEEP_NS: Final = 20_000_000
-"""A gap of this length (ns) between two returns lies between two sweeps: lidars turn in 50 ms or more."""
-_LEAST_OF_SWEEP: Final = 3
-"""So many returns of a sweep on a plate tell how far the poses moved it."""
 _VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 
 
@@ -55,7 +51,8 @@ class PlaneOfPlate(NamedTuple):
 
 
 def features_of(
-    scene: Scene, plane: PlaneOfPlate, outline: Outline, beams: Beams | None, beside: float, above_m: float
+    scene: Scene, plane: PlaneOfPlate, outline: Outline, beams: Beams | None, residual_m: float, beside: float,
+    above_m: float,
 ) -> dict[str, float]:  # fmt: skip
     """Returns the features of a plate by name; NaN where one is not known.
 
@@ -63,9 +60,7 @@ def features_of(
     """
     returns, near = scene.returns, plane.near
     past = np.column_stack([returns.x_m[near], returns.y_m[near], returns.height_m[near]]) - plane.middle
-    on = np.isin(near, plane.rows)
-    u, v, off = past @ plane.right, past @ plane.up, _off_its_sweep(scene, near, on, past @ plane.normal)
-    away = np.abs(off)
+    u, v, away = past @ plane.right, past @ plane.up, np.abs(past @ plane.normal)
     wide, tall = outline.width_m / 2, outline.height_m / 2
     inside = (np.abs(u) < wide) & (np.abs(v) < tall)
     column = (np.abs(u) < wide + 0.1) & (away < 0.25)
@@ -79,7 +74,7 @@ def features_of(
     return {
         "returns": math.log(number), "range_m": float(np.median(returns.ranges_m(plane.rows))),
         "bright_median": float(np.median(light)), "bright_high": float(np.quantile(light, 0.9)),
-        "residual_m": float(np.sqrt(np.mean(off[on] ** 2))), "beside": beside,
+        "residual_m": residual_m, "beside": beside,
         "behind": float((inside & (away > _THIN_M) & (away < _BEHIND_M)).sum()) / number,
         "around": float(around.sum()) / number, "on_top": float(on_top.sum()) / number,
         "below": float(below.sum()) / number,
@@ -92,23 +87,6 @@ def features_of(
         "passed": _passed(beams, outline), "vehicle": _vehicles(scene, plane.middle) / number,
         "wall_m": _to_wall(scene, plane),
     }  # fmt: skip
-
-
-def _off_its_sweep(scene: Scene, rows: Int64, on: npt.NDArray[np.bool_], off_m: Float64) -> Float64:
-    """Returns how far returns lie off the plane (n,), where their own sweep saw it (m).
-
-    Poses step from sweep to sweep: what lies behind a plate by less than that was seen by another sweep.
-    """
-    returns = scene.returns
-    device = returns.pass_id[rows].astype(np.int64) * 256 + returns.sensor[rows]
-    later = np.diff(returns.epoch_gps_ns[rows]) > _SWEEP_NS
-    sweep = np.append(0, np.cumsum(later | (np.diff(device) != 0)))
-    out = off_m.copy()
-    for own in range(int(sweep[-1]) + 1):
-        of_sweep = sweep == own
-        if np.count_nonzero(of_sweep & on) >= _LEAST_OF_SWEEP:
-            out[of_sweep] -= np.median(off_m[of_sweep & on])
-    return out
 
 
 def _filled(u: Float64, v: Float64, on: npt.NDArray[np.bool_], wide: float, tall: float) -> float:

@@ -61,7 +61,7 @@ _SPOT_SHARE: Final = 0.25
 """1 σ of where within its spot the middle of a beam lies that a plate just stops, as a share of half the spot."""
 _USUAL_HALF_RAD: Final = math.radians(0.17 / 2.0)
 """Half the angle of a beam whose width is not known (rad): that of common spinning lidars."""
-JUDGE: Final = Judge("sign", "e1492785e75b7463")
+JUDGE: Final = Judge("sign", "00c8eb2b7c050222")
 
 
 class SignOptions(KindOptions):
@@ -256,7 +256,7 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     place = middle + outline.middle[0] * right + outline.middle[1] * up
     above = float(place[2]) - ground
     plane = PlaneOfPlate(rows, near, place, normal, right, up)
-    features = features_of(scene, plane, outline, beams, about, above)
+    features = features_of(scene, plane, outline, beams, residual, about, above)
     azimuth = math.degrees(math.atan2(float(normal[0]), float(normal[1]))) % 360.0
     lean = math.degrees(math.asin(max(-1.0, min(1.0, float(normal[2])))))
     clearance = above - outline.height_m / 2

@@ -20,9 +20,9 @@ from benchmarks.judgement import Segments
 from benchmarks.labelled_returns import LabelledReturns, labelled_returns
 from benchmarks.labelled_scenes import labelled_scenes
 from benchmarks.labelled_street import recording_folder
+from roadscan.assets.furniture.compact import Compact, compact_things
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box
-from roadscan.assets.upright.compact import Compact, compact_things
 from roadscan.simulate import Scene as Street
 
 TYPES: Final = ("cabinet", "bin", "bench", "hydrant", "bus_shelter")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from roadscan.assets.furniture.compact import compact_things
 from roadscan.assets.kinds.street_furniture import JUDGES, StreetFurniture
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box
-from roadscan.assets.upright.compact import compact_things
 from roadscan.simulate.scene import Scene as StreetScene
 from roadscan.simulate.things import objects_table
 from tests.assets.streets import Street, street

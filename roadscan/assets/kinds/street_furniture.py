@@ -9,10 +9,10 @@ import numpy as np
 import pyarrow as pa
 
 from roadscan.assets import classes
+from roadscan.assets.furniture.compact import Compact, compact_things
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.compact import Compact, compact_things
 from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of, schema_of
 
 JUDGES: Final = {
@@ -34,7 +34,7 @@ _SIZE_SIGMA_M: Final = 0.14
 
 
 class StreetFurniture(AssetKind):
-    """Street furniture, from compact things (:mod:`roadscan.assets.upright.compact`)."""
+    """Street furniture, from compact things (:mod:`roadscan.assets.furniture.compact`)."""
 
     name = "street_furniture"
     title = "Street furniture"

@@ -34,6 +34,8 @@ ROUGHEST_M: Final = 0.03  # Ground that scatters more (m) is not searched for pa
 ROUGHEST_NOISES: Final = 2.5
 """… unless heights of the survey do anyway: more than so many times their noise. Ranges, and passes that differ in
 height, scatter all ground alike, plants and gravel only some."""
+MOST_ROUGH_M: Final = 0.05
+"""In no case more than this (m): passes that differ by 75 mm scatter by less; beyond, that paint is not sought is said."""
 _ROUGH_M: Final = 0.12
 """Weights of the height's scatter about its mean fall within this distance (m)."""
 SMOOTH_M: Final = 0.06
@@ -95,7 +97,7 @@ def contrast_of(scene: Scene) -> Contrast:
     contrasts(x, y, intensity, grid, *_levels(x, y, intensity, window), (*_CLIP, _LEAST_NOISE), contrast, noise)
     shape = round((window.y_max_m - window.y_min_m) / CELL_M), round((window.x_max_m - window.x_min_m) / CELL_M)
     cell = np.maximum(cells_of(x, y, (grid[0], grid[1], CELL_M), shape), 0).astype(np.int64)
-    roughest_m = max(ROUGHEST_M, ROUGHEST_NOISES * raster_of(scene).noise_m)
+    roughest_m = min(max(ROUGHEST_M, ROUGHEST_NOISES * raster_of(scene).noise_m), MOST_ROUGH_M)
     mean, sigma, counts = _means(cell, contrast, noise, scene.above_ground_m[rows], shape, roughest_m)
     heights = found.height_m[rows]
     return Contrast(rows, x, y, heights, contrast, noise, _lines(found, rows), cell, window, mean, sigma, *counts)

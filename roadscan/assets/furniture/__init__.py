@@ -1,0 +1,1 @@
+"""Street furniture: what stands compactly on the ground, and its features."""

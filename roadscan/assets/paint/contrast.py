@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.classes import PERSON, VEHICLE
-from roadscan.assets.edges.raster import raster_of
 from roadscan.assets.kernels.paint_levels import contrasts, paint_levels, paint_sums, scan_lines, seen_on_ground
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
@@ -30,12 +29,7 @@ _USUAL_STEP, _USUAL_SIZE = 3, 9
 """The usual brightness is a median over 13 m, of every third cell."""
 _DARKEST: Final = 0.9
 """Surroundings darker than this share of the usual brightness (fresh bitumen, water) count as this bright."""
-ROUGHEST_M: Final = 0.03  # Ground that scatters more (m) is not searched for paint …
-ROUGHEST_NOISES: Final = 2.5
-"""… unless heights of the survey do anyway: more than so many times their noise. Ranges, and passes that differ in
-height, scatter all ground alike, plants and gravel only some."""
-MOST_ROUGH_M: Final = 0.05
-"""In no case more than this (m): passes that differ by 75 mm scatter by less; beyond, that paint is not sought is said."""
+ROUGHEST_M: Final = 0.03  # Ground that scatters more (m) is not searched for paint.
 _ROUGH_M: Final = 0.12
 """Weights of the height's scatter about its mean fall within this distance (m)."""
 SMOOTH_M: Final = 0.06
@@ -97,8 +91,7 @@ def contrast_of(scene: Scene) -> Contrast:
     contrasts(x, y, intensity, grid, *_levels(x, y, intensity, window), (*_CLIP, _LEAST_NOISE), contrast, noise)
     shape = round((window.y_max_m - window.y_min_m) / CELL_M), round((window.x_max_m - window.x_min_m) / CELL_M)
     cell = np.maximum(cells_of(x, y, (grid[0], grid[1], CELL_M), shape), 0).astype(np.int64)
-    roughest_m = min(max(ROUGHEST_M, ROUGHEST_NOISES * raster_of(scene).noise_m), MOST_ROUGH_M)
-    mean, sigma, counts = _means(cell, contrast, noise, scene.above_ground_m[rows], shape, roughest_m)
+    mean, sigma, counts = _means(cell, contrast, noise, scene.above_ground_m[rows], shape, ROUGHEST_M)
     heights = found.height_m[rows]
     return Contrast(rows, x, y, heights, contrast, noise, _lines(found, rows), cell, window, mean, sigma, *counts)
 

@@ -12,7 +12,7 @@ import pytest
 import typer.testing
 from hypothesis import settings
 
-from tests.pictures import blank
+from tests.drawing import blank
 from tests.surveys import adjusted, finished, raw_site, simulated
 from tests.workshop import damage, far_apart_place, place, places, workshop
 
@@ -81,6 +81,6 @@ def faults(recordings: Path) -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def blank_pictures() -> Iterator[None]:
-    """Tests that look at drawings ask for them (:func:`tests.pictures.drawn`)."""
+    """Tests that look at drawings ask for them (:func:`tests.drawing.drawn`)."""
     with blank():
         yield

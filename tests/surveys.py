@@ -16,7 +16,7 @@ from roadscan.run.stage import stages
 from roadscan.simulate import Scene, simulate
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from tests.pictures import drawn
+from tests.drawing import drawn
 
 
 class Lines(Reporter):

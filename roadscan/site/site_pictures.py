@@ -9,11 +9,11 @@ from typing import Final
 from roadscan.assets.tasks.picture_work import CUT_OUTS
 from roadscan.core.errors import RoadscanError
 from roadscan.core.grid import Bounds
+from roadscan.pictures.placed import Pictures as PlacedPictures
+from roadscan.pictures.placed import plan_pictures
+from roadscan.pictures.views import PictureRule
 from roadscan.site.material import Material
 from roadscan.store.manifest import OutputRecord
-from roadscan.surface.tasks.pictures import Pictures as PlacedPictures
-from roadscan.surface.tasks.pictures import plan_pictures
-from roadscan.surface.views import PictureRule
 
 _RULE: Final = PictureRule((), 30.0, 0.0, 1)
 """Selects all cameras with an interior orientation."""

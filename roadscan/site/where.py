@@ -12,9 +12,9 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
 from roadscan.georeference.plan.plan import plan_of
+from roadscan.pictures.placed import plan_pictures
+from roadscan.pictures.views import PictureRule, sights
 from roadscan.run.session import Session
-from roadscan.surface.tasks.pictures import plan_pictures
-from roadscan.surface.views import PictureRule, sights
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 

@@ -23,8 +23,8 @@ from roadscan.core.ids import LanePass, TileId
 from roadscan.core.plugins import found_kinds
 from roadscan.core.strict import Strict
 from roadscan.georeference.cloud import TilePoints
+from roadscan.pictures.views import PictureRule
 from roadscan.surface.tile import SurfaceTile
-from roadscan.surface.views import PictureRule
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.lane_direction import LaneDirections
 from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of

@@ -25,7 +25,7 @@ from roadscan.simulate import Scene, simulate
 from roadscan.store.small_tables import read_small, small_path
 from roadscan.store.sql import query
 from roadscan.survey.run import run_stages
-from tests.pictures import drawn
+from tests.drawing import drawn
 from tests.surveys import Lines, Simulated, changed
 
 OFF = {"on": False}

@@ -23,9 +23,9 @@ from roadscan.ingest.reading.format import format_of
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from tests.answers import roadscan
+from tests.drawing import drawn
 from tests.formats.gnss_observations import SKY, ecef, enu_axes, navigation, observe, rinex2, rinex3, sp3, ubx
 from tests.formats.log_reading import Log, read_log
-from tests.pictures import drawn
 
 pytestmark = pytest.mark.skipif(
     shutil.which("rnx2rtkp") is None, reason="RTKLIB is not on PATH: apt-get install rtklib"

@@ -20,12 +20,12 @@ from roadscan.georeference.kernels.road_ranges import keep_road
 from roadscan.georeference.kernels.tick_places import between_ticks
 from roadscan.georeference.kernels.tile_set import add_tile, empty, mark_zonotope, take, tile_set
 from roadscan.navigation.inertial.kernels.strapdown import geodetic_of, gravity_at, turned_frame
+from roadscan.pictures.kernels.picture_colours import sample, take_better
 from roadscan.surface.kernels.coarse import CellSums, Profiles, rasterise, spline_profiles, sum_patches
 from roadscan.surface.kernels.delaunay import flip_edges
 from roadscan.surface.kernels.directional_filters import choose_filters
 from roadscan.surface.kernels.ground import depths, grounds, highest, rim, slopes
 from roadscan.surface.kernels.line_medians import keep_better, window_sums
-from roadscan.surface.kernels.picture_colours import sample, take_better
 from roadscan.surface.kernels.smoothing import descend
 from roadscan.surface.kernels.vertex_neighbourhoods import units
 from roadscan.surface.kernels.vertex_rings import grow, is_narrow, whitening

@@ -30,7 +30,7 @@ from roadscan.store.logs import write_log_record
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.status import survey_status, verify_store
-from tests.pictures import drawn
+from tests.drawing import drawn
 from tests.surveys import changed
 
 S = 10**9

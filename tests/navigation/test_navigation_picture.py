@@ -22,7 +22,7 @@ from roadscan.navigation.picture import (
     _summary,
     draw_navigation,
 )
-from tests.pictures import drawn
+from tests.drawing import drawn
 
 
 @pytest.fixture(autouse=True)

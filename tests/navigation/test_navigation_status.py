@@ -24,9 +24,9 @@ from roadscan.simulate.sensors.imu import COLUMNS
 from roadscan.store.logs import read_log_records
 from roadscan.store.sql import query
 from roadscan.store.store import Store
+from tests.drawing import drawn
 from tests.navigation.test_navigate import navigating_scene
 from tests.navigation.walks import OUTAGES, Walked, walked
-from tests.pictures import drawn
 
 PICTURE = "products/navigation/run-1.png"
 RUN = """

@@ -23,7 +23,7 @@ from roadscan.run.session import Session
 from roadscan.site.report_copy import linked_report
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest, write_failures
-from tests.pictures import drawn
+from tests.drawing import drawn
 from tests.surveys import Simulated
 
 BROWSERS_OWN = re.compile(r"^https?://([\w-]+\.)*(google\.com|googleapis\.com|gvt1\.com)/")

@@ -57,8 +57,8 @@ from roadscan.survey.run import run_stages
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
+from tests.drawing import drawn
 from tests.inventory.streets import EAST, NORTH, asset, found
-from tests.pictures import drawn
 from tests.surveys import Lines, Simulated, small_scene
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "viewer.md"

@@ -22,7 +22,7 @@ from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status, verify_store
-from tests.pictures import drawn
+from tests.drawing import drawn
 from tests.surveys import Simulated, changed, outputs
 
 MAKE = {"products__make": ["las", "geotiff", "mosaic", "kilometre", "tile_table"]}

@@ -29,7 +29,7 @@ from roadscan.store.store import Store
 from roadscan.store.writer import write_parquet
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import verify_store
-from tests.pictures import drawn
+from tests.drawing import drawn
 from tests.surveys import Simulated, changed, outputs
 
 DISK_BYTES = 48 << 20

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from roadscan.assets.pictures.settings import AssetPicturesSettings
-from roadscan.surface.views import PictureRule
+from roadscan.pictures.views import PictureRule
 
 _ANY_ANGLE_DEG: Final = -90.0  # Least angle below the horizon: any (degrees).
 _BORDER_PX: Final = 1  # Border of a picture that is not used (pixels).

@@ -22,12 +22,12 @@ from roadscan.assets.tiling import AssetGrid
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
+from roadscan.pictures.placed import Pictures, plan_pictures
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest, file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.store import Store
-from roadscan.surface.tasks.pictures import Pictures, plan_pictures
 
 SEEN: Final = "asset_pictures"
 """Manifest name of what pictures show of a kind's objects in a square."""

@@ -22,12 +22,12 @@ from roadscan.assets.tasks.recognition import recognition_of
 from roadscan.assets.tasks.sights import best_sights, named
 from roadscan.core.extras import cv2
 from roadscan.core.grid import Bounds
+from roadscan.pictures.colours import ColourSource, world_places
+from roadscan.pictures.placed import Pictures
+from roadscan.pictures.views import NO_VIEW, WIDTH, Sights, best_views
 from roadscan.run.engine.compute import reason_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord, read_recorded
-from roadscan.surface.tasks.picture_colours import ColourSource, world_places
-from roadscan.surface.tasks.pictures import Pictures
-from roadscan.surface.views import NO_VIEW, WIDTH, Sights, best_views
 from roadscan.tiles.tasks.tiles import TaskResult
 
 Float64 = npt.NDArray[np.float64]

@@ -24,9 +24,9 @@ from roadscan.footprints.footprints import FootprintRanges
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.georeference.sources import ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import TrajectorySource
+from roadscan.pictures.placed import rule_cameras
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
-from roadscan.surface.tasks.pictures import rule_cameras
 from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.tile_plan import PlannedTiles, TilePlan, plan_tiles

@@ -13,9 +13,9 @@ import pyarrow as pa
 from roadscan.assets.kernels.sight_lines import find_hidden
 from roadscan.assets.pictures.reader import Sight
 from roadscan.assets.screens import EDGE_M
-from roadscan.surface.tasks.picture_colours import world_places
-from roadscan.surface.tasks.pictures import Pictures
-from roadscan.surface.views import Sights, sights
+from roadscan.pictures.colours import world_places
+from roadscan.pictures.placed import Pictures
+from roadscan.pictures.views import Sights, sights
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -11,6 +11,8 @@ import numpy as np
 from roadscan.core.errors import DamagedError
 from roadscan.georeference.picture_axes import camera_from_map
 from roadscan.navigation.tasks.taken_pictures import taken_pictures
+from roadscan.pictures.placed import Pictures as PlacedPictures
+from roadscan.pictures.views import HEIGHT, WIDTH
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.site.document import Ask, Document, json_document
@@ -25,8 +27,6 @@ from roadscan.site.site_pictures import (
     placed_pictures,
 )
 from roadscan.store.manifest import OutputRecord, read_recorded
-from roadscan.surface.tasks.pictures import Pictures as PlacedPictures
-from roadscan.surface.views import HEIGHT, WIDTH
 
 _LENS: Final = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 _CODE: Final = "roadscan.site.parts.pictures"

@@ -1,1 +1,1 @@
-"""Kernels of surfaces: triangulation, smoothing, holes, coarse heights, colours."""
+"""Kernels of surfaces: triangulation, smoothing, holes, coarse heights."""

@@ -10,10 +10,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from roadscan.core.strict import Strict
+from roadscan.pictures.views import PictureRule
 from roadscan.store.codecs import SOFTWARE
 from roadscan.store.codecs.mesh import Mesh, check_glb, check_ply, write_glb, write_ply
 from roadscan.surface.tile import SurfaceTile
-from roadscan.surface.views import PictureRule
 from roadscan.tiles.product import ProductContext, SurfaceProduct
 from roadscan.tiles.products.mesh import mesh_of
 

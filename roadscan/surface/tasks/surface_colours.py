@@ -12,10 +12,10 @@ from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.pictures.colours import ColourSource
+from roadscan.pictures.placed import Pictures, check_folders, check_pictures, plan_pictures, rule_cameras
 from roadscan.store.manifest import OutputRecord
 from roadscan.surface.reconstruction import SurfaceGrid
-from roadscan.surface.tasks.picture_colours import ColourSource
-from roadscan.surface.tasks.pictures import Pictures, check_folders, check_pictures, plan_pictures, rule_cameras
 from roadscan.surface.tile import NodeColours, SurfaceTile
 from roadscan.tiles.product import SurfaceProduct
 from roadscan.tiles.tasks.tile_files import WantedSurface

@@ -13,6 +13,7 @@ from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
+from roadscan.pictures.placed import Pictures
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord
@@ -20,7 +21,6 @@ from roadscan.store.store import Store
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.found_regions import FoundRegions
-from roadscan.surface.tasks.pictures import Pictures
 from roadscan.surface.tasks.surface_colours import shown_box
 from roadscan.surface.tasks.surface_regions import Regions, stated_regions
 from roadscan.tiles.blocks import Block, cut_blocks

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.extras import cv2
+from roadscan.pictures.placed import Pictures
+from roadscan.pictures.views import HEIGHT, NO_VIEW, WIDTH, Shown, best_views, sampled
 from roadscan.store.codecs.image_files import ImageError, image_size
-from roadscan.surface.tasks.pictures import Pictures
-from roadscan.surface.views import HEIGHT, NO_VIEW, WIDTH, Shown, best_views, sampled
 
 UInt8 = npt.NDArray[np.uint8]
 Float64 = npt.NDArray[np.float64]

@@ -19,13 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
+from roadscan.pictures.placed import Pictures
 from roadscan.run.engine.compute import Compute, Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, stages
 from roadscan.simulate import simulate, truth
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
-from roadscan.surface.tasks.pictures import Pictures
 from roadscan.surface.tasks.surface_plan import SURFACE
 from roadscan.surface.tasks.surface_work import plan_surface_work
 from roadscan.survey.run import run_stages
@@ -191,8 +191,8 @@ def test_neighbours_agree_and_workers_change_no_byte(drive: Drive, monkeypatch: 
     first[which] = colour  # any of those at one place
     assert np.array_equal(first[which], colour)
     monkeypatch.setattr("roadscan.surface.tasks.surface_plan._BLOCK_TILES", 1)
-    monkeypatch.setattr("roadscan.surface.tasks.picture_colours._KEPT_BYTES", 0)
-    monkeypatch.setattr("roadscan.surface.tasks.picture_colours._POINTS_AT_ONCE", 777)
+    monkeypatch.setattr("roadscan.pictures.colours._KEPT_BYTES", 0)
+    monkeypatch.setattr("roadscan.pictures.colours._POINTS_AT_ONCE", 777)
     assert drive.run(drive.survey(), TwoThreads()) == files
     monkeypatch.setattr(Pictures, "near", lambda self, *_: self)  # all pictures: none that counts was left out
     assert drive.run(drive.survey()) == files

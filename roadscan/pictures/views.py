@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.core.camera import Interior
 from roadscan.core.extras import cv2
-from roadscan.surface.kernels.picture_colours import AROUND, HEIGHT, WIDTH, sample, take_better
+from roadscan.pictures.kernels.picture_colours import AROUND, HEIGHT, WIDTH, sample, take_better
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -23,8 +23,8 @@ from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory
 from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
+from roadscan.pictures.views import Lens, PictureRule, Views
 from roadscan.poses.trajectory import Poses, world_from_ned
-from roadscan.surface.views import Lens, PictureRule, Views
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -1,0 +1,1 @@
+"""Loops over pictures and their pixels that Numba compiles."""

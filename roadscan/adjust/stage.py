@@ -13,7 +13,7 @@ from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import footprints_of, index_footprints
-from roadscan.georeference.plan.plan import plan_of
+from roadscan.georeference.plan.plan import plan_of, poses_plan_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
@@ -26,23 +26,25 @@ class Adjust(Stage):
 
     name = "adjust"
     title = "corrections of the poses, from passes that overlap and from ground control"
-    after = ("footprints",)
+    after = ("footprints", "picture_ties")
     section = "adjust"
     units = "solutions"
     reads = (
         "scans", "returns", "cloud", "trajectory", "trajectory_accuracy", "control_points", "control_lines", "clocks",
-        "mountings", "footprints",
+        "mountings", "footprints", "picture_tracks", "images",
     )  # fmt: skip
     writes = ("ties", "control_sightings", *TABLES, "corrections", "mounting_corrections")
 
     def run(self, session: Session) -> None:
         """Adjust where evidence, settings or code differ from those of the last solution."""
-        if is_current(plan_of(session), session.manifest):
+        if is_current(poses_plan_of(session), session.manifest):
             return
         if AdjustConfig.of(session.survey).on:
             adjust_survey(session)
         else:
             withdraw(session)
+        if not poses_plan_of(session).sources:
+            return
         session.take(plan_of, plan_of(session).corrected_anew())
         # Corrections beyond the margin of footprints make these anew, and nothing else does.
         found = index_footprints(plan_of(session), session.manifest, session.compute, session.bar("footprints"))
@@ -68,7 +70,7 @@ class Adjust(Stage):
 
     def state(self, session: Session) -> StageState:
         """Whether the corrections are those of the survey as it is, and what they are worth."""
-        plan, asked = plan_of(session), self.is_asked(session.survey)
+        plan, asked = poses_plan_of(session), self.is_asked(session.survey)
         why = why_due(plan, session.manifest)
         notes = ["the adjustment is due: it may make more tiles stale than these"] if why and asked else []
         return StageState(

@@ -61,7 +61,7 @@ from roadscan.adjust.tie_settings import PlaceSettings
 from roadscan.core.counted import counted as count_of
 from roadscan.core.extras import can_draw
 from roadscan.core.witness import Finding
-from roadscan.georeference.plan.plan import SurveyPlan, plan_of
+from roadscan.georeference.plan.plan import SurveyPlan, poses_plan_of
 from roadscan.georeference.plan.road import road_key
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.poses.movement import largest
@@ -159,7 +159,7 @@ def _is_drawn(record: OutputRecord) -> bool:
 
 def withdraw(session: Session) -> None:
     """Remove the stage's products: the recorded poses are used."""
-    manifest, plan = session.manifest, plan_of(session)
+    manifest, plan = session.manifest, poses_plan_of(session)
     manifest.remove([r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()])
     publish(session.store, {}, AdjustConfig.of(plan.survey))
     publish_mountings(session.store, None, AdjustConfig.of(plan.survey))
@@ -171,14 +171,14 @@ class _Collector:
 
     def __init__(self, session: Session, sources: Sources, priors: tuple[RunPrior, ...], mounted: Mounted) -> None:
         self.session, self.sources, self.priors, self.mounted = session, sources, priors, mounted
-        self.runs = runs_of(plan_of(session))
-        self.work = plan_work(plan_of(session), sources, priors)
+        self.runs = runs_of(poses_plan_of(session))
+        self.work = plan_work(poses_plan_of(session), sources, priors)
         self.lacks = False
         """Whether some of the evidence failed."""
         self._seams = {place.number for task in self.work.ties for place in task.places if place.seam}
         self.of_heads, self._useless = self._heads()
         """Findings on heads that do not meet as they should."""
-        self.again = first_ties(plan_of(session), sources, self.work.ties, self.work.control, (self.observe, self.load))
+        self.again = first_ties(poses_plan_of(session), sources, self.work.ties, self.work.control, (self.observe, self.load))
 
     def observe(self, tasks: Sequence[TieTask]) -> None:
         """Update ties."""
@@ -197,8 +197,8 @@ class _Collector:
         A run in which heads meet otherwise than in the others gets separate mountings.
         """
         self.observe(self.work.ties)
-        steps = steps_of(self._loaded(self.work.ties), AdjustConfig.of(plan_of(self.session).survey).ties.return_s)
-        swapped = exchanged(plan_of(self.session), self.sources, steps)
+        steps = steps_of(self._loaded(self.work.ties), AdjustConfig.of(poses_plan_of(self.session).survey).ties.return_s)
+        swapped = exchanged(poses_plan_of(self.session), self.sources, steps)
         useless = {one.run for one, _ in swapped}
         odd = odd_steps([one for one in steps if one.run not in useless])
         if self.mounted.priors and odd:
@@ -219,12 +219,12 @@ class _Collector:
 
     def solve(self, ties: KnownTies, control: Sequence[ControlTask]) -> Solution:
         """Returns corrections of all runs."""
-        return solve(plan_of(self.session), self.evidence(ties, control).evidence)
+        return solve(poses_plan_of(self.session), self.evidence(ties, control).evidence)
 
 
 def adjust_survey(session: Session) -> None:
     """Collect what evidence is missing, solve, and publish the corrections, tables and pictures."""
-    plan, manifest, config = plan_of(session), session.manifest, AdjustConfig.of(plan_of(session).survey)
+    plan, manifest, config = poses_plan_of(session), session.manifest, AdjustConfig.of(poses_plan_of(session).survey)
     key = solution_key(plan)
     foreign = foreign_runs(session.store)
     sources = [pair for pair in adjusted_sources(plan) if pair[0].run not in foreign]

@@ -90,12 +90,17 @@ class SurveyPlan:
 
 
 def plan_survey(
-    survey: Survey, store: Store, calibrated: DatedMountings | None = None, records: Sequence[LogRecord] | None = None
+    survey: Survey,
+    store: Store,
+    calibrated: DatedMountings | None = None,
+    records: Sequence[LogRecord] | None = None,
+    *,
+    needs_readings: bool = True,
 ) -> SurveyPlan:
     """Build the plan from the tables and the survey file; reads no readings.
 
     `calibrated` stand in for the table of mountings where they are given, `records` for those of the survey's logs and
-    trajectories.
+    trajectories. `needs_readings` is false for what pictures alone serve for.
 
     Raises
     ------
@@ -131,7 +136,7 @@ def plan_survey(
     sources = tuple(_sources(survey, store, used, ground, known, corrections))
     if not sources and apart and any(r.tables.get(t) for r in records for t in DATA_TABLES):
         raise NothingPlacedError.of(apart)
-    if not sources:
+    if not sources and needs_readings:
         if not any(yields_readings(r.format) for r in records):
             raise NothingToPlaceError(
                 "nothing to place: the survey has no log of scans, returns or points",
@@ -322,3 +327,14 @@ def _profile_ns(source: ReadingSource) -> int:
 def plan_of(session: Session) -> SurveyPlan:
     """Return the plan of the session's survey."""
     return plan_survey(session.survey, session.store, records=records_of(session))
+
+
+@found_once
+def poses_plan_of(session: Session) -> SurveyPlan:
+    """Return the plan of the session's survey; it may have no readings where pictures alone improve the poses."""
+    try:
+        return plan_of(session)
+    except NothingToPlaceError:
+        if not session.survey.has("picture_ties"):
+            raise
+        return plan_survey(session.survey, session.store, records=records_of(session), needs_readings=False)

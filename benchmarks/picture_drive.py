@@ -1,0 +1,104 @@
+"""A drive with pictures alone (KITTI), as a survey that a user would write, whose poses are disturbed on purpose.
+
+The recording is ``pictures/drive_left``: 51 grey pictures, their poses and the lens. The poses that the survey states
+are those of the recording with errors that vary slowly; `roadscan run` has to take them out again.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+Float64 = npt.NDArray[np.float64]
+
+RECORDING: Final = "pictures/drive_left"
+STEP_S: Final = 0.1
+"""Time from picture to picture (s)."""
+FIRST_UNIX_S: Final = 1_600_000_000.0
+"""Unix time of the first picture (s); the recording states none."""
+
+_SURVEY: Final = """
+id = "drive_left"
+rig = "rig.toml"
+store = "store"
+[map.local]
+name = "axes of the vehicle at the first picture"
+[tiles]
+cell_m = 0.2
+[picture_ties]
+[adjust.priors]
+source = "stated"
+sigma_horizontal_m = {sigma_m}
+sigma_down_m = {sigma_m}
+sigma_roll_pitch_deg = {sigma_deg}
+sigma_heading_deg = {sigma_deg}
+[[runs]]
+id = "drive"
+[[runs.logs]]
+path = "poses.txt"
+format = "pose_matrices"
+crs = "local"
+clock = {{ system = "unix_utc" }}
+options = {{ axes = "flu", frame = "flu", times = "times.txt" }}
+[[runs.logs]]
+path = "pictures"
+format = "images"
+sensor = "left"
+clock = {{ system = "unix_utc" }}
+options = {{ stamps = "stamps.csv" }}
+"""
+_RIG: Final = """
+name = "KITTI car"
+[sensors.left]
+kind = "camera"
+axes = "frd"
+lever_arm_body_m = [0.0, 0.0, 0.0]
+boresight = { roll_deg = 0.0, pitch_deg = 0.0, heading_deg = 0.0 }
+[sensors.left.interior]
+width_px = 1226
+height_px = 370
+focal_px = [707.0912, 707.0912]
+principal_px = [601.8873, 183.1104]
+"""
+VEHICLE_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Axes forward, left, up from the camera's right, down, ahead."""
+
+
+def true_poses(recording: Path) -> Float64:
+    """Returns the recorded poses (n, 3, 4) in axes forward, left, up of the first picture."""
+    poses = np.loadtxt(recording / "poses.txt").reshape(-1, 3, 4)
+    turned = VEHICLE_FROM_CAMERA @ poses[:, :, :3] @ VEHICLE_FROM_CAMERA.T
+    return np.concatenate([turned, (poses[:, :, 3] @ VEHICLE_FROM_CAMERA.T)[:, :, None]], axis=2)
+
+
+def disturbed(poses: Float64, sigma_m: float, sigma_deg: float, seed: int) -> Float64:
+    """Returns poses with errors of these 1 σ on each axis, that vary over some seconds: three waves of random phase."""
+    rng = np.random.default_rng(seed)
+    time_s = STEP_S * np.arange(len(poses))
+    waves = np.zeros((len(poses), 6))
+    for period_s in (5.0, 9.0, 17.0):
+        phase, size = rng.uniform(0.0, 2.0 * np.pi, 6), rng.normal(size=6)
+        waves += size * np.sin(2.0 * np.pi * time_s[:, None] / period_s + phase)
+    waves *= np.sqrt(2.0 / 3.0)
+    turn = Rotation.from_rotvec(np.radians(sigma_deg) * waves[:, 3:]).as_matrix()
+    return np.concatenate([poses[:, :, :3] @ turn, poses[:, :, 3:] + sigma_m * waves[:, :3, None]], axis=2)
+
+
+def laid_out(recording: Path, folder: Path, sigma_m: float, sigma_deg: float, seed: int = 0) -> Path:
+    """Write the survey of the drive with disturbed poses below a folder; returns its survey file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    poses = disturbed(true_poses(recording), sigma_m, sigma_deg, seed)
+    np.savetxt(folder / "poses.txt", poses.reshape(-1, 12), fmt="%.9f")
+    stamps = FIRST_UNIX_S + STEP_S * np.arange(len(poses))
+    np.savetxt(folder / "times.txt", stamps, fmt="%.6f")
+    shutil.copytree(recording / "image_l", folder / "pictures", dirs_exist_ok=True)
+    lines = ["file,time", *(f"{number:06d}.png,{stamp:.6f}" for number, stamp in enumerate(stamps))]
+    (folder / "pictures" / "stamps.csv").write_text("\n".join(lines) + "\n")
+    (folder / "rig.toml").write_text(_RIG)
+    (folder / "SURVEY.toml").write_text(_SURVEY.format(sigma_m=sigma_m, sigma_deg=sigma_deg))
+    return folder / "SURVEY.toml"

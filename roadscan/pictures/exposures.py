@@ -1,0 +1,200 @@
+"""Exposures of cameras: when each picture was taken, and how the recorded poses place and move the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.rig import Sensor
+from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
+from roadscan.georeference.sources import load_mountings
+from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
+from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
+from roadscan.poses.trajectory import world_from_ned
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+
+_PIECE_NS: Final = 600 * NS_PER_S
+"""Poses of this long (ns) are loaded at once."""
+_BESIDE_NS: Final = 10_000_000
+"""Poses so long before and after an exposure (ns) give the motion in between."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera of a run."""
+
+    run: str
+    sensor: str
+    log: str
+    """Key of the log of its pictures."""
+    folder: Path
+    rig: Sensor
+    """What the rig file states of it; it has an interior orientation."""
+    world: str
+    """World frame of the run's poses."""
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """n pictures that have a recorded pose, by camera and time."""
+
+    cameras: tuple[Camera, ...]
+    camera: Int64
+    """(n,) number of the camera."""
+    epoch_gps_ns: Int64
+    """(n,)"""
+    file: npt.NDArray[Any]
+    """(n,) path relative to the camera's folder."""
+    body_world_m: Float64
+    """(n, 3) origin of the body."""
+    world_from_body: Float64
+    """(n, 3, 3)"""
+    velocity_world_m_s: Float64
+    """(n, 3) of the origin of the body."""
+    rate_body_rad_s: Float64
+    """(n, 3) turn of the body, along its axes."""
+    level_from_body: Float64
+    """(n, 3, 3) north, east, down from body axes."""
+    lever_body_m: Float64
+    """(n, 3) of the camera, as stated."""
+    body_from_opencv: Float64
+    """(n, 3, 3) of the camera's axes in OpenCV's order, as stated."""
+
+    def __len__(self) -> int:
+        """Returns the number of pictures."""
+        return self.epoch_gps_ns.size
+
+    def at(self, rows: Int64 | Bool) -> Self:
+        """Returns a subset."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return type(self)(**{n: v if n == "cameras" else v[rows] for n, v in values.items()})
+
+    def name(self, number: int) -> str:
+        """Returns the name of a picture in messages."""
+        camera = self.cameras[self.camera[number]]
+        return f"{camera.run}/{camera.sensor}/{self.file[number]}"
+
+    def path(self, number: int) -> Path:
+        """Returns the file of a picture."""
+        return Path(self.cameras[self.camera[number]].folder, str(self.file[number]))
+
+    @property
+    def eye_world_m(self) -> Float64:
+        """Returns projection centres (n, 3)."""
+        return np.asarray(self.body_world_m + np.einsum("nij,nj->ni", self.world_from_body, self.lever_body_m))
+
+    @property
+    def world_from_opencv(self) -> Float64:
+        """Returns attitudes (n, 3, 3) of the cameras."""
+        return np.asarray(self.world_from_body @ self.body_from_opencv)
+
+
+def exposures_of(plan: SurveyPlan) -> tuple[Exposures, tuple[str, ...]]:
+    """Returns the pictures of all cameras with an interior orientation, and notes on those that are left out.
+
+    A picture is left out whose size is not that of the interior orientation, and one at whose time there is no pose.
+    """
+    parts, cameras, notes = list[Exposures](), list[Camera](), list[str]()
+    for name, sensor in sorted(plan.survey.rig.sensors.items()):
+        if sensor.kind != "camera":
+            continue
+        for taken in taken_pictures(plan.store, plan.records, name):
+            where = f"{taken.record.run}/{name}"
+            if sensor.interior is None or taken.record.attributes.get("kind") == "video":
+                why = "no interior orientation in the rig file" if sensor.interior is None else "frames of a video"
+                notes.append(f"{where}: {len(taken.files)} pictures left out: {why}")
+                continue
+            own, said = _of_log(plan, sensor, taken, len(cameras))
+            parts.append(own)
+            cameras += own.cameras
+            notes += [f"{where}: {one}" for one in said]
+    return _joined(parts, cameras), tuple(notes)
+
+
+def _of_log(plan: SurveyPlan, rig: Sensor, taken: TakenPictures, number: int) -> tuple[Exposures, list[str]]:
+    """Returns the pictures of a log, and how many were left out."""
+    record, interior = taken.record, rig.interior
+    source = trajectory_source(record.run, plan.records)
+    size = (0, 0) if interior is None else (interior.width_px, interior.height_px)
+    fits = ((taken.size_px == 0) | (taken.size_px == size)).all(axis=1)
+    order = np.argsort(taken.epochs_gps_ns, kind="stable")
+    rows = order[fits[order]]
+    epochs = taken.epochs_gps_ns[rows]
+    first = np.concatenate([[True], np.diff(epochs) > 0]) if epochs.size else np.zeros(0, bool)
+    found, body, turned, velocity, rate = _motion(plan, source, epochs)
+    kept = found & first
+    notes = []
+    for count, why in (
+        (int((~fits).sum()), f"another size than the {size[0]} × {size[1]} px of the interior orientation"),
+        (int((~first).sum()), "the epoch of the picture before"),
+        (int((~found & first).sum()), "no recorded pose at their time"),
+    ):
+        if count:
+            notes.append(f"{count} of {rows.size} pictures left out: {why}")
+    lever, axes = np.empty((epochs.size, 3)), np.empty((epochs.size, 3, 3))
+    mountings = mountings_of(record.run, record.sensor, rig.mounting(), load_mountings(plan.store))
+    for part, mounting in mountings.pieces(epochs):
+        rotation, lever[part] = mounting.arrays()
+        axes[part] = rotation @ SENSOR_FROM_OPENCV
+    camera = Camera(record.run, record.sensor, record.key, plan.survey.resolve(Path(record.path)), rig, source.world)
+    level = np.einsum("nji,njk->nik", world_from_ned(source.world, body[kept]), turned[kept])
+    own = Exposures(
+        (camera,), np.full(int(kept.sum()), number), epochs[kept],
+        np.array([taken.files[i] for i in rows[kept].tolist()], dtype=object),
+        body[kept], turned[kept], velocity[kept], rate[kept], level, lever[kept], axes[kept],
+    )  # fmt: skip
+    return own, notes
+
+
+def _motion(
+    plan: SurveyPlan, source: TrajectorySource, epochs_gps_ns: Int64
+) -> tuple[Bool, Float64, Float64, Float64, Float64]:
+    """Returns whether there is a pose at epochs (n,) in order, position, attitude, velocity and turning rate."""
+    n = epochs_gps_ns.size
+    found, body, turned = np.zeros(n, bool), np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+    velocity, rate = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+    pieces = epochs_gps_ns // _PIECE_NS
+    for rows in np.split(np.arange(n), np.flatnonzero(np.diff(pieces)) + 1) if n else []:
+        own = epochs_gps_ns[rows]
+        span = (int(own[0]) - _BESIDE_NS, int(own[-1]) + _BESIDE_NS)
+        trajectory = load_recorded(plan.store, source, [span], plan.ground.max_gap_s)
+        here, before, after = (trajectory.poses(own + shift) for shift in (0, -_BESIDE_NS, _BESIDE_NS))
+        # At the ends of a trajectory the motion to one side stands for both.
+        early = np.where(before.found, -_BESIDE_NS, 0)
+        late = np.where(after.found, _BESIDE_NS, 0)
+        step_s = np.maximum(late - early, 1)[:, None] / NS_PER_S
+        first_m = np.where(before.found[:, None], before.position_world_m, here.position_world_m)
+        last_m = np.where(after.found[:, None], after.position_world_m, here.position_world_m)
+        first = np.where(before.found[:, None, None], before.world_from_body, here.world_from_body)
+        last = np.where(after.found[:, None, None], after.world_from_body, here.world_from_body)
+        found[rows], body[rows], turned[rows] = here.found, here.position_world_m, here.world_from_body
+        moving = here.found & (late > early)
+        velocity[rows] = np.where(moving[:, None], (last_m - first_m) / step_s, 0.0)
+        between = np.einsum("nji,njk->nik", first, last)
+        between[~moving] = np.eye(3)
+        rate[rows] = Rotation.from_matrix(between).as_rotvec() / step_s
+    return found, body, turned, velocity, rate
+
+
+def _joined(parts: Sequence[Exposures], cameras: Sequence[Camera]) -> Exposures:
+    """Returns all pictures, in the order of the parts."""
+    if not parts:
+        nothing, none = np.zeros((0, 3)), np.zeros(0, np.int64)
+        turns = np.zeros((0, 3, 3))
+        file = np.zeros(0, dtype=object)
+        return Exposures((), none, none, file, nothing, turns, nothing, nothing, turns, nothing, turns)
+    columns = {
+        f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Exposures) if f.name != "cameras"
+    }
+    return Exposures(tuple(cameras), **columns)

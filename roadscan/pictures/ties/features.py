@@ -1,0 +1,85 @@
+"""Features of a picture: SIFT (Lowe 2004), as RootSIFT (Arandjelović & Zisserman 2012), spread evenly over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.extras import cv2
+
+Float32 = npt.NDArray[np.float32]
+UInt8 = npt.NDArray[np.uint8]
+Int64 = npt.NDArray[np.int64]
+
+DESCRIPTOR: Final = 128
+"""Numbers of a descriptor."""
+_CONTRAST: Final = 0.01
+"""Least contrast of a feature; a quarter of Lowe's, since asphalt is dull and the best of each cell are kept."""
+_CELLS: Final = (12, 8)
+"""Columns and rows of the cells over which features are spread."""
+_SCALE: Final = 255.0  # Scale of a descriptor's roots, which lie between 0 and 1, as bytes.
+_SAME_PX: Final = 1e-3  # Features so near each other (px) are one place with two directions.
+
+
+@dataclass(frozen=True)
+class Features:
+    """k features."""
+
+    pixel: Float32
+    """(k, 2) u, v from the centre of the upper left pixel."""
+    size_px: Float32
+    """(k,) diameter."""
+    descriptor: UInt8
+    """(k, 128) roots of the shares of the gradients, times 255."""
+
+    def __len__(self) -> int:
+        """Returns the number of features."""
+        return len(self.pixel)
+
+
+def features_of(picture: UInt8, most: int, seen: UInt8 | None = None) -> Features:
+    """Returns the features of a grey picture (height, width), at most `most` of them.
+
+    Parameters
+    ----------
+    seen : (height, width) 0 where nothing is looked for, such as on the vehicle itself.
+    """
+    height, width = picture.shape
+    finder = cv2.SIFT.create(nfeatures=0, contrastThreshold=_CONTRAST)
+    found = finder.detect(picture, seen)
+    if not found:
+        return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, DESCRIPTOR), np.uint8))
+    values = np.array([(*one.pt, one.size, one.response, one.angle) for one in found])
+    order = np.lexsort((values[:, 4], values[:, 2], values[:, 0], values[:, 1], -values[:, 3]))
+    order = order[_first_at_place(values[order, :2])]
+    rows = order[_spread(values[order, :2], (width, height), most)]
+    kept, raw = finder.compute(picture, [found[k] for k in rows.tolist()])
+    place = np.array([one.pt for one in kept], np.float32).reshape(-1, 2)
+    size = np.array([one.size for one in kept], np.float32)
+    share = raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
+    descriptor = np.clip(np.rint(_SCALE * np.sqrt(share)), 0, _SCALE).astype(np.uint8)
+    return Features(place, size, descriptor)
+
+
+def _first_at_place(place_px: npt.NDArray[np.float64]) -> Int64:
+    """Returns rows of the first feature at each place, in order."""
+    _, first = np.unique(np.rint(place_px / _SAME_PX).astype(np.int64), axis=0, return_index=True)
+    return np.sort(first).astype(np.int64)
+
+
+def _spread(place_px: npt.NDArray[np.float64], size: tuple[int, int], most: int) -> Int64:
+    """Returns rows of features, best first as they come, of which each cell of the picture gives as many as it can."""
+    columns, rows = _CELLS
+    column = np.clip(place_px[:, 0] * columns / size[0], 0, columns - 1).astype(np.int64)
+    row = np.clip(place_px[:, 1] * rows / size[1], 0, rows - 1).astype(np.int64)
+    cell = row * columns + column
+    order = np.argsort(cell, kind="stable")
+    starts = np.searchsorted(cell[order], np.arange(columns * rows))
+    rank = np.empty(cell.size, np.int64)
+    rank[order] = np.arange(cell.size) - starts[cell[order]]
+    # The first of each cell, then the second of each, and so on.
+    chosen = np.lexsort((np.arange(cell.size), rank))[:most]
+    return np.sort(chosen).astype(np.int64)

@@ -1,0 +1,144 @@
+"""Stage `picture_ties`: what several pictures show is found and matched, for the adjustment of the poses."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Final
+
+from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.core.extras import need
+from roadscan.core.survey import Survey
+from roadscan.core.witness import Finding, Witness
+from roadscan.georeference.plan.plan import poses_plan_of
+from roadscan.pictures.ties.work import (
+    ALL,
+    FEATURES,
+    MATCHES,
+    TRACKS,
+    TieWork,
+    find_features,
+    match_picture,
+    match_tasks,
+    plan_ties,
+    tracks_key,
+    write_tracks,
+)
+from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.session import Session
+from roadscan.run.stage import Stage, StageState
+from roadscan.store.logs import LogRecord
+from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.schema import table_schema
+
+_PICTURES: Final = 20
+"""Pictures of a task: some ten seconds of work, which a killed worker loses at most."""
+_NAMED: Final = 5  # Pictures that a finding names.
+
+ODD_PICTURES: Final = Witness(
+    "odd_pictures",
+    input="pictures",
+    fault="A picture cannot be read, has another size than its lens, is black, or is a copy of another one.",
+    asks="its bytes, and the features that it shows",
+    does="it gives no tie point; the other pictures go on without it",
+    told=("findings",),
+)
+
+
+class PictureTies(Stage):
+    """The stage of tie points: a file of features and one of matches a picture, and the tracks of the survey."""
+
+    name = "picture_ties"
+    title = "tie points: what several pictures show, for the adjustment of the poses"
+    after = ("navigate",)
+    section = "picture_ties"
+    units = "pictures"
+    reads = ("images", "trajectory", "trajectory_accuracy", "clocks", "mountings")
+    writes = (FEATURES, MATCHES, TRACKS)
+
+    def run(self, session: Session) -> None:
+        """Find features and matches that are missing or stale, and join them to tracks."""
+        manifest = session.manifest
+        if not self.is_asked(session.survey):
+            manifest.remove([r for name in (FEATURES, MATCHES, TRACKS) for r in manifest.of(name).values()])
+            return
+        work = plan_ties(poses_plan_of(session))
+        for note in work.notes:
+            session.note(f"{self.name}: {note}")
+        due = [t for t in work.features if not manifest.is_current(FEATURES, t.unit, t.key)]
+        failed = run_bundles(
+            find_features, due, lambda _: 1, _PICTURES, manifest, session.compute, session.bar("features of pictures")
+        )
+        session.failed(self.name, [(str(task.path), reason) for task, reason in failed])
+        tasks = match_tasks(work, manifest)
+        left = [t for t in tasks if not manifest.is_current(MATCHES, t.unit, t.key)]
+        unmatched = run_bundles(
+            match_picture, left, lambda t: len(t.partners), _PICTURES, manifest, session.compute,
+            session.bar("pictures matched"),
+        )  # fmt: skip
+        session.failed(self.name, [(t.unit, reason) for t, reason in unmatched])
+        manifest.remove(manifest.beside([FEATURES], set(work.units)))
+        manifest.remove(manifest.beside([MATCHES], {t.unit for t in tasks}))
+        key = tracks_key(work, tasks, manifest)
+        if not manifest.is_current(TRACKS, ALL, key):
+            manifest.add([write_tracks(work, tasks, manifest, session.store)])
+        for line in _lines(work, manifest):
+            session.reporter.line(f"{self.name}: {line}")
+
+    def check(self, survey: Survey) -> list[RoadscanError]:
+        """Check that the rig has a camera whose directions are known."""
+        if not self.is_asked(survey):
+            return []
+        cameras = {name: one for name, one in survey.rig.sensors.items() if one.kind == "camera"}
+        try:
+            need("cv2", "the section [picture_ties]")
+            if not any(one.interior is not None for one in cameras.values()):
+                raise ConfigError(
+                    "the survey asks for tie points of pictures, and no camera of its rig has an interior orientation",
+                    expected=f"[sensors.{next(iter(cameras), 'NAME')}.interior] in the rig file",
+                    change="find it from chessboard pictures: `roadscan camera interior`, or leave out [picture_ties]",
+                )
+        except RoadscanError as error:
+            return [error]
+        return []
+
+    def state(self, session: Session) -> StageState:
+        """Pictures whose features are current, and those that are due."""
+        if not self.is_asked(session.survey):
+            return StageState()
+        work, manifest = plan_ties(poses_plan_of(session)), session.manifest
+        state = StageState.of(manifest, [(FEATURES, t.unit, t.key) for t in work.features])
+        tasks = match_tasks(work, manifest)
+        state.join(StageState.of(manifest, [(MATCHES, t.unit, t.key) for t in tasks]))
+        state.join(StageState.of(manifest, [(TRACKS, ALL, tracks_key(work, tasks, manifest))]))
+        return state
+
+    def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
+        """Returns a finding on pictures that give no tie points."""
+        record = manifest.get(TRACKS, ALL)
+        odd = [] if record is None else json.loads(record.detail).get("odd", [])
+        if not odd:
+            return ()
+        named = "; ".join(f"{name}: {why}" for name, why in odd[:_NAMED])
+        more = f" and {len(odd) - _NAMED:,} more" if len(odd) > _NAMED else ""
+        return (
+            ODD_PICTURES.finds(
+                "pictures", f"{len(odd):,} pictures give no tie point: {named}{more}", left_out=len(odd)
+            ),
+        )
+
+    def folders(self) -> Sequence[str]:
+        """Returns the folders of features, matches and tracks."""
+        return [str(table_schema(name).location) for name in (FEATURES, MATCHES, TRACKS)]
+
+
+def _lines(work: TieWork, manifest: Manifest) -> list[str]:
+    """Returns what was found, in words."""
+    record: OutputRecord | None = manifest.get(TRACKS, ALL)
+    if record is None:
+        return []
+    own = json.loads(record.detail)
+    return [
+        f"{len(work.units):,} pictures, {len(work.pairs):,} pairs compared: {own['found']:,} tie points, of which "
+        f"{own['tracks']:,} are kept (long ones first, spread over the pictures)"
+    ]

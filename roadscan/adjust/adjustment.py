@@ -23,8 +23,8 @@ from roadscan.adjust.control.control_test import COMPONENTS as SURVEYED
 from roadscan.adjust.control.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
 from roadscan.adjust.estimation import SURVEY, Estimate, Problem, Rounds
 from roadscan.adjust.fixed_runs import FixedRun, fixed_runs
-from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations
-from roadscan.adjust.process import MountingPrior, RunPrior, line_variance
+from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, MOUNTED, Observations
+from roadscan.adjust.process import CameraPrior, MountingPrior, RunPrior, line_variance
 from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, Unknowns, directions_of
@@ -90,6 +90,27 @@ class MountingErrors:
     covariance: Float64
     """(7 s, 7 s) of the errors of all sensors, without the height error common to all."""
 
+    def of(self, which: Bool) -> MountingErrors:
+        """Returns the errors of some sensors (s,)."""
+        rows = np.flatnonzero(np.repeat(which, len(MOUNTED)))
+        names = tuple(one for one, kept in zip(self.sensors, which.tolist(), strict=True) if kept)
+        return MountingErrors(
+            names, self.prior_sigma[which], self.error[which], self.sigma[which], self.covariance[np.ix_(rows, rows)]
+        )
+
+
+@dataclass(frozen=True)
+class CameraErrors:
+    """Errors of the lenses and clocks of k cameras after the adjustment."""
+
+    sensors: tuple[str, ...]
+    prior_sigma: Float64
+    """(k, 11) as it came in, `CAMERA`; 0: not estimated."""
+    error: Float64
+    """(k, 11) correction that is added; 0 where not estimated."""
+    sigma: Float64
+    """(k, 11) 1 σ of the corrected value."""
+
 
 @dataclass(frozen=True)
 class Adjustment:
@@ -116,6 +137,7 @@ class Adjustment:
     """(n,) against the prediction of all others, over its σ; NaN where not used."""
     control: ControlErrors
     mountings: MountingErrors
+    cameras: CameraErrors
     variance_factors: Mapping[str, float]
     """Of the stated variances, by kind of observation, by component of the processes, and of the surveys of control; 1
     where not estimated."""
@@ -185,6 +207,7 @@ def adjust(
     priors: Sequence[RunPrior],
     settings: AdjustmentSettings,
     mountings: Sequence[MountingPrior] = (),
+    cameras: Sequence[CameraPrior] = (),
 ) -> Adjustment:
     """Returns the adjustment of all runs.
 
@@ -193,13 +216,14 @@ def adjust(
     observations : in any order; the result does not depend on it.
     priors : of each run that `Observations.run` counts.
     mountings : of each sensor that `Observations.sensor` counts; estimated where all runs are adjusted jointly.
+    cameras : of each camera that `Observations.camera` counts, likewise.
 
     Raises
     ------
     ConfigError
         for an observation that is not a number, of no known run, or outside of its run's time.
     """
-    found, wider = _once(observations, priors, settings, mountings), np.ones((len(priors), len(COMPONENTS)))
+    found, wider = _once(observations, priors, settings, (mountings, cameras)), np.ones((len(priors), len(COMPONENTS)))
     if settings.estimate_variance_components is not None or settings.mode != "joint" or len(priors) < 2:
         return found
     for _ in range(_SCALED):
@@ -208,7 +232,7 @@ def adjust(
         if (more == 1.0).all():
             break
         own = [p.wider(f) for p, f in zip(priors, wider * more, strict=True)]
-        other = _once(observations, own, settings, mountings)
+        other = _once(observations, own, settings, (mountings, cameras))
         if any((found.run_factors[:, axes] > 1.0).any() for axes in _still_doubted(found, other)):
             break
         found, wider = other, wider * more
@@ -230,7 +254,7 @@ def _once(
     observations: Observations,
     priors: Sequence[RunPrior],
     settings: AdjustmentSettings,
-    mountings: Sequence[MountingPrior],
+    shared: tuple[Sequence[MountingPrior], Sequence[CameraPrior]],
 ) -> Adjustment:
     """Returns an adjustment with the stated σ of each run's poses."""
     order = _canonical(observations)
@@ -239,7 +263,7 @@ def _once(
     chosen = ordered.chosen(which)
     components = HEIGHT_ALONE if settings.mode == "vertical" else np.ones(len(COMPONENTS), bool)
     control = ControlPoints.of(chosen, each_pass=settings.mode == "each_pass")
-    shared = mountings if settings.mode == "joint" else ()
+    shared = shared if settings.mode == "joint" else ((), ())
     first = Unknowns.of(priors, control, settings.knot_spacing_s, components, shared)
     first.check(observations)
     priors, unknowns, rounds, alone = _without_surveys(first, chosen, settings)
@@ -258,6 +282,7 @@ def _once(
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
         _of_control(unknowns, estimate, n, verdict.survey_factor), _of_mountings(unknowns, estimate, solution),
+        _of_cameras(unknowns, estimate, solution),
         {k: float(v) for k, v in factors.items()},
         estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.active, response,
         factors_of_runs, fixed_runs(unknowns, _of_solution(unknowns, estimate.solution)),
@@ -295,6 +320,7 @@ def _canonical(observations: Observations) -> Int64:
     o = observations
     keys = [o.kind, o.place, *o.run.T, *o.sensor.T, *o.epoch_gps_ns.T, o.observed_m, o.sigma_m, o.survey_sigma_m]
     keys += list(o.partials.reshape(o.size, 2 * len(COMPONENTS)).T)
+    keys += [o.camera, *o.camera_partials.T] if (o.camera >= 0).any() else []
     return np.lexsort(keys[::-1])
 
 
@@ -310,7 +336,7 @@ def _used(observations: Observations, mode: str) -> Bool:
 def _problem(unknowns: Unknowns, observations: Observations) -> Problem:
     """Returns the rows of the observations, then of the surveys of control points."""
     rows, lines = unknowns.rows(observations, unknowns.control.of_observation)
-    numbers = unknowns.of_control
+    numbers = unknowns.of_surveys
     surveyed = numbers[numbers >= 0]
     m = surveyed.size
     _, first, own = np.unique(observations.group, return_index=True, return_inverse=True)
@@ -335,7 +361,7 @@ def _problem(unknowns: Unknowns, observations: Observations) -> Problem:
 
 def _surveyed(unknowns: Unknowns) -> tuple[Int64, Int64, Float64]:
     """Returns control point, axis and σ (m,) of each surveyed coordinate, in the order of their unknowns."""
-    point, axis = np.nonzero(unknowns.of_control >= 0)
+    point, axis = np.nonzero(unknowns.of_surveys >= 0)
     return point.astype(np.int64), axis.astype(np.int64), unknowns.control.sigma_m[point, axis]
 
 
@@ -368,7 +394,8 @@ def _in_time(control: ControlPoints, observations: Observations) -> Int64:
     first = np.full(control.place.size, np.iinfo(np.int64).max)
     seen = control.of_observation >= 0
     np.minimum.at(first, control.of_observation[seen], observations.epoch_gps_ns[seen].max(axis=1))
-    return np.argsort(first, kind="stable").astype(np.int64)
+    order = np.argsort(first, kind="stable").astype(np.int64)
+    return order[~control.free[order]]
 
 
 def _counting(unknowns: Unknowns, verdict: ControlVerdict, refused: Sequence[str]) -> Float64:
@@ -487,9 +514,19 @@ def _of_mountings(unknowns: Unknowns, estimate: Estimate, solution: Float64) -> 
     return MountingErrors(tuple(one.key for one in unknowns.mountings), prior, error, np.sqrt(variance), covariance)
 
 
+def _of_cameras(unknowns: Unknowns, estimate: Estimate, solution: Float64) -> CameraErrors:
+    prior, numbers = unknowns.camera_sigma, unknowns.of_cameras
+    there = numbers >= 0
+    error, variance = np.zeros(prior.shape), np.zeros(prior.shape)
+    error[there] = solution[numbers[there]] * prior[there]
+    variance[there] = estimate.inverse.at(numbers[there], numbers[there]) * prior[there] ** 2
+    return CameraErrors(tuple(one.sensor for one in unknowns.cameras), prior, error, np.sqrt(variance))
+
+
 def _of_control(unknowns: Unknowns, estimate: Estimate, n: int, factor: float) -> ControlErrors:
-    """Returns the errors of control: rows after the first n are those of surveys."""
-    control, numbers = unknowns.control, unknowns.of_control
+    """Returns the errors of surveyed control: rows after the first n are those of surveys."""
+    surveyed = ~unknowns.control.free
+    control, numbers = unknowns.control, unknowns.of_control[surveyed]
     there = numbers >= 0
 
     def table(values: Float64) -> Float64:
@@ -497,9 +534,10 @@ def _of_control(unknowns: Unknowns, estimate: Estimate, n: int, factor: float) -
         found[there] = values
         return found
 
-    without, sigma = estimate.without, control.sigma_m
+    without, sigma = estimate.without, control.sigma_m[surveyed]
     error = table(estimate.solution[numbers[there]]) * sigma
     # The survey states zero for its error; the others predict it.
     left_out = table(-without.residual[n:]) * sigma
     left_out_sigma = table(np.sqrt(factor + without.variance[n:])) * sigma
-    return ControlErrors(control.place, control.run, sigma, error, table(estimate.weight[n:]), left_out, left_out_sigma)
+    place, run = control.place[surveyed], control.run[surveyed]
+    return ControlErrors(place, run, sigma, error, table(estimate.weight[n:]), left_out, left_out_sigma)

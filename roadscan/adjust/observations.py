@@ -33,10 +33,11 @@ UInt8 = npt.NDArray[np.uint8]
 
 KINDS: Final = (
     "height_tie", "shift_tie", "plane_tie", "control_height", "control_position", "head_tie", "hand_tie",
+    "picture_tie", "picture_control",
 )  # fmt: skip
 """Height of one pass against another's; shift of one image or relief against another's; distance of two planes;
 height, or a component of the place, of a control point; height of one head against that of another of the same pass;
-what a person found in two passes."""
+what a person found in two passes; column or row of a tie point, or of a control point, in a picture."""
 
 COMPONENTS: Final = ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
 """The unknowns of a pose, in the order of the partial derivatives."""
@@ -45,8 +46,14 @@ MOUNTED: Final = ("forward_m", "right_m", "down_m", "roll_rad", "pitch_rad", "he
 """The unknowns of a mounting: lever arm and a turn that follows the boresight, both along the axes of the body, and the
 share by which ranges are longer."""
 
+CAMERA: Final = (
+    "focal_x_px", "focal_y_px", "centre_x_px", "centre_y_px", "k1", "k2", "p1", "p2", "k3", "clock_s", "line_time_s",
+)  # fmt: skip
+"""The unknowns of a camera beside its mounting: its lens (OpenCV's parameters), what is added to the stamps of its
+pictures, and to the time between the exposures of two rows."""
+
 FIXED: Final = -1
-"""Run of an end that no correction moves: a control point."""
+"""Run of an end that no correction moves: a control point, or a tie point of pictures."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +85,15 @@ class Observations:
     """(n, 2) number of the sensor that saw each end; −1 where its mounting is not estimated."""
     mount_partials: Float64 = field(default_factory=lambda: np.zeros((0, 2, len(MOUNTED))))
     """(n, 2, 7) derivatives by `MOUNTED` of that sensor, the sign of the end included."""
+    camera: Int32 = field(default_factory=lambda: np.zeros(0, np.int32))
+    """(n,) number of the camera whose lens and clock are estimated, −1: none."""
+    camera_partials: Float64 = field(default_factory=lambda: np.zeros((0, len(CAMERA))))
+    """(n, 11) derivatives by `CAMERA` of that camera."""
 
     def __post_init__(self) -> None:
+        if len(self.camera) != self.kind.size or len(self.camera_partials) != self.kind.size:
+            object.__setattr__(self, "camera", np.full(self.kind.size, -1, np.int32))
+            object.__setattr__(self, "camera_partials", np.zeros((self.kind.size, len(CAMERA))))
         if len(self.sensor) != self.kind.size or len(self.mount_partials) != self.kind.size:
             object.__setattr__(self, "sensor", np.full((self.kind.size, 2), -1, np.int32))
             object.__setattr__(self, "mount_partials", np.zeros((self.kind.size, 2, len(MOUNTED))))

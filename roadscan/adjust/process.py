@@ -160,6 +160,15 @@ class MountingPrior:
         return self.run, self.sensor
 
 
+@dataclass(frozen=True)
+class CameraPrior:
+    """Prior knowledge of a camera's lens and clock."""
+
+    sensor: str
+    sigma: Float64
+    """(11,) 1 σ of their errors, in the order of `CAMERA`; 0: not estimated."""
+
+
 def knots_of(prior: RunPrior, spacing_s: float) -> Int64:
     """Returns epochs (k,) of a run's knots from its first epoch to its last, at most `spacing_s` apart.
 

@@ -7,6 +7,7 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from roadscan.adjust.bundle.settings import CameraPriors
 from roadscan.adjust.solver_settings import ControlRules, SolverSettings
 from roadscan.adjust.tie_settings import AgainSettings, PlaceSettings, TieSettings
 from roadscan.core.errors import nearest
@@ -168,6 +169,8 @@ class AdjustConfig(SurveySection):
     """Errors of the recorded poses."""
     mountings: MountingPriors = MountingPriors()
     """Errors of the sensors' mountings."""
+    cameras: CameraPriors = CameraPriors()
+    """Errors of cameras whose pictures have tie points (`[picture_ties]`)."""
     places: PlaceSettings = PlaceSettings()
     """Where passes are compared."""
     ties: TieSettings = TieSettings()

@@ -33,7 +33,7 @@ class Adjust(Stage):
         "scans", "returns", "cloud", "trajectory", "trajectory_accuracy", "control_points", "control_lines", "clocks",
         "mountings", "footprints", "picture_tracks", "images",
     )  # fmt: skip
-    writes = ("ties", "control_sightings", *TABLES, "corrections", "mounting_corrections")
+    writes = ("ties", "control_sightings", *TABLES, "corrections", "mounting_corrections", "camera_corrections")
 
     def run(self, session: Session) -> None:
         """Adjust where evidence, settings or code differ from those of the last solution."""
@@ -77,7 +77,7 @@ class Adjust(Stage):
             int(not why),
             int(bool(why)),
             why=Counter([why] if why else []),
-            keys=[solution_key(plan)] if asked else [],
+            keys=[solution_key(plan, session.manifest)] if asked else [],
             notes=notes,
             lines=known_lines(session.manifest),
         )

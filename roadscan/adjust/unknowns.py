@@ -8,14 +8,22 @@ which all runs that saw a point share, then those of the mountings of sensors, w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.observations import COMPONENTS, FIXED, MOUNTED, Observations
-from roadscan.adjust.process import MountingPrior, RunPrior, knots_of, line_variance, precision_of, stretches
+from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, Observations
+from roadscan.adjust.process import (
+    CameraPrior,
+    MountingPrior,
+    RunPrior,
+    knots_of,
+    line_variance,
+    precision_of,
+    stretches,
+)
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
@@ -25,6 +33,7 @@ Int64 = npt.NDArray[np.int64]
 
 _SIZE = len(COMPONENTS)
 _MOUNT_SIZE = len(MOUNTED)
+_TIE_POINT = KINDS.index("picture_tie")
 _DOWN = 2  # Index of the component down.
 _ALONG = 0.5
 """Least component of a direction along an axis for it to determine that coordinate; each has one or two such axes."""
@@ -49,6 +58,9 @@ class ControlPoints:
     surveyed: the slope of the road, where the height alone is compared, and 0 where the place is."""
     of_observation: Int64
     """(n,) index of each observation's point, −1: none."""
+    free: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    """(c,) True of tie points of pictures, which nobody surveyed: `sigma_m` is how far they may lie from where they
+    were taken to be. They follow all others."""
 
     @classmethod
     def of(cls, observations: Observations, *, each_pass: bool) -> ControlPoints:
@@ -61,7 +73,9 @@ class ControlPoints:
         index = np.full(observations.size, -1, np.int64)
         index[seen] = own.ravel()
         sigma = np.zeros((len(points), 3))
-        along = np.abs(directions_of(observations)[seen]) >= _ALONG
+        free = np.zeros(len(points), bool)
+        free[index[observations.kind == _TIE_POINT]] = True
+        along = (np.abs(directions_of(observations)[seen]) >= _ALONG) | free[index[seen]][:, None]
         for axis in range(3):
             which = along[:, axis]
             np.maximum.at(sigma[:, axis], index[seen][which], observations.survey_sigma_m[seen][which])
@@ -70,7 +84,7 @@ class ControlPoints:
         lean, count = np.zeros((len(points), 2)), np.bincount(index[upright], minlength=len(points))
         np.add.at(lean, index[upright], direction[upright, :2] / direction[upright, _DOWN:])
         lean /= np.maximum(count, 1)[:, None]
-        return cls(points[:, 0].astype(np.int64), points[:, 1].astype(np.int64), sigma, lean, index)
+        return cls(points[:, 0].astype(np.int64), points[:, 1].astype(np.int64), sigma, lean, index, free)
 
 
 def directions_of(observations: Observations) -> Float64:
@@ -90,6 +104,7 @@ class Unknowns:
     """(k, 6), or (k, 12) where a run has outages: σ of the parts of each run's processes at its knots; 0: not there."""
     control: ControlPoints
     mountings: tuple[MountingPrior, ...] = ()
+    cameras: tuple[CameraPrior, ...] = ()
 
     @classmethod
     def of(
@@ -98,13 +113,13 @@ class Unknowns:
         control: ControlPoints,
         spacing_s: float,
         components: npt.NDArray[np.bool_],
-        mountings: Sequence[MountingPrior] = (),
+        shared: tuple[Sequence[MountingPrior], Sequence[CameraPrior]] = ((), ()),
     ) -> Unknowns:
         """Returns unknowns with knots at most `spacing_s` apart; only some components are estimated."""
         knots = tuple(knots_of(p, spacing_s) for p in priors)
         parts = [p.parts_at(own) for p, own in zip(priors, knots, strict=True)]
         sigmas = tuple(own * np.tile(components, own.shape[1] // _SIZE) for own in parts)
-        return cls(tuple(priors), knots, sigmas, control, tuple(mountings))
+        return cls(tuple(priors), knots, sigmas, control, tuple(shared[0]), tuple(shared[1]))
 
     @cached_property
     def active(self) -> npt.NDArray[np.bool_]:
@@ -128,6 +143,11 @@ class Unknowns:
     @property
     def size(self) -> int:
         """Returns the number of unknowns."""
+        return self.first_camera + int((self.camera_sigma > 0.0).sum())
+
+    @property
+    def first_camera(self) -> int:
+        """Returns the first unknown of a camera."""
         return self.first_mounting + int((self.mount_sigma > 0.0).sum())
 
     @property
@@ -147,6 +167,24 @@ class Unknowns:
         numbers = np.full(there.shape, -1, np.int64)
         numbers[there] = self.first_mounting + np.arange(int(there.sum()))
         return numbers
+
+    @cached_property
+    def camera_sigma(self) -> Float64:
+        """Returns (k, 11) prior σ of the cameras."""
+        return np.array([one.sigma for one in self.cameras]).reshape(-1, len(CAMERA))
+
+    @cached_property
+    def of_cameras(self) -> Int64:
+        """Returns the unknown (k, 11) of each component of the cameras, −1: none."""
+        there = self.camera_sigma > 0.0
+        numbers = np.full(there.shape, -1, np.int64)
+        numbers[there] = self.first_camera + np.arange(int(there.sum()))
+        return numbers
+
+    @cached_property
+    def of_surveys(self) -> Int64:
+        """Returns the unknown (c, 3) of each surveyed coordinate of the control points, −1: none."""
+        return np.where(self.control.free[:, None], -1, self.of_control)
 
     @cached_property
     def of_control(self) -> Int64:
@@ -204,7 +242,20 @@ class Unknowns:
         unknown[seen, -3:] = self.of_control[point[seen]]
         derivative[seen, -3:] = directions_of(observations)[seen] * self.control.sigma_m[point[seen]]
         mounted, by_mounting = self._of_mounted(observations)
-        return Rows.of(np.hstack([unknown, mounted]), np.hstack([derivative, by_mounting])), variance
+        filmed, by_camera = self._of_filmed(observations)
+        rows = Rows.of(np.hstack([unknown, mounted, filmed]), np.hstack([derivative, by_mounting, by_camera]))
+        return rows, variance
+
+    def _of_filmed(self, observations: Observations) -> tuple[Int64, Float64]:
+        """Returns unknowns and derivatives (n, 11) of cameras; (n, 0) where none is estimated."""
+        if not self.cameras:
+            return np.zeros((observations.size, 0), np.int64), np.zeros((observations.size, 0))
+        here = observations.camera >= 0
+        unknown = np.full((observations.size, len(CAMERA)), -1, np.int64)
+        unknown[here] = self.of_cameras[observations.camera[here]]
+        derivative = np.zeros(unknown.shape)
+        derivative[here] = observations.camera_partials[here] * self.camera_sigma[observations.camera[here]]
+        return unknown, derivative
 
     def _of_mounted(self, observations: Observations) -> tuple[Int64, Float64]:
         """Returns unknowns and derivatives (n, 14), of the mountings of both ends; (n, 0) where none is estimated."""
@@ -220,8 +271,8 @@ class Unknowns:
     def prior_entries(self) -> tuple[Int64, Int64, Float64, Int64]:
         """Returns upper entries of the prior's inverse covariance: row, column, value, component.
 
-        Mountings have the component `len(COMPONENTS)`. Those of control points are not among them: their survey is an
-        observation, which may be wrong.
+        Mountings, cameras and tie points of pictures have the component `len(COMPONENTS)`. Those of control points
+        are not among them: their survey is an observation, which may be wrong.
         """
         parts: list[tuple[Int64, Int64, Float64, Int64]] = []
         for run, prior in enumerate(self.priors):
@@ -234,6 +285,8 @@ class Unknowns:
                     value = np.concatenate([diagonal, beside])
                     parts.append((row, column, value, np.full(row.size, component, np.int64)))
         parts.append(self._of_mounting_priors())
+        free = np.concatenate([self.of_control[self.control.free].ravel(), self.of_cameras[self.of_cameras >= 0]])
+        parts.append((free, free, np.ones(free.size), np.full(free.size, _SIZE, np.int64)))
         rows, columns, values, components = zip(*parts, strict=True)
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values), np.concatenate(components)
 
@@ -261,8 +314,8 @@ class Unknowns:
         """Pairs of unknowns whose covariance is needed: of a knot, of neighbouring knots, of a control point, of all
         mountings.
         """
-        mounted = self.of_mountings.reshape(1, -1)
-        parts = [_pairs(self.of_control, self.of_control), _pairs(mounted, mounted)]
+        mounted, filmed = self.of_mountings.reshape(1, -1), self.of_cameras
+        parts = [_pairs(self.of_control, self.of_control), _pairs(mounted, mounted), _pairs(filmed, filmed)]
         for run in range(len(self.priors)):
             numbers = self.of_run(run)
             parts += [_pairs(numbers, numbers), _pairs(numbers[:-1], numbers[1:])]

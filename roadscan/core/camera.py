@@ -32,12 +32,17 @@ class Interior(Strict):
     """cx, cy, from the centre of the upper left pixel (pixels); may be left out for a picture of 360°: its middle."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3."""
+    line_time_us: float = Field(default=0.0, ge=-1000.0, le=1000.0)
+    """Time from the exposure of a row to that of the row below (µs): of a rolling shutter; 0 of a global one. The stamp
+    of a picture is the time of its middle row."""
     sigma_focal_px: tuple[float, float] | None = None
     """1 σ of `focal_px`, from the calibration."""
     sigma_principal_px: tuple[float, float] | None = None
     """1 σ of `principal_px`."""
     sigma_distortion: tuple[float, float, float, float, float] | None = None
     """1 σ of `distortion`."""
+    sigma_line_time_us: float | None = Field(default=None, ge=0.0)
+    """1 σ of `line_time_us`."""
     rms_px: float | None = Field(default=None, ge=0.0)
     """RMS of the calibration's residuals (pixels)."""
     pictures: int | None = Field(default=None, ge=0)

@@ -27,6 +27,7 @@ REPAIR_HINT: Final = {
     "mountings": "`roadscan calibrate` makes it anew of the survey file's evidence; if it is removed, the rig file's "
     "mountings hold",
     "mounting_corrections": "put it back, or adjust again; if it is removed, mountings hold as they were stated",
+    "camera_corrections": "put it back, or adjust again; if it is removed, lenses and clocks hold as they were stated",
     "corrections": "put it back, or compute it again; if it is removed, trajectories hold as they were recorded",
 }
 """How each table is repaired when it is damaged."""

@@ -17,6 +17,8 @@ from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
 from roadscan.adjust.settings import AdjustConfig
+from roadscan.adjust.tasks.bundle import pictures_key, pictures_of
+from roadscan.adjust.tasks.cameras import picture_lines, picture_rows, publish_cameras
 from roadscan.adjust.tasks.control_lines import lines_line
 from roadscan.adjust.tasks.control_work import (
     SIGHTINGS,
@@ -109,7 +111,7 @@ class Seen(NamedTuple):
     """Findings on ties by hand."""
 
 
-def solution_key(plan: SurveyPlan) -> str:
+def solution_key(plan: SurveyPlan, manifest: Manifest) -> str:
     """Hash of all that the solution depends on: settings, code, readings, poses, control. It reads no reading."""
     config = AdjustConfig.of(plan.survey)
     picked = None if config.targets.picked is None else plan.survey.resolve(config.targets.picked)
@@ -131,7 +133,7 @@ def solution_key(plan: SurveyPlan) -> str:
             for name, s in sorted(plan.survey.rig.sensors.items())
         ],
         sorted((name, sigma.tolist()) for name, sigma in calibrated_sigma(plan.store).items()),
-        by_hand, sorted(foreign_runs(plan.store)),
+        by_hand, sorted(foreign_runs(plan.store)), *pictures_key(plan, manifest),
     )  # fmt: skip
 
 
@@ -145,7 +147,7 @@ def why_due(plan: SurveyPlan, manifest: Manifest) -> str:
     record = manifest.get(ADJUSTMENT, SOLUTION)
     if not AdjustConfig.of(plan.survey).on:
         return "" if record is None else "switched off"
-    if record is None or record.key != solution_key(plan):
+    if record is None or record.key != solution_key(plan, manifest):
         return MISSING if record is None else CHANGED
     parts = [r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()]
     whole = all(manifest.is_current(r.product, r.unit, r.key) and _is_drawn(r) for r in parts)
@@ -163,6 +165,7 @@ def withdraw(session: Session) -> None:
     manifest.remove([r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()])
     publish(session.store, {}, AdjustConfig.of(plan.survey))
     publish_mountings(session.store, None, AdjustConfig.of(plan.survey))
+    publish_cameras(session.store, None)
     manifest.forget(ADJUSTMENT, [SOLUTION])
 
 
@@ -178,7 +181,11 @@ class _Collector:
         self._seams = {place.number for task in self.work.ties for place in task.places if place.seam}
         self.of_heads, self._useless = self._heads()
         """Findings on heads that do not meet as they should."""
-        self.again = first_ties(poses_plan_of(session), sources, self.work.ties, self.work.control, (self.observe, self.load))
+        plan = poses_plan_of(session)
+        keys = [one.key for one in self.mounted.priors]
+        self._pictures = pictures_of(plan, session.manifest, self.runs, keys, self.work.points)
+        tools = self.observe, self.load
+        self.again = first_ties(plan, sources, self.work.ties, self.work.control, tools)
 
     def observe(self, tasks: Sequence[TieTask]) -> None:
         """Update ties."""
@@ -197,7 +204,9 @@ class _Collector:
         A run in which heads meet otherwise than in the others gets separate mountings.
         """
         self.observe(self.work.ties)
-        steps = steps_of(self._loaded(self.work.ties), AdjustConfig.of(poses_plan_of(self.session).survey).ties.return_s)
+        steps = steps_of(
+            self._loaded(self.work.ties), AdjustConfig.of(poses_plan_of(self.session).survey).ties.return_s
+        )
         swapped = exchanged(poses_plan_of(self.session), self.sources, steps)
         useless = {one.run for one, _ in swapped}
         odd = odd_steps([one for one in steps if one.run not in useless])
@@ -214,7 +223,9 @@ class _Collector:
         joined, unmeasured = with_hand_ties(ties, hand, ends, self.mounted, self.runs)
         wide = self.again.misplaced
         priors = tuple(p.widened(wide[p.run]) if p.run in wide else p for p in self.priors)
-        evidence = Evidence(self.runs, priors, joined, tuple(points), self.mounted, self._useless)
+        evidence = Evidence(
+            self.runs, priors, joined, tuple(points), self.mounted, self._useless, self._pictures, self.work.points
+        )
         return Seen(evidence, rows, unmeasured)
 
     def solve(self, ties: KnownTies, control: Sequence[ControlTask]) -> Solution:
@@ -225,7 +236,7 @@ class _Collector:
 def adjust_survey(session: Session) -> None:
     """Collect what evidence is missing, solve, and publish the corrections, tables and pictures."""
     plan, manifest, config = poses_plan_of(session), session.manifest, AdjustConfig.of(poses_plan_of(session).survey)
-    key = solution_key(plan)
+    key = solution_key(plan, manifest)
     foreign = foreign_runs(session.store)
     sources = [pair for pair in adjusted_sources(plan) if pair[0].run not in foreign]
     mounted = mounted_of(plan, sources, foreign=bool(foreign))
@@ -238,10 +249,12 @@ def adjust_survey(session: Session) -> None:
     ]
     doubts += [*collector.of_heads, *again.findings, *work.hand.findings, *seen.unmeasured]
     evidence = seen.evidence
-    if not (evidence.ties.accepted.any() or any(one.point.role == "gcp" for one in evidence.sightings)):
+    pictured = evidence.pictures is not None and config.mode == "joint"
+    if not (pictured or evidence.ties.accepted.any() or any(one.point.role == "gcp" for one in evidence.sightings)):
         lines = [f"nothing to adjust: {_no_ties(work)}, {_seen(work, evidence.sightings)}"]
         held: Held = publish(session.store, {}, config)
         publish_mountings(session.store, None, config)
+        publish_cameras(session.store, None)
         manifest.remove([r for name in (*TABLES, PICTURES) for r in manifest.of(name).values()])
         _forget_others(manifest, again, work)
         said = lines, [*doubts, *_of_points(work, evidence.sightings)]
@@ -254,11 +267,13 @@ def adjust_survey(session: Session) -> None:
     _forget_others(manifest, again, work)
     held = publish(session.store, solution.corrections, config)
     changes = publish_mountings(session.store, solution.mountings, config)
+    publish_cameras(session.store, solution.cameras)
     tables = _tables(evidence, solution, held, held_values(collector.mounted, changes), work.tracks)
     keep_tables(session.store, manifest, key, tables)
     shown, not_drawn = shown_seams(again.every, evidence, solution, (held, changes), session.compute)
     keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), shown), seen.rows)
     lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
+    lines += picture_lines(solution.pictures, solution.cameras)
     if config.mode in ("joint", "vertical"):
         doubts += failed_ties(evidence.ties, solution.tie_weight)
     doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings)]
@@ -277,6 +292,7 @@ def _tables(
         "relative_accuracy": relative_rows(evidence, tracks, held, added),
         "absolute_accuracy": accuracy_rows(points, evidence, solution),
         "accuracy_by_distance": distance_rows(of_points(points, evidence), evidence, solution, tracks),
+        **picture_rows(solution.pictures),
     }
 
 

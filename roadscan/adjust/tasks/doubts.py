@@ -113,6 +113,8 @@ _WORDS: Final = {
     "hand_tie": "ties by hand",
     "control_height": "heights measured at control points",
     "control_position": "places measured at control points",
+    "picture_tie": "tie points in pictures",
+    "picture_control": "control points in pictures",
     "control_survey": "the survey of the control points",
     "north_m": "the poses, north",
     "east_m": "the poses, east",

@@ -9,7 +9,9 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.adjustment import Adjustment, ControlErrors, MountingErrors, adjust
+from roadscan.adjust.adjustment import Adjustment, CameraErrors, ControlErrors, MountingErrors, adjust
+from roadscan.adjust.bundle.outcome import PictureOutcome, outcome_of
+from roadscan.adjust.bundle.solve import Approached, PictureEvidence, approached
 from roadscan.adjust.control.control import ControlPoint, SeenBy, Sighting, observations_of
 from roadscan.adjust.control.control_faults import WrongPoint, datum_fault, far_in_height
 from roadscan.adjust.control.control_test import COMPONENTS as _AXES
@@ -17,11 +19,12 @@ from roadscan.adjust.control.control_test import HEIGHT, PLACE
 from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.observations import FIXED, MOUNTED, Observations
 from roadscan.adjust.patches import level_from_map
-from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of
+from roadscan.adjust.process import CameraPrior, GaussMarkov, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
 from roadscan.adjust.settings import AdjustConfig, PosePriors
 from roadscan.adjust.solver_settings import AdjustmentSettings, ControlRules
 from roadscan.adjust.targets.shapes import SurveyedLine
+from roadscan.adjust.tasks.bundle import picture_spans
 from roadscan.adjust.tasks.control_lines import line_findings
 from roadscan.adjust.tasks.doubts import (
     CONTROL,
@@ -48,7 +51,7 @@ from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.tasks.tie_work import KnownTies
 from roadscan.adjust.tasks.tracks import span_of
 from roadscan.core.witness import Finding
-from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.navigation.tasks.pose_sigma import stated_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.poses.level import level_poses
@@ -78,6 +81,10 @@ class Evidence:
     mounted: Mounted
     useless: frozenset[int] = frozenset()
     """Runs whose readings are misplaced: neither their ties nor their control counts."""
+    pictures: PictureEvidence | None = None
+    """Tie points and control in pictures."""
+    points: tuple[ControlPoint, ...] = ()
+    """Control points of the survey, by number."""
 
     def seen_by(self, one: Sighting) -> SeenBy:
         """Returns the sensor that saw a point."""
@@ -122,6 +129,10 @@ class Solution:
     """Poses minus control as a whole, and 1 σ of the datum (m): see :func:`datum_figures`."""
     mountings: MountingErrors | None = None
     """Errors of the sensors' mountings; None where they are not estimated."""
+    cameras: CameraErrors | None = None
+    """Errors of lenses and clocks; None where no picture takes part."""
+    pictures: PictureOutcome | None = None
+    """What is left in pictures."""
 
     def point(self, number: int, run: int) -> PointFigures | None:
         """Returns figures of a point as a run saw it."""
@@ -130,14 +141,16 @@ class Solution:
 
 def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[RunPrior, ...]:
     """Returns errors of the recorded poses of each run; of a run without readings there are none."""
-    config, found = AdjustConfig.of(plan.survey).priors, []
+    config, found, filmed = AdjustConfig.of(plan.survey).priors, [], picture_spans(plan)
     for run in runs:
         own = [(s, files) for s, files in sources if s.run == run]
         trajectory = own[0][0].trajectory if own else None
+        if trajectory is None and run in filmed:
+            trajectory = trajectory_source(run, plan.records)
         if trajectory is None:
             found.append(RunPrior(run, 0, 0, _NONE))
             continue
-        spans = [span_of(s, files) for s, files in own]
+        spans = [span_of(s, files) for s, files in own] + ([filmed[run]] if run in filmed else [])
         stated = _stated(plan, trajectory) if config.source == "sigma" else None
         first, last = min(a for a, _ in spans), max(b for _, b in spans)
         held = run in AdjustConfig.of(plan.survey).fixed
@@ -194,23 +207,24 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     if config.mode == "helmert":
         return _rigid_solution(plan, evidence, control, entering, found)
     entering_ties = _entering(evidence)
-    adjusted, first, named = _adjusted(config, evidence, control.chosen(entering), config.mode)
+    adjusted, first, named, approach = _adjusted(config, evidence, control.chosen(entering), config.mode)
     wrong_ties, said = wrong_hand_ties(evidence.ties, entering_ties, adjusted, config.control.false_alarm)
     if wrong_ties:
         found += said
         evidence = replace(evidence, ties=evidence.ties.refused(np.isin(evidence.ties.columns["name"], wrong_ties)))
         entering_ties = _entering(evidence)
-        adjusted, first, named = _adjusted(config, evidence, control.chosen(entering), config.mode)
+        adjusted, first, named, approach = _adjusted(config, evidence, control.chosen(entering), config.mode)
     weight = np.zeros(entering_ties.size)
     weight[entering_ties] = adjusted.weight[: int(entering_ties.sum())]
     points = _points(adjusted.control, first)
-    wrong = _wrong(evidence.sightings, adjusted, first)
+    wrong = _wrong(evidence.points, adjusted, first)
     of_lines = {one.point.name for one in evidence.sightings if one.point.is_of_line}
     found += wrong_points([one for one in wrong if one.name not in of_lines])
     found += line_findings([one for one in wrong if one.name in of_lines], evidence.sightings)
     counting = len(_counting_points(adjusted.control))
     found += offset_findings(adjusted.verdict, adjusted.applied, counting)
     found += shift_findings(adjusted.verdict.shift) + run_findings(evidence.runs, adjusted.run_factors)
+    outcome = None if approach is None else outcome_of(approach, adjusted, evidence.points)
     joined = evidence.ties.observations.chosen(weight > 0.0)
     found += _not_held(evidence, joined.run, control.chosen(entering), points)
     found += fixed_findings(adjusted.fixed, config.control.false_alarm)
@@ -218,6 +232,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     reached = {
         int(run) for run in np.unique([*joined.run.ravel(), *control.chosen(entering).run.ravel()]) if run != FIXED
     }
+    reached |= set() if approach is None else set(approach.rows.observations.run[:, 0].tolist())
     moved = sorted(run for run in reached if _moves(evidence.priors[run]))
     corrections = {evidence.runs[k]: _with_sigma(adjusted, k) for k in moved}
     lines = [
@@ -230,6 +245,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
         corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),
         _left_out(adjusted.control, first, evidence), datum_figures(adjusted.verdict, adjusted.applied),
         adjusted.mountings if adjusted.mountings.sensors else None,
+        adjusted.cameras if approach else None, outcome,
     )  # fmt: skip
 
 
@@ -249,8 +265,9 @@ def _entering(evidence: Evidence) -> Bool:
 
 def _adjusted(
     config: AdjustConfig, evidence: Evidence, control: Observations, mode: Literal["joint", "each_pass", "vertical"]
-) -> tuple[Adjustment, int, tuple[Cause, ...]]:
-    """Returns the adjustment of ties and control, the place that stands for point 0, and possible faults of mountings.
+) -> tuple[Adjustment, int, tuple[Cause, ...], Approached | None]:
+    """Returns the adjustment of ties, control and pictures, the place that stands for point 0, possible faults of
+    mountings, and how pictures entered.
 
     A mounting that is off by more than its stated σ allows would be held back by it: such a σ is taken to be as large
     as what was found, and the adjustment is made once more. Control that is off as a whole looks like lever arms of all
@@ -262,9 +279,13 @@ def _adjusted(
     joined = Observations.joined([ties.chosen(_entering(evidence)), replace(control, place=control.place + first)])
     rules = {name: getattr(config.control, name) for name in ControlRules.model_fields}
     settings = AdjustmentSettings(mode=mode, **config.solver.model_dump(), **rules)
-    priors = evidence.mounted.priors
+    priors, cameras, approach = evidence.mounted.priors, list[CameraPrior](), None
+    if evidence.pictures is not None and mode == "joint":
+        approach = approached(evidence.pictures, (joined, first), evidence.priors, settings, priors)
+        joined = Observations.joined([joined, approach.rows.observations])
+        cameras = list(evidence.pictures.cameras)
     for _ in range(_WIDENED):
-        found = adjust(joined, evidence.priors, settings, priors)
+        found = adjust(joined, evidence.priors, settings, priors, cameras)
         shared = [axis for name in found.verdict.doubted for axis in _AXES[name]]
         if len(priors) and any((one.sigma[shared] > 0.0).any() for one in priors):
             priors = tuple(replace(one, sigma=_without(one.sigma, shared)) for one in priors)
@@ -275,20 +296,21 @@ def _adjusted(
         sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
         priors = tuple(replace(one, sigma=own) for one, own in zip(priors, sigma, strict=True))
     stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, len(MOUNTED))
-    estimated, wrong = found.mountings, contradicted(found.mountings)
-    named = causes(found.mountings)
+    filmed = np.array([name in evidence.mounted.cameras for _, name in found.mountings.sensors], bool)
+    estimated, wrong = found.mountings, contradicted(found.mountings, evidence.mounted.cameras)
+    named = causes(found.mountings.of(~filmed))
     if priors and not wrong.all():
         priors = tuple(
             replace(one, sigma=one.sigma if is_wrong else np.zeros(len(MOUNTED)))
             for one, is_wrong in zip(priors, wrong, strict=True)
         )
-        found = adjust(joined, evidence.priors, settings, priors)
+        found = adjust(joined, evidence.priors, settings, priors, cameras)
         estimated = replace(
             estimated,
             error=np.where(wrong[:, None], found.mountings.error, 0.0),
             sigma=np.where(wrong[:, None], found.mountings.sigma, estimated.sigma),
         )
-    return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named
+    return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named, approach
 
 
 def _without(sigma: Float64, axes: Sequence[int]) -> Float64:
@@ -348,9 +370,9 @@ def _far_findings(far: Mapping[str, float], evidence: Evidence) -> list[Finding]
     return far_points(far) + exchanged(points)
 
 
-def _wrong(sightings: Sequence[Sighting], adjusted: Adjustment, first: int) -> list[WrongPoint]:
+def _wrong(points: Sequence[ControlPoint], adjusted: Adjustment, first: int) -> list[WrongPoint]:
     """Returns points whose height or place is wrong, by name."""
-    by_number, control = {one.point.number: one.point for one in sightings}, adjusted.control
+    by_number, control = {one.number: one for one in points}, adjusted.control
     found: list[WrongPoint] = []
     for one in adjusted.verdict.wrong:
         point = by_number[int(control.place[one.point]) - first]
@@ -381,7 +403,7 @@ def _rigid_solution(
     found += wrong_points(_left_out_of(evidence.sightings, points))
     # Poses and ties test the control as a whole; a rigid transformation follows the control in any case.
     following = config.model_copy(update={"control": config.control.model_copy(update={"datum_offset": "follow"})})
-    adjusted, _, _ = _adjusted(following, evidence, control.chosen(entering), "joint")
+    adjusted, _, _, _ = _adjusted(following, evidence, control.chosen(entering), "joint")
     found += offset_findings(adjusted.verdict, adjusted.applied, len(points))
     corrections, sides_m = _rigid_corrections(plan, evidence, fit)
     prior = max((float(p.sigmas[2]) for p in evidence.priors), default=0.0)

@@ -1,0 +1,140 @@
+"""What is left in pictures after the adjustment: residuals, and where the rays to control points meet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import chdtri
+
+from roadscan.adjust.adjustment import Adjustment
+from roadscan.adjust.bundle.measurements import Measurements, State, met_at, rows_of, seen
+from roadscan.adjust.bundle.solve import Approached, PictureEvidence, state_of
+from roadscan.adjust.control.control import ControlPoint
+from roadscan.adjust.observations import KINDS
+from roadscan.pictures.ties.tracks import places_of
+from roadscan.poses.trajectory import world_from_ned
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_BOUNDS: Final = (0.025, 0.975)
+"""Chances below and above which χ² is out of its bounds: 95 % of right solutions lie between."""
+
+
+@dataclass(frozen=True)
+class ControlOfPictures:
+    """A control point as the rays of its pictures meet: easting-like axes are north, east, down of the level."""
+
+    point: ControlPoint
+    pictures: int
+    before_m: Float64
+    """(3,) met minus surveyed, north, east, down, by the recorded poses; NaN where fewer than two pictures see it."""
+    after_m: Float64
+    """(3,) the same by the adjusted poses."""
+    sigma_m: Float64
+    """(3,) 1 σ of where the rays meet, without that of the poses."""
+
+
+@dataclass(frozen=True)
+class PictureOutcome:
+    """Residuals of m measurements, and control points."""
+
+    measured: Measurements
+    before_px: Float64
+    """(m, 2) observed minus computed, with the recorded poses and the points where their rays meet."""
+    after_px: Float64
+    """(m, 2) the same with what was adjusted."""
+    weight: Float64
+    """(m,) 1 = counts fully, 0 = rejected; NaN of check points."""
+    control: tuple[ControlOfPictures, ...]
+    names: tuple[str, ...]
+    """(p,) name of each point's control point, "" of tie points."""
+    sigma_px: float
+    """1 σ of a tie point, as measured."""
+    chi_square: float
+    """Weighted squares over redundancy of all rows of pictures; 1 where all is as stated."""
+    bounds: tuple[float, float]
+    """Between which it lies with a chance of 95 %."""
+    solutions: int
+    notes: tuple[str, ...]
+
+    def rms_px(self, *, after: bool) -> float:
+        """Returns the root mean square of each coordinate of the tie points that count."""
+        used = (self.weight > 0.0) & self.measured.is_tie
+        values = (self.after_px if after else self.before_px)[used]
+        values = values[np.isfinite(values).all(axis=1)]
+        return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
+def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[ControlPoint]) -> PictureOutcome:
+    """Returns what is left by an adjustment; the rows of the pictures are the last ones of its observations."""
+    pictures, rows = approach.pictures, approach.rows
+    measured, own = pictures.measured, slice(adjusted.weight.size - rows.measurement.size, None)
+    weight = np.zeros(measured.point.size)
+    weight[rows.measurement] = adjusted.weight[own]
+    counted = np.where(pictures.enters, weight, 0.0)
+    state = state_of(adjusted)
+    before, after = (_residuals(pictures, one, counted) for one in (State(), state))
+    left = adjusted.residual_m[own] / rows.observations.sigma_m
+    factor = adjusted.variance_factors[KINDS[int(rows.observations.kind[0])]] if rows.observations.size else 1.0
+    squares = float((adjusted.weight[own] * left**2).sum()) / factor
+    redundancy = float(np.where(adjusted.weight[own] > 0.0, np.nan_to_num(adjusted.redundancy[own]), 0.0).sum())
+    degrees = max(redundancy, 1.0)
+    low, high = (float(chdtri(degrees, 1.0 - chance)) / degrees for chance in _BOUNDS)
+    named = {one.number: one for one in points}
+    control = [
+        _control(pictures, number, named[int(pictures.control[number])], (State(), state))
+        for number in np.flatnonzero(pictures.control >= 0).tolist()
+    ]
+    names = tuple(named[k].name if k >= 0 else "" for k in pictures.control.tolist())
+    return PictureOutcome(
+        measured, before, after, np.where(pictures.enters, weight, np.nan), tuple(control), names, approach.sigma_px,
+        squares / degrees, (low, high), approach.solutions, pictures.notes,
+    )  # fmt: skip
+
+
+def _residuals(pictures: PictureEvidence, state: State, weight: Float64) -> Float64:
+    measured = pictures.measured
+    place = met_at(measured, seen(measured, state, pictures.numbers), weight)
+    return rows_of(measured, state, pictures.numbers, place, np.zeros(len(place), np.int64)).residual_px
+
+
+def _control(
+    pictures: PictureEvidence, number: int, point: ControlPoint, states: tuple[State, State]
+) -> ControlOfPictures:
+    """Returns where the rays of one control point meet, by the recorded poses and by the adjusted ones."""
+    measured = pictures.measured.at(np.flatnonzero(pictures.measured.point == number))
+    surveyed = measured.surveyed_world_m[number]
+    away, sigma, none = list[Float64](), np.full(3, np.nan), np.full(3, np.nan)
+    for state in states:
+        where = seen(measured, state, pictures.numbers)
+        if measured.point.size < 2:
+            away.append(none)
+            continue
+        focal = [float(np.mean(_focal(measured, k))) for k in measured.picture.tolist()]
+        weight = (np.array(focal) / measured.sigma_px) ** 2
+        found = places_of(np.zeros(measured.point.size, np.int64), where.eye_world_m, where.ray_world, weight)
+        world = measured.exposures.cameras[measured.exposures.camera[measured.picture[0]]].world
+        axes = world_from_ned(world, surveyed[None])[0]
+        away.append(axes.T @ (found.place_m[0] - surveyed))
+        sigma = _meeting_sigma(where.eye_world_m, where.ray_world, found.place_m[0], weight, axes)
+    return ControlOfPictures(point, int(measured.point.size), away[0], away[1], sigma)
+
+
+def _focal(measured: Measurements, picture: int) -> tuple[float, float]:
+    interior = measured.exposures.cameras[measured.exposures.camera[picture]].rig.interior
+    return (1.0, 1.0) if interior is None else interior.focal_px
+
+
+def _meeting_sigma(eye_m: Float64, ray: Float64, place_m: Float64, weight: Float64, axes: Float64) -> Float64:
+    """Returns 1 σ (3,; north, east, down) of where rays meet, weights being those of angles (1 / rad²)."""
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    distance = np.linalg.norm(place_m - eye_m, axis=1)
+    matrix = np.einsum("n,nij->ij", weight / distance**2, across)
+    if not np.isfinite(matrix).all() or np.linalg.cond(matrix) > 1e12:
+        return np.full(3, np.nan)
+    return np.asarray(np.sqrt(np.diag(axes.T @ np.linalg.inv(matrix) @ axes)))

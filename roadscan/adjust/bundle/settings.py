@@ -1,0 +1,31 @@
+"""How well cameras are known before the adjustment estimates what is wrong with them."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from roadscan.core.strict import Strict
+
+
+class CameraPriors(Strict):
+    """How well cameras are known whose pictures have tie points.
+
+    σ that the rig file states (`lever_arm_sigma_m`, `boresight_sigma_deg`, `sigma_focal_px` and those beside it) stand
+    in place of these. What has a σ of 0 is not estimated.
+    """
+
+    sigma_lever_m: float = Field(default=0.02, ge=0.0, le=1.0)
+    """1 σ of the lever arm on each axis (m)."""
+    sigma_boresight_deg: float = Field(default=0.5, ge=0.0, le=10.0)
+    """1 σ of the boresight about each axis (degrees)."""
+    sigma_focal: float = Field(default=0.001, ge=0.0, le=0.1)
+    """1 σ of the focal length, as a share of it."""
+    sigma_k1: float = Field(default=0.002, ge=0.0, le=1.0)
+    """1 σ of the radial distortion k1. The principal point and the other parameters of the distortion are estimated
+    only where the rig file states their σ: on a straight drive they cannot be told from the boresight."""
+    sigma_clock_s: float = Field(default=0.0, ge=0.0, le=1.0)
+    """1 σ of what the stamps of the pictures are off (s). 0: the stage `clocks` is to find it."""
+    sigma_line_time_us: float = Field(default=0.0, ge=0.0, le=100.0)
+    """1 σ of the time between two rows (µs), of cameras whose rig file states such a time."""
+    sigma_control_px: float = Field(default=0.3, gt=0.0, le=10.0)
+    """1 σ of each pixel coordinate of a control point, where the measurement states none (px)."""

@@ -1,0 +1,220 @@
+"""Pictures of a survey as evidence of the adjustment: tie points and control points, and what they show of cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.bundle.measurements import Measurements, Numbers
+from roadscan.adjust.bundle.settings import CameraPriors
+from roadscan.adjust.bundle.solve import PictureEvidence
+from roadscan.adjust.control.control import ControlPoint
+from roadscan.adjust.observations import CAMERA
+from roadscan.adjust.process import CameraPrior
+from roadscan.adjust.settings import AdjustConfig
+from roadscan.core.rig import Sensor
+from roadscan.core.survey import Survey
+from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.pictures.exposures import Exposures, exposures_of
+from roadscan.pictures.settings import PictureTiesConfig
+from roadscan.pictures.ties.work import ALL, TRACKS
+from roadscan.store.manifest import Manifest, read_recorded
+from roadscan.store.readings.row_groups import read_groups
+from roadscan.store.store import Store
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+POINTS: Final = "picture_points"
+"""Table of control points measured in pictures."""
+_START_PX: Final = 0.5
+"""1 σ of a tie point (px) until its residuals show it."""
+_BESIDE_NS: Final = 1_000_000_000
+"""Time (ns) before the first picture and after the last one that corrections reach: clocks and rows are off by less."""
+
+
+def asks_pictures(survey: Survey) -> bool:
+    """Returns whether pictures take part in the adjustment."""
+    return survey.has(PictureTiesConfig.table) and PictureTiesConfig.of(survey).on
+
+
+def picture_spans(plan: SurveyPlan) -> dict[str, tuple[int, int]]:
+    """Returns first and last epoch (GPS ns) of the pictures of each run; none where pictures take no part."""
+    spans: dict[str, tuple[int, int]] = {}
+    for record in plan.records if asks_pictures(plan.survey) else ():
+        for file in record.tables.get("images", ()):
+            if file.span is not None and _has_lens(plan.survey.rig.sensors.get(record.sensor)):
+                first, last = spans.get(record.run, file.span)
+                spans[record.run] = (min(first, file.span[0]), max(last, file.span[1]))
+    return {run: (first - _BESIDE_NS, last + _BESIDE_NS) for run, (first, last) in spans.items()}
+
+
+def _has_lens(camera: Sensor | None) -> bool:
+    return camera is not None and camera.interior is not None
+
+
+def pictures_key(plan: SurveyPlan, manifest: Manifest) -> list[Any]:
+    """Returns what the evidence of pictures depends on, for the key of the solution."""
+    if not asks_pictures(plan.survey):
+        return []
+    tracks = manifest.get(TRACKS, ALL)
+    cameras = [
+        [name, one.model_dump(mode="json")] for name, one in sorted(plan.survey.rig.sensors.items()) if _has_lens(one)
+    ]
+    logs = [[r.key, r.run, r.sensor] for r in plan.records if r.tables.get("images") or r.tables.get(POINTS)]
+    return ["" if tracks is None else tracks.digest, cameras, logs]
+
+
+def camera_sigma(camera: Sensor, own: CameraPriors) -> tuple[Float64, Float64]:
+    """Returns 1 σ (7,) of a camera's mounting, `MOUNTED`, and (11,) of its lens and clock, `CAMERA`."""
+    lever = camera.lever_arm_sigma_m or (own.sigma_lever_m,) * 3
+    boresight = camera.boresight_sigma_deg or (own.sigma_boresight_deg,) * 3
+    mounted = np.array([*lever, *np.radians(boresight), 0.0])
+    interior = camera.interior
+    if interior is None:
+        return mounted, np.zeros(len(CAMERA))
+    focal = interior.sigma_focal_px or tuple(own.sigma_focal * f for f in interior.focal_px)
+    principal = interior.sigma_principal_px or (0.0, 0.0)
+    bent = interior.sigma_distortion or (own.sigma_k1, 0.0, 0.0, 0.0, 0.0)
+    if interior.model == "equirectangular":
+        focal, principal, bent = (0.0, 0.0), (0.0, 0.0), (0.0,) * 5
+    line = interior.sigma_line_time_us
+    line = (own.sigma_line_time_us if interior.line_time_us else 0.0) if line is None else line
+    return mounted, np.array([*focal, *principal, *bent, own.sigma_clock_s, 1e-6 * line])
+
+
+def pictures_of(
+    plan: SurveyPlan, manifest: Manifest, runs: Sequence[str], mounted: Sequence[tuple[str, str]],
+    points: Sequence[ControlPoint],
+) -> PictureEvidence | None:  # fmt: skip
+    """Returns the evidence of a survey's pictures; None where they take no part, or show nothing.
+
+    Parameters
+    ----------
+    runs : by which observations number them.
+    mounted : run and sensor of the mountings that are estimated, by number.
+    points : control points of the survey.
+    """
+    if not asks_pictures(plan.survey):
+        return None
+    exposures, notes = exposures_of(plan)
+    sensors = sorted({camera.sensor for camera in exposures.cameras})
+    priors = AdjustConfig.of(plan.survey).cameras
+    cameras = tuple(CameraPrior(one, camera_sigma(plan.survey.rig.sensors[one], priors)[1]) for one in sensors)
+    seats = [("*", camera.sensor) for camera in exposures.cameras]
+    numbers = Numbers(
+        np.array([runs.index(camera.run) for camera in exposures.cameras], np.int32),
+        np.array([mounted.index(one) if one in mounted else -1 for one in seats], np.int32),
+        np.array([sensors.index(camera.sensor) for camera in exposures.cameras], np.int32),
+    )
+    index = {_named(exposures, k): k for k in range(len(exposures))}
+    tracks = _tracks(plan.store, manifest, index)
+    control, number, more = _control(plan, priors, index, points)
+    notes = (*notes, *more)
+    tied = int(tracks.point.max(initial=-1)) + 1
+    whole = _joined(tracks, control, tied)
+    if not whole.point.size:
+        return None
+    surveyed = [points[k] for k in number.tolist()]
+    place = _world(plan, exposures, surveyed)
+    sigma = np.array([[p.sigma_horizontal_m, p.sigma_height_m] for p in surveyed]).reshape(-1, 2)
+    measured = Measurements(
+        exposures, whole.picture, whole.pixel, whole.sigma_px, whole.point,
+        np.concatenate([np.full((tied, 3), np.nan), place]), np.concatenate([np.full((tied, 2), np.nan), sigma]),
+    )  # fmt: skip
+    is_check = np.array([False] * tied + [p.role != "gcp" for p in surveyed], bool)
+    named = np.concatenate([np.full(tied, -1), [p.number for p in surveyed]]).astype(np.int64)
+    return PictureEvidence(measured, numbers, cameras, named, ~is_check[measured.point], notes)
+
+
+def _named(exposures: Exposures, number: int) -> tuple[str, str, str]:
+    camera = exposures.cameras[exposures.camera[number]]
+    return camera.run, camera.sensor, str(exposures.file[number])
+
+
+class _Part:
+    """Measurements of some points, numbered from 0."""
+
+    def __init__(self, picture: Int64, pixel: Float64, sigma_px: Float64, point: Int64) -> None:
+        self.picture, self.pixel, self.sigma_px, self.point = picture, pixel, sigma_px, point
+
+
+def _joined(tracks: _Part, control: _Part, tied: int) -> _Part:
+    """Returns tie points, then control points."""
+    return _Part(
+        np.concatenate([tracks.picture, control.picture]), np.concatenate([tracks.pixel, control.pixel]),
+        np.concatenate([tracks.sigma_px, control.sigma_px]), np.concatenate([tracks.point, control.point + tied]),
+    )  # fmt: skip
+
+
+def _tracks(store: Store, manifest: Manifest, index: dict[tuple[str, str, str], int]) -> _Part:
+    """Returns the measurements of tie points."""
+    record = manifest.get(TRACKS, ALL)
+    if record is None or not record.path:
+        return _Part(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
+    rows = store.parse_table(read_recorded(store, record), record.path)
+    names = zip(*(rows.column(c).to_pylist() for c in ("run", "sensor", "file")), strict=True)
+    picture = np.array([index.get(one, -1) for one in names], np.int64)
+    here = picture >= 0
+    pixel = np.stack([rows.column(c).to_numpy() for c in ("u_px", "v_px")], axis=-1).astype(np.float64)
+    number = np.unique(rows.column("track").to_numpy()[here], return_inverse=True)[1].astype(np.int64)
+    return _Part(picture[here], pixel[here], np.full(int(here.sum()), _START_PX), number)
+
+
+def _control(
+    plan: SurveyPlan, priors: CameraPriors, index: dict[tuple[str, str, str], int], points: Sequence[ControlPoint]
+) -> tuple[_Part, Int64, list[str]]:
+    """Returns measurements of control points, the control point of each point, and notes on those left out."""
+    rows = [
+        row
+        for record in plan.records
+        for file in record.tables.get(POINTS, ())
+        for row in read_groups(plan.store, file.path, range(len(file.group_rows))).to_pylist()
+    ]
+    known = {one.name: k for k, one in enumerate(points) if not one.is_of_line}
+    cameras = sorted({key[:2] for key in index})
+    picture, pixel, sigma, point = list[int](), list[list[float]](), list[float](), list[int]()
+    unknown, unseen = set[str](), set[str]()
+    for row in rows:
+        at = _picture_of(row, index, cameras)
+        if row["point"] not in known:
+            unknown.add(row["point"])
+        elif at is None:
+            unseen.add(row["picture"])
+        else:
+            picture.append(at)
+            pixel.append([row["u_px"], row["v_px"]])
+            sigma.append(row["sigma_px"] or priors.sigma_control_px)
+            point.append(known[row["point"]])
+    number, own = np.unique(np.array(point, np.int64), return_inverse=True)
+    notes = [f"no control point is called {', '.join(sorted(unknown)[:5])}: not used"] if unknown else []
+    notes += [f"no picture with a pose is called {', '.join(sorted(unseen)[:5])}: not used"] if unseen else []
+    part = _Part(
+        np.array(picture, np.int64), np.array(pixel, np.float64).reshape(-1, 2), np.array(sigma), own.astype(np.int64)
+    )
+    return part, number.astype(np.int64), notes
+
+
+def _picture_of(
+    row: dict[str, Any], index: dict[tuple[str, str, str], int], cameras: Sequence[tuple[str, str]]
+) -> int | None:
+    """Returns the number of the picture that a row names; run and camera may be left out where one has such a file."""
+    fits = [
+        index[run, sensor, row["picture"]]
+        for run, sensor in cameras
+        if row.get("run") in (None, "", run)
+        and row.get("sensor") in (None, "", sensor)
+        and (run, sensor, row["picture"]) in index
+    ]
+    return fits[0] if len(fits) == 1 else None
+
+
+def _world(plan: SurveyPlan, exposures: Exposures, points: Sequence[ControlPoint]) -> Float64:
+    """Returns places (p, 3) of control points in the world frame of the poses."""
+    if not points:
+        return np.zeros((0, 3))
+    enh = np.array([[p.easting_m, p.northing_m, p.height_m] for p in points])
+    return plan.ground.map.world_from_map(exposures.cameras[0].world, enh)

@@ -1,0 +1,137 @@
+"""Cameras in the outcome of an adjustment: the table `camera_corrections`, residuals, and what is said of them."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.adjust.adjustment import CameraErrors
+from roadscan.adjust.bundle.outcome import ControlOfPictures, PictureOutcome
+from roadscan.adjust.tasks.figures import Rows
+from roadscan.core.counted import counted
+from roadscan.pictures.camera_changes import COLUMNS, TABLE
+from roadscan.store.small_tables import read_small, small_path, write_small
+from roadscan.store.store import Store
+
+Float64 = npt.NDArray[np.float64]
+
+_SAME: Final = 0.01
+"""Values that change by no more than this share of their σ stay, so that what rests on them stays current."""
+_KNOWN: Final = 0.7
+"""A value whose σ fell below this share of the stated one is determined: its variance is halved."""
+_WORDS: Final = {
+    "focal_x_px": ("focal length", 1.0, "px"), "centre_x_px": ("principal point, right", 1.0, "px"),
+    "centre_y_px": ("principal point, down", 1.0, "px"), "k1": ("k1", 1.0, ""), "clock_s": ("clock", 1e3, "ms"),
+    "line_time_s": ("row time", 1e6, "µs"),
+}  # fmt: skip
+"""What is said of a camera: words, factor and unit."""
+
+
+def publish_cameras(store: Store, found: CameraErrors | None) -> None:
+    """Update the table; a solution that changes nothing leaves it as it is."""
+    table = read_small(store, TABLE)
+    before = {row["sensor"]: row for row in ([] if table is None else table.to_pylist())}
+    after: dict[str, dict[str, Any]] = {}
+    for k, sensor in enumerate(() if found is None else found.sensors):
+        if found is not None and found.error[k].any():
+            row = _row(found, k)
+            known = before.get(sensor)
+            after[sensor] = known if known is not None and _stays(known, row) else row
+    if after == before:
+        return
+    if after:
+        write_small(store, TABLE, [after[sensor] for sensor in sorted(after)])
+    else:
+        store.remove(small_path(TABLE))
+
+
+def _row(found: CameraErrors, k: int) -> dict[str, Any]:
+    columns = {"": found.error[k], "sigma_": found.sigma[k], "prior_sigma_": found.prior_sigma[k]}
+    return {"sensor": found.sensors[k]} | {
+        f"{prefix}{name}": float(value)
+        for prefix, values in columns.items()
+        for name, value in zip(COLUMNS, values, strict=True)
+    }
+
+
+def _stays(known: dict[str, Any], row: dict[str, Any]) -> bool:
+    return all(abs(known[c] - row[c]) <= _SAME * row[f"sigma_{c}"] for c in COLUMNS)
+
+
+def picture_rows(found: PictureOutcome | None) -> dict[str, Rows]:
+    """Returns rows of the tables of the outcome."""
+    if found is None:
+        return {}
+    measured = found.measured
+    rows: Rows = []
+    for m, picture in enumerate(measured.picture.tolist()):
+        camera = measured.exposures.cameras[measured.exposures.camera[picture]]
+        point = int(measured.point[m])
+        rows.append(
+            {
+                "run": camera.run, "sensor": camera.sensor, "file": str(measured.exposures.file[picture]),
+                "point": found.names[point] or None, "track": None if found.names[point] else point,
+                "u_px": float(measured.pixel[m, 0]), "v_px": float(measured.pixel[m, 1]),
+                "sigma_px": float(measured.sigma_px[m]),
+                "before_u_px": _finite(found.before_px[m, 0]), "before_v_px": _finite(found.before_px[m, 1]),
+                "after_u_px": _finite(found.after_px[m, 0]), "after_v_px": _finite(found.after_px[m, 1]),
+                "weight": _finite(found.weight[m]),
+            }
+        )  # fmt: skip
+    return {"picture_residuals": rows, "picture_control": [_control_row(one) for one in found.control]}
+
+
+def _control_row(one: ControlOfPictures) -> dict[str, Any]:
+    row: dict[str, Any] = {"point": one.point.name, "role": one.point.role, "pictures": one.pictures}
+    for word, values in (("before", one.before_m), ("after", one.after_m), ("sigma", one.sigma_m)):
+        row |= {f"{word}_{axis}_m": _finite(v) for axis, v in zip(("north", "east", "down"), values, strict=True)}
+    return row
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def picture_lines(found: PictureOutcome | None, cameras: CameraErrors | None) -> list[str]:
+    """Returns what pictures said, in words."""
+    if found is None:
+        return []
+    tie = found.measured.is_tie
+    used = int(((found.weight > 0.0) & tie).sum())
+    pictures = np.unique(found.measured.picture[(found.weight > 0.0)]).size
+    points = np.unique(found.measured.point[tie]).size
+    lines = [
+        f"{pictures:,} of {len(found.measured.exposures):,} pictures take part, with {used:,} of {int(tie.sum()):,} "
+        f"measurements of {points:,} tie points: RMS {found.rms_px(after=False):.2f} px before, "
+        f"{found.rms_px(after=True):.3f} px after; 1 σ of one is {found.sigma_px:.2f} px; χ² over redundancy "
+        f"{found.chi_square:.3f} (95 %: {found.bounds[0]:.3f} to {found.bounds[1]:.3f})"
+    ]
+    for role, word in (("gcp", "control points"), ("check", "check points")):
+        own = [one for one in found.control if one.point.role == role and np.isfinite(one.after_m).all()]
+        if own:
+            was, now = (np.sqrt(np.mean([(v**2).sum() for v in values])) for values in (
+                [one.before_m for one in own], [one.after_m for one in own],
+            ))  # fmt: skip
+            lines.append(
+                f"{counted(len(own), word[:-1])} in pictures: RMS in space {1e3 * was:.0f} mm before, "
+                f"{1e3 * now:.1f} mm after"
+            )
+    return [*lines, *_camera_lines(cameras), *found.notes]
+
+
+def _camera_lines(cameras: CameraErrors | None) -> list[str]:
+    lines = list[str]()
+    if cameras is None:
+        return lines
+    for k, sensor in enumerate(cameras.sensors):
+        words = []
+        for name, (word, factor, unit) in _WORDS.items():
+            column = COLUMNS.index(name)
+            error, sigma, prior = (v[k, column] for v in (cameras.error, cameras.sigma, cameras.prior_sigma))
+            if prior > 0.0 and sigma < _KNOWN * prior:
+                words.append(f"{word} {factor * error:+.3g} {unit} (σ {factor * sigma:.2g})".replace("  ", " "))
+        if words:
+            lines.append(f"lens and clock of {sensor}: {'; '.join(words)}")
+    return lines

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import Sensor
 from roadscan.pictures.lens import PARAMETERS, parameters, with_parameters
 from roadscan.store.small_tables import read_small
@@ -43,3 +44,8 @@ def interior_of(camera: Sensor, change: Float64 | None) -> Interior:
     if change is None or not np.any(change):
         return camera.interior
     return with_parameters(camera.interior, parameters(camera.interior) + change[: len(LENS)])
+
+
+def clock_ns(change: Float64 | None) -> int:
+    """Returns what is added to the stamps of a camera's pictures (ns)."""
+    return 0 if change is None else round(float(change[COLUMNS.index("clock_s")]) * NS_PER_S)

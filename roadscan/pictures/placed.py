@@ -20,9 +20,10 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.grid import Bounds
 from roadscan.core.rig import Mountings, Rig, Sensor
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
-from roadscan.georeference.sources import load_mountings
+from roadscan.georeference.sources import change_of, load_mounting_changes, load_mountings
 from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
+from roadscan.pictures.camera_changes import clock_ns, interior_of, load_camera_changes
 from roadscan.pictures.views import Lens, PictureRule, Views
 from roadscan.poses.trajectory import Poses, world_from_ned
 
@@ -203,7 +204,8 @@ class _Placed:
 
 def _camera_logs(plan: SurveyPlan, rule: PictureRule) -> list[tuple[Sensor, TakenPictures]]:
     """Returns logs of pictures with their cameras."""
-    cameras = rule_cameras(plan.survey.rig, rule)
+    changes = load_camera_changes(plan.store)
+    cameras = [(name, _changed(one, changes.get(name))) for name, one in rule_cameras(plan.survey.rig, rule)]
     found = [(c, taken) for name, c in cameras for taken in taken_pictures(plan.store, plan.records, name)]
     usable = [(c, taken) for c, taken in found if taken.files and not _is_video(taken)]
     if not usable:
@@ -216,6 +218,11 @@ def _camera_logs(plan: SurveyPlan, rule: PictureRule) -> list[tuple[Sensor, Take
             change=f"list it in the survey file, or {_WITHOUT}",
         )
     return usable
+
+
+def _changed(camera: Sensor, change: Float64 | None) -> Sensor:
+    """Returns a camera with the lens that an adjustment found."""
+    return camera if change is None else camera.model_copy(update={"interior": interior_of(camera, change)})
 
 
 def _is_video(taken: TakenPictures) -> bool:
@@ -264,9 +271,12 @@ def _placed(plan: SurveyPlan, camera: Sensor, taken: TakenPictures, rule: Pictur
     log = PictureLog(record.key, record.run, record.sensor, plan.survey.resolve(Path(record.path)))
     source = trajectory_source(record.run, plan.records)
     mountings = mountings_of(record.run, record.sensor, camera.mounting(), load_mountings(plan.store))
+    change = change_of(load_mounting_changes(plan.store), record.run, record.sensor)
+    mountings = mountings if change is None else change.applied(mountings, parallel=False)
     order = np.argsort(taken.epochs_gps_ns, kind="stable")
     fits = order[_fits(camera, taken)[order]]
-    poses = list(_poses(plan, source, taken.epochs_gps_ns[fits]))
+    later_ns = clock_ns(load_camera_changes(plan.store).get(record.sensor))
+    poses = list(_poses(plan, source, taken.epochs_gps_ns[fits] + later_ns))
     found = np.concatenate([p.found for p in poses]) if poses else np.zeros(0, np.bool_)
     eye, turn = (np.concatenate(a) for a in zip(*(_eyes(p, mountings) for p in poses), strict=True))
     eye, turn, kept = eye[found], turn[found], fits[found]

@@ -1,9 +1,9 @@
 """Measurements in pictures as observations: residuals in metres at the point, and what moves them.
 
-A camera that sees a place in a pixel says nothing of its distance. Of each coordinate of the pixel, column or row, let g
-be its derivative by the point in the camera's axes (pixels a metre). Then n = g / |g| is the direction at the point
-across the ray in which the pixel moves, and the residual of the pixel over |g| is how far the ray passes the point along
-it. A correction of the pose moves the ray at the point as it moves a reading of a lidar there, so the derivatives
+A camera that sees a place in a pixel says nothing of its distance. Of each coordinate of the pixel, column or row, let
+g be its derivative by the point in the camera's axes (pixels a metre). Then n = g / |g| is the direction at the point
+across the ray in which the pixel moves, and the residual of the pixel over |g| is how far the ray passes the point
+along it. A correction of the pose moves the ray at the point as it moves a reading of a lidar there, so the derivatives
 are those of all observations (:mod:`roadscan.adjust.observations`). The equations are those of a bundle block
 adjustment with GNSS/INS (Förstner & Wrobel 2016, 15.2), but that its unknowns are corrections of each run's poses in
 time.

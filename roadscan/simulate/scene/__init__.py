@@ -17,9 +17,9 @@ from pydantic import BaseModel, Field, model_validator
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.strict import NAME_PATTERN, Strict, load_toml
 from roadscan.simulate.lidar_model import lidar_model
+from roadscan.simulate.scene.camera import Camera, FurtherCamera
 from roadscan.simulate.scene.rig import (
     Bag,
-    Camera,
     ClockError,
     Control,
     Encoder,
@@ -44,6 +44,7 @@ __all__ = [
     "Control",
     "Element",
     "Encoder",
+    "FurtherCamera",
     "Gnss",
     "Imu",
     "Lidar",
@@ -123,12 +124,20 @@ class Scene(Strict):
     """Wheel encoder."""
     camera: Camera = Camera()
     """Camera."""
+    further_cameras: list[FurtherCamera] = []
+    """Further cameras of the rig."""
     bag: Bag = Bag()
     """Recording in one ROS bag."""
     noise: Noise = Noise()
     """Errors; all 0 where left out."""
     control: Control = Control()
     """Control points."""
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """Cameras that the rig carries, by name."""
+        named = {"camera": self.camera} | {one.name: one for one in self.further_cameras}
+        return {name: one for name, one in named.items() if one.on}
 
     @property
     def stations_m(self) -> tuple[float, float]:
@@ -146,6 +155,8 @@ class Scene(Strict):
     def _check(self) -> Self:
         if self.lidar.on and not self.bag.on:
             self._check_capture()
+        if len({one.name for one in self.further_cameras}) < len(self.further_cameras):
+            raise ValueError("two of further_cameras have one name")
         for one in self.passes:
             if one.route is None and one.lane > self.road.lanes:
                 raise ValueError(f"a pass drives lane {one.lane} of a road with {self.road.lanes}")
@@ -190,6 +201,8 @@ class Scene(Strict):
     def _check_roadside(self) -> None:
         """Refuse objects off the road; a scene that `changed` shortens leaves them out instead."""
         for kind, listed in self.roadside:
+            if not isinstance(listed, list):
+                continue
             for i, one in enumerate(listed):
                 for key in ("start_m", "end_m") if isinstance(one, Barrier) else ("station_m",):
                     self._refuse_beyond(f"roadside.{kind}.{i}.{key}", getattr(one, key))
@@ -231,11 +244,11 @@ class Scene(Strict):
         """
         values: dict[str, Any] = self.model_dump() | {"noise": Noise()}
         right = {"offset_s": 0.0, "drift_ppm": 0.0}
-        for name in ("profilers", "lidar", "sick", "imu", "encoder", "camera"):
+        for name in ("profilers", "lidar", "sick", "imu", "encoder"):
             values[name]["clock"] |= right
         for mount in (values["profilers"]["left"], values["profilers"]["right"]):
             mount["error"] = {}
-        for name in ("lidar", "sick", "camera"):
+        for name in ("lidar", "sick"):
             values[name]["mount"]["error"] = {}
         for name in ("lidar", "sick"):
             values[name]["divergence_deg"] = 0.0
@@ -247,7 +260,10 @@ class Scene(Strict):
         values["gnss"] |= {"sigma_horizontal_m": 0.0, "sigma_vertical_m": 0.0, "float_sigma_m": 0.0}
         values["gnss"] |= {"jumps_per_minute": 0.0, "lever_arm_error_m": (0.0, 0.0, 0.0)}
         values["encoder"]["scale_error"] = 0.0
-        values["camera"]["noise"] = 0.0
+        for camera in (values["camera"], *values["further_cameras"]):
+            camera["clock"] |= right
+            camera["mount"]["error"], camera["lens_error"], camera["faults"] = {}, {}, {}
+            camera["noise"], camera["exposure"] = 0.0, None
         return self.parse(values)
 
 

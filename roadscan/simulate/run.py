@@ -92,7 +92,8 @@ def simulate(
     files.write_rig(scene, known.rig_file, nominal=False)
     files.write_clocks(scene, known.clocks_file)
     marks = control_marks(scene, surface)
-    write_true_control(marks, known.control_file)
+    if scene.cameras or scene.roadside.targets:
+        write_true_control(marks, known.control_file)
     if scene.cameras:
         files.write_cameras(scene, known.cameras_file)
     with own_files.written_for_the_user(target) as new:

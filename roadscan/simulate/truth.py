@@ -59,7 +59,9 @@ class Truth:
 
     @property
     def control_file(self) -> Path:
-        """CSV of the true places of the control points: what they are, easting, northing, height."""
+        """CSV of the true places of the control points, where there are cameras or upright targets: what they are,
+        easting, northing, height.
+        """
         return self.folder / "control.csv"
 
     @property

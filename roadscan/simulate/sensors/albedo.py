@@ -25,6 +25,7 @@ _LEAVES: Final = frozenset({"tree", "planting", "hedge"})  # kinds of objects wi
 _ROUGH: Final = frozenset({"facade", "wall", "fence", "gate", "box", "steps", "planter", "balcony", "shelter"})
 """Kinds of objects that are rough; all others are smooth, but for leaves."""
 _BRICKS: Final = frozenset({"facade", "wall"})  # kinds of objects that may be of bricks
+_PAINT_SHARE: Final = 0.4  # contrast of paint as a share of that of the pavement under it
 _DARKEST: Final = 0.15
 """Least factor of brightness."""
 
@@ -72,6 +73,7 @@ class Albedos:
                 self._bricks[one.id] = one.kind in _BRICKS and self._beside.bricks > 0.0
         shades = scene.road.brightness
         grass = () if scene.road.grass is None else (scene.road.grass.shade,)
+        self._paint = np.float32(shades.marking)
         self._verges = np.array([shades.verge, shades.kerb, *grass], np.float32)
 
     @property
@@ -84,9 +86,10 @@ class Albedos:
         change = np.zeros(len(seen.shade), np.float32)
         ground = seen.object_id == 0
         is_verge = ground & np.isin(seen.shade, self._verges)
+        painted = np.where(seen.shade >= self._paint, np.float32(_PAINT_SHARE), np.float32(1.0))
         for settings, rows in ((self._paved, ground & ~is_verge), (self._verge, is_verge)):
             if settings is not None:
-                contrast = np.full(len(change), settings.contrast, np.float32)
+                contrast = np.float32(settings.contrast) * painted
                 self._add(settings, np.flatnonzero(rows), contrast, seen, change)
         if self._beside is not None:
             rows = np.flatnonzero((seen.object_id > 0) & np.isfinite(seen.place_m[:, 0]))

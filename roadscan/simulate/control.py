@@ -1,4 +1,4 @@
-"""The control points of a scene: painted targets and plates, or points along the lanes; as they are and as surveyed."""
+"""The control points of a scene: painted targets and plates, or points along the lanes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from roadscan.simulate.bodies import place_at
-from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 
@@ -52,29 +51,11 @@ def control_marks(scene: Scene, surface: Surface) -> list[ControlMark]:
     return marks
 
 
-def write_control(scene: Scene, marks: Sequence[ControlMark], file: Path) -> None:
-    """Write the control points with their survey errors.
-
-    The stated σ is the true one, or a millimetre where the points have no error: no surveyor states zero.
-    """
-    true = np.array([mark.enh_m for mark in marks])
-    sigma = scene.noise.control_m
-    stated_sigma = max(sigma, 0.001)
-    stated = true + sigma * stream(scene.seed, 0, "control").standard_normal(true.shape)
-    with file.open("w", encoding="utf-8", newline="") as out:
-        rows = csv.writer(out, lineterminator="\n")
-        header = "name,code,role,easting_m,northing_m,height_m,sigma_horizontal_m,sigma_height_m"
-        rows.writerow(header.split(","))
-        for mark, enh in zip(marks, stated, strict=True):
-            numbers = [f"{value:.4f}" for value in (*enh, stated_sigma, stated_sigma)]
-            rows.writerow([mark.name, mark.code, mark.role, *numbers])
-
-
 def write_true_control(marks: Sequence[ControlMark], file: Path) -> None:
     """Write the control points as they are."""
     with file.open("w", encoding="utf-8", newline="") as out:
         rows = csv.writer(out, lineterminator="\n")
-        rows.writerow("name,code,role,style,size_m,easting_m,northing_m,height_m".split(","))
+        rows.writerow(["name", "code", "role", "style", "size_m", "easting_m", "northing_m", "height_m"])
         for mark in marks:
             words = [mark.name, mark.code, mark.role, mark.style, f"{mark.size_m:g}"]
             rows.writerow([*words, *(f"{value:.6f}" for value in mark.enh_m)])

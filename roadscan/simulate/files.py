@@ -1,4 +1,4 @@
-"""Writes the survey's files: ``SURVEY.toml``, ``RIG.toml``, and what the truth tells of clocks and cameras."""
+"""Writes the survey's files: ``SURVEY.toml``, ``RIG.toml``, control points; and the truth of clocks and cameras."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.imu import ImuErrors, ImuGrade
+from roadscan.simulate.control import PLATE, control_marks
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.logs import SimulatedLog
+from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Camera, Mount, Scene
 from roadscan.simulate.sensors import sick
 from roadscan.simulate.sensors.gnss import antenna_mount
@@ -20,6 +24,7 @@ from roadscan.simulate.sensors.imu import AT_BODY, head_imus
 from roadscan.simulate.sensors.lens import Lens
 from roadscan.simulate.sensors.lidar import beam_width_deg
 from roadscan.simulate.sensors.profiler import Head, heads
+from roadscan.simulate.surface import Surface
 
 SURVEY_FILE: Final = "SURVEY.toml"
 RIG_FILE: Final = "RIG.toml"
@@ -49,6 +54,8 @@ def write_survey(scene: Scene, earth: Earth, logs: Sequence[Sequence[SimulatedLo
             lines += [f'lane = "{one.lane}"', f"direction = {_text(one.direction)}"]
     lines += ["", "[[control]]", f"path = {_text(CONTROL_FILE)}", f"crs = {_text(scene.map.crs)}"]
     lines += ['height = "ellipsoidal"', ""]
+    if scene.roadside.targets:
+        lines += ["[adjust.targets.codes]", f'{PLATE} = {{ shape = "pictures" }}', ""]
     file.write_text("\n".join(lines), encoding="utf-8")
 
 
@@ -120,6 +127,25 @@ def write_cameras(scene: Scene, file: Path) -> None:
         listed[name]["mount"] = camera.mount.model_dump(exclude={"error"})
         listed[name]["clock"] = camera.clock.model_dump(include={"offset_s", "drift_ppm"})
     file.write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
+
+
+def write_control(scene: Scene, surface: Surface, file: Path) -> None:
+    """Write the control points with their survey errors.
+
+    The stated σ is the true one, or a millimetre where the points have no error: no surveyor states zero.
+    """
+    marks = control_marks(scene, surface)
+    true = np.array([mark.enh_m for mark in marks])
+    sigma = scene.noise.control_m
+    stated_sigma = max(sigma, 0.001)
+    stated = true + sigma * stream(scene.seed, 0, "control").standard_normal(true.shape)
+    with file.open("w", encoding="utf-8", newline="") as out:
+        rows = csv.writer(out, lineterminator="\n")
+        header = "name,code,role,easting_m,northing_m,height_m,sigma_horizontal_m,sigma_height_m"
+        rows.writerow(header.split(","))
+        for mark, enh in zip(marks, stated, strict=True):
+            numbers = [f"{value:.4f}" for value in (*enh, stated_sigma, stated_sigma)]
+            rows.writerow([mark.name, mark.code, mark.role, *numbers])
 
 
 def _log(path: str, log: SimulatedLog) -> list[str]:

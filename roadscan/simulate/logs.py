@@ -173,9 +173,7 @@ class Pass:
             clock = SensorClock.of(self.scene, camera.clock, TimeSystem.UNIX_UTC)
 
             def write(name: str = name, clock: SensorClock = clock) -> Iterator[int]:
-                return write_camera(
-                    Studio.of(world, name), self.drive, clock, self.raw / name, self.true_camera(name)
-                )
+                return write_camera(Studio.of(world, name), self.drive, clock, self.raw / name, self.true_camera(name))
 
             yield SimulatedLog(name, write, "other", "images", name, clock.toml("ns", self.drive.start_gps_ns))
 

@@ -13,7 +13,7 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.extras import need
 from roadscan.simulate import files, own_files, truth
 from roadscan.simulate.caster import World
-from roadscan.simulate.control import control_marks, write_control, write_true_control
+from roadscan.simulate.control import control_marks, write_true_control
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.logs import Pass, SimulatedLog
@@ -91,14 +91,13 @@ def simulate(
         counts.update(_written(files.run_id(drive.number), listed, progress or (lambda _: None)))
     files.write_rig(scene, known.rig_file, nominal=False)
     files.write_clocks(scene, known.clocks_file)
-    marks = control_marks(scene, surface)
     if scene.cameras or scene.roadside.targets:
-        write_true_control(marks, known.control_file)
+        write_true_control(control_marks(scene, surface), known.control_file)
     if scene.cameras:
         files.write_cameras(scene, known.cameras_file)
     with own_files.written_for_the_user(target) as new:
         files.write_rig(scene, new / files.RIG_FILE)
-        write_control(scene, marks, new / files.CONTROL_FILE)
+        files.write_control(scene, surface, new / files.CONTROL_FILE)
         files.write_survey(scene, earth, logs, new / files.SURVEY_FILE)
     return SimulatedSurvey(
         folder=target,

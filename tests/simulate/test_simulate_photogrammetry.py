@@ -22,7 +22,15 @@ SMALL = {"width_px": 640, "height_px": 400, "focal_px": 490.0, "principal_px": (
 STREET = Scene.load("street_with_cameras")
 PLATES = [
     {"station_m": 9.0, "offset_m": 4.0, "height_m": 1.4, "size_m": 0.8, "style": "checker", "name": "P1"},
-    {"station_m": 15.0, "offset_m": -4.0, "height_m": 2.0, "size_m": 1.2, "style": "ring", "name": "P2", "role": "check"},
+    {
+        "station_m": 15.0,
+        "offset_m": -4.0,
+        "height_m": 2.0,
+        "size_m": 1.2,
+        "style": "ring",
+        "name": "P2",
+        "role": "check",
+    },
     {"station_m": 12.0, "offset_m": -5.2, "height_m": 1.2, "size_m": 0.8, "style": "disc", "turned_deg": 30.0},
 ]
 TARGETS = [
@@ -117,7 +125,10 @@ def test_matches_of_sift_agree_with_the_true_poses(yard: Survey):
     found = [finder.detectAndCompute(yard.picture(i), None) for i in (0, 1)]
     pairs = matcher.knnMatch(found[0][1], found[1][1], k=2)
     good = [a for a, b in pairs if a.distance < 0.8 * b.distance]
-    places = [np.array([found[0][0][m.queryIdx].pt for m in good]), np.array([found[1][0][m.trainIdx].pt for m in good])]
+    places = [
+        np.array([found[0][0][m.queryIdx].pt for m in good]),
+        np.array([found[1][0][m.trainIdx].pt for m in good]),
+    ]
     poses = [yard.pose(i) for i in (0, 1)]
     origin = poses[0][1]
     moved = [-rotation @ (at - origin) for rotation, at in poses]
@@ -152,7 +163,8 @@ def test_the_survey_states_all_targets_with_its_errors(yard: Survey):
         "G005": ("PLATE", "gcp"),
     }  # fmt: skip
     away = [
-        [float(stated[name][k]) - float(marks[name][k]) for k in ("easting_m", "northing_m", "height_m")] for name in marks
+        [float(stated[name][k]) - float(marks[name][k]) for k in ("easting_m", "northing_m", "height_m")]
+        for name in marks
     ]
     assert 0.0 < np.abs(away).max() < 5 * YARD.noise.control_m
 
@@ -167,7 +179,7 @@ def test_the_rig_file_states_lens_and_mounting_with_their_errors(yard: Survey):
 
 
 def test_brightness_is_fixed_to_the_surface_and_only_pictures_see_it(tmp_path: Path):
-    even = YARD.changed(road={"albedo": None, "verge_albedo": None}, roadside={"albedo": None})
+    even = YARD.changed(albedo={"road": None, "verge": None, "beside": None})
     lidar = {"on": True, "range_max_m": 6.0}
     logs = []
     for name, scene in (("rough", YARD), ("even", even)):
@@ -202,7 +214,11 @@ def test_exposure_faults_and_a_second_camera(tmp_path: Path):
     small = {"width_px": 160, "height_px": 100, "focal_px": 120.0, "principal_px": None}
     camera = small | {"every_m": 0.5, "exposure": {"walk": 0.0, "step": 0.4, "steps_per_100": 60.0}}
     camera |= {"faults": {"black": [2], "doubled": [4]}, "noise": 1.0}
-    back = {"name": "camera_back", "every_m": 1.5, "mount": {"lever_arm_body_m": (-1.5, 0.0, -1.1), "heading_deg": 180.0}}
+    back = {
+        "name": "camera_back",
+        "every_m": 1.5,
+        "mount": {"lever_arm_body_m": (-1.5, 0.0, -1.1), "heading_deg": 180.0},
+    }
     scene = YARD.changed(camera=camera, further_cameras=[small | back])
     survey = Survey(simulate(scene, tmp_path / "faults").folder)
     rows = survey.rows()
@@ -225,4 +241,4 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(ConfigError, match="one name"):
         YARD.changed(further_cameras=[{"name": "camera_left"}, {"name": "camera_left"}])
     with pytest.raises(ConfigError, match="finer"):
-        YARD.changed(road={"albedo": {"finest_m": 0.5, "coarsest_m": 0.1}})
+        YARD.changed(albedo={"road": {"finest_m": 0.5, "coarsest_m": 0.1}})

@@ -17,6 +17,7 @@ from pydantic import BaseModel, Field, model_validator
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.strict import NAME_PATTERN, Strict, load_toml
 from roadscan.simulate.lidar_model import lidar_model
+from roadscan.simulate.scene.albedo import SurfaceAlbedo
 from roadscan.simulate.scene.camera import Camera, FurtherCamera
 from roadscan.simulate.scene.rig import (
     Bag,
@@ -59,6 +60,7 @@ __all__ = [
     "Route",
     "Scene",
     "Sick",
+    "SurfaceAlbedo",
     "Trajectory",
     "Vehicle",
     "shipped_scenes",
@@ -104,6 +106,8 @@ class Scene(Strict):
     """Its surface."""
     roadside: Roadside = Roadside()
     """What stands and moves beside and on it."""
+    albedo: SurfaceAlbedo = SurfaceAlbedo()
+    """Random brightness of surfaces in pictures."""
     passes: list[PassScene] = Field(default=[PassScene(lane=2)], min_length=1)
     """Traverses, in the order driven."""
     vehicle: Vehicle = Vehicle()
@@ -201,8 +205,6 @@ class Scene(Strict):
     def _check_roadside(self) -> None:
         """Refuse objects off the road; a scene that `changed` shortens leaves them out instead."""
         for kind, listed in self.roadside:
-            if not isinstance(listed, list):
-                continue
             for i, one in enumerate(listed):
                 for key in ("start_m", "end_m") if isinstance(one, Barrier) else ("station_m",):
                     self._refuse_beyond(f"roadside.{kind}.{i}.{key}", getattr(one, key))

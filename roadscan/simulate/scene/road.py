@@ -381,8 +381,8 @@ class Crosswalk(Strict):
 
 
 TargetStyle = Literal["disc", "ring", "checker"]
-"""disc: white with a black centre; ring: a black ring around a white disc, on white; checker: 2 × 2 squares, two of them
-black."""
+"""disc: white with a black centre; ring: a black ring around a white disc, on white; checker: 2 × 2 squares, two of
+them black."""
 
 
 class Target(Strict):
@@ -403,28 +403,6 @@ class Target(Strict):
     squares, along and across the road, two of them black."""
     name: str = Field(default="", pattern=r"^[A-Za-z0-9_-]{0,16}$")
     """Name in the survey; made of its role and number where left out."""
-
-
-class Albedo(Strict):
-    """Random brightness of a surface in pictures: noise of several octaves, fixed to the surface in space.
-
-    An octave that is finer than a pixel fades out, as in a picture. Lidars and profilers do not see it.
-    """
-
-    contrast: float = Field(default=0.12, ge=0.0, le=0.6)
-    """Standard deviation of the brightness, as a share of its mean, over all octaves."""
-    finest_m: float = Field(default=0.01, ge=0.002, le=1.0)
-    """Wavelength of the finest octave (m)."""
-    coarsest_m: float = Field(default=1.0, ge=0.01, le=20.0)
-    """No octave is longer than this (m); each is twice as long as the one before."""
-    growth: float = Field(default=1.0, ge=0.5, le=2.0)
-    """Contrast of an octave over that of the next finer one."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.coarsest_m < self.finest_m:
-            raise ValueError(f"coarsest_m {self.coarsest_m:g} is finer than finest_m {self.finest_m:g}")
-        return self
 
 
 class KerbRamp(Strict):
@@ -549,10 +527,6 @@ class Road(Strict):
     targets: list[Target] = []
     """Painted control targets; with the plates of the roadside they are the survey's control points where there are
     any."""
-    albedo: Albedo | None = None
-    """Random brightness of lanes and shoulders, with their paint, in pictures; even where left out."""
-    verge_albedo: Albedo | None = None
-    """The same of the verge and of kerbs."""
     grass: Grass | None = None
     """Grass on the verge; bare where left out."""
     stains: list[Stain] = []

@@ -10,7 +10,7 @@ from typing import Literal, Self, TypeAlias
 from pydantic import Field, model_validator
 
 from roadscan.core.strict import Strict
-from roadscan.simulate.scene.road import Albedo, Shade, TargetStyle
+from roadscan.simulate.scene.road import Shade, TargetStyle
 
 SignColour: TypeAlias = Literal["white", "red", "blue", "yellow", "green", "brown", "orange", "black"]
 
@@ -75,17 +75,6 @@ class TargetPlate(Standing):
     """Name in the survey; made of its role and number where left out."""
     shade: Shade = 200.0
     """Intensity of its white parts; the black ones have a twelfth of it."""
-
-
-class RoadsideAlbedo(Albedo):
-    """Random brightness in pictures of all that stands and moves; moving things take theirs along."""
-
-    leaves: float = Field(default=0.35, ge=0.0, le=0.6)
-    """`contrast` of trees, plants and hedges."""
-    smooth: float = Field(default=0.03, ge=0.0, le=0.6)
-    """`contrast` of vehicles, signs, posts and lamps."""
-    bricks: float = Field(default=0.12, ge=0.0, le=0.6)
-    """Contrast of the bricks of façades and walls, which are 0.25 m by 0.075 m; 0: plastered."""
 
 
 class Pole(Standing):
@@ -481,5 +470,3 @@ class Roadside(Strict):
     """Overhead wires."""
     targets: list[TargetPlate] = []
     """Upright control targets."""
-    albedo: RoadsideAlbedo | None = None
-    """Random brightness in pictures; even where left out."""

@@ -13,7 +13,7 @@ from roadscan.simulate.kernels import albedo as kernels
 from roadscan.simulate.kernels import things as body
 from roadscan.simulate.kernels.rays import Movers
 from roadscan.simulate.noise import stream
-from roadscan.simulate.scene.road import Albedo
+from roadscan.simulate.scene.albedo import Albedo
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -60,8 +60,7 @@ class Albedos:
     def __init__(self, world: World) -> None:
         self._world = world
         scene = world.scene
-        self._paved, self._verge = scene.road.albedo, scene.road.verge_albedo
-        self._beside = scene.roadside.albedo
+        self._paved, self._verge, self._beside = scene.albedo.road, scene.albedo.verge, scene.albedo.beside
         self._seed = np.uint64(stream(scene.seed, 0, "albedo").integers(0, 2**62))
         known = [*world.objects, *world.moving]
         count = 1 + max([o.id for o in known], default=0)

@@ -81,10 +81,9 @@ def gains_of(scene: Scene, name: str, camera: Camera, drive: Drive, count: int) 
     is_step = rng.random(count) < settings.steps_per_100 / 100.0
     moves += np.where(is_step, settings.step * rng.choice([-1.0, 1.0], count), 0.0)
     level = 0.0
-    for i, move in enumerate(moves.tolist()):
-        if abs(level + move) > _MOST_LOG_GAIN:
-            move = -move
-        level = min(max(level + move, -_MOST_LOG_GAIN), _MOST_LOG_GAIN) if i else 0.0
+    for i, move in enumerate(moves.tolist()[1:], 1):
+        turned = move if abs(level + move) <= _MOST_LOG_GAIN else -move
+        level = min(max(level + turned, -_MOST_LOG_GAIN), _MOST_LOG_GAIN)
         gains[i] = math.exp(level)
     return gains
 

@@ -1,7 +1,7 @@
 """Renders what a camera sees of a scene: a ray through each pixel, sunlight and shadows, more rays at edges.
 
-With a rolling shutter each row has its own pose. Where surfaces have a random brightness, shadows are cast for each second
-pixel of each second row, and for the others where those around them do not agree.
+With a rolling shutter each row has its own pose. Where surfaces have a random brightness, shadows are cast for each
+second pixel of each second row, and for the others where those around them do not agree.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ _RAYS_AT_ONCE: Final = 1 << 17  # rays cast together
 _NEAREST_M: Final = 0.05  # nearer things are not met
 _KEYS_A_PICTURE: Final = 1 << 32  # random keys reserved for a picture
 _EVENLY_NS: Final = 2_000_000
-"""Longest time (ns) within which the camera moves evenly while rows are exposed: at 30 degrees a second and 100 of their
-change it is off by 10⁻⁶."""
+"""Longest time (ns) within which the camera moves evenly while rows are exposed: turning at 30 degrees a second its
+axes are off by 10⁻⁶ in between."""
 _DIM: Final = 1e-12  # a pixel sees nothing that would be closer together
 
 SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 150.0, 42.0

@@ -41,7 +41,7 @@ INK, WARM, COOL, LEAF = "#333333", "#d1495b", "#00798c", "#3d8b40"
 COLOURS: Final = {
     "ground": "#9aa0a6", "facade": "#8c6d4f", "tree": LEAF, "parked_car": WARM, "moving_car": "#f4a259",
     "guardrail": COOL, "sign": "#7b2d8b", "pole": "#2b6cb0", "lamp_post": "#1f3a5f", "fence": "#b0852f",
-    "box": "#c2185b",
+    "box": "#c2185b", "wall": "#7a6a58", "target": "#000000",
 }  # fmt: skip
 
 

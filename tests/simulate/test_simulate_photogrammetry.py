@@ -1,4 +1,4 @@
-"""Simulated pictures as photogrammetry needs them: held against OpenCV's SIFT, corners and projection, with the truth."""
+"""Simulated pictures as photogrammetry needs them, with their truth: held against OpenCV's SIFT and projection."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def ring_middle(picture: np.ndarray, near: np.ndarray) -> np.ndarray:
     column, row = np.rint(near).astype(int)
     window = picture[row - reach : row + reach + 1, column - reach : column + reach + 1]
     bright = cv2.resize(window, None, fx=8, fy=8, interpolation=cv2.INTER_CUBIC)
-    level, binary = cv2.threshold(bright, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    _, binary = cv2.threshold(bright, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     outlines, _ = cv2.findContours(binary, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     middle = (np.array(bright.shape[::-1]) - 1) / 2
     inside = [o for o in outlines if len(o) > 30 and cv2.pointPolygonTest(o, middle.tolist(), False) > 0]

@@ -96,7 +96,7 @@ class Albedos:
             self._add(self._beside, rows, contrast, seen, change)
             if self._beside.bricks > 0.0:
                 self._lay_bricks(rows[self._bricks[seen.object_id[rows]]], seen, change)
-        return np.maximum(np.float32(1.0) + change, np.float32(_DARKEST))
+        return np.asarray(np.maximum(np.float32(1.0) + change, np.float32(_DARKEST)))
 
     def _contrast_of(self, kind: str) -> float:
         """Return the contrast of a kind of objects."""

@@ -38,7 +38,7 @@ class Seen:
 
     def by_point(self) -> list[tuple[str, ...]]:
         """Return a line for each control point."""
-        lines = []
+        lines: list[tuple[str, ...]] = []
         for name, role in sorted(self.roles.items()):
             own = [one for one in self.sought if one.aim.point.name == name]
             good = [one for one in own if one.found is not None]

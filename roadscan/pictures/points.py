@@ -37,8 +37,8 @@ def measured_points(store: Store, records: Sequence[LogRecord], rig: Rig) -> Mea
     """Return the points that logs state to be measured in pictures.
 
     A row without a run or a sensor has those of its log, or else those of the only picture of that name. A row whose
-    picture is not known, or that several pictures of one name could be meant by, is left out and noted; so is all but the
-    last of several places of one point in one picture.
+    picture is not known, or that several pictures of one name could be meant by, is left out and noted; so is all but
+    the last of several places of one point in one picture.
     """
     known = _pictures(store, records, rig)
     kept: dict[tuple[str, str, str, str], dict[str, Any]] = {}

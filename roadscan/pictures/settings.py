@@ -16,8 +16,8 @@ class PictureTarget(Strict):
     """What a target looks like."""
 
     styles: list[TargetStyle] = Field(default=["ring", "checker", "disc"], min_length=1)
-    """`ring`: a black ring around a white disc; `disc`: a white disc with a black centre; `checker`: two of 2 × 2 fields
-    are black. Where several are named, the one that fits best counts."""
+    """`ring`: a black ring around a white disc; `disc`: a white disc with a black centre; `checker`: two of 2 × 2
+    fields are black. Where several are named, the one that fits best counts."""
     size_m: float = Field(default=0.30, gt=0.0, le=5.0)
     """Edge of a ring's white square and of all four fields together, or diameter of the white disc (m)."""
     ring: tuple[float, float] = (0.4, 0.8)

@@ -43,8 +43,8 @@ class OdmGcp(LogFormat):
 
     The CRS is an EPSG code, a PROJ string or ``WGS84 UTM 32N``, as OpenDroneMap has it; x is easting or longitude. A
     point without a name is called by its number among the points of other coordinates. Its places in pictures are read
-    by `odm_picture_points`. A point whose height is NaN is rejected. The file does not say whether heights are ellipsoidal, nor their unit
-    where the CRS counts in feet: state both.
+    by `odm_picture_points`. A point whose height is NaN is rejected. The file does not say whether heights are
+    ellipsoidal, nor their unit where the CRS counts in feet: state both.
     """
 
     name = "odm_gcp"

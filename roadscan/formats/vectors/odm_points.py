@@ -25,9 +25,9 @@ class OdmPointsOptions(Strict):
 class OdmPoints(LogFormat):
     """Where the points of OpenDroneMap's list are in pictures: the columns of x and y in the picture of each line.
 
-    Pixels count from the centre of the upper left one, as OpenSfM, which reads these lists, counts them. Points are named
-    as `odm_gcp` names them, which reads their positions from the same file; so this format has to be stated. A point
-    whose height is NaN is read: it needs none.
+    Pixels count from the centre of the upper left one, as OpenSfM, which reads these lists, counts them. Points are
+    named as `odm_gcp` names them, which reads their positions from the same file; so this format has to be stated. A
+    point whose height is NaN is read: it needs none.
     """
 
     name = "odm_picture_points"

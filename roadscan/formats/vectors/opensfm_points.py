@@ -35,8 +35,8 @@ class OpensfmPoints(LogFormat):
     """Where the points of OpenSfM's `points` are in pictures: the `projection` of each of their `observations`.
 
     Projections are places from the picture's middle, in units of the larger of its width and height. Points without a
-    position, and points in one picture only, are read as well: they tie pictures together, or wait for more. The points'
-    positions are read by `opensfm_gcp` from the same file, so this format has to be stated.
+    position, and points in one picture only, are read as well: they tie pictures together, or wait for more. The
+    points' positions are read by `opensfm_gcp` from the same file, so this format has to be stated.
     """
 
     name = "opensfm_picture_points"

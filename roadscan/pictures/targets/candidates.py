@@ -94,7 +94,7 @@ class _Straight:
             part = cv2.GaussianBlur(part, (0, 0), _SOFT * reduced)
         at = (pixel - corner).astype(np.float32)
         shown = cv2.remap(part, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return cls(shown, known.astype(np.uint8), pose, half, low, pitch)
+        return cls(shown, np.asarray(known, np.uint8), pose, half, low, pitch)
 
     def matches(self, shape: Shape) -> Iterator[Candidate]:
         """Yield the best places of a shape."""

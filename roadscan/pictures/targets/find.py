@@ -12,10 +12,10 @@ import pyarrow as pa
 
 from roadscan.core.extras import cv2
 from roadscan.pictures.placed import Pictures
+from roadscan.pictures.settings import PictureTargetsConfig
 from roadscan.pictures.targets.aim import Aim, Eye, TargetPoint, aims
 from roadscan.pictures.targets.candidates import Candidate, candidates
 from roadscan.pictures.targets.fit import Fitted, fit, is_target
-from roadscan.pictures.settings import PictureTargetsConfig
 from roadscan.pictures.targets.shapes import Shape
 from roadscan.store.schema import table_schema
 

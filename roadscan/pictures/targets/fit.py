@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 
 from roadscan.core.extras import cv2
 from roadscan.pictures.targets.aim import Eye, Pose
@@ -24,7 +23,11 @@ Float64 = npt.NDArray[np.float64]
 _LARGEST_PX: Final = 56.0
 """A target larger than this is reduced before it is fitted (pixels)."""
 _BLUR_PX: Final = 0.6  # blur with which the search begins (σ, pixels)
-_BLUR_LIMITS_PX: Final = (0.2, 4.0)  # limits of the blur of a target that counts (σ, pixels)
+_SHARPEST_PX: Final = 0.3
+"""Least blur (σ, pixels): a pixel alone makes as much, and with less the middle would depend on no grey value."""
+_MOST_BLUR_PX: Final = 4.0  # largest blur of a target that counts (σ, pixels)
+_WORST_FIELD: Final = 0.16
+"""RMS of the misfit in any quarter of a target, as a share of its contrast, up to which it counts: more is hidden."""
 _MOVE_PX: Final = 6.0  # largest move of the middle from the candidate's (pixels)
 _TILT_SIGMA: Final = 0.2  # 1 σ of a round target's tilt from how it is taken to stand (tangents)
 _SIZE_SIGMA: Final = 0.15  # 1 σ of its size, as a logarithm
@@ -55,10 +58,14 @@ class Fitted:
     """How far it stands from how it was taken to stand: largest of its tilts (tangent)."""
     size: float
     """Its size over the candidate's."""
+    worst_field: float
+    """Largest RMS of the misfit in one of its quarters, as a share of the contrast."""
 
 
 def fit(picture: Float32, eye: Eye, candidate: Candidate) -> Fitted | None:
     """Return a candidate fitted to a picture (height, width); None where too little of it is in the picture."""
+    from scipy.optimize import least_squares
+
     window = _Window.of(picture, eye, candidate)
     if window is None:
         return None
@@ -168,12 +175,20 @@ class _Window:
             self.middle_px + values[:2], max(sigma, _LEAST_SIGMA_PX), float(likeness), float(contrast),
             float(np.exp(values[-1])) * self.step, float(np.abs(values[2:4]).max()),
             1.0 if self._is_chequered else float(np.exp(values[4])),
+            self._worst_field(values) / max(abs(float(contrast)), 1.0),
         )  # fmt: skip
+
+    def _worst_field(self, values: Float64) -> float:
+        """Return the largest RMS of the misfit in one of the target's quarters (grey values)."""
+        x, y, _ = self.in_plane(values)
+        quarter = (2 * (x > 0.0) + (y > 0.0))[self.used]
+        left = self.misfit(values)
+        return max(float(np.sqrt((left[quarter == k] ** 2).mean())) for k in range(4) if (quarter == k).any())
 
     def _pattern(self, values: Float64) -> Float64:
         """Return how white the used pixels (n,) are."""
         x, y, per_px = self.in_plane(values)
-        blur = float(np.clip(np.exp(values[-1]), 0.05, 50.0))
+        blur = float(np.clip(np.exp(values[-1]), _SHARPEST_PX, 50.0))
         used = (np.maximum(per_px[0][self.used], 1e-9), np.maximum(per_px[1][self.used], 1e-9))
         return self.candidate.shape.white(x[self.used], y[self.used], used, blur)
 
@@ -200,7 +215,9 @@ def is_target(found: Fitted, most_sigma_px: float, least_likeness: float) -> str
     """Return why a fitted target is none; empty where nothing speaks against it."""
     if found.likeness < least_likeness:
         return f"its picture is like the target by {found.likeness:.2f} only"
-    if not _BLUR_LIMITS_PX[0] * 0.5 <= found.blur_px <= _BLUR_LIMITS_PX[1]:
+    if found.worst_field > _WORST_FIELD:
+        return f"a quarter of it differs by {100 * found.worst_field:.0f} % of the contrast: hidden, or in shadow"
+    if found.blur_px > _MOST_BLUR_PX:
         return f"its edges are blurred by {found.blur_px:.1f} pixels"
     if found.sigma_px > most_sigma_px:
         return f"its middle is known to {found.sigma_px:.2f} pixels only"

@@ -22,8 +22,8 @@ class LensError(Strict):
 
 
 class Exposure(Strict):
-    """Exposure that changes from picture to picture: grey values are multiplied by a gain, e to the sum of a random
-    walk and of steps, which stays between 0.4 and 2.5.
+    """Exposure that changes from picture to picture: grey values are multiplied by a gain, whose logarithm is the sum of
+    a random walk and of steps, returns to 0 by 4 % from picture to picture, and stays within ± 0.6.
     """
 
     walk: float = Field(default=0.02, ge=0.0, le=0.5)
@@ -77,6 +77,8 @@ class Camera(Strict):
     """Noise of the pixels' values."""
     jpeg_quality: int = Field(default=90, ge=10, le=100)
     """Quality of the pictures' compression."""
+    blur_px: float = Field(default=0.0, ge=0.0, le=5.0)
+    """Blur of the lens, a Gaussian's σ (pixels); 0: none, and edges along rows or columns are jagged."""
     vignetting: float = Field(default=0.0, ge=0.0, le=0.9)
     """Share of the light that the picture's corners lose; it grows with the square of the distance from the middle."""
     exposure: Exposure | None = None

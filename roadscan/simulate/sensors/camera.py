@@ -28,7 +28,8 @@ Int64 = npt.NDArray[np.int64]
 
 STAMPS_FILE: Final = "stamps.csv"
 _STAMPS: Final = pa.schema([("file", pa.string()), ("time_ns", pa.int64())])
-_MOST_LOG_GAIN: Final = 0.9
+_BACK: Final = 0.96  # share of a gain's logarithm that the next picture keeps
+_MOST_LOG_GAIN: Final = 0.6
 """Largest logarithm of a gain, up or down."""
 _POSE: Final = ("x_world_m", "y_world_m", "z_world_m", "qw", "qx", "qy", "qz")
 
@@ -72,7 +73,7 @@ def write_camera(
 
 
 def gains_of(scene: Scene, name: str, camera: Camera, drive: Drive, count: int) -> Float64:
-    """Return the gains (n,) of a pass's pictures: a random walk with steps (logarithm), kept within ± 0.9."""
+    """Return the gains (n,) of a pass's pictures: a random walk with steps (logarithm) that returns to 0."""
     gains = np.ones(count)
     if camera.exposure is None:
         return gains
@@ -82,6 +83,7 @@ def gains_of(scene: Scene, name: str, camera: Camera, drive: Drive, count: int) 
     moves += np.where(is_step, settings.step * rng.choice([-1.0, 1.0], count), 0.0)
     level = 0.0
     for i, move in enumerate(moves.tolist()[1:], 1):
+        level *= _BACK
         turned = move if abs(level + move) <= _MOST_LOG_GAIN else -move
         level = min(max(level + turned, -_MOST_LOG_GAIN), _MOST_LOG_GAIN)
         gains[i] = math.exp(level)
@@ -94,6 +96,8 @@ def _taken(studio: Studio, drive: Drive, epoch_gps_ns: int, number: int) -> Floa
     if number in camera.faults.black:
         return np.zeros((camera.height_px, camera.width_px, *((3,) if camera.colour else ())), np.float32)
     taken = picture(studio, drive, epoch_gps_ns, number)
+    if camera.blur_px > 0.0:
+        taken = cv2.GaussianBlur(taken, (0, 0), camera.blur_px, borderType=cv2.BORDER_REPLICATE)
     if camera.vignetting > 0.0:
         away = [np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in (camera.height_px, camera.width_px)]
         squared = away[0][:, None] ** 2 + away[1][None] ** 2 * (camera.width_px / camera.height_px) ** 2

@@ -17,6 +17,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from roadscan.simulate.caster import Hits, Pattern, World, ray_key
 from roadscan.simulate.drive import Drive
+from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Camera
 from roadscan.simulate.sensors.albedo import Albedos
 from roadscan.simulate.sensors.albedo import Seen as SeenPlaces
@@ -96,7 +97,7 @@ def picture(studio: Studio, drive: Drive, epoch_gps_ns: int, number: int) -> Flo
     grey = plain.reshape(*shape, -1).mean(axis=-1)
     edges = np.flatnonzero((maximum_filter(grey, 3) - minimum_filter(grey, 3) > _EDGE).ravel())
     if edges.size:
-        tone[edges] = _closer(eye, seen, plane, steps, edges, shape)
+        tone[edges] = _closer(eye, seen, plane, steps, edges, shape, _inside(studio, drive, number, edges.size))
     return tone.reshape(*shape, *tone.shape[1:])
 
 
@@ -374,12 +375,30 @@ def _step(point: FloatArray, object_id: Int32, axis: int) -> FloatArray:
     return np.where((size[0] <= size[1])[..., None], ahead, behind)
 
 
+def _inside(studio: Studio, drive: Drive, number: int, count: int) -> Float32:
+    """Return places (4, n, 2) of further rays within n pixels: fixed ones; where surfaces have a random brightness, one
+    at random in each quarter, so that an edge along a row or a column is not rounded to a quarter of a pixel.
+    """
+    middle = np.array(_INSIDE_PX, np.float32)[:, None]
+    if studio.albedos is None:
+        return np.repeat(middle, count, axis=1)
+    rng = stream(studio.world.scene.seed, drive.number, f"{studio.name} further rays", number)
+    shift = rng.random((len(_INSIDE_PX), count, 2), dtype=np.float32) - np.float32(0.5)
+    return np.asarray(middle + np.float32(0.5) * shift)
+
+
 def _closer(
-    eye: _Eye, seen: _Seen, plane: Float32, steps: _Steps | None, edges: Int64, shape: tuple[int, int]
+    eye: _Eye,
+    seen: _Seen,
+    plane: Float32,
+    steps: _Steps | None,
+    edges: Int64,
+    shape: tuple[int, int],
+    inside_px: Float32,
 ) -> Float32:
     """Return values (n,) or (n, 3) of pixels with several things in them: the mean of four rays through each."""
     row, column = (a.astype(np.float32) for a in np.unravel_index(edges, shape))
-    inside = [eye.look(column + x, row + y) for x, y in _INSIDE_PX]
+    inside = [eye.look(column + places[:, 0], row + places[:, 1]) for places in inside_px]
     at = None if steps is None else _Steps(steps.across_m[edges], steps.down_m[edges])
     tones = (eye.tones(one, _plane_beside(one, seen, plane, edges, shape), at, None)[0] for one in inside)
     mean: Float32 = functools.reduce(np.add, tones) / np.float32(len(inside))

@@ -41,7 +41,7 @@ INK, WARM, COOL, LEAF = "#333333", "#d1495b", "#00798c", "#3d8b40"
 COLOURS: Final = {
     "ground": "#9aa0a6", "facade": "#8c6d4f", "tree": LEAF, "parked_car": WARM, "moving_car": "#f4a259",
     "guardrail": COOL, "sign": "#7b2d8b", "pole": "#2b6cb0", "lamp_post": "#1f3a5f", "fence": "#b0852f",
-    "box": "#c2185b",
+    "box": "#c2185b", "wall": "#7a6a58", "target": "#000000",
 }  # fmt: skip
 
 
@@ -71,6 +71,7 @@ VIEWS: Final = {
     "calibration_yard": View(30.0, 0.0, (26.0, 54.0), 13.0, 12.28 / 13.0, 8.0, (5.0, 5.0)),
     "urban_street": View(70.0, 1.6, (85.0, 115.0)),
     "highway_three_lanes": View(20.0, 0.0, (85.0, 125.0), raised_m=(12.0, 6.0)),
+    "street_with_cameras": View(20.0, 1.6, (30.0, 65.0)),
     "runway": View(4.0, 6.0, (0.0, 110.0), detail_reach_m=27.0, raised_m=(16.0, 10.0)),
 }
 

@@ -16,7 +16,7 @@ from roadscan.core.survey import SurveyConfig, SurveySection
 
 AdjustMode = Literal["joint", "each_pass", "vertical", "helmert"]
 """What is adjusted."""
-TargetShape = Literal["none", "circle", "chequered"]
+TargetShape = Literal["none", "circle", "chequered", "pictures"]
 """What is painted at a control point."""
 
 
@@ -73,7 +73,8 @@ class TargetConfig(Strict):
 
     shape: TargetShape = "none"
     """`circle`: a bright disc with a dark centre; `chequered`: four fields, bright and dark in turn; `none`: nothing is
-    looked for, the point is used for its height only."""
+    looked for, the point is used for its height only; `pictures`: the point is no place on the road (a plate on a
+    wall), and only pictures see it."""
     size_m: float = Field(default=0.30, gt=0.0, le=5.0)
     """Diameter of the disc, or edge of the four fields together (m)."""
     centre_m: float = Field(default=0.06, ge=0.0, le=5.0)

@@ -89,6 +89,7 @@ app.command("demo")(simulations.demo)
 camera = typer.Typer(help="Interior orientation and mounting of cameras.", no_args_is_help=True)
 camera.command("interior")(cameras.camera_interior)
 camera.command("resect")(cameras.camera_resect)
+camera.command("targets")(cameras.camera_targets)
 app.add_typer(camera, name="camera")
 
 assets = typer.Typer(help="The inventory of assets: what was found, and what people changed.", no_args_is_help=True)

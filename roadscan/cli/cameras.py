@@ -72,6 +72,27 @@ def camera_resect(
     typer.echo("nothing written" if found.rig_file is None else f"written: {found.rig_file}, [sensors.{sensor}]")
 
 
+def camera_targets(
+    survey_file: SurveyFile,
+    out: Annotated[Path, typer.Option(help="CSV to write: a line for each target found in a picture.")],
+    sensor: Annotated[list[str] | None, typer.Option(help="Camera of the rig; all of them where left out.")] = None,
+    misses: Annotated[bool, typer.Option("--misses", help="Also list where a target was not found, and why.")] = False,
+) -> None:
+    """Control targets in pictures: found, measured to a tenth of a pixel, and written to a CSV."""
+    from roadscan.cli.targets import Seen, seen_targets
+    from roadscan.pictures.points import write_points
+
+    seen: Seen = seen_targets(survey_file, tuple(sensor or ()))
+    write_points(seen.rows, out)
+    for note in seen.notes:
+        typer.echo(note)
+    header = ("point", "role", "in pictures", "found", "mean du px", "mean dv px", "RMS px", "median σ px")
+    print_table(header, seen.by_point())
+    if misses:
+        print_table(("picture", "point", "not found"), seen.misses)
+    typer.echo(f"written: {out}, {seen.rows.num_rows:,} measurements; du, dv: found less where the stated poses say")
+
+
 def numbers(values: Sequence[float], digits: int) -> str:
     """The numbers with so many digits, separated by commas."""
     return ", ".join(f"{value:.{digits}f}" for value in values)

@@ -1,12 +1,63 @@
-"""Settings of tie points between pictures (section ``[picture_ties]`` of the survey file)."""
+"""Settings of pictures as measurements: tie points (``[picture_ties]``) and control targets (``[picture_targets]``)."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from roadscan.core.strict import Strict
 from roadscan.core.survey import SurveySection
+
+TargetStyle = Literal["ring", "disc", "checker"]
+
+
+class PictureTarget(Strict):
+    """What a target looks like."""
+
+    styles: list[TargetStyle] = Field(default=["ring", "checker", "disc"], min_length=1)
+    """`ring`: a black ring around a white disc; `disc`: a white disc with a black centre; `checker`: two of 2 × 2
+    fields are black. Where several are named, the one that fits best counts."""
+    size_m: float = Field(default=0.30, gt=0.0, le=5.0)
+    """Edge of a ring's white square and of all four fields together, or diameter of the white disc (m)."""
+    ring: tuple[float, float] = (0.4, 0.8)
+    """Inner and outer diameter of a black ring, as shares of the edge."""
+    centre: float = Field(default=0.2, gt=0.0, le=0.8)
+    """Diameter of a disc's black centre, as a share of the disc's."""
+    lies: Literal["flat", "upright", "any"] = "any"
+    """`flat`: on the road; `upright`: on a wall or a post; `any`: both are tried."""
+
+    @model_validator(mode="after")
+    def _check(self) -> PictureTarget:
+        if not 0.1 <= self.ring[0] < self.ring[1] <= 1.0:
+            raise ValueError(f"ring {list(self.ring)}: give the inner diameter, 0.1 or more, and the outer, 1 or less")
+        return self
+
+
+class PictureTargetsConfig(PictureTarget, SurveySection):
+    """Targets of control points, as pictures show them: one kind for all, or by the points' codes or names."""
+
+    table: ClassVar[str] = "picture_targets"
+    meaning: ClassVar[str] = "What control targets look like in pictures, and where they are looked for."
+
+    codes: dict[str, PictureTarget] = {}
+    """Targets of points with a surveyor's code of their own, by the code; in place of the kind above."""
+    names: dict[str, PictureTarget] = {}
+    """Targets of single points, by their names; in place of both."""
+    position_m: float = Field(default=0.15, gt=0.0, le=5.0)
+    """1 σ of the cameras' stated places on each axis (m): three of it are searched …"""
+    angle_deg: float = Field(default=0.25, gt=0.0, le=10.0)
+    """… and of the directions in which they look (degrees)."""
+    farthest_m: float = Field(default=30.0, gt=1.0, le=500.0)
+    """Targets farther away are not looked for (m)."""
+    least_px: float = Field(default=7.0, ge=4.0, le=100.0)
+    """Least height or width of a target in the picture (pixels)."""
+    most_sigma_px: float = Field(default=0.15, gt=0.0, le=2.0)
+    """A target whose middle is less certain than this (1 σ, pixels) is none."""
+
+    def of_point(self, name: str, code: str | None) -> PictureTarget:
+        """Return the target of a point."""
+        return self.names.get(name) or self.codes.get(code or "", self)
 
 
 class PictureTiesConfig(SurveySection):

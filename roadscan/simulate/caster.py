@@ -76,6 +76,12 @@ class Hits:
     part: npt.NDArray[np.int8]
     """(g, m) class of the body met, where it is another than its object's; 0: it is not, or none was met. Numbers of
     :mod:`roadscan.simulate.semantics`."""
+    body: npt.NDArray[np.int32] | None = None
+    """(g, m) body met, numbers of moving ones follow on those of the world; −1: none."""
+    movers: kernels.Movers | None = None
+    """What moved near these rays."""
+    slots_from_gps_ns: int = 0
+    """Epoch of the movers' first slot."""
 
     def of_groups(self, groups: int) -> Self:
         """Return the same rays in another number of groups."""
@@ -87,6 +93,9 @@ class Hits:
             self.object_id.reshape(shape),
             self.is_mixed.reshape(shape),
             self.part.reshape(shape),
+            None if self.body is None else self.body.reshape(shape),
+            self.movers,
+            self.slots_from_gps_ns,
         )
 
 
@@ -198,6 +207,9 @@ class World:
             found.object_id,
             found.is_mixed,
             np.concatenate([self._parts, movers.bodies[0, :, PART].astype(np.int8), np.zeros(1, np.int8)])[found.body],
+            found.body,
+            movers,
+            slots_from,
         )
 
     def _movers(self, drive: Drive, first: int, last: int, centre: Float64, reach_m: float) -> kernels.Movers:

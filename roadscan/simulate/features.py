@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy.spatial import Voronoi
 
 from roadscan.simulate.kernels.road import NODE_STEP_M
+from roadscan.simulate.kernels.things import RING_FROM, RING_TO
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene.road import Alligator, Joints, Patch, Ravelling, Road, Slabs
 
@@ -20,8 +21,10 @@ _FACE_M = 0.001
 """Width of a slab's face, seen from above (m)."""
 _RAMP_M = 5.0
 """Length of the slabs that lead to the first fault and from the last one (m)."""
-RECTANGLE, ELLIPSE, RING, BAND = 0.0, 1.0, 2.0, 3.0
+RECTANGLE, ELLIPSE, RING, BAND, CHECKER = 0.0, 1.0, 2.0, 3.0, 4.0
 """Kinds of painted or spilt items."""
+BLACK = 15.0
+"""Intensity of the black parts of painted targets."""
 
 
 @dataclass(frozen=True)
@@ -267,9 +270,18 @@ def _painted(road: Road) -> list[list[float]]:
         ]
     for target in road.targets:
         place = [target.station_m, target.offset_m]
+        half = target.diameter_m / 2
+        if target.style != "disc":
+            rows.append([RECTANGLE, paint, *place, half, half, 0.0, 0.0])
+        if target.style == "checker":
+            rows.append([CHECKER, BLACK, *place, half, half, 0.0, 0.0])
+            continue
+        if target.style == "ring":
+            rows.append([RING, BLACK, *place, RING_FROM * half, RING_TO * half, 0.0, 0.0])
+            continue
         rows.append([RING, paint, *place, target.centre_m / 2, target.diameter_m / 2, 0.0, 0.0])
         if target.centre_m > 0.0:
-            rows.append([RING, 15.0, *place, 0.0, target.centre_m / 2, 0.0, 0.0])
+            rows.append([RING, BLACK, *place, 0.0, target.centre_m / 2, 0.0, 0.0])
     return rows
 
 

@@ -1,4 +1,4 @@
-"""Writes the survey's files: ``SURVEY.toml``, ``RIG.toml`` and the control points."""
+"""Writes the survey's files: ``SURVEY.toml``, ``RIG.toml``, control points; and the truth of clocks and cameras."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.imu import ImuErrors, ImuGrade
+from roadscan.simulate.control import PLATE, control_marks
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.logs import SimulatedLog
@@ -54,6 +54,8 @@ def write_survey(scene: Scene, earth: Earth, logs: Sequence[Sequence[SimulatedLo
             lines += [f'lane = "{one.lane}"', f"direction = {_text(one.direction)}"]
     lines += ["", "[[control]]", f"path = {_text(CONTROL_FILE)}", f"crs = {_text(scene.map.crs)}"]
     lines += ['height = "ellipsoidal"', ""]
+    if scene.roadside.targets:
+        lines += ["[adjust.targets.codes]", f'{PLATE} = {{ shape = "pictures" }}', ""]
     file.write_text("\n".join(lines), encoding="utf-8")
 
 
@@ -77,11 +79,9 @@ def write_rig(scene: Scene, file: Path, *, nominal: bool = True) -> None:
         limits = (sick.RANGE_MIN_M, scene.sick.range_max_m + 1.0)
         lines += _sensor("sick", "lidar", "SICK LMS 200", "frd", mounted(scene.sick.mount), limits)
         lines.append(f"divergence_deg = {scene.sick.divergence_deg!r}")
-    if scene.camera.on:
-        lines += _sensor(
-            "camera", "camera", "pinhole camera, Brown-Conrady distortion", "frd", mounted(scene.camera.mount)
-        )
-        lines += _interior(scene.camera)
+    for name, camera in scene.cameras.items():
+        lines += _sensor(name, "camera", "pinhole camera, Brown-Conrady distortion", "frd", mounted(camera.mount))
+        lines += _interior(name, camera.stated() if nominal else camera)
     if scene.imu.on:
         own, axes = scene.imu.errors is not None, "flu" if scene.bag.on else "frd"
         lines += _sensor("imu", "imu", f"IMU, {'own' if own else scene.imu.grade} grade", axes, mounted(AT_BODY))
@@ -103,10 +103,11 @@ def write_clocks(scene: Scene, file: Path) -> None:
     """Write how far the sensors' clocks are ahead: offset at the first profile of the first pass, and drift."""
     clocks = {head.name: scene.profilers.clock for head in heads(scene.profilers)}
     clocks |= {imu.name: scene.profilers.clock for imu in head_imus(scene)}
-    for name in ("lidar", "sick", "imu", "encoder", "camera"):
+    for name in ("lidar", "sick", "imu", "encoder"):
         sensor = getattr(scene, name)
         if sensor.on:
             clocks[name] = sensor.clock
+    clocks |= {name: camera.clock for name, camera in scene.cameras.items()}
     start = gps_ns_from_utc(scene.start)
     with file.open("w", encoding="utf-8", newline="") as out:
         rows = csv.writer(out, lineterminator="\n")
@@ -115,14 +116,26 @@ def write_clocks(scene: Scene, file: Path) -> None:
             rows.writerow([name, repr(clock.offset_s), repr(clock.drift_ppm), start, str(clock.known).lower()])
 
 
+def write_cameras(scene: Scene, file: Path) -> None:
+    """Write the cameras as they are in truth: lens, mounting, clock, line time and the row of the stamps."""
+    kept = ("model", "width_px", "height_px", "focal_px", "distortion", "line_time_us", "stamped_row", "vignetting")
+    listed = {}
+    for name, camera in scene.cameras.items():
+        listed[name] = {key: getattr(camera, key) for key in kept}
+        listed[name]["principal_px"] = Lens.of(camera).principal_px
+        listed[name]["stamped_row_px"] = camera.stamped_row_px
+        listed[name]["mount"] = camera.mount.model_dump(exclude={"error"})
+        listed[name]["clock"] = camera.clock.model_dump(include={"offset_s", "drift_ppm"})
+    file.write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
+
+
 def write_control(scene: Scene, surface: Surface, file: Path) -> None:
-    """Write control points: the painted targets, or points along both edges of the lanes, every third a check point.
+    """Write the control points with their survey errors.
 
     The stated σ is the true one, or a millimetre where the points have no error: no surveyor states zero.
     """
-    places, roles = _control_places(scene)
-    easting, northing, _ = surface.place(places[:, 0], places[:, 1])
-    true = np.stack([easting, northing, surface.height_m(easting, northing, texture=False)], axis=-1)
+    marks = control_marks(scene, surface)
+    true = np.array([mark.enh_m for mark in marks])
     sigma = scene.noise.control_m
     stated_sigma = max(sigma, 0.001)
     stated = true + sigma * stream(scene.seed, 0, "control").standard_normal(true.shape)
@@ -130,22 +143,9 @@ def write_control(scene: Scene, surface: Surface, file: Path) -> None:
         rows = csv.writer(out, lineterminator="\n")
         header = "name,code,role,easting_m,northing_m,height_m,sigma_horizontal_m,sigma_height_m"
         rows.writerow(header.split(","))
-        for i, enh in enumerate(stated):
-            role, letter = roles[i], "C" if roles[i] == "check" else "G"
+        for mark, enh in zip(marks, stated, strict=True):
             numbers = [f"{value:.4f}" for value in (*enh, stated_sigma, stated_sigma)]
-            rows.writerow([f"{letter}{i + 1:03d}", "PAINT", role, *numbers])
-
-
-def _control_places(scene: Scene) -> tuple[npt.NDArray[np.float64], list[str]]:
-    """Return stations and offsets (n, 2) of the control points, and their roles."""
-    targets = scene.road.targets
-    if targets:
-        return np.array([[t.station_m, t.offset_m] for t in targets]), [t.role for t in targets]
-    spacing = scene.control.spacing_m
-    stations = np.arange(min(spacing, scene.length_m) / 2, scene.length_m, spacing)
-    offset = scene.road.half_width_m - scene.control.inset_m
-    places = np.stack(np.meshgrid(stations, [-offset, offset], indexing="ij"), axis=-1).reshape(-1, 2)
-    return places, ["check" if i % 3 == 2 else "gcp" for i in range(len(places))]
+            rows.writerow([mark.name, mark.code, mark.role, *numbers])
 
 
 def _log(path: str, log: SimulatedLog) -> list[str]:
@@ -180,9 +180,9 @@ def _sensor(
     return lines
 
 
-def _interior(camera: Camera) -> list[str]:
-    """Return the true interior orientation: calibrations of simulated cameras have no error."""
-    size = ["[sensors.camera.interior]", f"width_px = {camera.width_px}", f"height_px = {camera.height_px}"]
+def _interior(name: str, camera: Camera) -> list[str]:
+    """Return the interior orientation."""
+    size = [f"[sensors.{name}.interior]", f"width_px = {camera.width_px}", f"height_px = {camera.height_px}"]
     if camera.model == "equirectangular":
         return [*size, f"model = {_text(camera.model)}"]
     lens = Lens.of(camera)

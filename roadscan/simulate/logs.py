@@ -16,6 +16,7 @@ from roadscan.simulate.scene import ClockError, Scene
 from roadscan.simulate.sensors import bag, captures, encoder, gnss, imu, sick
 from roadscan.simulate.sensors.camera import write_camera
 from roadscan.simulate.sensors.clock import SensorClock
+from roadscan.simulate.sensors.picture import Studio
 from roadscan.simulate.sensors.profiler import Head, heads, write_profiles
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import Object
@@ -60,8 +61,8 @@ class Pass:
     """Folder of the logs."""
     true_trajectory: Path
     """File of the true poses."""
-    true_camera: Path
-    """File of the camera's true poses."""
+    true_camera: Callable[[str], Path]
+    """Returns the file of a camera's true poses."""
     hits: Callable[[str], Path | None]
     """Returns the file of a sensor's hits; None where they are not requested."""
 
@@ -166,15 +167,15 @@ class Pass:
 
     def _camera(self) -> Iterator[SimulatedLog]:
         world = self.world
-        if world is None or not self.scene.camera.on:
+        if world is None:
             return
-        clock = self.clock("camera", TimeSystem.UNIX_UTC)
+        for name, camera in self.scene.cameras.items():
+            clock = SensorClock.of(self.scene, camera.clock, TimeSystem.UNIX_UTC)
 
-        def write() -> Iterator[int]:
-            return write_camera(self.scene, world, self.drive, clock, self.raw / "camera", self.true_camera)
+            def write(name: str = name, clock: SensorClock = clock) -> Iterator[int]:
+                return write_camera(Studio.of(world, name), self.drive, clock, self.raw / name, self.true_camera(name))
 
-        stated = clock.toml("ns", self.drive.start_gps_ns)
-        yield SimulatedLog("camera", write, "other", "images", "camera", stated)
+            yield SimulatedLog(name, write, "other", "images", name, clock.toml("ns", self.drive.start_gps_ns))
 
     def _imus(self) -> Iterator[SimulatedLog]:
         scene = self.scene

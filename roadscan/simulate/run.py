@@ -13,6 +13,7 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.extras import need
 from roadscan.simulate import files, own_files, truth
 from roadscan.simulate.caster import World
+from roadscan.simulate.control import control_marks, write_true_control
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.logs import Pass, SimulatedLog
@@ -70,7 +71,7 @@ def simulate(
         where the folder holds something else, one of these files was edited, or the map's CRS cannot be used; where
         the scene has a camera or a bag, and OpenCV or rosbags is not installed.
     """
-    if scene.camera.on:
+    if scene.cameras:
         need("cv2", "a simulated camera")
     if scene.bag.on:
         need("rosbags.typesys", "a simulated bag")
@@ -81,7 +82,7 @@ def simulate(
     drives = drives_of(scene, earth, ride)
     known = truth.Truth(scene, surface, target / truth.TRUTH_FOLDER)
     truth.save_objects(scene, surface, target)
-    casts = scene.lidar.on or scene.sick.on or scene.camera.on
+    casts = scene.lidar.on or scene.sick.on or bool(scene.cameras)
     world = World(scene, surface) if casts else None
     things = world.objects if world is not None else objects_of(scene, surface)
     logs = [_pass(known, world, things, drive, target, write_hits).logs() for drive in drives]
@@ -90,6 +91,10 @@ def simulate(
         counts.update(_written(files.run_id(drive.number), listed, progress or (lambda _: None)))
     files.write_rig(scene, known.rig_file, nominal=False)
     files.write_clocks(scene, known.clocks_file)
+    if scene.cameras or scene.roadside.targets:
+        write_true_control(control_marks(scene, surface), known.control_file)
+    if scene.cameras:
+        files.write_cameras(scene, known.cameras_file)
     with own_files.written_for_the_user(target) as new:
         files.write_rig(scene, new / files.RIG_FILE)
         files.write_control(scene, surface, new / files.CONTROL_FILE)
@@ -114,7 +119,7 @@ def _pass(
     run = files.run_id(drive.number)
     raw = folder / "raw" / run
     needed = [raw, known.trajectory_file(run).parent]
-    needed += [known.camera_file(run).parent] if known.scene.camera.on else []
+    needed += [known.camera_file(run, name).parent for name in known.scene.cameras]
     needed += [known.hits_file(run, "").parent] if write_hits else []
     for one in needed:
         one.mkdir(parents=True, exist_ok=True)
@@ -122,8 +127,10 @@ def _pass(
     def hits(sensor: str) -> Path | None:
         return known.hits_file(run, sensor) if write_hits else None
 
-    trajectory, camera = known.trajectory_file(run), known.camera_file(run)
-    return Pass(known.scene, known.surface, world, things, drive, raw, trajectory, camera, hits)
+    def camera(name: str) -> Path:
+        return known.camera_file(run, name)
+
+    return Pass(known.scene, known.surface, world, things, drive, raw, known.trajectory_file(run), camera, hits)
 
 
 def _written(run: str, logs: list[SimulatedLog], tell: Callable[[str], None]) -> Counter[str]:

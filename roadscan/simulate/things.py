@@ -49,6 +49,7 @@ from roadscan.simulate.scene.roadside import (
     Sign,
     Signal,
     Standing,
+    TargetPlate,
     Tree,
     Vehicle,
     Wall,
@@ -70,6 +71,8 @@ _PLATES: Final = {
     "diamond": body.DIAMOND,
 }  # fmt: skip
 _HEIGHT_SHARE: Final = {"round": 1.0, "triangle": math.sqrt(3.0) / 2.0, "octagon": 1.0, "diamond": 1.0}  # of width
+_STYLES: Final = {"disc": body.DISC_STYLE, "ring": body.RING_STYLE, "checker": body.CHECKER_STYLE}
+_PLATE_BACK: Final = 60.0  # intensity of the back of a control target
 _ARM_M: Final = 0.12  # thickness of an arm
 _LAMP_M: Final = (0.5, 0.25, 0.12)  # width, length and height of a lamp
 _WHEEL_M: Final = (0.62, 0.20, 0.60)  # length, width and greatest height of a wheel
@@ -168,6 +171,7 @@ def _standing(scene: Scene) -> Iterator[tuple[str, Standing | Barrier, float]]:
         ("facade", side.facades), ("box", side.boxes), ("signal", side.signals), ("overhead", side.overheads),
         ("planting", side.plantings), ("", side.vehicles), ("person", side.persons), ("wall", side.walls),
         ("hedge", side.hedges), ("", side.furniture), ("", side.covers), ("wire", side.wires),
+        ("target", side.targets),
     )  # fmt: skip
     for kind, described in kinds:
         for one in described:
@@ -273,6 +277,25 @@ def _(one: Sign, place: Place, surface: Surface) -> tuple[tuple[float, float, fl
     face[body.PART] = back[body.PART] = SIGN
     pole = post(place.enh_m[:2], z, high, _POST_RADIUS_M, 120.0)
     return (one.width_m, 2 * _PLATE_BEFORE_POST_M, high - z), math.pi / 2, np.stack([face, back, pole])
+
+
+@_made.register
+def _(one: TargetPlate, place: Place, surface: Surface) -> tuple[tuple[float, float, float], float, Float64]:
+    middle = place.enh_m[2] + one.height_m
+    away = {"forward": 0.0, "backward": math.pi, "road": math.copysign(math.pi / 2, -one.offset_m)}[one.faces]
+    facing = place.heading_rad + away + math.radians(one.turned_deg)
+    half, low_high = (one.size_m / 2, 0.0), (middle - one.size_m / 2, middle + one.size_m / 2)
+    # its length runs to the left as seen from before, so that both sides differ
+    face = body_row(body.PLATE, place.enh_m[:2], facing + math.pi / 2, half, low_high, one.shade)
+    face[body.WINDOW] = _STYLES[one.style]
+    behind = place.beside(-_PLATE_M, 0.0, facing)
+    back = body_row(body.WALL, behind, facing + math.pi / 2, half, low_high, _PLATE_BACK)
+    rows = [face, back]
+    if one.post:
+        at = place.beside(-_PLATE_BEFORE_POST_M, 0.0, facing)
+        rows.append(post(at, place.enh_m[2], middle + one.size_m / 2, _POST_RADIUS_M, 120.0))
+    size = (one.size_m, 2 * _PLATE_BEFORE_POST_M, one.height_m + one.size_m / 2)
+    return size, facing + math.pi / 2 - place.heading_rad, np.stack(rows)
 
 
 @_made.register

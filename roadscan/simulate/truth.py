@@ -48,9 +48,21 @@ class Truth:
         """Return the Parquet file of a run's true poses (columns of the table ``trajectory``, world frame ECEF)."""
         return self.folder / "trajectory" / f"{run}.parquet"
 
-    def camera_file(self, run: str) -> Path:
+    def camera_file(self, run: str, camera: str = "camera") -> Path:
         """Return the Parquet file of a run's pictures: epoch, file, and the camera's true pose (world frame ECEF)."""
-        return self.folder / "camera" / f"{run}.parquet"
+        return self.folder / camera / f"{run}.parquet"
+
+    @property
+    def cameras_file(self) -> Path:
+        """JSON of the cameras as they are: lens, mounting, clock, shutter."""
+        return self.folder / "cameras.json"
+
+    @property
+    def control_file(self) -> Path:
+        """CSV of the true places of the control points, where there are cameras or upright targets: what they are,
+        easting, northing, height.
+        """
+        return self.folder / "control.csv"
 
     @property
     def rig_file(self) -> Path:

@@ -157,11 +157,13 @@ def control_tasks(
     points: Sequence[ControlPoint],
     priors: Sequence[RunPrior],
 ) -> list[ControlTask]:
-    """Returns a task for each point that a pass saw, with the key of its sightings.
+    """Returns a task for each point that a pass saw, with the key of its sightings; none for those of pictures alone.
 
     priors : of each run, in the order of the survey file.
     """
-    passes = [passes_of(plan, tracks, point) for point in points]
+    targets = AdjustConfig.of(plan.survey).targets
+    on_road = [targets.of_code(point.code).shape != "pictures" for point in points]
+    passes = [passes_of(plan, tracks, point) if is_on else [] for point, is_on in zip(points, on_road, strict=True)]
     seen = list(zip(points, passes, strict=True))
     return sighting_tasks(plan, sources, priors, seen, picked_places(plan, points))
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Final, Literal
 
@@ -41,9 +42,9 @@ class OdmGcp(LogFormat):
     """A line with the CRS; then a line for each picture of a point: x, y, z, column, row, picture, name.
 
     The CRS is an EPSG code, a PROJ string or ``WGS84 UTM 32N``, as OpenDroneMap has it; x is easting or longitude. A
-    point without a name is called by its number among the points of other coordinates. Its places in pictures are not
-    read. A point whose height is NaN is rejected. The file does not say whether heights are ellipsoidal, nor their unit
-    where the CRS counts in feet: state both.
+    point without a name is called by its number among the points of other coordinates. Its places in pictures are read
+    by `odm_picture_points`. A point whose height is NaN is rejected. The file does not say whether heights are
+    ellipsoidal, nor their unit where the CRS counts in feet: state both.
     """
 
     name = "odm_gcp"
@@ -61,6 +62,11 @@ class OdmGcp(LogFormat):
         rows = [line.split() for line in lines[1:-1] or lines[1:] if line.strip()]
         return bool(rows) and _is_row(rows[0]) and _crs(lines[0].strip()) is not None
 
+    @staticmethod
+    def need_list(path: Path) -> None:
+        """Refuse a file whose first line is no CRS."""
+        _first_crs(path)
+
     def header(self, source: LogSource) -> LogHeader:
         """Check CRS, heights and roles."""
         frame = _frame(source)
@@ -71,27 +77,55 @@ class OdmGcp(LogFormat):
         """Stream points; a line that is none is rejected."""
         frame, role = _frame(source), options_of(source, OdmGcpOptions).role
         reader, unit_m = ControlReader(frame), _height_unit_m(source, frame)
-        known: dict[tuple[float, ...], str] = {}
         points: dict[str, tuple[int, int, tuple[float, ...]]] = {}
-        for record, line in enumerate(_lines(source.path)):
-            if isinstance(line, Reject):
-                yield replace(line, record=record)
+        for row in odm_rows(source.path):
+            if isinstance(row, Reject):
+                yield row
                 continue
-            offset, words = line
-            if words[2:3] and words[2].lower() == _NO_NUMBER and _is_row(words):
-                yield Reject("the height of the point is not stated (NaN)", record, offset)
+            if math.isnan(row.place[2]):
+                yield Reject("the height of the point is not stated (NaN)", row.record, row.offset)
                 continue
-            if not _is_row(words):
-                yield Reject("the line is not x, y, z, column, row and picture of a point", record, offset)
-                continue
-            place = tuple(float(word) for word in words[:3])
-            name = words[6] if len(words) > _FEWEST else known.get(place, f"gcp_{len(known) + 1}")
-            known.setdefault(place, name)
+            record, offset, name, place = row.record, row.offset, row.point, row.place
             if points.setdefault(name, (record, offset, place))[2] != place:
                 yield Reject("a point of this name has other coordinates above", record, offset)
         if points:
             yield from reader.items(_raw(points, (frame.horizontal_scale, frame.horizontal_scale, unit_m), role or ""))
         yield from reader.findings()
+
+
+@dataclass(frozen=True)
+class OdmRow:
+    """A point in a picture."""
+
+    record: int
+    offset: int
+    point: str
+    place: tuple[float, float, float]
+    """x, y, z as the file has them; z is NaN where it is not stated."""
+    u_px: float
+    v_px: float
+    picture: str
+
+
+def odm_rows(path: Path) -> Iterator[OdmRow | Reject]:
+    """Yield the lines of a list with the names that its points have; a line that is none as a reject."""
+    known: dict[tuple[str, ...], str] = {}
+    for record, line in enumerate(_lines(path)):
+        if isinstance(line, Reject):
+            yield replace(line, record=record)
+            continue
+        offset, words = line
+        if not _is_row(words):
+            yield Reject("the line is not x, y, z, column, row and picture of a point", record, offset)
+            continue
+        x, y, z, u, v = (float(word) for word in words[:5])
+        key = tuple(words[:3]) if math.isnan(z) else (repr(x), repr(y), repr(z))
+        # a height that is not stated is no place: such a point takes no number away from those that have one
+        numbered = f"gcp_{len(known) + 1}" if not math.isnan(z) else f"gcp_without_height_{x!r}_{y!r}"
+        name = words[6] if len(words) > _FEWEST else known.get(key, numbered)
+        if not math.isnan(z):
+            known.setdefault(key, name)
+        yield OdmRow(record, offset, name, (x, y, z), u, v, words[5])
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]] | Reject]:
@@ -176,16 +210,20 @@ def _height_unit_m(source: LogSource, frame: ControlFrame) -> float:
     return 1.0 if unit_m is None else unit_m
 
 
-def _frame(source: LogSource) -> ControlFrame:
-    source.need_file()
-    first = next((line for line in head_of(source.path).decode("utf-8", "replace").lstrip("\ufeff").splitlines()), "")
+def _first_crs(path: Path) -> str:
+    """Return the CRS of a list's first line."""
+    first = next((line for line in head_of(path).decode("utf-8", "replace").lstrip("\ufeff").splitlines()), "")
     crs = _crs(first.strip())
     if crs is None:
         raise FormatError(
-            f"the first line, '{first[:60]}', is no CRS",
-            expected="such as EPSG:32632 or WGS84 UTM 32N",
-            file=source.path,
+            f"the first line, '{first[:60]}', is no CRS", expected="such as EPSG:32632 or WGS84 UTM 32N", file=path
         )
+    return crs
+
+
+def _frame(source: LogSource) -> ControlFrame:
+    source.need_file()
+    crs = _first_crs(source.path)
     if source.crs is not None and not pyproj.CRS(source.crs).equals(pyproj.CRS(crs), ignore_axis_order=True):
         raise CrsError(
             f"the file's first line says {crs}, the survey file '{source.crs}'",

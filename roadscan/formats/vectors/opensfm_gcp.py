@@ -34,7 +34,7 @@ class OpensfmGcp(LogFormat):
 
     Positions are degrees of WGS 84 (EPSG:4326), unless crs states the datum of those who measured them. The file does
     not say whether altitudes are ellipsoidal: state it. A point without a position, which OpenSfM allows, is rejected;
-    places in pictures are not read.
+    places in pictures are read by `opensfm_picture_points`.
     """
 
     name = "opensfm_gcp"
@@ -61,7 +61,7 @@ class OpensfmGcp(LogFormat):
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream points; one without a position is rejected."""
-        frame, points = _frame(source), _points(source.path)
+        frame, points = _frame(source), opensfm_points(source.path)
         reader = ControlReader(frame)
         placed = {record: place for record, point in enumerate(points) if (place := _place(point)) is not None}
         for record in range(len(points)):
@@ -90,7 +90,7 @@ def _frame(source: LogSource) -> ControlFrame:
     return ControlFrame.of(replace(source, crs=source.crs or source.defaults.crs or _CRS))
 
 
-def _points(path: Path) -> list[dict[str, Any]]:
+def opensfm_points(path: Path) -> list[dict[str, Any]]:
     """Return the points of a file as JSON objects; what is no object becomes an empty one."""
     try:
         if path.stat().st_size > _LARGEST:
@@ -109,10 +109,11 @@ def _place(point: dict[str, Any]) -> tuple[float, float, float] | None:
     position = point.get("position")
     if not isinstance(position, dict) or position.get("has_altitude") is False:
         return None
-    longitude, latitude, altitude = (_number(position.get(name)) for name in ("longitude", "latitude", "altitude"))
+    longitude, latitude, altitude = (number_of(position.get(name)) for name in ("longitude", "latitude", "altitude"))
     return longitude, latitude, altitude
 
 
-def _number(value: Any) -> float:
+def number_of(value: Any) -> float:
+    """Return a JSON number, NaN for anything else."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18
     return float(value) if is_number else math.nan

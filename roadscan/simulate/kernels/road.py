@@ -73,7 +73,8 @@ class RoadArrays(NamedTuple):
     items: Float64
     """(m, 8) by node, what is painted or spilt: kind, intensity, station, offset, and
     0 rectangle: half length, half width, share of the paint that is worn off; 1 ellipse with a soft edge: half length,
-    half width; 2 ring: inner and outer radius; 3 band: half width, 0, station and offset of its other end."""
+    half width; 2 ring: inner and outer radius; 3 band: half width, 0, station and offset of its other end; 4 the black
+    squares of a chequered target: half edge."""
     tracks: Float64
     """(t, s) unevenness (m) at even offsets and stations; (0, 0): none."""
     texture: Float32
@@ -453,6 +454,8 @@ def painted(items: Float64, i: int, station: float, offset: float, under: float)
     elif kind == 2.0:
         away = math.sqrt(ds * ds + do * do)
         cover = 1.0 if items[i, 4] <= away <= items[i, 5] else 0.0
+    elif kind == 4.0:
+        cover = 1.0 if max(abs(ds), abs(do)) <= items[i, 4] and ds * do > 0.0 else 0.0
     else:
         length_s = items[i, 6] - items[i, 2]
         length_o = items[i, 7] - items[i, 3]

@@ -17,9 +17,13 @@ Float64 = npt.NDArray[np.float64]
 
 BOX, CYLINDER, ELLIPSOID, WALL, DISC, TRIANGLE, OCTAGON, DIAMOND = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
 """Kinds of bodies. Walls, discs and the four after them are thin, upright, and visible from both sides."""
-SLOPE, LID, ROD, VOLUME, BUSH, PICKETS, GLAZED = 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0
+SLOPE, LID, ROD, VOLUME, BUSH, PICKETS, GLAZED, PLATE = 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0
 """A leaning rectangle and ellipse; a cylinder in any direction; a box and an ellipsoid that stop beams within; a wall
-with slots; a wall of glass, or with windows of it."""
+with slots; a wall of glass, or with windows of it; a control target."""
+DISC_STYLE, RING_STYLE, CHECKER_STYLE = 1.0, 2.0, 3.0  # styles of a control target
+DISC_SHARE, RING_FROM, RING_TO = 0.2, 0.4, 0.8
+"""Diameters of a disc's black centre, and of a ring's inner and outer edge, as shares of the target's edge."""
+BLACK_SHARE = 1.0 / 12.0  # intensity of the black parts of a control target as a share of the white ones'
 
 # Columns of a body.
 KIND, EASTING, NORTHING, SINE, COSINE, HALF_LENGTH, HALF_WIDTH, LOW, HIGH = 0, 1, 2, 3, 4, 5, 6, 7, 8
@@ -35,6 +39,7 @@ _OCTAGON_CUT = math.sqrt(2.0)
 # pattern is ALONG past its beginning at the wall's start. DENSITY: share of beams that it stops each time they pass.
 # SLOPE and LID: LOW is the height of the middle, ALONG and STOREY the rise ahead and to the right (m/m), WINDOW > 0: it
 # is of glass; HIGH only bounds it. ROD: LOW and LOW_END are heights of its axis' ends, half its width is the radius.
+# PLATE: WINDOW is its style.
 # VOLUME and BUSH: DENSITY is the extinction along a beam (1/m). PICKETS: WINDOW of each BAY is solid. GLAZED: windows
 # stop the share DENSITY; with BAY 0 the whole wall is one.
 FRAME_M = 0.07
@@ -317,7 +322,23 @@ def shade(rows: Float64, i: int, x: float, y: float, z: float) -> float:
         if up > 0.0 and abs(aside) < half and abs(level) < half:
             return FRAME_SHADE if kind == GLAZED else np.nan
     value: float = rows[i, INTENSITY]
+    if kind == PLATE:
+        along = (x - rows[i, EASTING]) * rows[i, SINE] + (y - rows[i, NORTHING]) * rows[i, COSINE]
+        up = z - 0.5 * (rows[i, LOW] + rows[i, HIGH])
+        if is_black(rows[i, WINDOW], along / rows[i, HALF_LENGTH], up / rows[i, HALF_LENGTH]):
+            value *= BLACK_SHARE
     return value
+
+
+@inlined
+def is_black(style: float, right: float, up: float) -> bool:
+    """Return whether a control target is black at a place, given in half edges from its middle."""
+    if style == CHECKER_STYLE:
+        return right * up > 0.0
+    away = math.sqrt(right * right + up * up)
+    if style == RING_STYLE:
+        return RING_FROM <= away <= RING_TO
+    return style == DISC_STYLE and away <= DISC_SHARE
 
 
 @inner

@@ -17,9 +17,10 @@ from pydantic import BaseModel, Field, model_validator
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.strict import NAME_PATTERN, Strict, load_toml
 from roadscan.simulate.lidar_model import lidar_model
+from roadscan.simulate.scene.albedo import SurfaceAlbedo
+from roadscan.simulate.scene.camera import Camera, FurtherCamera
 from roadscan.simulate.scene.rig import (
     Bag,
-    Camera,
     ClockError,
     Control,
     Encoder,
@@ -44,6 +45,7 @@ __all__ = [
     "Control",
     "Element",
     "Encoder",
+    "FurtherCamera",
     "Gnss",
     "Imu",
     "Lidar",
@@ -58,6 +60,7 @@ __all__ = [
     "Route",
     "Scene",
     "Sick",
+    "SurfaceAlbedo",
     "Trajectory",
     "Vehicle",
     "shipped_scenes",
@@ -103,6 +106,8 @@ class Scene(Strict):
     """Its surface."""
     roadside: Roadside = Roadside()
     """What stands and moves beside and on it."""
+    albedo: SurfaceAlbedo = SurfaceAlbedo()
+    """Random brightness of surfaces in pictures."""
     passes: list[PassScene] = Field(default=[PassScene(lane=2)], min_length=1)
     """Traverses, in the order driven."""
     vehicle: Vehicle = Vehicle()
@@ -123,12 +128,20 @@ class Scene(Strict):
     """Wheel encoder."""
     camera: Camera = Camera()
     """Camera."""
+    further_cameras: list[FurtherCamera] = []
+    """Further cameras of the rig."""
     bag: Bag = Bag()
     """Recording in one ROS bag."""
     noise: Noise = Noise()
     """Errors; all 0 where left out."""
     control: Control = Control()
     """Control points."""
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """Cameras that the rig carries, by name."""
+        named = {"camera": self.camera} | {one.name: one for one in self.further_cameras}
+        return {name: one for name, one in named.items() if one.on}
 
     @property
     def stations_m(self) -> tuple[float, float]:
@@ -146,6 +159,8 @@ class Scene(Strict):
     def _check(self) -> Self:
         if self.lidar.on and not self.bag.on:
             self._check_capture()
+        if len({one.name for one in self.further_cameras}) < len(self.further_cameras):
+            raise ValueError("two of further_cameras have one name")
         for one in self.passes:
             if one.route is None and one.lane > self.road.lanes:
                 raise ValueError(f"a pass drives lane {one.lane} of a road with {self.road.lanes}")
@@ -231,11 +246,11 @@ class Scene(Strict):
         """
         values: dict[str, Any] = self.model_dump() | {"noise": Noise()}
         right = {"offset_s": 0.0, "drift_ppm": 0.0}
-        for name in ("profilers", "lidar", "sick", "imu", "encoder", "camera"):
+        for name in ("profilers", "lidar", "sick", "imu", "encoder"):
             values[name]["clock"] |= right
         for mount in (values["profilers"]["left"], values["profilers"]["right"]):
             mount["error"] = {}
-        for name in ("lidar", "sick", "camera"):
+        for name in ("lidar", "sick"):
             values[name]["mount"]["error"] = {}
         for name in ("lidar", "sick"):
             values[name]["divergence_deg"] = 0.0
@@ -247,7 +262,10 @@ class Scene(Strict):
         values["gnss"] |= {"sigma_horizontal_m": 0.0, "sigma_vertical_m": 0.0, "float_sigma_m": 0.0}
         values["gnss"] |= {"jumps_per_minute": 0.0, "lever_arm_error_m": (0.0, 0.0, 0.0)}
         values["encoder"]["scale_error"] = 0.0
-        values["camera"]["noise"] = 0.0
+        for camera in (values["camera"], *values["further_cameras"]):
+            camera["clock"] |= right
+            camera["mount"]["error"], camera["lens_error"], camera["faults"] = {}, {}, {}
+            camera["noise"], camera["exposure"] = 0.0, None
         return self.parse(values)
 
 

@@ -251,40 +251,6 @@ class Encoder(Strict):
     """Its clock; GPS time by default."""
 
 
-class Camera(Strict):
-    """A camera: pictures of a pinhole with or without distortion (Brown–Conrady, as OpenCV has it), or of 360°."""
-
-    on: bool = False
-    """Whether the rig carries it."""
-    every_m: float = Field(default=5.0, gt=0.1)
-    """Distance driven from picture to picture (m)."""
-    model: Literal["perspective", "equirectangular"] = "perspective"
-    """`equirectangular` for pictures of 360°: their columns and rows are even steps of longitude and latitude over the
-    whole sphere, so that focal length, principal point and distortion say nothing."""
-    width_px: int = Field(default=960, ge=64, le=8192)
-    """Width of a picture."""
-    height_px: int = Field(default=600, ge=64, le=8192)
-    """Height of a picture."""
-    focal_px: float = Field(default=820.0, gt=10.0)
-    """Focal length (pixels)."""
-    principal_px: tuple[float, float] | None = None
-    """Principal point, from the centre of the upper left pixel; the picture's middle where left out."""
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3."""
-    range_max_m: float = Field(default=80.0, gt=5.0, le=500.0)
-    """What lies farther away is sky (m)."""
-    colour: bool = False
-    """Whether its pictures have colours; grey where not."""
-    noise: float = Field(default=2.0, ge=0.0, le=50.0)
-    """Noise of the pixels' values."""
-    jpeg_quality: int = Field(default=90, ge=10, le=100)
-    """Quality of the pictures' compression."""
-    mount: Mount = Mount(lever_arm_body_m=(0.9, -0.25, -1.15), roll_deg=0.3, pitch_deg=-12.0, heading_deg=1.5)
-    """Mounting (axes frd of the sensor frame: x forward along the optical axis, y right, z down)."""
-    clock: ClockError = ClockError()
-    """Clock of its stamps; Unix UTC by default."""
-
-
 class Noise(Strict):
     """Errors of the sensors and of the stated trajectory, 1 σ."""
 

@@ -380,19 +380,29 @@ class Crosswalk(Strict):
     """Share of its paint that is worn off, in flakes of 3 cm."""
 
 
+TargetStyle = Literal["disc", "ring", "checker"]
+"""disc: white with a black centre; ring: a black ring around a white disc, on white; checker: 2 × 2 squares, two of
+them black."""
+
+
 class Target(Strict):
-    """A painted circular control target: a white disc with a black centre; its middle is surveyed."""
+    """A painted control target; its middle is surveyed."""
 
     station_m: float
     """Station of its middle (m)."""
     offset_m: float
     """Offset of its middle (m)."""
     diameter_m: float = Field(default=0.30, gt=0.05, le=2.0)
-    """Diameter of the disc (m)."""
+    """Diameter of the disc; edge of the square of the other styles (m)."""
     centre_m: float = Field(default=0.06, ge=0.0)
-    """Diameter of the black centre (m)."""
+    """Diameter of the black centre of a disc (m)."""
     role: Literal["gcp", "check"] = "gcp"
     """Whether the survey states it as a control point or as a check point."""
+    style: TargetStyle = "disc"
+    """disc: white with a black centre; ring: a black ring, from 0.4 to 0.8 of the square, on white; checker: 2 × 2
+    squares, along and across the road, two of them black."""
+    name: str = Field(default="", pattern=r"^[A-Za-z0-9_-]{0,16}$")
+    """Name in the survey; made of its role and number where left out."""
 
 
 class KerbRamp(Strict):
@@ -515,7 +525,8 @@ class Road(Strict):
     crosswalks: list[Crosswalk] = []
     """Zebra crossings."""
     targets: list[Target] = []
-    """Painted control targets; they are the survey's control points where there are any."""
+    """Painted control targets; with the plates of the roadside they are the survey's control points where there are
+    any."""
     grass: Grass | None = None
     """Grass on the verge; bare where left out."""
     stains: list[Stain] = []

@@ -10,7 +10,7 @@ from typing import Literal, Self, TypeAlias
 from pydantic import Field, model_validator
 
 from roadscan.core.strict import Strict
-from roadscan.simulate.scene.road import Shade
+from roadscan.simulate.scene.road import Shade, TargetStyle
 
 SignColour: TypeAlias = Literal["white", "red", "blue", "yellow", "green", "brown", "orange", "black"]
 
@@ -51,6 +51,30 @@ class Sign(Standing):
     """Colour of a rim around it."""
     text: str = Field(default="", max_length=12)
     """Text on the face (ASCII)."""
+
+
+class TargetPlate(Standing):
+    """An upright control target: a square plate, on a post or before a wall; its middle is surveyed."""
+
+    size_m: float = Field(default=0.30, gt=0.05, le=2.0)
+    """Edge of the plate (m)."""
+    height_m: float = Field(default=1.5, gt=0.1, le=30.0)
+    """Height of its middle above the ground (m)."""
+    style: TargetStyle = "ring"
+    """disc: white with a black centre of a fifth; ring: a black ring, from 0.4 to 0.8 of the plate, on white; checker:
+    2 × 2 squares, two of them black."""
+    faces: Literal["forward", "backward", "road"] = "backward"
+    """Whom it faces: backward is read by traffic towards growing stations, road looks across to the reference line."""
+    turned_deg: float = Field(default=0.0, ge=-180.0, le=180.0)
+    """Turn of the plate from there, clockwise from above (degrees)."""
+    post: bool = True
+    """Whether it is on a post; without one it hangs where it is, before a wall."""
+    role: Literal["gcp", "check"] = "gcp"
+    """Whether the survey states it as a control point or as a check point."""
+    name: str = Field(default="", pattern=r"^[A-Za-z0-9_-]{0,16}$")
+    """Name in the survey; made of its role and number where left out."""
+    shade: Shade = 200.0
+    """Intensity of its white parts; the black ones have a twelfth of it."""
 
 
 class Pole(Standing):
@@ -444,3 +468,5 @@ class Roadside(Strict):
     """Covers and drains."""
     wires: list[Wire] = []
     """Overhead wires."""
+    targets: list[TargetPlate] = []
+    """Upright control targets."""

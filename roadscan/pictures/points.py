@@ -1,0 +1,119 @@
+"""Points measured in pictures (table `picture_points`): those that logs state, and files of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+
+from roadscan.core.errors import RunError
+from roadscan.core.rig import Rig
+from roadscan.navigation.tasks.taken_pictures import taken_pictures
+from roadscan.store.logs import LogRecord
+from roadscan.store.readings.row_groups import read_groups
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+
+TABLE: Final = "picture_points"
+_CONTROL: Final = "control_points"
+_CSV_DIGITS: Final = 4  # digits of pixels in a file
+
+
+@dataclass(frozen=True)
+class MeasuredPoints:
+    """Measurements whose pictures are known, and notes on those that were left out."""
+
+    rows: pa.Table
+    """Of the table `picture_points`; run and sensor are never null."""
+    notes: tuple[str, ...]
+
+
+def measured_points(store: Store, records: Sequence[LogRecord], rig: Rig) -> MeasuredPoints:
+    """Return the points that logs state to be measured in pictures.
+
+    A row without a run or a sensor has those of its log, or else those of the only picture of that name. A row whose
+    picture is not known, or that several pictures of one name could be meant by, is left out and noted; so is all but
+    the last of several places of one point in one picture.
+    """
+    known = _pictures(store, records, rig)
+    kept: dict[tuple[str, str, str, str], dict[str, Any]] = {}
+    faults: Counter[str] = Counter()
+    for record in records:
+        for file in record.tables.get(TABLE, ()):
+            for row in read_groups(store, file.path, range(len(file.group_rows))).to_pylist():
+                meant = _meant(row, record, known)
+                if len(meant) != 1:
+                    why = "is not in the store" if not meant else "is the name of several pictures"
+                    faults[f"{record.path}: '{row['picture']}' {why}"] += 1
+                    continue
+                run, sensor = meant[0]
+                place = run, sensor, row["picture"], row["point"]
+                if place in kept:
+                    faults[f"{record.path}: {row['point']} stands twice in {run}/{sensor}/{row['picture']}"] += 1
+                kept[place] = row | {"run": run, "sensor": sensor}
+    ordered = [kept[place] for place in sorted(kept)]
+    notes = tuple(f"{text}: {n:,} measurement{'s' * (n > 1)} left out" for text, n in sorted(faults.items()))
+    return MeasuredPoints(pa.Table.from_pylist(ordered, schema=table_schema(TABLE).arrow()), notes)
+
+
+def control_rows(store: Store, records: Sequence[LogRecord]) -> list[dict[str, Any]]:
+    """Return the rows of the survey's control points, by name.
+
+    Raises
+    ------
+    RunError
+        where there are none, or two have one name.
+    """
+    files = [file for record in records for file in record.tables.get(_CONTROL, ())]
+    rows = [row for f in files for row in read_groups(store, f.path, range(len(f.group_rows))).to_pylist()]
+    if not rows:
+        raise RunError(
+            "no control points are in the store",
+            expected="[[control]] in the survey file",
+            change="state it, then `roadscan ingest`",
+        )
+    twice = [name for name, count in Counter(row["name"] for row in rows).items() if count > 1]
+    if twice:
+        raise RunError(f"two control points are called '{twice[0]}'", expected="a name of its own for each")
+    return sorted(rows, key=lambda row: str(row["name"]))
+
+
+def write_points(rows: pa.Table, file: Path) -> None:
+    """Write measurements as a file that `picture_points_csv` and `roadscan camera resect` read."""
+    listed = rows.to_pylist()
+    for row in listed:
+        for name in ("u_px", "v_px", "sigma_px"):
+            row[name] = None if row[name] is None else round(row[name], _CSV_DIGITS)
+    table = pa.Table.from_pylist(listed, schema=rows.schema)
+    pa_csv.write_csv(table, file, pa_csv.WriteOptions(quoting_style="needed"))
+
+
+def _pictures(store: Store, records: Sequence[LogRecord], rig: Rig) -> dict[str, list[tuple[str, str]]]:
+    """Return run and camera of the pictures by their names."""
+    known: dict[str, list[tuple[str, str]]] = {}
+    for name, sensor in rig.sensors.items():
+        if sensor.kind != "camera":
+            continue
+        for taken in taken_pictures(store, records, name):
+            for file in dict.fromkeys(taken.files):
+                known.setdefault(file, []).append((taken.record.run, name))
+    return known
+
+
+def _meant(
+    row: dict[str, Any], record: LogRecord, known: dict[str, list[tuple[str, str]]]
+) -> list[tuple[str, str]]:  # fmt: skip
+    """Return run and camera of the pictures that a row may mean: what it states, then what its log does."""
+    named = known.get(row["picture"], [])
+    for run, sensor in ((row["run"], row["sensor"]), (row["run"] or record.run, row["sensor"] or record.sensor)):
+        fitting = [one for one in named if run in (None, one[0]) and sensor in (None, one[1])]
+        if len(fitting) == 1:
+            return fitting
+    stated = [one for one in named if row["run"] in (None, one[0]) and row["sensor"] in (None, one[1])]
+    own = [one for one in stated if one[0] == record.run]
+    return own if len(own) == 1 else stated

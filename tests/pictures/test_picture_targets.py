@@ -144,7 +144,7 @@ def test_where_there_is_no_target_none_is_found(yard: Path, tmp_path: Path) -> N
     (folder / "control.csv").write_bytes((yard.parent / "control.csv").read_bytes())
     rows, told = targets(ready(folder), tmp_path / "none.csv", "--misses")
     assert rows == []
-    assert "nothing there looks like it" in told
+    assert told.count("run-1/camera/") >= 9, "no reasons are told"
 
 
 def test_found_targets_are_read_again_and_give_the_mounting(yard: Path, tmp_path: Path) -> None:
@@ -160,8 +160,8 @@ def test_found_targets_are_read_again_and_give_the_mounting(yard: Path, tmp_path
     assert table.notes == ()
     listed = sorted((r["picture"], r["point"], float(r["u_px"])) for r in rows)
     assert sorted((r["picture"], r["point"], r["u_px"]) for r in table.rows.to_pylist()) == listed
-    report = resect_camera(survey, store, "camera", found, 0.1, write=False)
-    assert report.resection.rms_px < 3.0  # the poses are off by 3 cm and 0.05°
+    report = resect_camera(survey, store, "camera", found, 1.0, write=False)  # the stated lens is off by 2 pixels
+    assert report.resection.rms_px < 3.0
     assert {one.measured.point for one in report.checks} <= {"P3", "P4"}
 
 

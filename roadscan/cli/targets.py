@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 
-from roadscan.georeference.plan.plan import plan_of
+from roadscan.georeference.plan.plan import plan_without_readings
 from roadscan.pictures.placed import plan_pictures
 from roadscan.pictures.points import control_rows
 from roadscan.pictures.settings import PictureTargetsConfig
@@ -69,7 +69,7 @@ def seen_targets(survey_file: Path, cameras: Sequence[str]) -> Seen:
         where pictures, poses or control points are not ingested.
     """
     session = Session.open(survey_file)
-    plan = plan_of(session)
+    plan = plan_without_readings(session.survey, session.store)
     settings = PictureTargetsConfig.of(session.survey)
     pictures = plan_pictures(plan, PictureRule(tuple(cameras), settings.farthest_m, _ANY_ANGLE_DEG, _BORDER_PX))
     control = control_rows(plan.store, plan.records)

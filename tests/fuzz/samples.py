@@ -56,6 +56,7 @@ from tests.formats import (
     test_ouster_bag,
     test_pcd,
     test_picture_control,
+    test_picture_points,
     test_ply,
     test_ppk,
     test_psi,
@@ -645,6 +646,10 @@ def _tables() -> Iterator[Sample]:
     yield Sample("control_csv", "dms", file("a.csv", control_dms), {"role": "gcp"}, dms, **lines)
     odm, opensfm = test_picture_control.ODM.encode(), test_picture_control.opensfm(RECORDS)
     yield Sample("odm_gcp", "plain", file("gcp_list.txt", odm), {"role": "gcp"}, test_picture_control.UTM32, text=True)
+    places = functools.partial(test_picture_points.sample, RECORDS)
+    yield Sample("picture_points_csv", "plain", file("a.csv", places), {}, {}, **lines)
+    yield Sample("odm_picture_points", "plain", file("gcp_list.txt", odm), {}, {}, text=True)
+    yield Sample("opensfm_picture_points", "plain", file("a.json", opensfm), {"size_px": [400, 300]}, {}, text=True)
     yield Sample("opensfm_gcp", "plain", file("a.json", opensfm), {"role": "gcp"}, dms, text=True)
     yield Sample("control_vector", "geojson", vector(control_degrees, "a.geojson"), {}, _DEGREES, text=True)
     yield Sample("control_vector", "gpkg", vector(control_layer, "a.gpkg"), {}, _UTM32)

@@ -111,22 +111,7 @@ def plan_survey(
     """
     records = tuple(records_with_trajectories(survey, store) if records is None else records)
     survey = Survey(survey.config, _mounted_rig(survey.rig, records), survey.folder)
-    config = survey.config
-    f = config.filters
-    unlimited = float("inf")
-    heights = HeightLimits(
-        -unlimited if f.height_min_m is None else f.height_min_m,
-        unlimited if f.height_max_m is None else f.height_max_m,
-        -unlimited if f.above_body_min_m is None else f.above_body_min_m,
-        unlimited if f.above_body_max_m is None else f.above_body_max_m,
-    )
-    ground = MapSettings(
-        map=survey.frame(),
-        grid=TileGrid(config.tiles.size_m, config.tiles.cell_m),
-        heights=heights,
-        max_gap_s=config.navigation.max_gap_s,
-        marks=f.keep_marked,
-    )
+    config, ground = survey.config, _ground(survey)
     known = load_mountings(store) if calibrated is None else calibrated
     clocks = load_clocks(store)
     apart = (*apart_logs(survey, records, clocks, estimated=True), *one_stamp_logs(records))
@@ -154,6 +139,33 @@ def plan_survey(
         None if centre_lines is None else centre_lines.key(),
     )
     return SurveyPlan(survey, store, records, ground, sources, passes, centre_lines, tile_key, apart, corrections)
+
+
+def plan_without_readings(survey: Survey, store: Store) -> SurveyPlan:
+    """Return the plan of a survey for what needs poses and pictures alone: it has no readings, passes and tiles."""
+    records = tuple(records_with_trajectories(survey, store))
+    survey = Survey(survey.config, _mounted_rig(survey.rig, records), survey.folder)
+    corrections = KnownCorrections.load(store)
+    return SurveyPlan(survey, store, records, _ground(survey), (), (), None, "", (), corrections)
+
+
+def _ground(survey: Survey) -> MapSettings:
+    """Return the map of a survey with the limits of its points."""
+    f, config = survey.config.filters, survey.config
+    unlimited = float("inf")
+    heights = HeightLimits(
+        -unlimited if f.height_min_m is None else f.height_min_m,
+        unlimited if f.height_max_m is None else f.height_max_m,
+        -unlimited if f.above_body_min_m is None else f.above_body_min_m,
+        unlimited if f.above_body_max_m is None else f.above_body_max_m,
+    )
+    return MapSettings(
+        map=survey.frame(),
+        grid=TileGrid(config.tiles.size_m, config.tiles.cell_m),
+        heights=heights,
+        max_gap_s=config.navigation.max_gap_s,
+        marks=f.keep_marked,
+    )
 
 
 def _without(records: Sequence[LogRecord], faults: Sequence[Fault]) -> list[LogRecord]:

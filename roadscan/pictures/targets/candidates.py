@@ -17,7 +17,7 @@ from roadscan.pictures.targets.shapes import Shape
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 
-_HALF_PX: Final = (7.0, 14.0)
+_HALF_PX: Final = (6.0, 8.0)
 """Half an edge of a target in the straightened picture: as many pixels as it has, within these limits."""
 _SOFT: Final = 0.4  # σ of the blur that goes before a reduction (pixels of the reduced picture)
 _MOST_M: Final = 6.0
@@ -109,7 +109,7 @@ class _Straight:
             middle = self.pose.middle_m + offset[0] * self.pose.right + offset[1] * self.pose.down
             c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
             right, down = c * self.pose.right + s * self.pose.down, c * self.pose.down - s * self.pose.right
-            yield Candidate(shape, Pose(middle, right, down), scale * self.half_m, likeness)
+            yield Candidate(shape, Pose(middle, right, down, self.pose.tilt_sigma), scale * self.half_m, likeness)
 
     def _peaks(self, shape: Shape, scale: float, turn_deg: float) -> Iterator[tuple[float, float, float]]:
         """Yield likeness, column and row of local maxima of the correlation."""

@@ -15,7 +15,7 @@ from roadscan.pictures.placed import Pictures
 from roadscan.pictures.settings import PictureTargetsConfig
 from roadscan.pictures.targets.aim import Aim, Eye, TargetPoint, aims
 from roadscan.pictures.targets.candidates import Candidate, candidates
-from roadscan.pictures.targets.fit import Fitted, fit, is_target
+from roadscan.pictures.targets.fit import Fitted, best_turned, fit, is_target
 from roadscan.pictures.targets.shapes import Shape
 from roadscan.store.schema import table_schema
 
@@ -26,10 +26,12 @@ Read: TypeAlias = Callable[[int], Float32 | None]
 
 TABLE: Final = "picture_points"
 """Table of points measured in pictures."""
-_TRIED: Final = 5  # candidates that are fitted
+_TRIED: Final = 4  # candidates that are fitted
 _APART_PX: Final = 3.0  # finds nearer together than this are one (pixels)
 _LEAST_LIKENESS: Final = 0.88  # correlation of a picture with a fitted target that counts
 _LEAST_CONTRAST: Final = 25.0  # white less black of a target that counts (grey values)
+_SURE: Final = 0.97  # correlation of a fitted target beside which others need no fit …
+_SURELY: Final = 0.15  # … where no candidate elsewhere comes nearer than this to its own likeness
 _CLEARER: Final = 0.04  # by how much the better of two finds has to be likelier to count
 
 
@@ -129,6 +131,8 @@ def _find(
     reason = "nothing there looks like it"
     for candidate in tried:
         found = fit(picture, eye, candidate)
+        if found is not None and candidate.shape.radii and found.likeness >= _LEAST_LIKENESS:
+            found = best_turned(picture, eye, candidate, found, aim.poses)
         if found is None:
             continue
         against = _against(found, aim, others, settings)
@@ -136,6 +140,9 @@ def _find(
             reason = against if reason.startswith("nothing") else reason
             continue
         good.append(found)
+        rest = [one.likeness for one in tried if _is_elsewhere(eye, one, found)]
+        if found.likeness > _SURE and max(rest, default=0.0) < candidate.likeness - _SURELY:
+            return found, ""
     good.sort(key=lambda one: -one.likeness)
     if not good:
         return None, reason
@@ -144,6 +151,11 @@ def _find(
     if any(best.likeness - one.likeness < _CLEARER for one in rivals):
         return None, "two places look like it"
     return best, ""
+
+
+def _is_elsewhere(eye: Eye, candidate: Candidate, found: Fitted) -> bool:
+    """Return whether a candidate is another place than what was found."""
+    return bool(np.linalg.norm(eye.pixels(candidate.pose.middle_m)[0] - found.pixel) > _APART_PX)
 
 
 def _distinct(found: list[Candidate], eye: Eye) -> list[Candidate]:

@@ -7,6 +7,7 @@ eccentricity: Dold 1996, Luhmann 2014). Of a chequered target both edges turn by
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.extras import cv2
-from roadscan.pictures.targets.aim import Eye, Pose
+from roadscan.pictures.targets.aim import Eye, Pose, across
 from roadscan.pictures.targets.candidates import Candidate
 
 Float32 = npt.NDArray[np.float32]
@@ -26,17 +27,20 @@ _BLUR_PX: Final = 0.6  # blur with which the search begins (σ, pixels)
 _SHARPEST_PX: Final = 0.3
 """Least blur (σ, pixels): a pixel alone makes as much, and with less the middle would depend on no grey value."""
 _MOST_BLUR_PX: Final = 4.0  # largest blur of a target that counts (σ, pixels)
+_ALIKE: Final = 0.25
+"""Two fits are alike where what they leave unexplained differs by less than this share."""
 _WORST_FIELD: Final = 0.16
 """RMS of the misfit in any quarter of a target, as a share of its contrast, up to which it counts: more is hidden."""
 _MOVE_PX: Final = 6.0  # largest move of the middle from the candidate's (pixels)
-_TILT_SIGMA: Final = 0.2  # 1 σ of a round target's tilt from how it is taken to stand (tangents)
 _SIZE_SIGMA: Final = 0.15  # 1 σ of its size, as a logarithm
 _NOISE: Final = 4.0  # σ of grey values with which the search begins
 _LEAST_PIXELS: Final = 24  # pixels that a target has at least
 _CORRELATED: Final = 2.0
 """Factor of σ: neighbouring pixels err together (compression, light), which the sum over them does not know."""
 _LEAST_SIGMA_PX: Final = 0.02  # least stated σ (pixels)
-_ROUNDS: Final = 60  # most evaluations of the gradient
+_ROUNDS: Final = 30  # most evaluations of the gradient
+_SETTLED: Final = 1e-6  # change of the sum of squares at which the search ends
+_HOPELESS: Final = 0.8  # correlation after the first search below which there is no second
 _LEVEL: Final = 1e-9  # least variance of a pattern that has two levels
 
 
@@ -70,9 +74,11 @@ def fit(picture: Float32, eye: Eye, candidate: Candidate) -> Fitted | None:
     if window is None:
         return None
     noise, start = _NOISE, window.start()
-    for _ in range(2):
-        found = least_squares(window.residuals, start, x_scale="jac", max_nfev=_ROUNDS, args=(noise,))
+    for number in range(2):
+        found = least_squares(window.residuals, start, x_scale="jac", ftol=_SETTLED, max_nfev=_ROUNDS, args=(noise,))
         start = found.x
+        if number == 0 and window.told(found.x, found.jac).likeness < _HOPELESS:
+            break
         left = window.misfit(found.x)
         noise = max(float(np.sqrt(left @ left / max(left.size - found.x.size - 2, 1))), 0.5)
     return window.told(found.x, found.jac)
@@ -135,7 +141,8 @@ class _Window:
     def in_plane(self, values: Float64) -> tuple[Float64, Float64, tuple[Float64, Float64]]:
         """Return places (h, w) of the pixels in the target's plane, in half edges, and their change in a pixel."""
         pose = self._pose(values)
-        share = (pose.middle_m @ pose.normal) / (self.ray @ pose.normal)
+        normal = pose.normal
+        share = (pose.middle_m @ normal) / (self.ray @ normal)
         past = self.ray * share[..., None] - pose.middle_m
         half = self.candidate.half_m * (1.0 if self._is_chequered else float(np.exp(values[4])))
         x, y = past @ pose.right / half, past @ pose.down / half
@@ -158,7 +165,7 @@ class _Window:
         """Return what least squares make small: misfits, and how far the target stands from what is known of it."""
         known = np.maximum(np.abs(values[:2]) - _MOVE_PX, 0.0)
         if not self._is_chequered:
-            known = np.concatenate([known, values[2:4] / _TILT_SIGMA, values[4:5] / _SIZE_SIGMA])
+            known = np.concatenate([known, values[2:4] / self.candidate.pose.tilt_sigma, values[4:5] / _SIZE_SIGMA])
         return np.concatenate([self.misfit(values) / noise, known])
 
     def told(self, values: Float64, jacobian: Float64) -> Fitted:
@@ -198,17 +205,32 @@ class _Window:
         ray = self.eye.rays((self.middle_px + values[:2])[None])[0]
         middle = ray * pose.middle_m[2]
         if self._is_chequered:
-            return Pose(middle, pose.right, pose.down)
+            return replace(pose, middle_m=middle)
         normal = pose.normal + values[2] * pose.right + values[3] * pose.down
         normal = normal / np.linalg.norm(normal)
         right = pose.right - (pose.right @ normal) * normal
         right = right / np.linalg.norm(right)
-        return Pose(middle, right, np.cross(normal, right))
+        return Pose(middle, right, across(normal, right), pose.tilt_sigma)
 
     @staticmethod
     def _change(values: Float64) -> Float64:
         """Return the length of the gradient (h, w) in a pixel."""
         return np.asarray(np.hypot(*np.gradient(values)))
+
+
+def best_turned(picture: Float32, eye: Eye, candidate: Candidate, found: Fitted, poses: Sequence[Pose]) -> Fitted:
+    """Return the best fit of a round target over the ways in which it may stand.
+
+    A circle that leans to one side looks nearly like one that leans to the other, and its middle lies elsewhere. Where
+    two of them fit alike, σ holds half of what is between their middles.
+    """
+    ray = eye.rays(found.pixel[None])[0]
+    starts = [replace(candidate, pose=replace(p, middle_m=ray * candidate.pose.middle_m[2])) for p in poses]
+    fits = [found, *(one for start in starts if (one := fit(picture, eye, start)) is not None)]
+    best = max(fits, key=lambda one: one.likeness)
+    alike = [one.pixel for one in fits if best.likeness - one.likeness < _ALIKE * (1.0 - best.likeness)]
+    apart = max(float(np.linalg.norm(one - best.pixel)) for one in alike)
+    return replace(best, sigma_px=float(np.hypot(best.sigma_px, 0.5 * apart)))
 
 
 def is_target(found: Fitted, most_sigma_px: float, least_likeness: float) -> str:

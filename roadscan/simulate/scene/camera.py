@@ -22,8 +22,10 @@ class LensError(Strict):
 
 
 class Exposure(Strict):
-    """Exposure that changes from picture to picture: grey values are multiplied by a gain, whose logarithm is the sum of
-    a random walk and of steps, returns to 0 by 4 % from picture to picture, and stays within ± 0.6.
+    """Exposure that changes from picture to picture: grey values are multiplied by a gain.
+
+    Its logarithm is the sum of a random walk and of steps, returns to 0 by 4 % from picture to picture, and stays
+    within ± 0.6.
     """
 
     walk: float = Field(default=0.02, ge=0.0, le=0.5)

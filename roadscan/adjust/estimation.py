@@ -30,8 +30,6 @@ SURVEY: Final = len(KINDS)
 _HUBER_ROUNDS: Final = 10  # Rounds with Huber's weights before IGG III.
 _SETTLED: Final = 0.01
 """Weights, and logarithms of factors, that change by less are final."""
-_MOST_TIED: Final = 0.99
-"""Tie points of pictures are thousands, and single ones at the limit change nothing: so many of them have to settle."""
 _CALM: Final = 15
 """From this round on, weights move only halfway: two observations that exclude one another no longer alternate."""
 _LEAST: Final = 1e-6
@@ -220,10 +218,9 @@ class Rounds:
         """Returns weights of the next round; one close to 0 becomes 0, so that 0 marks a row that does not count."""
         weight = np.where(weight < _SETTLED, 0.0, weight)
         weight[self._surveyed] = self._survey_weight
-        change = np.abs(weight - self._weight)
-        moved = float(change[~self._tied].max(initial=0.0))
-        if self._tied.any():
-            moved = max(moved, float(np.quantile(change[self._tied], _MOST_TIED)))
+        # Tie points of pictures were judged on the way to their rows: what came here counts, as its σ says.
+        weight = np.where(self._tied, 1.0, weight)
+        moved = float(np.abs(weight - self._weight).max(initial=0.0))
         self._weight = weight
         return moved
 

@@ -74,8 +74,7 @@ def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[Cont
     """Returns what is left by an adjustment; the rows of the pictures are the last ones of its observations."""
     pictures, rows = approach.pictures, approach.rows
     measured, own = pictures.measured, slice(adjusted.weight.size - rows.measurement.size, None)
-    weight = np.zeros(measured.point.size)
-    weight[rows.measurement] = adjusted.weight[own]
+    weight = approach.weight
     counted = np.where(pictures.enters, weight, 0.0)
     state = state_of(adjusted)
     before, after = (_residuals(pictures, one, counted) for one in (State(), state))

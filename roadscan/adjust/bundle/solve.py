@@ -14,13 +14,18 @@ from roadscan.adjust.bundle.measurements import Measurements, Numbers, Rows, Sta
 from roadscan.adjust.observations import Observations
 from roadscan.adjust.process import CameraPrior, MountingPrior, RunPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
+from roadscan.calibrate.robust import length_limit
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-_MOST: Final = 8  # Solutions on the way, at most; four are usual.
-_ROUNDS: Final = 6  # Rounds of weights of a solution on the way; the last solution takes as many as it needs.
+_MOST: Final = 14  # Solutions on the way, at most; eight are usual.
+_ROUNDS: Final = 2
+"""Rounds of weights of the other observations in a solution on the way; the last solution takes as many as it needs."""
+_WIDE: Final = np.array([4.0, 2.0, 1.5])
+"""Factors of the limits of judgement in the first solutions, which poses still distort."""
+_LEAST: Final = 0.02  # A weight below this is none.
 _SETTLED_PX: Final = 0.02
 """Where residuals change by less than this from solution to solution (px, 95 %), rows are linear enough."""
 _MEDIAN: Final = 0.6745
@@ -56,6 +61,8 @@ class Approached:
     """Of the measurements that enter."""
     place_m: Float64
     """(p, 3) of the points."""
+    weight: Float64
+    """(m,) of each measurement."""
     sigma_px: float
     """1 σ of a tie point; NaN where there is none."""
     solutions: int
@@ -87,7 +94,9 @@ def approached(
 ) -> Approached:
     """Returns rows of the pictures about the solution that they and all other observations have.
 
-    The σ of tie points is that which their residuals show: nobody states how well a feature is found in a street.
+    From solution to solution, rays are made anew, and each measurement is judged by its residual against the
+    prediction of all others: weights of IGG III (Yang 1994), first with wide limits. The σ of tie points is that which
+    their residuals show: nobody states how well a feature is found in a street.
 
     Parameters
     ----------
@@ -101,26 +110,61 @@ def approached(
         measured = pictures.measured
         place = met_at(measured, seen(measured, state, pictures.numbers), weight)
         rows = _entering(pictures, state, place, first, weight)
-        residual = rows.residual_px
         if len(before):
-            settled = _change(before, residual) < _SETTLED_PX
+            settled = number > _WIDE.size and _change(before, rows.residual_px, weight) < _SETTLED_PX
         if settled or number == _MOST:
             break
-        before = residual
-        found = adjust(Observations.joined([others[0], rows.observations]), priors, quiet, mountings, pictures.cameras)
+        before = rows.residual_px
+        joined = Observations.joined([others[0], rows.observations])
+        found = adjust(joined, priors, quiet, mountings, pictures.cameras)
         state = state_of(found)
-        own = slice(others[0].size, None)
-        tie = measured.is_tie[rows.measurement]
-        factor = _factor(found.normalised_residual[own][tie])
-        pictures = _with_sigma(pictures, factor)
-        judged = np.zeros(weight.size)
-        judged[rows.measurement] = found.weight[own]
-        weight = np.where(pictures.enters, judged, 0.0)
-        weight[~measured.is_tie & pictures.enters] = 1.0
-        weight = _once_more(pictures, state, weight)
+        wide = float(_WIDE[min(number, _WIDE.size) - 1])
+        lengths, factor = _judged(pictures, rows, found, others[0].size)
+        limits = settings.full_weight_within * wide, settings.reject_beyond * wide
+        pictures, weight = _with_sigma(pictures, factor), _weights(pictures, state, (lengths, weight), limits)
     tied = pictures.measured.sigma_px[pictures.measured.is_tie]
     sigma = float(np.median(tied)) if tied.size else float("nan")
-    return Approached(pictures, rows, place, sigma, number, settled)
+    return Approached(pictures, rows, place, weight, sigma, number, settled)
+
+
+def _judged(pictures: PictureEvidence, rows: Rows, found: Adjustment, others: int) -> tuple[Float64, float]:
+    """Returns the length (m,) of each measurement's residual against the prediction of all others, in σ, NaN where it
+    did not enter; and by how much tie points are off more than their σ says, in the median.
+    """
+    own = slice(others, None)
+    left_out = found.residual_m[own] / found.redundancy[own]
+    whole = (left_out / found.normalised_residual[own]) ** 2
+    stated = rows.observations.sigma_m**2
+    # A weight below 1 is a larger σ: without it the measurement is judged by the σ that all have.
+    plain = (pictures.measured.sigma_px[rows.measurement] / rows.px_per_m) ** 2
+    statistic = left_out / np.sqrt(np.maximum(whole - stated, 0.0) + plain)
+    squares = np.bincount(rows.measurement, np.nan_to_num(statistic) ** 2, minlength=pictures.measured.point.size)
+    lengths = np.full(squares.size, np.nan)
+    lengths[rows.measurement] = np.sqrt(squares[rows.measurement])
+    tie = pictures.measured.is_tie[rows.measurement]
+    known = np.abs(statistic[tie & np.isfinite(statistic)])
+    return lengths, float(np.median(known)) / _MEDIAN if known.size else 1.0
+
+
+def _weights(
+    pictures: PictureEvidence, state: State, before: tuple[Float64, Float64], limits: tuple[float, float]
+) -> Float64:
+    """Returns new weights (m,) of IGG III; what did not enter comes back where its point lies on its ray by now.
+
+    Parameters
+    ----------
+    before : lengths of the residuals in σ, and weights.
+    limits : σ of one number up to which a measurement counts wholly, and from which on it does not.
+    """
+    measured, (lengths, weight) = pictures.measured, before
+    near, far = (length_limit(limit, 2) for limit in limits)
+    slope = (far - np.minimum(np.nan_to_num(lengths, nan=far), far)) / (far - near)
+    judged = np.where(lengths <= near, 1.0, near / np.maximum(np.nan_to_num(lengths, nan=far), near) * slope**2)
+    place = met_at(measured, seen(measured, state, pictures.numbers), weight)
+    away = _lengths(pictures, state, place) / measured.sigma_px
+    judged = np.where(np.isnan(lengths), (away < near).astype(np.float64), judged)
+    judged = np.where(judged < _LEAST, 0.0, judged)
+    return np.where(measured.is_tie, np.where(pictures.enters, judged, 0.0), pictures.enters)
 
 
 def _at_start(pictures: PictureEvidence) -> Float64:
@@ -130,27 +174,11 @@ def _at_start(pictures: PictureEvidence) -> Float64:
     for _ in range(2):
         place = met_at(measured, seen(measured, State(), pictures.numbers), weight)
         away = _lengths(pictures, State(), place)
-        usual = (
-            float(
-                np.median(
-                    away[(weight > 0.0) & measured.is_tie & np.isfinite(away)],
-                )
-            )
-            if weight.any()
-            else 0.0
-        )
+        known = (weight > 0.0) & measured.is_tie & np.isfinite(away)
+        usual = float(np.median(away[known])) if known.any() else 0.0
         far = measured.is_tie & ~(away <= _GROSS * max(usual, 0.5))
         weight = np.where(far, 0.0, pictures.enters)
     return weight
-
-
-def _once_more(pictures: PictureEvidence, state: State, weight: Float64) -> Float64:
-    """Returns weights (m,) with those measurements back whose points lie where the others' rays meet now."""
-    measured = pictures.measured
-    place = met_at(measured, seen(measured, state, pictures.numbers), weight)
-    away = _lengths(pictures, state, place) / measured.sigma_px
-    back = measured.is_tie & pictures.enters & (weight == 0.0) & (away < 3.0)
-    return np.where(back, 1.0, weight)
 
 
 def _lengths(pictures: PictureEvidence, state: State, place_m: Float64) -> Float64:
@@ -161,12 +189,16 @@ def _lengths(pictures: PictureEvidence, state: State, place_m: Float64) -> Float
 
 
 def _entering(pictures: PictureEvidence, state: State, place_m: Float64, first_place: Int64, weight: Float64) -> Rows:
-    """Returns the rows of measurements that enter; of a tie point that fewer than two pictures see there are none."""
+    """Returns the rows of measurements that count; a weight below 1 is a larger σ of a tie point.
+
+    Of a tie point that fewer than two pictures see there are none.
+    """
     measured = pictures.measured
     counted = np.bincount(measured.point[weight > 0.0], minlength=len(place_m))
     known = np.isfinite(place_m).all(axis=1) & (counted >= 2)
-    enter = pictures.enters & ((measured.is_tie & known[measured.point]) | ~measured.is_tie)
-    whole = rows_of(measured, state, pictures.numbers, place_m, first_place)
+    enter = (weight > 0.0) & (known[measured.point] | ~measured.is_tie)
+    scaled = replace(measured, sigma_px=measured.sigma_px / np.sqrt(np.where(enter, weight, 1.0)))
+    whole = rows_of(scaled, state, pictures.numbers, place_m, first_place)
     kept = enter[whole.measurement]
     return replace(
         whole, observations=whole.observations.chosen(kept), measurement=whole.measurement[kept],
@@ -174,17 +206,11 @@ def _entering(pictures: PictureEvidence, state: State, place_m: Float64, first_p
     )  # fmt: skip
 
 
-def _change(before: Float64, after: Float64) -> float:
-    """Returns by how much residuals (m, 2) changed (px): 95 % by less."""
-    away = np.hypot(*(after - before).T)
+def _change(before: Float64, after: Float64, weight: Float64) -> float:
+    """Returns by how much residuals (m, 2) of what counts changed (px): 95 % by less."""
+    away = np.hypot(*(after - before)[weight > 0.0].T)
     away = away[np.isfinite(away)]
     return float(np.quantile(away, 0.95)) if away.size else 0.0
-
-
-def _factor(normalised: Float64) -> float:
-    """Returns by how much residuals are larger than their σ, in the median."""
-    known = np.abs(normalised[np.isfinite(normalised)])
-    return float(np.median(known)) / _MEDIAN if known.size else 1.0
 
 
 def _with_sigma(pictures: PictureEvidence, factor: float) -> PictureEvidence:

@@ -206,7 +206,7 @@ class Rounds:
         inverse = self._equations.inverse()
         own, weight = self._own(), self._weight.copy()
         kinds, processes = self._kinds.copy(), self._processes.copy()
-        without = left_out(residual, inverse.variances(self.problem.rows), own, self._counted())
+        without = left_out(residual, inverse.variances(), own, self._counted())
         near, far = self.settings.full_weight_within, self.settings.reject_beyond
         wanted = self.problem.groups.igg_iii(without.statistic, near, far)
         moved = self._moved_to(0.5 * (weight + wanted) if calm else wanted)

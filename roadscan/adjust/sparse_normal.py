@@ -87,6 +87,7 @@ class NormalEquations:
         column = np.repeat(np.arange(size), np.diff(self._starts))
         self._of_prior = np.searchsorted(column * size + self._rows, prior[1] * size + prior[0])
         self._solver: Any = None
+        self._permuted: Rows | None = None
 
     def factor(self, weight: Float64, prior: Float64) -> None:
         """Sum and factor the equations.
@@ -120,7 +121,9 @@ class NormalEquations:
         starts, rows = lower.indptr.astype(np.int64), lower.indices.astype(np.int32)
         diagonal, below = np.zeros(self.size), np.zeros(rows.size)
         selected_inverse(starts, rows, lower.data, np.asarray(pivots, np.float64), diagonal, below)
-        return SelectedInverse(place, starts, rows, diagonal, below)
+        if self._permuted is None:  # the order of the factor is that of the pattern, which stays
+            self._permuted = _permuted(self.rows, place)
+        return SelectedInverse(place, starts, rows, diagonal, below, self._permuted)
 
     def covariances(self, groups: Sequence[Int64]) -> list[Float64]:
         """Returns covariances (m, m) of the unknowns of each group: (L⁻¹ E)ᵀ D⁻¹ (L⁻¹ E), E their unit vectors."""
@@ -153,6 +156,8 @@ class SelectedInverse:
     rows: npt.NDArray[np.int32]
     diagonal: Float64
     below: Float64
+    observed: Rows
+    """The observations, their unknowns replaced by places, ascending within a row."""
 
     def at(self, first: Int64, second: Int64) -> Float64:
         """Returns covariances of pairs of unknowns, of any shape; NaN where the factor lacks the pair."""
@@ -161,9 +166,15 @@ class SelectedInverse:
         entries(*places, self.starts, self.rows, self.diagonal, self.below, found)
         return found.reshape(first.shape)
 
-    def variances(self, rows: Rows) -> Float64:
-        """Returns variances (n,) of the rows' predictions."""
-        found = np.empty(rows.first.size - 1)
-        unknown = self.place[rows.unknown]
-        variances(rows.first, unknown, rows.derivative, self.starts, self.rows, self.diagonal, self.below, found)
+    def variances(self) -> Float64:
+        """Returns variances (n,) of the observations' predictions."""
+        own, found = self.observed, np.empty(self.observed.first.size - 1)
+        variances(own.first, own.unknown, own.derivative, self.starts, self.rows, self.diagonal, self.below, found)
         return found
+
+
+def _permuted(rows: Rows, place: Int64) -> Rows:
+    """Returns rows with the place of each unknown in its stead, ascending within a row."""
+    row = np.repeat(np.arange(rows.first.size - 1), np.diff(rows.first))
+    order = np.lexsort((place[rows.unknown], row))
+    return Rows(rows.first, place[rows.unknown][order], rows.derivative[order])

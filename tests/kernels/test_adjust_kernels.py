@@ -58,7 +58,7 @@ def test_selected_entries_are_those_of_the_inverse(matrix: scipy.sparse.csc_arra
     assert np.isnan(found).all()
     # A prediction from places that a column of the factor holds together.
     k = int(np.argmax(np.diff(starts)))
-    unknown = np.concatenate([rows[starts[k] : starts[k + 1]][::-1], [k]]).astype(np.int64)
+    unknown = np.concatenate([[k], rows[starts[k] : starts[k + 1]]]).astype(np.int64)
     derivative = np.random.default_rng(5).standard_normal(unknown.size)
     first, found = np.array([0, unknown.size], np.int64), np.zeros(1)
     variances(first, unknown, derivative, starts, rows, diagonal, below, found)

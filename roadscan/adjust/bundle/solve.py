@@ -119,7 +119,7 @@ def approached(
         found = adjust(joined, priors, quiet, mountings, pictures.cameras)
         state = state_of(found)
         wide = float(_WIDE[min(number, _WIDE.size) - 1])
-        lengths, factor = _judged(pictures, rows, found, others[0].size)
+        lengths, factor = _judged(pictures, rows, found, others[0].size, robust=number <= _WIDE.size)
         limits = settings.full_weight_within * wide, settings.reject_beyond * wide
         pictures, weight = _with_sigma(pictures, factor), _weights(pictures, state, (lengths, weight), limits)
     tied = pictures.measured.sigma_px[pictures.measured.is_tie]
@@ -127,9 +127,12 @@ def approached(
     return Approached(pictures, rows, place, weight, sigma, number, settled)
 
 
-def _judged(pictures: PictureEvidence, rows: Rows, found: Adjustment, others: int) -> tuple[Float64, float]:
+def _judged(
+    pictures: PictureEvidence, rows: Rows, found: Adjustment, others: int, *, robust: bool
+) -> tuple[Float64, float]:
     """Returns the length (m,) of each measurement's residual against the prediction of all others, in σ, NaN where it
-    did not enter; and by how much tie points are off more than their σ says, in the median.
+    did not enter; and by how much tie points are off more than their σ says: in the median, or the root of their
+    squares over their redundancy.
     """
     own = slice(others, None)
     left_out = found.residual_m[own] / found.redundancy[own]
@@ -143,7 +146,12 @@ def _judged(pictures: PictureEvidence, rows: Rows, found: Adjustment, others: in
     lengths[rows.measurement] = np.sqrt(squares[rows.measurement])
     tie = pictures.measured.is_tie[rows.measurement]
     known = np.abs(statistic[tie & np.isfinite(statistic)])
-    return lengths, float(np.median(known)) / _MEDIAN if known.size else 1.0
+    if not known.size:
+        return lengths, 1.0
+    if robust:
+        return lengths, float(np.median(known)) / _MEDIAN
+    left = (found.residual_m[own] / rows.observations.sigma_m)[tie]
+    return lengths, float(np.sqrt((left**2).sum() / max(float(found.redundancy[own][tie].sum()), 1.0)))
 
 
 def _weights(

@@ -41,7 +41,11 @@ def add_observations(first, unknown, derivative, weight, starts, rows, values):
             continue
         for b in range(first[n], first[n + 1]):
             scaled = weight[n] * derivative[b]
-            column = unknown[b]
+            low, end = starts[unknown[b]], starts[unknown[b] + 1]
             for a in range(first[n], b + 1):
-                place = place_of(rows, starts[column], starts[column + 1], unknown[a])
+                # Unknowns ascend, and most follow one another: the next place is tried first.
+                place = low
+                if rows[low] != unknown[a]:
+                    place = place_of(rows, low, end, unknown[a])
                 values[place] += scaled * derivative[a]
+                low = place + 1

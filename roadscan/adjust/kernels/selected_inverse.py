@@ -88,16 +88,25 @@ def variances(first, unknown, derivative, starts, rows, diagonal, below, found):
 
     Parameters
     ----------
-    first, unknown, derivative : observations in compressed rows; `unknown` are permuted places, in any order.
+    first, unknown, derivative : observations in compressed rows; `unknown` are permuted places, ascending in a row.
     """
     for n in range(first.size - 1):
         total = 0.0
         for b in range(first[n], first[n + 1]):
-            total += derivative[b] * derivative[b] * diagonal[unknown[b]]
-            for a in range(first[n], b):
-                i, j = max(unknown[a], unknown[b]), min(unknown[a], unknown[b])
-                place = place_of(rows, starts[j], starts[j + 1], i)
-                total += 2.0 * derivative[a] * derivative[b] * (below[place] if place >= 0 else np.nan)
+            column = unknown[b]
+            low, end = starts[column], starts[column + 1]
+            inner = 0.0
+            for a in range(b + 1, first[n + 1]):
+                # Places that follow one another stand beside one another: the next one is tried first.
+                place = low
+                if low >= end or rows[low] != unknown[a]:
+                    place = place_of(rows, low, end, unknown[a])
+                if place < 0:
+                    inner = np.nan
+                    break
+                inner += derivative[a] * below[place]
+                low = place + 1
+            total += derivative[b] * (derivative[b] * diagonal[column] + 2.0 * inner)
         found[n] = total
 
 

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.adjust.bundle.picture import residuals_of
 from roadscan.adjust.control.control import ControlPoint, Sighting
 from roadscan.adjust.control.control_faults import listed
 from roadscan.adjust.picture import AdjustmentPicture, Residuals
@@ -271,7 +272,8 @@ def adjust_survey(session: Session) -> None:
     tables = _tables(evidence, solution, held, held_values(collector.mounted, changes), work.tracks)
     keep_tables(session.store, manifest, key, tables)
     shown, not_drawn = shown_seams(again.every, evidence, solution, (held, changes), session.compute)
-    keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), shown), seen.rows)
+    filmed = [] if solution.pictures is None else list(residuals_of(solution.pictures))
+    keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), shown, filmed), seen.rows)
     lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
     lines += picture_lines(solution.pictures, solution.cameras)
     if config.mode in ("joint", "vertical"):

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
+from roadscan.adjust.bundle.picture import CameraResiduals, draw_residuals
 from roadscan.adjust.picture import AdjustmentPicture, draw_adjustment
 from roadscan.adjust.seams_picture import ShownSeam, draw_seams
 from roadscan.adjust.tasks.figures import Rows
@@ -69,22 +70,23 @@ def keep_pictures(
     store: Store,
     manifest: Manifest,
     key: str,
-    shown: tuple[AdjustmentPicture, Sequence[ShownSeam]],
+    shown: tuple[AdjustmentPicture, Sequence[ShownSeam], Sequence[CameraResiduals]],
     sightings: Sequence[Mapping[str, Any]],
 ) -> None:
-    """Draw the outcome and seams, and the picture of each target as each pass saw it; remove those of no target.
+    """Draw the outcome, seams, residuals of cameras, and each target as each pass saw it; remove those of no target.
 
     Without Matplotlib there are only those of targets.
     """
-    outcome, seams = shown
+    outcome, seams, cameras = shown
     targets = {_target_name(row): row for row in sightings if row["picture"]}
     figures = {_WHOLE: partial(draw_adjustment, outcome)} | ({SEAMS: partial(draw_seams, seams)} if seams else {})
+    figures |= {f"camera-{one.camera}": partial(draw_residuals, one) for one in cameras}
     manifest.remove(manifest.beside([PICTURES], {*figures, *targets}))
     for name, draw in figures.items():
         if not can_draw():
             manifest.add([OutputRecord(PICTURES, name, NOT_DRAWN, "", 0, "")])
         elif not manifest.is_current(PICTURES, name, key):
-            keep_file(store, manifest, (PICTURES, name), key, f"{FOLDER}/{_FILES[name]}.png", draw)
+            keep_file(store, manifest, (PICTURES, name), key, f"{FOLDER}/{_FILES.get(name, name)}.png", draw)
     for name, row in targets.items():
         own = key_of(row["picture"], row["picture_columns"], row["status"])
         if not manifest.is_current(PICTURES, name, own):

@@ -287,8 +287,13 @@ def _adjusted(
     for _ in range(_WIDENED):
         found = adjust(joined, evidence.priors, settings, priors, cameras)
         shared = [axis for name in found.verdict.doubted for axis in _AXES[name]]
-        if len(priors) and any((one.sigma[shared] > 0.0).any() for one in priors):
-            priors = tuple(replace(one, sigma=_without(one.sigma, shared)) for one in priors)
+        own = [one for one in priors if one.sensor not in evidence.mounted.cameras]
+        if any((one.sigma[shared] > 0.0).any() for one in own):
+            # Where a camera stands beside the others is no error that all sensors have in common.
+            priors = tuple(
+                one if one.sensor in evidence.mounted.cameras else replace(one, sigma=_without(one.sigma, shared))
+                for one in priors
+            )
             continue
         off = disproved(found.mountings)
         if not off.any():

@@ -1,0 +1,98 @@
+"""Report section on pictures as measurements: tie points, residuals of each camera, control, worst pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+import pyarrow as pa
+
+from roadscan.adjust.tasks.outcome import FOLDER, PICTURES
+from roadscan.report.blocks import Block, Paragraph, Picture, Table
+from roadscan.report.section import Material, Section
+from roadscan.run.session import Session
+
+_WORST: Final = 8  # Pictures that are listed.
+_FEWEST: Final = 10  # Measurements of a picture that is compared.
+
+
+class Pictures(Section):
+    """What pictures measured, and how well they fit."""
+
+    name = "pictures"
+    title = "Pictures: tie points and control"
+    position = 310
+
+    def blocks(self, material: Material) -> Iterator[Block]:
+        """Yield a row for each camera, residual maps, the pictures that fit worst, and control points."""
+        session = material.session
+        rows = _table(session, "picture_residuals")
+        if rows is None:
+            return
+        yield _cameras(rows)
+        for record in session.manifest.of(PICTURES).values():
+            if record.path.startswith(f"{FOLDER}/camera-") and session.store.exists(record.path):
+                yield Picture(session.store.read_bytes(record.path), "Residuals of tie points, before and after", 170.0)
+        yield _worst(rows)
+        control = _table(session, "picture_control")
+        if control is not None:
+            yield _control(control.to_pylist())
+
+
+def _table(session: Session, name: str) -> pa.Table | None:
+    records = [record for record in session.manifest.of(name).values() if record.path]
+    return session.store.read_table(records[0].path) if records else None
+
+
+def _of(rows: pa.Table, by: list[str]) -> list[dict[str, Any]]:
+    """Return counts, sums and squares of the measurements of tie points that count, by run, camera or picture."""
+    used = rows.filter(pa.compute.and_(pa.compute.is_valid(rows["track"]), pa.compute.greater(rows["weight"], 0.0)))
+    columns: dict[str, Any] = {name: used[name] for name in by}
+    for word in ("before", "after"):
+        u, v = used[f"{word}_u_px"], used[f"{word}_v_px"]
+        columns[word] = pa.compute.add(pa.compute.multiply(u, u), pa.compute.multiply(v, v))
+    grouped = pa.table(columns).group_by(by).aggregate([("before", "mean"), ("after", "mean"), ("after", "count")])
+    found: list[dict[str, Any]] = grouped.sort_by([(name, "ascending") for name in by]).to_pylist()
+    return found
+
+
+def _cameras(rows: pa.Table) -> Table:
+    listed = [
+        (
+            one["run"], one["sensor"], f"{one['after_count']:,}", f"{(one['before_mean'] / 2) ** 0.5:.2f}",
+            f"{(one['after_mean'] / 2) ** 0.5:.3f}",
+        )
+        for one in _of(rows, ["run", "sensor"])
+    ]  # fmt: skip
+    return Table(
+        ("run", "camera", "measurements", "RMS before (px)", "RMS after (px)"), listed,
+        "Tie points that count; the RMS is that of one coordinate", "picture_residuals",
+    )  # fmt: skip
+
+
+def _worst(rows: pa.Table) -> Block:
+    every = [one for one in _of(rows, ["run", "sensor", "file"]) if one["after_count"] >= _FEWEST]
+    every.sort(key=lambda one: (-one["after_mean"], one["file"]))
+    listed = [
+        (one["run"], one["sensor"], one["file"], f"{one['after_count']:,}", f"{(one['after_mean'] / 2) ** 0.5:.3f}")
+        for one in every[:_WORST]
+    ]
+    if not listed:
+        return Paragraph(f"No picture has {_FEWEST} measurements that count.", is_warning=True)
+    return Table(
+        ("run", "camera", "picture", "measurements", "RMS after (px)"), listed, "Pictures that fit worst",
+        "worst_pictures",
+    )  # fmt: skip
+
+
+def _control(rows: list[dict[str, Any]]) -> Table:
+    return Table(
+        ("point", "role", "pictures", "before (mm): north, east, down", "after (mm): north, east, down"),
+        [(r["point"], r["role"], str(r["pictures"]), _mm(r, "before"), _mm(r, "after")) for r in rows],
+        "Control points in pictures: where their rays meet, minus survey; check points take no part", "picture_control",
+    )  # fmt: skip
+
+
+def _mm(row: dict[str, Any], word: str) -> str:
+    values = [row[f"{word}_{axis}_m"] for axis in ("north", "east", "down")]
+    return ", ".join("–" if value is None else f"{1e3 * value:+.0f}" for value in values)

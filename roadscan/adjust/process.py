@@ -10,7 +10,7 @@ the process about the line has a closed form (`line_variance`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -81,6 +81,9 @@ class RunPrior:
     """σ over time, which replaces the usual one in the corrected components that it states."""
     fixed: bool = False
     """True where the recorded poses are final, and those of other runs are adjusted to them."""
+    exposures_gps_ns: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(e,) ascending, when pictures were taken: many measurements share the pose of one instant, so that a line between
+    knots would be off for all of them at once."""
 
     def __post_init__(self) -> None:
         if self.last_gps_ns < self.first_gps_ns:
@@ -173,7 +176,8 @@ def knots_of(prior: RunPrior, spacing_s: float) -> Int64:
     """Returns epochs (k,) of a run's knots from its first epoch to its last, at most `spacing_s` apart.
 
     They are evenly spaced but where σ is larger than usual: there they are closer, as the variance by which the process
-    leaves a line between knots, about σ² h / (3 τ), would grow with σ². How many there are has a bound.
+    leaves a line between knots, about σ² h / (3 τ), would grow with σ². How many there are has a bound. Where a picture
+    was taken, its epoch stands in for even knots that are nearer than half the spacing.
     """
     span = prior.last_gps_ns - prior.first_gps_ns
     intervals = max(1, -(-span // max(1, round(spacing_s * NS_PER_S))))
@@ -181,6 +185,8 @@ def knots_of(prior: RunPrior, spacing_s: float) -> Int64:
         return np.array([prior.first_gps_ns], np.int64)
     steps = np.arange(intervals + 1, dtype=np.int64)
     even = np.asarray(prior.first_gps_ns + (span // intervals) * steps + (span % intervals) * steps // intervals)
+    if prior.exposures_gps_ns.size:
+        even = _at_exposures(even, prior.exposures_gps_ns, round(0.5 * spacing_s * NS_PER_S))
     if prior.stated is None:
         return even
     more = _more_knots(prior, even)
@@ -189,6 +195,19 @@ def knots_of(prior: RunPrior, spacing_s: float) -> Int64:
         own = more >= k
         parts.append(even[:-1][own] + np.diff(even)[own] * k // (more[own] + 1))
     return np.unique(np.concatenate(parts))
+
+
+def _at_exposures(even: Int64, exposures_gps_ns: Int64, near_ns: int) -> Int64:
+    """Returns knots (k,) with the epochs of exposures in place of those near them; the first and the last one stay."""
+    own = exposures_gps_ns[(exposures_gps_ns > even[0]) & (exposures_gps_ns < even[-1])]
+    own = own[np.diff(own, prepend=even[0]) > near_ns // 10] if own.size else own
+    if not own.size:
+        return even
+    after = np.clip(np.searchsorted(own, even), 0, own.size - 1)
+    before = np.maximum(after - 1, 0)
+    away = np.minimum(np.abs(own[after] - even), np.abs(own[before] - even))
+    away[[0, -1]] = near_ns + 1
+    return np.union1d(even[away > near_ns], own)
 
 
 def _more_knots(prior: RunPrior, even: Int64) -> Int64:

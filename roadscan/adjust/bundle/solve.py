@@ -28,8 +28,8 @@ _WIDE: Final = np.array([4.0, 2.0, 1.5])
 _LEAST: Final = 0.02  # A weight below this is none.
 _SETTLED_PX: Final = 0.02
 """Where residuals change by less than this from solution to solution (px, 95 %), rows are linear enough."""
-_MEDIAN: Final = 0.6745
-"""Median of the absolute value of a standard normal number."""
+_MEDIAN: Final = 1.1774
+"""Median of the length of two standard normal numbers (Rayleigh)."""
 _SIGMA_PX: Final = (0.05, 3.0)
 """Bounds of the measured σ of a tie point (px): SIFT reaches 0.1 at best, and beyond 3 px nothing was matched."""
 _GROSS: Final = 12.0
@@ -104,12 +104,12 @@ def approached(
     """
     first = places(pictures, others[1])
     quiet = settings.model_copy(update={"estimate_variance_components": False, "max_rounds": _ROUNDS})
-    state, weight = State(), _at_start(pictures)
+    state, weight, heavy = State(), _at_start(pictures), 1.0
     before, settled = np.zeros((0, 2)), False
     for number in range(1, _MOST + 1):
         measured = pictures.measured
         place = met_at(measured, seen(measured, state, pictures.numbers), weight)
-        rows = _entering(pictures, state, place, first, weight)
+        rows = _entering(pictures, state, (place, first), weight, heavy)
         if len(before):
             settled = number > _WIDE.size and _change(before, rows.residual_px, weight) < _SETTLED_PX
         if settled or number == _MOST:
@@ -119,20 +119,21 @@ def approached(
         found = adjust(joined, priors, quiet, mountings, pictures.cameras)
         state = state_of(found)
         wide = float(_WIDE[min(number, _WIDE.size) - 1])
-        lengths, factor = _judged(pictures, rows, found, others[0].size, robust=number <= _WIDE.size)
+        lengths, root = _judged(pictures, rows, found, others[0].size)
         limits = settings.full_weight_within * wide, settings.reject_beyond * wide
-        pictures, weight = _with_sigma(pictures, factor), _weights(pictures, state, (lengths, weight), limits)
+        weight, factor = _weights(pictures, state, (lengths, weight), limits)
+        heavy = max(heavy * root / factor, 1.0) if number > _WIDE.size else 1.0
+        pictures = _with_sigma(pictures, factor)
     tied = pictures.measured.sigma_px[pictures.measured.is_tie]
     sigma = float(np.median(tied)) if tied.size else float("nan")
     return Approached(pictures, rows, place, weight, sigma, number, settled)
 
 
 def _judged(
-    pictures: PictureEvidence, rows: Rows, found: Adjustment, others: int, *, robust: bool
+    pictures: PictureEvidence, rows: Rows, found: Adjustment, others: int
 ) -> tuple[Float64, float]:
     """Returns the length (m,) of each measurement's residual against the prediction of all others, in σ, NaN where it
-    did not enter; and by how much tie points are off more than their σ says: in the median, or the root of their
-    squares over their redundancy.
+    did not enter; and the root of the squares of tie points over their redundancy, in the σ of their rows.
     """
     own = slice(others, None)
     left_out = found.residual_m[own] / found.redundancy[own]
@@ -145,19 +146,18 @@ def _judged(
     lengths = np.full(squares.size, np.nan)
     lengths[rows.measurement] = np.sqrt(squares[rows.measurement])
     tie = pictures.measured.is_tie[rows.measurement]
-    known = np.abs(statistic[tie & np.isfinite(statistic)])
-    if not known.size:
-        return lengths, 1.0
-    if robust:
-        return lengths, float(np.median(known)) / _MEDIAN
     left = (found.residual_m[own] / rows.observations.sigma_m)[tie]
-    return lengths, float(np.sqrt((left**2).sum() / max(float(found.redundancy[own][tie].sum()), 1.0)))
+    freedom = float(found.redundancy[own][tie].sum())
+    return lengths, float(np.sqrt((left**2).sum() / freedom)) if freedom > 1.0 else 1.0
 
 
 def _weights(
     pictures: PictureEvidence, state: State, before: tuple[Float64, Float64], limits: tuple[float, float]
-) -> Float64:
-    """Returns new weights (m,) of IGG III; what did not enter comes back where its point lies on its ray by now.
+) -> tuple[Float64, float]:
+    """Returns new weights (m,) of IGG III, and by how much tie points are off more than their σ says, in the median.
+
+    What did not enter comes back where its point lies on its ray by now. It belongs to the median as well: of those
+    alone that were found good, σ would shrink from solution to solution.
 
     Parameters
     ----------
@@ -165,14 +165,16 @@ def _weights(
     limits : σ of one number up to which a measurement counts wholly, and from which on it does not.
     """
     measured, (lengths, weight) = pictures.measured, before
-    near, far = (length_limit(limit, 2) for limit in limits)
-    slope = (far - np.minimum(np.nan_to_num(lengths, nan=far), far)) / (far - near)
-    judged = np.where(lengths <= near, 1.0, near / np.maximum(np.nan_to_num(lengths, nan=far), near) * slope**2)
     place = met_at(measured, seen(measured, state, pictures.numbers), weight)
     away = _lengths(pictures, state, place) / measured.sigma_px
-    judged = np.where(np.isnan(lengths), (away < near).astype(np.float64), judged)
+    away = np.where(np.isnan(lengths), away, lengths)
+    every = measured.is_tie & pictures.enters & np.isfinite(away)
+    factor = float(np.median(away[every])) / _MEDIAN if every.any() else 1.0
+    near, far = (factor * length_limit(limit, 2) for limit in limits)
+    slope = (far - np.minimum(away, far)) / (far - near)
+    judged = np.where(away <= near, 1.0, near / np.maximum(away, near) * slope**2)
     judged = np.where(judged < _LEAST, 0.0, judged)
-    return np.where(measured.is_tie, np.where(pictures.enters, judged, 0.0), pictures.enters)
+    return np.where(measured.is_tie, np.where(pictures.enters, judged, 0.0), pictures.enters), factor
 
 
 def _at_start(pictures: PictureEvidence) -> Float64:
@@ -196,16 +198,25 @@ def _lengths(pictures: PictureEvidence, state: State, place_m: Float64) -> Float
     return np.where(np.isfinite(away), away, np.inf)
 
 
-def _entering(pictures: PictureEvidence, state: State, place_m: Float64, first_place: Int64, weight: Float64) -> Rows:
+def _entering(
+    pictures: PictureEvidence, state: State, points: tuple[Float64, Int64], weight: Float64, heavy: float
+) -> Rows:
     """Returns the rows of measurements that count; a weight below 1 is a larger σ of a tie point.
 
     Of a tie point that fewer than two pictures see there are none.
+
+    Parameters
+    ----------
+    points : places (p, 3) and their numbers (p,).
+    heavy : by which the σ of tie points that count is larger than the one they are judged by: their errors have heavier
+        tails than a normal distribution.
     """
-    measured = pictures.measured
+    measured, (place_m, first_place) = pictures.measured, points
     counted = np.bincount(measured.point[weight > 0.0], minlength=len(place_m))
     known = np.isfinite(place_m).all(axis=1) & (counted >= 2)
     enter = (weight > 0.0) & (known[measured.point] | ~measured.is_tie)
-    scaled = replace(measured, sigma_px=measured.sigma_px / np.sqrt(np.where(enter, weight, 1.0)))
+    larger = np.where(measured.is_tie, heavy, 1.0) / np.sqrt(np.where(enter, weight, 1.0))
+    scaled = replace(measured, sigma_px=measured.sigma_px * larger)
     whole = rows_of(scaled, state, pictures.numbers, place_m, first_place)
     kept = enter[whole.measurement]
     return replace(

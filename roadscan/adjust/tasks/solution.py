@@ -24,7 +24,7 @@ from roadscan.adjust.quality import LeaveOneOut, leave_one_out
 from roadscan.adjust.settings import AdjustConfig, PosePriors
 from roadscan.adjust.solver_settings import AdjustmentSettings, ControlRules
 from roadscan.adjust.targets.shapes import SurveyedLine
-from roadscan.adjust.tasks.bundle import picture_spans
+from roadscan.adjust.tasks.bundle import exposure_epochs, picture_spans
 from roadscan.adjust.tasks.control_lines import line_findings
 from roadscan.adjust.tasks.doubts import (
     CONTROL,
@@ -154,7 +154,8 @@ def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[
         stated = _stated(plan, trajectory) if config.source == "sigma" else None
         first, last = min(a for a, _ in spans), max(b for _, b in spans)
         held = run in AdjustConfig.of(plan.survey).fixed
-        found.append(RunPrior(run, first, last, _processes(config, stated), stated, held))
+        taken = exposure_epochs(plan, run) if run in filmed else np.zeros(0, np.int64)
+        found.append(RunPrior(run, first, last, _processes(config, stated), stated, held, taken))
     return tuple(found)
 
 

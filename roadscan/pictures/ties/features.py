@@ -48,7 +48,7 @@ def features_of(picture: UInt8, most: int, seen: UInt8 | None = None) -> Feature
     seen : (height, width) 0 where nothing is looked for, such as on the vehicle itself.
     """
     height, width = picture.shape
-    finder = cv2.SIFT.create(nfeatures=0, contrastThreshold=_CONTRAST)
+    finder = cv2.SIFT.create(nfeatures=0, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
     found = finder.detect(picture, seen)
     if not found:
         return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, DESCRIPTOR), np.uint8))

@@ -72,6 +72,7 @@ VIEWS: Final = {
     "urban_street": View(70.0, 1.6, (85.0, 115.0)),
     "highway_three_lanes": View(20.0, 0.0, (85.0, 125.0), raised_m=(12.0, 6.0)),
     "street_with_cameras": View(20.0, 1.6, (30.0, 65.0)),
+    "street_without_gnss": View(20.0, 1.6, (10.0, 60.0)),
     "runway": View(4.0, 6.0, (0.0, 110.0), detail_reach_m=27.0, raised_m=(16.0, 10.0)),
 }
 

@@ -235,6 +235,27 @@ def test_exposure_faults_and_a_second_camera(tmp_path: Path):
     assert rig["camera_back"]["interior"]["focal_px"] == [120.0, 120.0]
 
 
+def test_an_outage_drifts_and_says_so(tmp_path: Path):
+    """Errors of the stated positions by pyproj against the truth, over what the accuracy file states."""
+    outage = {"start_s": 0.5, "duration_s": 4.0, "position_m": 2.0}
+    scene = YARD.changed(length_m=50.0, road={"targets": TARGETS}, camera={"on": False}, noise={"outages": [outage]})
+    errors = []
+    for seed in range(8):
+        made = simulate(scene.changed(seed=seed), tmp_path / str(seed))
+        poses = np.fromfile(made.folder / "raw/run-1/trajectory.sbet", "<f8").reshape(-1, 17)
+        to_ecef = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+        stated = np.stack(to_ecef.transform(*np.degrees(poses[:, [2, 1]].T), poses[:, 3]), axis=-1)
+        true = pq.read_table(truth.load(made.folder).trajectory_file("run-1")).to_pandas()
+        away = stated - true[[f"{a}_world_m" for a in "xyz"]].to_numpy()
+        since = (true["epoch_gps_ns"].to_numpy() - 1e9 * scene.start.timestamp() + 315964800e9 - 18e9) * 1e-9
+        errors.append(np.abs(away).max(axis=1)[[int(np.abs(since - t).argmin()) for t in (-0.5, 2.5, 4.7)]])
+        accuracy = np.fromfile(made.folder / "raw/run-1/trajectory.smrmsg", "<f8").reshape(-1, 10)
+        assert accuracy[:, 1].min() < 0.2 and 1.8 < accuracy[:, 1].max() < 2.1
+    before, within, after = np.array(errors).T
+    assert before.max() < 0.5 and after.max() < 0.5
+    assert 1.0 < np.median(within) < 5.0
+
+
 def test_what_cannot_be_is_refused():
     with pytest.raises(ConfigError, match="picture 0"):
         YARD.changed(camera={"faults": {"doubled": [0]}})

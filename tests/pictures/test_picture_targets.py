@@ -29,11 +29,6 @@ from roadscan.store.store import Store
 from tests.simulate.test_simulate_photogrammetry import SMALL, STREET
 from tests.simulate.test_simulate_photogrammetry import Survey as Truth
 
-KINDS = """
-[picture_targets]
-size_m = 0.9
-codes = { PLATE = { size_m = 0.8, lies = "upright" }, PAINT = { size_m = 0.9, lies = "flat" } }
-"""
 PLATE = {"height_m": 1.4, "size_m": 0.8}
 PLATES = [
     PLATE | {"station_m": 10.0, "offset_m": 4.6, "style": "checker", "name": "P1"},
@@ -56,9 +51,8 @@ YARD = STREET.changed(
 
 
 def ready(folder: Path) -> Path:
-    """The survey of a simulated folder, ingested, with its kinds of targets stated."""
+    """The survey of a simulated folder, ingested."""
     file = folder / "SURVEY.toml"
-    file.write_text(file.read_text() + KINDS)
     survey = Survey.load(file)
     ingest(survey, Store(survey.store_url, survey.config.id))
     return file
@@ -142,6 +136,8 @@ def test_where_there_is_no_target_none_is_found(yard: Path, tmp_path: Path) -> N
     bare = YARD.changed(road={"targets": []}, roadside={"targets": []})
     folder = simulate(bare, tmp_path / "bare").folder
     (folder / "control.csv").write_bytes((yard.parent / "control.csv").read_bytes())
+    told_of_targets = (yard.read_text()).partition("[picture_targets.names]")
+    (folder / "SURVEY.toml").write_text((folder / "SURVEY.toml").read_text() + "".join(told_of_targets[1:]))
     rows, told = targets(ready(folder), tmp_path / "none.csv", "--misses")
     assert rows == []
     assert told.count("run-1/camera/") >= 9, "no reasons are told"

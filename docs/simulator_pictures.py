@@ -152,7 +152,8 @@ def draw(name: str, folder: Path) -> None:
     camera = {"on": True, "mount": mount.model_dump(), "focal_px": 760.0, "distortion": [0.0] * 5, "range_max_m": 200.0}
     raised = write(stretch.changed(**(off | {"camera": camera})), folder / "raised")
     both = np.concatenate([raised.picture(), recorded.picture()], axis=1)
-    cv2.imwrite(str(path_of(f"{name}-views")), cv2.resize(both, None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA))
+    small = cv2.resize(both, None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(path_of(f"{name}-views")), small, [cv2.IMWRITE_JPEG_QUALITY, 82])
 
 
 def write(scene: Scene, folder: Path, *, hits: bool = False) -> Survey:

@@ -316,8 +316,8 @@ class _Shutter:
         self._first_row = -0.5
         span = line_ns * camera.height_px
         count = max(math.ceil(span / _EVENLY_NS), 1)
-        first = epoch_gps_ns + (self._first_row - camera.stamped_row_px) * line_ns
-        borders = np.rint(first + span / count * np.arange(count + 1)).astype(np.int64)
+        first = (self._first_row - camera.stamped_row_px) * line_ns
+        borders = epoch_gps_ns + np.rint(first + span / count * np.arange(count + 1)).astype(np.int64)
         self.epochs: Int64 = np.stack([borders[:-1], borders[1:]], axis=-1)
         """(k, 2) beginning and end of the intervals within which the camera moves evenly."""
         self._rows = camera.height_px / count

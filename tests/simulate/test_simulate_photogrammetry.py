@@ -189,6 +189,23 @@ def test_brightness_is_fixed_to_the_surface_and_only_pictures_see_it(tmp_path: P
     assert logs[0][1] != logs[1][1]
 
 
+def test_a_moving_car_takes_its_brightness_along(tmp_path: Path):
+    """A car that drives ahead at the camera's own speed looks the same in each picture; the road under it does not."""
+    car = {"station_m": 8.0, "offset_m": 1.625, "speed_m_per_s": 10.0, "shade": 150.0}
+    still = {"speed_variation": 0.0, "wander_m": 0.0, "heave_m": 0.0, "sway_deg": 0.0}
+    scene = YARD.changed(
+        length_m=9.0, road={"targets": [], "roughness": None, "waves": []}, vehicle=still,
+        roadside={"moving_cars": [car], "facades": [], "targets": [], "walls": [], "fences": [], "lamp_posts": []},
+        albedo={"beside": {"smooth": 0.3}}, camera={"every_m": 4.0},
+    ).noiseless()  # fmt: skip
+    survey = Survey(simulate(scene, tmp_path / "car").folder)
+    first, second = (survey.picture(i).astype(float) for i in (0, 1))
+    rear, road = np.s_[150:185, 300:350], np.s_[330:390, 100:540]
+    assert first[rear].std() > 8.0 and first[road].std() > 8.0
+    assert np.corrcoef(first[rear].ravel(), second[rear].ravel())[0, 1] > 0.9
+    assert abs(np.corrcoef(first[road].ravel(), second[road].ravel())[0, 1]) < 0.5
+
+
 def test_rows_of_a_rolling_shutter_are_exposed_one_after_another(tmp_path: Path):
     fast = {"speed_m_per_s": 27.8}
     passes, camera = [{"lane": 2, **fast}], {"line_time_us": 60.0, "stamped_row": "last"}

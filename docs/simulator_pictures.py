@@ -72,6 +72,7 @@ VIEWS: Final = {
     "urban_street": View(70.0, 1.6, (85.0, 115.0)),
     "highway_three_lanes": View(20.0, 0.0, (85.0, 125.0), raised_m=(12.0, 6.0)),
     "street_with_cameras": View(20.0, 1.6, (30.0, 65.0)),
+    "street_without_gnss": View(20.0, 1.6, (10.0, 60.0)),
     "runway": View(4.0, 6.0, (0.0, 110.0), detail_reach_m=27.0, raised_m=(16.0, 10.0)),
 }
 
@@ -151,7 +152,8 @@ def draw(name: str, folder: Path) -> None:
     camera = {"on": True, "mount": mount.model_dump(), "focal_px": 760.0, "distortion": [0.0] * 5, "range_max_m": 200.0}
     raised = write(stretch.changed(**(off | {"camera": camera})), folder / "raised")
     both = np.concatenate([raised.picture(), recorded.picture()], axis=1)
-    cv2.imwrite(str(path_of(f"{name}-views")), cv2.resize(both, None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA))
+    small = cv2.resize(both, None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(path_of(f"{name}-views")), small, [cv2.IMWRITE_JPEG_QUALITY, 82])
 
 
 def write(scene: Scene, folder: Path, *, hits: bool = False) -> Survey:

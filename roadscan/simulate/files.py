@@ -12,7 +12,7 @@ import numpy as np
 
 from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.imu import ImuErrors, ImuGrade
-from roadscan.simulate.control import PLATE, control_marks
+from roadscan.simulate.control import PLATE, ControlMark, control_marks
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.logs import SimulatedLog
@@ -37,7 +37,9 @@ def run_id(number: int) -> str:
     return f"run-{number + 1}"
 
 
-def write_survey(scene: Scene, earth: Earth, logs: Sequence[Sequence[SimulatedLog]], file: Path) -> None:
+def write_survey(
+    scene: Scene, earth: Earth, surface: Surface, logs: Sequence[Sequence[SimulatedLog]], file: Path
+) -> None:
     """Write ``SURVEY.toml``: runs with their logs, passes, control points."""
     lines = [f"id = {_text(scene.id)}", f"title = {_text(scene.title)}", f"rig = {_text(RIG_FILE)}", "", "[map]"]
     lines += ['local = { name = "local" }' if earth.is_local else f"crs = {_text(scene.map.crs)}"]
@@ -56,7 +58,19 @@ def write_survey(scene: Scene, earth: Earth, logs: Sequence[Sequence[SimulatedLo
     lines += ['height = "ellipsoidal"', ""]
     if scene.roadside.targets:
         lines += ["[adjust.targets.codes]", f'{PLATE} = {{ shape = "pictures" }}', ""]
+    lines += _picture_targets(scene, control_marks(scene, surface))
     file.write_text("\n".join(lines), encoding="utf-8")
+
+
+def _picture_targets(scene: Scene, marks: Sequence[ControlMark]) -> list[str]:
+    """Return what targets look like in pictures, where the scene has others than painted discs."""
+    if not scene.cameras or all(mark.style in {"", "disc"} and mark.code != PLATE for mark in marks):
+        return []
+    lines = ["[picture_targets.names]"]
+    for mark in marks:
+        lies = "upright" if mark.code == PLATE else "flat"
+        lines.append(f'{mark.name} = {{ styles = ["{mark.style}"], size_m = {mark.size_m!r}, lies = "{lies}" }}')
+    return [*lines, ""]
 
 
 def write_rig(scene: Scene, file: Path, *, nominal: bool = True) -> None:

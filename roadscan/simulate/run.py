@@ -98,7 +98,7 @@ def simulate(
     with own_files.written_for_the_user(target) as new:
         files.write_rig(scene, new / files.RIG_FILE)
         files.write_control(scene, surface, new / files.CONTROL_FILE)
-        files.write_survey(scene, earth, logs, new / files.SURVEY_FILE)
+        files.write_survey(scene, earth, surface, logs, new / files.SURVEY_FILE)
     return SimulatedSurvey(
         folder=target,
         survey_file=target / files.SURVEY_FILE,

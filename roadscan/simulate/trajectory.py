@@ -20,6 +20,7 @@ from roadscan.core.gpstime import NS_PER_S, WEEK_S
 from roadscan.simulate.drive import Drive, Poses
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import Scene
+from roadscan.simulate.scene.rig import Outage
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -88,8 +89,23 @@ def write_accuracy(scene: Scene, drive: Drive, file: Path) -> Iterator[int]:
     rows = np.empty((epochs.size, 10))
     rows[:, 0] = epochs % (WEEK_S * NS_PER_S) / NS_PER_S
     rows[:, 1:] = [*position, *velocity, tilt, tilt, heading]
+    for one in outages_of(scene, drive.number):
+        grown = fading(one, (epochs - drive.start_gps_ns).astype(np.float64) * 1e-9)[:, None]
+        rows[:, 1:4] = np.hypot(rows[:, 1:4], one.position_m * grown)
+        rows[:, 7:10] = np.hypot(rows[:, 7:10], 60.0 * one.attitude_deg * grown)
     file.write_bytes(rows.astype("<f8").tobytes())
     yield epochs.size
+
+
+def outages_of(scene: Scene, number: int) -> list[Outage]:
+    """Return the outages of a pass, counted from 0."""
+    return [one for one in scene.noise.outages if not one.passes or number + 1 in one.passes]
+
+
+def fading(outage: Outage, time_s: Float64) -> Float64:
+    """Return σ (n,) at times since the first profile, as a share of that in an outage's middle; 0 outside."""
+    share = np.clip((time_s - outage.start_s) / outage.duration_s, 0.0, 1.0)
+    return np.asarray(4.0 * share * (1.0 - share))
 
 
 class PoseErrors:
@@ -108,6 +124,20 @@ class PoseErrors:
         self._level_m = noise.pass_step_m * rng.standard_normal(3)
         self._step_m, self._rng = noise.step_m, rng
         self._share = noise.steps_per_minute / 60.0 / scene.trajectory.poses_per_s
+        waves = stream(scene.seed, number, "outages")
+        self._drifts = [(one, waves.standard_normal((2, 6))) for one in outages_of(scene, number)]
+
+    def of(self, drive: Drive, epochs: Int64) -> tuple[Float64, Float64]:
+        """Return errors as :meth:`take` does, of the next poses, whose epochs are (n,), with those of outages."""
+        position, attitude = self.take(epochs.size)
+        time_s = (epochs - drive.start_gps_ns).astype(np.float64) * 1e-9
+        for one, waves in self._drifts:
+            turn = math.pi * (time_s - one.start_s) / one.duration_s
+            wave = np.cos(turn)[:, None] * waves[0] + np.sin(turn)[:, None] * waves[1]
+            wave *= fading(one, time_s)[:, None]
+            position = position + one.position_m * wave[:, :3]
+            attitude = attitude + math.radians(one.attitude_deg) * wave[:, 3:]
+        return position, attitude
 
     def take(self, count: int) -> tuple[Float64, Float64]:
         """Return position errors (count, 3) in metres and attitude errors (count, 3) in radians of the next poses."""
@@ -156,7 +186,7 @@ def _true_rows(drive: Drive, epochs: Int64) -> pa.RecordBatch:
 def _local_rows(drive: Drive, epochs: Int64, errors: PoseErrors) -> pa.RecordBatch:
     """Return stated poses in the local frame, axes forward, right, down."""
     here = drive.poses(epochs)
-    position, attitude = stated_poses(drive, here, *errors.take(len(here.position_ecef_m)))
+    position, attitude = stated_poses(drive, here, *errors.of(drive, epochs))
     quaternion = attitude.as_quat(canonical=True, scalar_first=True)
     return _batch([epochs, *quaternion.T, *position.T], _LOCAL_SCHEMA)
 
@@ -186,7 +216,7 @@ def _sbet(drive: Drive, epochs: Int64, errors: PoseErrors, wander: float) -> Flo
     before, here, after = (drive.poses(epochs + shift) for shift in (-_DIFFERENCE_NS, 0, _DIFFERENCE_NS))
     dt = _DIFFERENCE_NS * 1e-9
     level = drive.earth.ecef_from_level(here.position_ecef_m)
-    position, attitude = stated_poses(drive, here, *errors.take(len(here.position_ecef_m)))
+    position, attitude = stated_poses(drive, here, *errors.of(drive, epochs))
     stated = drive.earth.geographic_from_ecef(position)
     heading, pitch, roll = (level.inv() * attitude).as_euler("ZYX").T
     velocity = level.inv().apply((after.position_ecef_m - before.position_ecef_m) / (2 * dt))

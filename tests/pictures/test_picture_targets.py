@@ -29,11 +29,6 @@ from roadscan.store.store import Store
 from tests.simulate.test_simulate_photogrammetry import SMALL, STREET
 from tests.simulate.test_simulate_photogrammetry import Survey as Truth
 
-KINDS = """
-[picture_targets]
-size_m = 0.9
-codes = { PLATE = { size_m = 0.8, lies = "upright" }, PAINT = { size_m = 0.9, lies = "flat" } }
-"""
 PLATE = {"height_m": 1.4, "size_m": 0.8}
 PLATES = [
     PLATE | {"station_m": 10.0, "offset_m": 4.6, "style": "checker", "name": "P1"},
@@ -56,9 +51,8 @@ YARD = STREET.changed(
 
 
 def ready(folder: Path) -> Path:
-    """The survey of a simulated folder, ingested, with its kinds of targets stated."""
+    """The survey of a simulated folder, ingested."""
     file = folder / "SURVEY.toml"
-    file.write_text(file.read_text() + KINDS)
     survey = Survey.load(file)
     ingest(survey, Store(survey.store_url, survey.config.id))
     return file
@@ -142,6 +136,8 @@ def test_where_there_is_no_target_none_is_found(yard: Path, tmp_path: Path) -> N
     bare = YARD.changed(road={"targets": []}, roadside={"targets": []})
     folder = simulate(bare, tmp_path / "bare").folder
     (folder / "control.csv").write_bytes((yard.parent / "control.csv").read_bytes())
+    told_of_targets = (yard.read_text()).partition("[picture_targets.names]")
+    (folder / "SURVEY.toml").write_text((folder / "SURVEY.toml").read_text() + "".join(told_of_targets[1:]))
     rows, told = targets(ready(folder), tmp_path / "none.csv", "--misses")
     assert rows == []
     assert told.count("run-1/camera/") >= 9, "no reasons are told"
@@ -163,6 +159,22 @@ def test_found_targets_are_read_again_and_give_the_mounting(yard: Path, tmp_path
     report = resect_camera(survey, store, "camera", found, 1.0, write=False)  # the stated lens is off by 2 pixels
     assert report.resection.rms_px < 3.0
     assert {one.measured.point for one in report.checks} <= {"P3", "P4"}
+
+
+def test_what_is_wrong_in_measurements_is_named_and_counted(yard: Path) -> None:
+    lines = ["000000.jpg,P1,1,2,run-1", "000000.jpg,P1,3,4,", "000009.jpg,P1,5,6,", "000000.jpg,P2,5,6,run-7"]
+    (yard.parent / "odd.csv").write_text("\n".join(["picture,point,u_px,v_px,run", *lines, ""]))
+    file = yard.with_name("SURVEY-with-odd-points.toml")
+    log = '[[runs.logs]]\npath = "odd.csv"\nformat = "picture_points_csv"\nsensor = "camera"\n\n[[passes]]'
+    file.write_text(yard.read_text().replace("[[passes]]", log, 1))
+    survey = Survey.load(file)
+    store = Store(survey.store_url + "-odd", survey.config.id)
+    ingest(survey, store)
+    table = measured_points(store, read_log_records(store), survey.rig)
+    assert [(r["run"], r["sensor"], r["point"]) for r in table.rows.to_pylist()] == [("run-1", "camera", "P1")]
+    assert len(table.notes) == 3
+    assert any("000009.jpg" in note and "not in the store" in note for note in table.notes)
+    assert any("P1 stands twice" in note for note in table.notes)
 
 
 def test_a_picture_that_cannot_be_read_costs_itself(yard: Path) -> None:

@@ -189,6 +189,23 @@ def test_brightness_is_fixed_to_the_surface_and_only_pictures_see_it(tmp_path: P
     assert logs[0][1] != logs[1][1]
 
 
+def test_a_moving_car_takes_its_brightness_along(tmp_path: Path):
+    """A car that drives ahead at the camera's own speed looks the same in each picture; the road under it does not."""
+    car = {"station_m": 8.0, "offset_m": 1.625, "speed_m_per_s": 10.0, "shade": 150.0}
+    still = {"speed_variation": 0.0, "wander_m": 0.0, "heave_m": 0.0, "sway_deg": 0.0}
+    scene = YARD.changed(
+        length_m=9.0, road={"targets": [], "roughness": None, "waves": []}, vehicle=still,
+        roadside={"moving_cars": [car], "facades": [], "targets": [], "walls": [], "fences": [], "lamp_posts": []},
+        albedo={"beside": {"smooth": 0.3}}, camera={"every_m": 4.0},
+    ).noiseless()  # fmt: skip
+    survey = Survey(simulate(scene, tmp_path / "car").folder)
+    first, second = (survey.picture(i).astype(float) for i in (0, 1))
+    rear, road = np.s_[150:185, 300:350], np.s_[330:390, 100:540]
+    assert first[rear].std() > 8.0 and first[road].std() > 8.0
+    assert np.corrcoef(first[rear].ravel(), second[rear].ravel())[0, 1] > 0.9
+    assert abs(np.corrcoef(first[road].ravel(), second[road].ravel())[0, 1]) < 0.5
+
+
 def test_rows_of_a_rolling_shutter_are_exposed_one_after_another(tmp_path: Path):
     fast = {"speed_m_per_s": 27.8}
     passes, camera = [{"lane": 2, **fast}], {"line_time_us": 60.0, "stamped_row": "last"}
@@ -233,6 +250,27 @@ def test_exposure_faults_and_a_second_camera(tmp_path: Path):
     assert ahead < -0.9
     rig = tomllib.loads((survey.folder / "RIG.toml").read_text())["sensors"]
     assert rig["camera_back"]["interior"]["focal_px"] == [120.0, 120.0]
+
+
+def test_an_outage_drifts_and_says_so(tmp_path: Path):
+    """Errors of the stated positions by pyproj against the truth, over what the accuracy file states."""
+    outage = {"start_s": 0.5, "duration_s": 4.0, "position_m": 2.0}
+    scene = YARD.changed(length_m=50.0, road={"targets": TARGETS}, camera={"on": False}, noise={"outages": [outage]})
+    errors = []
+    for seed in range(8):
+        made = simulate(scene.changed(seed=seed), tmp_path / str(seed))
+        poses = np.fromfile(made.folder / "raw/run-1/trajectory.sbet", "<f8").reshape(-1, 17)
+        to_ecef = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+        stated = np.stack(to_ecef.transform(*np.degrees(poses[:, [2, 1]].T), poses[:, 3]), axis=-1)
+        true = pq.read_table(truth.load(made.folder).trajectory_file("run-1")).to_pandas()
+        away = stated - true[[f"{a}_world_m" for a in "xyz"]].to_numpy()
+        since = (true["epoch_gps_ns"].to_numpy() - 1e9 * scene.start.timestamp() + 315964800e9 - 18e9) * 1e-9
+        errors.append(np.abs(away).max(axis=1)[[int(np.abs(since - t).argmin()) for t in (-0.5, 2.5, 4.7)]])
+        accuracy = np.fromfile(made.folder / "raw/run-1/trajectory.smrmsg", "<f8").reshape(-1, 10)
+        assert accuracy[:, 1].min() < 0.2 and 1.8 < accuracy[:, 1].max() < 2.1
+    before, within, after = np.array(errors).T
+    assert before.max() < 0.5 and after.max() < 0.5
+    assert 1.0 < np.median(within) < 5.0
 
 
 def test_what_cannot_be_is_refused():

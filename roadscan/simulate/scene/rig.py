@@ -251,6 +251,25 @@ class Encoder(Strict):
     """Its clock; GPS time by default."""
 
 
+class Outage(Strict):
+    """A time in which the stated trajectory drifts, as one without GNSS that was smoothed from both ends.
+
+    The error of each axis is a random wave, of σ `position_m` or `attitude_deg` in the middle, that fades to 0 at both
+    ends as 4 s (1 − s) does, s being the share of the time that has passed. The accuracy file states that σ.
+    """
+
+    start_s: float
+    """Begin, from the first profile of the pass (s)."""
+    duration_s: float = Field(gt=0.0, le=3600.0)
+    """Length (s)."""
+    position_m: float = Field(default=1.0, ge=0.0, le=100.0)
+    """1 σ of north, east and down in its middle (m)."""
+    attitude_deg: float = Field(default=0.0, ge=0.0, le=5.0)
+    """1 σ of roll, pitch and heading in its middle (degrees)."""
+    passes: list[int] = []
+    """Passes in which it occurs, counted from 1; all of them where empty."""
+
+
 class Noise(Strict):
     """Errors of the sensors and of the stated trajectory, 1 σ."""
 
@@ -286,6 +305,8 @@ class Noise(Strict):
     """Steps of the stated position within a pass, on each axis (m) …"""
     steps_per_minute: float = Field(default=0.0, ge=0.0, le=60.0)
     """… and how often they come."""
+    outages: list[Outage] = []
+    """Times in which the stated trajectory drifts."""
     control_m: float = Field(default=0.0, ge=0.0)
     """Error of the control points, on each coordinate (m)."""
 

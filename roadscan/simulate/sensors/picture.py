@@ -1,7 +1,7 @@
 """Renders what a camera sees of a scene: a ray through each pixel, sunlight and shadows, more rays at edges.
 
 With a rolling shutter each row has its own pose. Where surfaces have a random brightness, shadows are cast for each
-second pixel of each second row, and for the others where those around them do not agree.
+second pixel of each second row, and for the others and for further rays where those around them do not agree.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, replace
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -54,9 +54,11 @@ _GLASS: Final = 58.0  # tone of glass
 _HORIZON, _ZENITH, _LAND = 226.0, 168.0, 142.0
 """Tones of the sky, and of the land beyond the verge, which has no surface."""
 _HAZE_M: Final = 300.0  # distance at which haze leaves e⁻¹ of the contrast
+_LIT, _DARK, _MIXED = 0, 1, 2  # states of pixels in the sun
 _EDGE: Final = 16.0
 """Difference of neighbouring pixels from which a pixel gets more rays."""
 _INSIDE_PX: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # further rays
+_CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.bool_)  # a pixel and its four neighbours
 _AROUND: Final = tuple((i, j) for i in (0, -1, 1) for j in (0, -1, 1))  # offsets of a pixel's neighbours
 
 
@@ -95,7 +97,8 @@ def picture(studio: Studio, drive: Drive, epoch_gps_ns: int, number: int) -> Flo
     steps = None if studio.albedos is None else _steps(seen, shape, camera.focal_px)
     tone, plain = eye.tones(seen, plane, steps, shape)
     grey = plain.reshape(*shape, -1).mean(axis=-1)
-    edges = np.flatnonzero((maximum_filter(grey, 3) - minimum_filter(grey, 3) > _EDGE).ravel())
+    around: dict[str, Any] = {"size": 3} if studio.albedos is None else {"footprint": _CROSS}
+    edges = np.flatnonzero((maximum_filter(grey, **around) - minimum_filter(grey, **around) > _EDGE).ravel())
     if edges.size:
         tone[edges] = _closer(eye, seen, plane, steps, edges, shape, _inside(studio, drive, number, edges.size))
     return tone.reshape(*shape, *tone.shape[1:])
@@ -117,6 +120,8 @@ class _Seen:
     """(n,)"""
     row_px: Float32
     """(n,) row of the picture."""
+    column_px: Float32
+    """(n,) column of the picture."""
     tint: Float32 | None = None
     """(n, 3) shares of red, green, blue."""
     place_m: Float64 | None = None
@@ -160,6 +165,8 @@ class _Eye:
         """(3,) direction to the sun, in the camera's axes."""
         self.down: Float64 = level[:, 2]
         """(3,) downwards."""
+        self._states: npt.NDArray[np.int8] | None = None
+        """(h, w) whether pixels and those around them are lit or dark, once the picture's own rays were cast."""
         self._suns = self.sun[None, None] + np.zeros((len(self._shutter.epochs), 2, 1))
         if self._shutter.rolls:
             ends = drive.poses(self._shutter.epochs.ravel()).sensor(self._camera.mount, EYE)[1]
@@ -182,7 +189,9 @@ class _Eye:
                 bodies.append(hits.body[0])
         ray, range_m, shade, object_id, glass, tint = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         single = np.float32
-        seen = _Seen(ray.astype(single), range_m.astype(single), shade.astype(single), object_id, glass, row_px)
+        seen = _Seen(
+            ray.astype(single), range_m.astype(single), shade.astype(single), object_id, glass, row_px, column_px
+        )
         if self._studio.tints is not None:
             seen = replace(seen, tint=tint.astype(single))
         if places:
@@ -199,7 +208,8 @@ class _Eye:
         """
         up = -seen.ray @ self.down.astype(np.float32)
         sky = np.where(up >= 0.0, _HORIZON + (_ZENITH - _HORIZON) * np.sqrt(np.maximum(up, 0.0)), _LAND)
-        light = self._light(seen, plane, None if self._studio.albedos is None else shape)
+        even = self._studio.albedos is None
+        light = self._light(seen, plane, None if even else shape, None if even else seen.column_px)
         near = np.exp(-np.nan_to_num(seen.range_m) / _HAZE_M)
         plain = _lit(seen, light, near, sky)
         if steps is None:
@@ -219,17 +229,27 @@ class _Eye:
             )
         )  # fmt: skip
 
-    def _light(self, seen: _Seen, plane: Float32, shape: tuple[int, int] | None) -> Float32:
+    def _light(self, seen: _Seen, plane: Float32, shape: tuple[int, int] | None, column_px: Float32 | None) -> Float32:
         """Return light (n,) as a share of that of level ground in the sun."""
         sun = self._sun_of(seen.row_px)
         cosine = plane @ sun.astype(np.float32) if sun.ndim == 1 else np.einsum("ij,ij->i", plane, sun)
         facing = np.nan_to_num(cosine, nan=math.sin(math.radians(SUN_ELEVATION_DEG)))
         is_sunny = (facing > 0.0) & np.isfinite(seen.range_m)
         direct = np.where(is_sunny, facing, 0.0).astype(np.float64)
-        if shape is None:
+        if shape is not None:
+            shadow = self._thinned_shadows(seen, is_sunny, shape)
+            self._states = _around_states(is_sunny, shadow, shape)
+        elif self._states is None or column_px is None:
             shadow = self._shadows(seen, np.flatnonzero(is_sunny))
         else:
-            shadow = self._thinned_shadows(seen, is_sunny, shape)
+            last = np.array(self._states.shape) - 1
+            row, column = (
+                np.minimum(np.rint(a).astype(np.int64), end)
+                for a, end in zip((seen.row_px, column_px), last.tolist(), strict=True)
+            )
+            state = self._states[row, column]
+            asked = self._shadows(seen, np.flatnonzero(is_sunny & (state == _MIXED)))
+            shadow = np.concatenate([asked, np.flatnonzero(is_sunny & (state == _DARK))])
         direct[shadow] = 0.0
         light: Float32 = ((_AMBIENT + (1.0 - _AMBIENT) * direct) / _LIT_GROUND).astype(np.float32)
         return light
@@ -296,8 +316,8 @@ class _Shutter:
         self._first_row = -0.5
         span = line_ns * camera.height_px
         count = max(math.ceil(span / _EVENLY_NS), 1)
-        first = epoch_gps_ns + (self._first_row - camera.stamped_row_px) * line_ns
-        borders = np.rint(first + span / count * np.arange(count + 1)).astype(np.int64)
+        first = (self._first_row - camera.stamped_row_px) * line_ns
+        borders = epoch_gps_ns + np.rint(first + span / count * np.arange(count + 1)).astype(np.int64)
         self.epochs: Int64 = np.stack([borders[:-1], borders[1:]], axis=-1)
         """(k, 2) beginning and end of the intervals within which the camera moves evenly."""
         self._rows = camera.height_px / count
@@ -315,6 +335,15 @@ class _Shutter:
         interval, share = self.at(row_px)
         first, last = self.epochs[interval, 0], self.epochs[interval, 1]
         return np.asarray(first + np.rint(share * (last - first)).astype(np.int64))
+
+
+def _around_states(is_sunny: Flags, shadow: Int64, shape: tuple[int, int]) -> npt.NDArray[np.int8]:
+    """Return whether all that faces the sun in a pixel (h, w) and those around it is lit, or is dark; else mixed."""
+    dark = np.zeros(is_sunny.size, np.bool_)
+    dark[shadow] = True
+    is_dark = maximum_filter((is_sunny & dark).reshape(shape), 3)
+    is_lit = maximum_filter((is_sunny & ~dark).reshape(shape), 3)
+    return np.where(is_dark == is_lit, _MIXED, np.where(is_dark, _DARK, _LIT)).astype(np.int8)
 
 
 def _lit(seen: _Seen, light: Float32, near: Float32, sky: Float64) -> Float32:

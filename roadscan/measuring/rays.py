@@ -30,6 +30,8 @@ def rays_of(lens: Lens, pixel: Float64) -> Float64:
         longitude, latitude = (pixel[:, 0] - cx) / fx, (pixel[:, 1] - cy) / fy
         level = np.cos(latitude)
         return np.column_stack([np.sin(longitude) * level, np.sin(latitude), np.cos(longitude) * level])
+    if not len(pixel):
+        return np.zeros((0, 3))
     matrix, distortion = matrix_of(lens), lens.parameters[4:9]
     settled = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ROUNDS, _SETTLED)
     found = cv2.undistortPoints(pixel.reshape(-1, 1, 2), matrix, distortion, criteria=settled).reshape(-1, 2)

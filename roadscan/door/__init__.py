@@ -606,5 +606,5 @@ def _frame(rows: pa.Table, crs: str | None) -> pd.DataFrame:
     return cast("pd.DataFrame", geopandas.GeoDataFrame(frame, geometry=shapes[0], crs=crs))
 
 
-_GEOMETRIES = ("geometry", "outline", "line", "centre")
+_GEOMETRIES = ("geometry", "outline", "line", "centre", "footprint")
 """Columns of GeoParquet tables that DuckDB returns as WKB."""

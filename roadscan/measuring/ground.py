@@ -78,6 +78,17 @@ class Ground:
         cells = {TileId.parse(r.unit): r for r in manifest.of(TILE).values() if r.path}
         known = {TileId.parse(r.unit): r for r in manifest.of(OVERVIEWS).values() if r.path}
         overviews = {tile: r for tile, r in known.items() if tile in cells and cells[tile].key == r.key}
+        return cls.from_records(store, grid, cells, overviews)
+
+    @classmethod
+    def from_records(
+        cls,
+        store: Store,
+        grid: TileGrid,
+        cells: Mapping[TileId, OutputRecord],
+        overviews: Mapping[TileId, OutputRecord],
+    ) -> Ground:
+        """Return the ground of some tiles; nothing is read."""
         return cls(store, grid, cells, overviews, OrderedDict(), OrderedDict())
 
     @property

@@ -72,9 +72,7 @@ class PictureOptions:
     second: Annotated[
         str | None, typer.Option(help="Another picture that shows the same: the place where both rays meet.")
     ] = None
-    second_pixel: Annotated[
-        str | None, typer.Option(metavar="U,V", help="Its pixel in that picture.")
-    ] = None
+    second_pixel: Annotated[str | None, typer.Option(metavar="U,V", help="Its pixel in that picture.")] = None
     sigma_pixel: Annotated[float, typer.Option(min=0.0, help="1 σ of a measured pixel, on each axis (pixels).")] = 0.5
     out: Annotated[Path | None, typer.Option(help="Write the line that was measured as GeoJSON.")] = None
 
@@ -134,7 +132,9 @@ def _measure(session: Session, asked: PictureOptions, reach_m: float) -> None:
     if asked.second is not None and asked.second_pixel is not None:
         if asked.out is not None:
             raise ConfigError("--out takes what was measured in one picture", expected="no --out with --second")
-        place, gap_m = meet(session, (picture, asked.second), (pixels[0], _pixel_of(asked.second_pixel)), asked.sigma_pixel)
+        place, gap_m = meet(
+            session, (picture, asked.second), (pixels[0], _pixel_of(asked.second_pixel)), asked.sigma_pixel
+        )
         _print_places([place])
         typer.echo(f"the rays pass each other by {1e3 * gap_m:.1f} mm")
         return
@@ -161,7 +161,17 @@ def _pixel_of(text: str) -> tuple[float, float]:
 
 
 def _print_places(places: Sequence[MeasuredPlace]) -> None:
-    head = ("u px", "v px", "easting m", "northing m", "height m", "σ east mm", "σ north mm", "σ height mm", "distance m")
+    head = (
+        "u px",
+        "v px",
+        "easting m",
+        "northing m",
+        "height m",
+        "σ east mm",
+        "σ north mm",
+        "σ height mm",
+        "distance m",
+    )
     rows = []
     for one in places:
         pixel = f"{one.u_px:g}", f"{one.v_px:g}"

@@ -33,7 +33,7 @@ _RADII_M: Final = (0.06, 0.12, 0.25, 0.5, 1.0)
 """A plane goes through the cells within the smallest of these radii that holds enough of them (m)."""
 _LEAST_CELLS: Final = 12  # A plane needs so many cells …
 _LEAST_SPREAD: Final = 0.2
-"""… whose standard deviation in their narrowest direction is at least this share of the radius; evenly spread it is 0.5."""
+"""… whose standard deviation in their narrowest direction is at least this share of the radius (0.5 evenly spread)."""
 _OUTLYING: Final = 4.0
 """Cells farther from the plane than so many times their scatter take no part in it."""
 
@@ -198,7 +198,7 @@ def _plane(near: Float64, radius_m: float) -> tuple[float, Float64, float] | Non
         if used.sum() < _LEAST_CELLS:
             return None
     cofactor = np.linalg.inv(design[used].T @ design[used])
-    return float(values[0]) + level, values[1:], float(scatter * np.sqrt(1.0 + cofactor[0, 0]))
+    return float(values[0]) + level, np.asarray(values[1:], np.float64), float(scatter * np.sqrt(1.0 + cofactor[0, 0]))
 
 
 def _kept(held: OrderedDict[TileId, T], tile: TileId, read: Callable[[TileId], T], most: int) -> T:

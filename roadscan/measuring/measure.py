@@ -267,17 +267,17 @@ def _met(
     miss = [parting, -parting]
     for k, ray, spread, share, off, t in zip(numbers, rays, spreads, shares, miss, along, strict=True):
         moves = _moves(poses, k, ray, t)
-        joint.append((share @ moves, off @ moves, k))
+        joint.append((share @ moves, off @ moves))
         across_ray = poses.map_from_ned[k] @ poses.ned_from_camera[k]
         noise = t**2 * across_ray @ spread @ across_ray.T
         covariance += share @ noise @ share.T
         apart += off @ noise @ off.T
     shared = poses.correlation(*numbers) * poses.sigma[numbers[0]] * poses.sigma[numbers[1]]
-    for which, total in ((0, covariance), (1, apart)):
-        (one, other) = (part[which] for part in joint)
-        total += one @ np.diag(poses.sigma[numbers[0]] ** 2) @ one.T
-        total += other @ np.diag(poses.sigma[numbers[1]] ** 2) @ other.T
-        total += one @ np.diag(shared) @ other.T + other @ np.diag(shared) @ one.T
+    own = [np.diag(poses.sigma[k] ** 2) for k in numbers]
+    for which, summed in ((0, covariance), (1, apart)):
+        one, other = (part[which] for part in joint)
+        summed += one @ own[0] @ one.T + other @ own[1] @ other.T  # noqa: PLW2901 — in place
+        summed += one @ np.diag(shared) @ other.T + other @ np.diag(shared) @ one.T  # noqa: PLW2901 — in place
     feet = [eye + t * unit for eye, unit, t in zip(eyes, units, along, strict=True)]
     gap = float(np.linalg.norm(feet[0] - feet[1]))
     words = []

@@ -33,7 +33,8 @@ def omega_phi_kappa_deg(map_from_camera: Float64) -> Float64:
     r = map_from_camera @ _IMAGE_FROM_CAMERA
     omega, phi = np.arctan2(-r[:, 1, 2], r[:, 2, 2]), np.arcsin(np.clip(r[:, 0, 2], -1.0, 1.0))
     kappa = np.arctan2(-r[:, 0, 1], r[:, 0, 0])
-    return np.degrees(np.stack([omega, phi, kappa], axis=-1))
+    out: Float64 = np.degrees(np.stack([omega, phi, kappa], axis=-1))
+    return out
 
 
 def yaw_pitch_roll_deg(ned_from_camera: Float64) -> Float64:

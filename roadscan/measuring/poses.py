@@ -53,7 +53,7 @@ class PicturePoses:
     ned_from_camera: Float64
     """(n, 3, 3) rotations."""
     influence: Float64
-    """(n, 6, 12) how errors (position in north, east, down; attitude, lever arm, boresight about and along body axes)
+    """(n, 6, 12) how errors (position in north, east, down; attitude, lever arm, boresight by body axes)
     move the camera (north, east, down; m) and turn it (about north, east, down; rad)."""
     sigma: Float64
     """(n, 12) 1 σ of those errors (m and rad)."""
@@ -144,7 +144,7 @@ def _pose_sigma(plan: SurveyPlan, source: TrajectorySource, epochs: Int64) -> tu
     settings, store = plan.survey.config.navigation.calibration, plan.store
     sigma = pose_sigma(store, plan.records, source, epochs, settings)
     _, stated = stated_pose_sigma(store, plan.records, source)
-    known = np.isfinite(stated).any(axis=0) if len(stated) else np.zeros(6, np.bool_)
+    known = [bool(np.isfinite(stated[:, k]).any()) for k in range(6)]
     span = (int(epochs.min()), int(epochs.max()))
     corrections = load_corrections(store, source.run)
     trajectory = load_trajectory(store, source, [span], plan.ground.max_gap_s)
@@ -152,13 +152,13 @@ def _pose_sigma(plan: SurveyPlan, source: TrajectorySource, epochs: Int64) -> tu
         since = (trajectory.epochs_gps_ns - span[0]).astype(np.float64)
         for k in range(3):
             sigma[:, k] = np.interp((epochs - span[0]).astype(np.float64), since, trajectory.sigma_ned_m[:, k])
-        known[:3] = True
+        known[:3] = [True] * 3
     if corrections is not None and corrections.sigma is not None and np.isfinite(corrections.sigma[:, 3:]).all():
         since = (corrections.epochs_gps_ns - span[0]).astype(np.float64)
         for k in range(3, 6):
             sigma[:, k] = np.interp((epochs - span[0]).astype(np.float64), since, corrections.sigma[:, k])
-        known[3:] = True
-    missing = [words for first, words in _WORDS.items() if not known[first : first + 3].all()]
+        known[3:] = [True] * 3
+    missing = [words for first, words in _WORDS.items() if not all(known[first : first + 3])]
     return sigma, f"σ of {' and '.join(missing)} as in navigation.calibration" if missing else ""
 
 

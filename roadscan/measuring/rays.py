@@ -62,10 +62,8 @@ def pixels_of(lens: Lens, point: Float64) -> Float64:
 
 def ray_slopes(lens: Lens, pixel: Float64) -> Float64:
     """Return derivatives (m, 3, 2) of the unit vectors by u and v, over a pixel about each (m, 2)."""
-    parts = []
-    for axis in np.eye(2):
-        parts.append(rays_of(lens, pixel + 0.5 * axis) - rays_of(lens, pixel - 0.5 * axis))
-    return np.stack(parts, axis=-1)
+    steps = 0.5 * np.eye(2)
+    return np.stack([rays_of(lens, pixel + step) - rays_of(lens, pixel - step) for step in steps], axis=-1)
 
 
 def matrix_of(lens: Lens) -> Float64:

@@ -58,9 +58,10 @@ def write_geojson_of(path: Path, measured: Measured, frame: MapFrame) -> int:
     single = len(kept) == 1
     geometry = {"type": "Point" if single else "LineString", "coordinates": coordinates[0] if single else coordinates}
     about = {
-        "run": measured.run, "camera": measured.camera, "picture": measured.file.name, "sigma_assumed": measured.assumed,
+        "run": measured.run, "camera": measured.camera, "picture": measured.file.name,
+        "sigma_assumed": measured.assumed,
         "left_out": len(measured.places) - len(kept), "length_m": round(_length_m(places), _METRE_DECIMALS),
-        "vertices": [{n: _rounded(v) for n, v in row.items() if n not in ("reason",)} for row in place_rows(kept)],
+        "vertices": [{n: _rounded(v) for n, v in row.items() if n != "reason"} for row in place_rows(kept)],
     }  # fmt: skip
     feature = {"type": "Feature", "geometry": geometry, "properties": about}
     path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}, indent=1, ensure_ascii=False))

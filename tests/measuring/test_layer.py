@@ -102,7 +102,7 @@ def test_footprints_hold_what_the_pictures_show(measured_drive: Drive, layer: ge
 
 def test_the_geopackage_holds_the_same(measured_drive: Drive, layer: geopandas.GeoDataFrame) -> None:
     file = measured_drive.survey_file.parent / FOLDER / "pictures.gpkg"
-    assert {name: kind for name, kind in pyogrio.list_layers(file)} == {
+    assert dict(pyogrio.list_layers(file)) == {
         "pictures": "Point Z", "footprints": "Polygon Z",
     }  # fmt: skip
     rows, prints = (pyogrio.read_dataframe(file, layer=name) for name in ("pictures", "footprints"))
@@ -140,5 +140,3 @@ def test_pictures_without_a_pose_say_why(measured_drive: Drive, tmp_path: Path) 
     assert stage_named("pictures").state(again).stale == 0
     package = pyogrio.read_dataframe(one.survey_file.parent / FOLDER / "pictures.gpkg", layer="pictures")
     assert len(package) == len(rows) and package["without_pose"].notna().sum() == 2
-
-

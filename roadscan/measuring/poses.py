@@ -45,7 +45,7 @@ class PicturePoses:
     place_m: Float64
     """(n, 3) easting, northing, height of the projection centres."""
     geographic: Float64
-    """(n, 3) longitude, latitude (degrees) and ellipsoidal height (m) in the trajectory's datum; NaN of local frames."""
+    """(n, 3) longitude, latitude (degrees), ellipsoidal height (m) in the trajectory's datum; NaN of local frames."""
     camera_from_map: Float64
     """(n, 3, 3) from differences on the map to camera axes: a rotation with the map's scale in it."""
     map_from_ned: Float64
@@ -53,7 +53,7 @@ class PicturePoses:
     ned_from_camera: Float64
     """(n, 3, 3) rotations."""
     influence: Float64
-    """(n, 6, 12) how errors (position in north, east, down; attitude, lever arm, boresight by body axes)
+    """(n, 6, 12) how errors (of position by north, east, down; of attitude, lever arm, boresight by body axes)
     move the camera (north, east, down; m) and turn it (about north, east, down; rad)."""
     sigma: Float64
     """(n, 12) 1 σ of those errors (m and rad)."""

@@ -54,6 +54,8 @@ def write_survey(scene: Scene, earth: Earth, logs: Sequence[Sequence[SimulatedLo
             lines += [f'lane = "{one.lane}"', f"direction = {_text(one.direction)}"]
     lines += ["", "[[control]]", f"path = {_text(CONTROL_FILE)}", f"crs = {_text(scene.map.crs)}"]
     lines += ['height = "ellipsoidal"', ""]
+    if scene.camera.on:
+        lines += ["[privacy]", 'pictures = "off" # nobody real is in simulated pictures', ""]
     file.write_text("\n".join(lines), encoding="utf-8")
 
 

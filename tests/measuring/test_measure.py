@@ -111,9 +111,6 @@ def test_stated_sigma_is_right_where_poses_and_mounting_are_disturbed(measured_d
         error = place.place_m - corners[one]
         stereo.append(error @ np.linalg.solve(place.covariance_m2, error) / 3)
     rms = np.sqrt(np.mean(np.array(normalised) ** 2, axis=0))
-    print(
-        f"errors over σ: {rms.round(2)}, joint {np.sqrt(np.mean(squares)):.2f}, stereo {np.sqrt(np.mean(stereo)):.2f}"
-    )
     assert (rms[:2] > 0.7).all() and (rms[:2] < 1.3).all()
     assert 0.7 < np.sqrt(np.mean(squares)) < 1.3
     assert 0.7 < np.sqrt(np.mean(stereo)) < 1.3

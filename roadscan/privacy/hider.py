@@ -72,7 +72,7 @@ class Hider:
     def key(self) -> str:
         """Hash of the settings, the network and the code."""
         model = "" if self.model is None else file_digest(self.model)
-        code = code_digest(f"{__name__}:Hider.hide")
+        code = code_digest(f"{__name__}:Hider")
         return key_of(code, self.config.model_dump(mode="json", exclude={"detector": {"model"}}), model)
 
     def key_of(self, pictures: Pictures, number: int) -> str:

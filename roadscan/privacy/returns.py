@@ -41,6 +41,7 @@ _STAYS_S: Final = 1.0
 _CUBE_M: Final = 0.5  # Edge of such a cube (m).
 _ONE_THING_M: Final = 0.7
 """Returns nearer to each other belong to one thing (m)."""
+_GRAIN_M: Final = 0.25  # Edge of the cubes that stand for the returns in them when things are told apart (m).
 _AROUND_M: Final = 0.25
 """Around each return so much is hidden: scanners leave gaps, and glass returns nothing (m)."""
 _KEPT_SQUARES: Final = 12  # Squares whose returns stay in memory.
@@ -141,14 +142,20 @@ def _read(path: Path) -> _Seen:
     return _Seen(place, code[own], epoch, stays)
 
 
+def _things(place_m: Float64) -> tuple[int, Int64]:
+    """Return how many things returns (n, 3) show, and the number of each one's thing: cubes that are near to others."""
+    cube, of_return = np.unique(np.floor(place_m / _GRAIN_M).astype(np.int64), axis=0, return_inverse=True)
+    pairs = scipy.spatial.cKDTree(cube).query_pairs(_ONE_THING_M / _GRAIN_M, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs), np.int8), pairs.T), shape=(len(cube), len(cube)))
+    count, thing = connected_components(graph, directed=False)
+    return int(count), thing[of_return.reshape(-1)]
+
+
 def _covered(pictures: Pictures, number: int, place_m: Float64, what: str) -> list[Region]:
     """Return a region for each thing that returns (n, 3) of one class belong to."""
     if not len(place_m):
         return []
-    pairs = scipy.spatial.cKDTree(place_m).query_pairs(_ONE_THING_M, output_type="ndarray")
-    size = len(place_m)
-    graph = coo_matrix((np.ones(len(pairs), np.int8), pairs.T), shape=(size, size))
-    count, thing = connected_components(graph, directed=False)
+    count, thing = _things(place_m)
     views = pictures.views
     lens = views.lenses[views.lens[number]]
     world = world_places(pictures, pictures.worlds[views.world[number]], place_m)

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from roadscan.cli import app
 from roadscan.store.codecs.jpeg_segments import comment_of, with_comment, with_tags, without_tags
-from tests.measuring.conftest import DISTORTION, HEIGHT, MATRIX, WIDTH, Drive, measured_drive  # noqa: F401
+from tests.measuring.drive import DISTORTION, HEIGHT, MATRIX, WIDTH, Drive
 
 BAR_PX = 0.3
 
@@ -31,7 +31,7 @@ def exported(drive: Drive, kind: str, out: Path, *options: str) -> str:
 
 def points_file(drive: Drive, file: Path) -> np.ndarray:
     """Control points on the road and above it as the exports take them."""
-    places = np.vstack([drive.corners(), drive.corners() + [[0.0, 0.0, 1.2]]])
+    places = np.vstack([drive.corners(), drive.corners() + np.array([0.0, 0.0, 1.2])])
     with file.open("w", newline="") as stream:
         rows = csv.writer(stream)
         rows.writerow(["easting_m", "northing_m", "height_m"])
@@ -103,7 +103,7 @@ def test_control_points_are_seen_where_they_truly_are(
     measured_drive: Drive,
     tmp_path: Path,
     kind: str,
-    read,  # noqa: F811
+    read,
 ) -> None:
     places = points_file(measured_drive, tmp_path / "points.csv")
     exported(measured_drive, kind, tmp_path / "out", "--points", str(tmp_path / "points.csv"))
@@ -122,7 +122,7 @@ def test_control_points_are_seen_where_they_truly_are(
 
 def test_without_points_the_list_is_empty_and_a_second_export_is_refused(
     measured_drive: Drive,
-    tmp_path: Path,  # noqa: F811
+    tmp_path: Path,
 ) -> None:
     told = exported(measured_drive, "colmap", tmp_path / "out", "--run", "run-1", "--camera", "camera")
     assert "raw/run-1/camera" in told
@@ -136,7 +136,7 @@ def test_without_points_the_list_is_empty_and_a_second_export_is_refused(
     assert CliRunner().invoke(app, unknown).exit_code != 0
 
 
-def test_copies_say_where_they_were_taken(measured_drive: Drive, tmp_path: Path) -> None:  # noqa: F811
+def test_copies_say_where_they_were_taken(measured_drive: Drive, tmp_path: Path) -> None:
     exported(measured_drive, "pictures", tmp_path / "out")
     raw = measured_drive.survey_file.parent / "raw" / "run-1" / "camera"
     to_degrees = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
@@ -181,7 +181,7 @@ def test_copies_say_where_they_were_taken(measured_drive: Drive, tmp_path: Path)
         assert float(rows[f"run-1/camera/{file}"]["yaw_deg"]) == pytest.approx(yaw, abs=1e-5)
 
 
-def test_undistorted_copies_belong_to_their_pinhole(measured_drive: Drive, tmp_path: Path) -> None:  # noqa: F811
+def test_undistorted_copies_belong_to_their_pinhole(measured_drive: Drive, tmp_path: Path) -> None:
     """Patches around control points are the same in the picture and in the copy, at the pinhole's pixel."""
     exported(measured_drive, "pictures", tmp_path / "out", "--undistorted")
     camera = json.loads((tmp_path / "out" / "cameras.json").read_text())["camera"]
@@ -195,14 +195,13 @@ def test_undistorted_copies_belong_to_their_pinhole(measured_drive: Drive, tmp_p
     )
     ray = np.column_stack([(grid - MATRIX[:2, 2]) / MATRIX[0, 0], np.ones(len(grid))])
     where = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), MATRIX, np.array(DISTORTION))[0].reshape(-1, 2)
-    samples = cv2.remap(
-        bent, where.astype(np.float32)[None, :, 0], where.astype(np.float32)[None, :, 1], cv2.INTER_LINEAR
-    )
+    columns, rows = where.astype(np.float32).T[:, None]
+    samples = cv2.remap(bent, columns, rows, cv2.INTER_LINEAR)
     own = flat[grid[:, 1].astype(int), grid[:, 0].astype(int)]
     assert np.median(np.abs(samples[0] - own)) < 2.0 and np.abs(where - grid).max() > 5.0
 
 
-def test_jpeg_tags_leave_all_else_as_it_was(measured_drive: Drive) -> None:  # noqa: F811
+def test_jpeg_tags_leave_all_else_as_it_was(measured_drive: Drive) -> None:
     raw = measured_drive.survey_file.parent / "raw" / "run-1" / "camera"
     content = (raw / next(iter(measured_drive.poses))).read_bytes()
     tagged = with_tags(content, b"MM\0*\0\0\0\x08\0\0", b"<x/>")

@@ -19,7 +19,7 @@ from roadscan.core.survey import Survey
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.survey.run import run_stages
-from tests.measuring.conftest import FOCAL, HEIGHT, WIDTH, Drive
+from tests.measuring.drive import FOCAL, HEIGHT, WIDTH, Drive
 from tests.surveys import Lines
 
 FOLDER = "store/survey=demo/products/pictures"

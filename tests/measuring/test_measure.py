@@ -18,7 +18,7 @@ from roadscan.measuring.kernels.march import BELOW, NO_GROUND, first_hits
 from roadscan.measuring.measure import measure, meet
 from roadscan.run.session import Session
 from roadscan.store.small_tables import write_small
-from tests.measuring.conftest import MATRIX, Drive
+from tests.measuring.drive import MATRIX, Drive
 from tests.surveys import changed
 
 POSE_SIGMA = np.array([0.03, 0.02, 0.04, 8e-4, 6e-4, 1.5e-3])

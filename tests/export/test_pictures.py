@@ -168,10 +168,10 @@ def test_copies_say_where_they_were_taken(measured_drive: Drive, tmp_path: Path)
             for one in ElementTree.fromstring(xmp.split("?>", 1)[1].rsplit("<?", 1)[0]).iter()
             for name, value in one.items()
         }
-        east_north = np.array([[-np.sin(np.radians(lon)), np.cos(np.radians(lon)), 0.0],
-                               [-np.sin(np.radians(lat)) * np.cos(np.radians(lon)),
-                                -np.sin(np.radians(lat)) * np.sin(np.radians(lon)), np.cos(np.radians(lat))]])  # fmt: skip
-        east, north = east_north @ turn.as_matrix()[:, 0]
+        along, up = np.radians([lon, lat])
+        to_east = [-np.sin(along), np.cos(along), 0.0]
+        to_north = [-np.sin(up) * np.cos(along), -np.sin(up) * np.sin(along), np.cos(up)]
+        east, north = np.array([to_east, to_north]) @ turn.as_matrix()[:, 0]
         yaw = np.degrees(np.arctan2(east, north)) % 360.0
         assert float(place[gps.GPSImgDirection]) == pytest.approx(yaw, abs=1e-5)
         assert float(about["Yaw"]) == pytest.approx(yaw, abs=1e-5)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from roadscan.core.errors import DamagedError
 from roadscan.georeference.picture_axes import camera_from_map
+from roadscan.measuring.poses import picture_poses
 from roadscan.navigation.tasks.taken_pictures import taken_pictures
 from roadscan.pictures.placed import Pictures as PlacedPictures
 from roadscan.pictures.views import HEIGHT, WIDTH
@@ -169,8 +172,17 @@ def _poses(material: Material, held: PlacedPictures, numbers: list[int], epochs:
         "url": [picture_url(material, held, k) for k in numbers], "name": [held.name(k) for k in numbers],
         "epoch_gps_ns": [epochs[k] for k in numbers],
         "easting_m": np.round(place[:, 0], 5), "northing_m": np.round(place[:, 1], 5),
-        "height_m": np.round(place[:, 2], 5), "camera_from_map": turn.reshape(-1, 9), "sigma_m": [None] * len(numbers),
+        "height_m": np.round(place[:, 2], 5), "camera_from_map": turn.reshape(-1, 9),
+        "sigma_m": np.round(_sigma_m(material, held)[numbers], 4),
     }  # fmt: skip
+
+
+@functools.lru_cache(maxsize=2)
+def _sigma_m(material: Material, held: PlacedPictures) -> npt.NDArray[np.float64]:
+    """Return the horizontal 1 σ (n,) of the projection centres, √(σ_north² + σ_east²)."""
+    spread = picture_poses(material.plan, held).covariance
+    out: npt.NDArray[np.float64] = np.sqrt(spread[:, 0, 0] + spread[:, 1, 1])
+    return out
 
 
 def _epochs(material: Material, held: PlacedPictures) -> list[str]:

@@ -173,13 +173,16 @@ def _poses(material: Material, held: PlacedPictures, numbers: list[int], epochs:
         "epoch_gps_ns": [epochs[k] for k in numbers],
         "easting_m": np.round(place[:, 0], 5), "northing_m": np.round(place[:, 1], 5),
         "height_m": np.round(place[:, 2], 5), "camera_from_map": turn.reshape(-1, 9),
-        "sigma_m": np.round(_sigma_m(material, held)[numbers], 4),
+        "sigma_m": np.round(_sigma_m(material)[numbers], 4),
     }  # fmt: skip
 
 
 @functools.lru_cache(maxsize=2)
-def _sigma_m(material: Material, held: PlacedPictures) -> npt.NDArray[np.float64]:
+def _sigma_m(material: Material) -> npt.NDArray[np.float64]:
     """Return the horizontal 1 σ (n,) of the projection centres, √(σ_north² + σ_east²)."""
+    held = placed_pictures(material)
+    if held is None:
+        return np.zeros(0)
     spread = picture_poses(material.plan, held).covariance
     out: npt.NDArray[np.float64] = np.sqrt(spread[:, 0, 0] + spread[:, 1, 1])
     return out

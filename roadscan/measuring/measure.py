@@ -171,6 +171,9 @@ def measured_places(
         if not np.isfinite(one).all():
             found.append(_nowhere(u, v, "the lens has no ray there: its distortion has no inverse"))
             continue
+        if lens.hidden.size and lens.hidden[_nearest(v, lens.hidden.shape[0]), _nearest(u, lens.hidden.shape[1])]:
+            found.append(_nowhere(u, v, "the pixel shows the survey's own vehicle (own_vehicle_px of the rig file)"))
+            continue
         if hit < 0.0:
             found.append(_nowhere(u, v, _why(hit, reach_m)))
             continue
@@ -364,6 +367,11 @@ def _covariance(
 def _pixel_covariance(by_pixel: Float64, sigma_px: float) -> Float64:
     """Return the covariance (3, 3) of a unit ray in camera axes."""
     return sigma_px**2 * by_pixel @ by_pixel.T
+
+
+def _nearest(at: float, size: int) -> int:
+    """Return the number of the pixel that holds a place along a side."""
+    return min(max(int(at + 0.5), 0), size - 1)
 
 
 def _nowhere(u: float, v: float, reason: str) -> MeasuredPlace:

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Final
 
+from roadscan.core.extras import is_installed
 from roadscan.core.survey import Survey
 from roadscan.measuring.layer import GEOPACKAGE, PRODUCT, PictureRows, write_picture_package, write_rows
 from roadscan.measuring.settings import PicturesConfig
@@ -44,6 +45,9 @@ class PictureLayer(Stage):
     def run(self, session: Session) -> None:
         """Write the files that are missing or stale."""
         manifest = session.manifest
+        if self.is_asked(session.survey) and not is_installed("cv2"):
+            session.note('no layer of pictures without the package opencv: pip install "roadscan[opencv]"')
+            return
         tasks = row_tasks(session) if self.is_asked(session.survey) else []
         manifest.remove(manifest.beside({PRODUCT}, {*(t.unit for t in tasks), *((GEOPACKAGE,) if tasks else ())}))
         if not tasks:
@@ -61,7 +65,7 @@ class PictureLayer(Stage):
 
     def state(self, session: Session) -> StageState:
         """Files that are missing or stale."""
-        if not self.is_asked(session.survey):
+        if not self.is_asked(session.survey) or not is_installed("cv2"):
             return StageState()
         tasks, manifest = row_tasks(session), session.manifest
         units = [(PRODUCT, t.unit, t.key) for t in tasks]

@@ -20,6 +20,7 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.survey.run import run_stages
 from tests.measuring.drive import FOCAL, HEIGHT, WIDTH, Drive
+from tests.surface.test_surfaces import TwoThreads
 from tests.surveys import Lines
 
 FOLDER = "store/survey=demo/products/pictures"
@@ -112,6 +113,28 @@ def test_the_geopackage_holds_the_same(measured_drive: Drive, layer: geopandas.G
         assert one.equals_exact(shapely.from_wkb(shapely.to_wkb(same)), 1e-6)
     table = rs.open_survey(measured_drive.survey_file).table("pictures")
     assert len(table) == len(layer) and table.geometry.iloc[0].has_z and table["footprint"].iloc[0].area > 1.0
+
+
+def test_workers_and_files_change_no_byte(
+    measured_drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = sorted((measured_drive.survey_file.parent / FOLDER).iterdir())
+    before = {file.name: file.read_bytes() for file in files}
+    one = Drive(measured_drive.copy_with_store_to(tmp_path / "survey").survey_file)
+    session = Session(Survey.load(one.survey_file), one.store(), TwoThreads(), reporter=Lines())
+    session.manifest.remove(list(session.manifest.of("pictures").values()))
+    run_stages(session, [stage_named("pictures")])
+    folder = one.survey_file.parent / FOLDER
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    monkeypatch.setattr("roadscan.measuring.work._IN_A_FILE", 2)
+    again = Session(Survey.load(one.survey_file), one.store(), TwoThreads(), reporter=Lines())
+    run_stages(again, [stage_named("pictures")])
+    parts = sorted(folder.glob("*.parquet"))
+    assert len(parts) == 3
+    joined = np.concatenate([geopandas.read_parquet(part)["kappa_deg"].to_numpy() for part in parts])
+    (whole,) = (name for name in before if name.endswith(".parquet"))
+    (tmp_path / "whole.parquet").write_bytes(before[whole])
+    assert np.array_equal(joined, geopandas.read_parquet(tmp_path / "whole.parquet")["kappa_deg"].to_numpy())
 
 
 def test_pictures_without_a_pose_say_why(measured_drive: Drive, tmp_path: Path) -> None:

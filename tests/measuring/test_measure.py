@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pyproj
 import pytest
@@ -12,10 +13,13 @@ from typer.testing import CliRunner
 
 import roadscan as rs
 from roadscan.cli import app
+from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
 from roadscan.measuring.kernels.march import BELOW, NO_GROUND, first_hits
 from roadscan.measuring.measure import measure, meet
+from roadscan.measuring.rays import pixels_of, rays_of
+from roadscan.pictures.views import Lens
 from roadscan.run.session import Session
 from roadscan.store.small_tables import write_small
 from tests.measuring.drive import MATRIX, Drive
@@ -145,6 +149,41 @@ def test_what_has_no_place_says_why(measured_drive: Drive) -> None:
         survey.measured(file, [(700.0, 3.0)])
     with pytest.raises(ConfigError, match="no picture with a pose is called"):
         survey.measured("0000xx.jpg", [(3.0, 3.0)])
+
+
+def test_the_own_vehicle_is_no_ground(measured_drive: Drive) -> None:
+    bonnet = ((100.0, 300.0), (540.0, 300.0), (540.0, 399.0), (100.0, 399.0))
+    survey = changed(Survey.load(measured_drive.survey_file), {"rig__sensors__camera__own_vehicle_px": [bonnet]})
+    file = next(iter(measured_drive.poses))
+    on, beside = measure(Session(survey, measured_drive.store()), file, [(320.0, 350.0), (50.0, 350.0)]).places
+    assert "own vehicle" in on.reason and not beside.reason
+
+
+LENSES = (
+    Interior(width_px=640, height_px=400, focal_px=(410.0, 405.0), principal_px=(322.0, 195.0),
+             distortion=(-0.21, 0.06, 0.0015, -0.002, -0.01)),
+    Interior(model="equirectangular", width_px=1600, height_px=800),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("interior", LENSES, ids=("perspective", "around"))
+def test_rays_lead_back_to_their_pixels(interior: Interior) -> None:
+    rng = np.random.default_rng(7)
+    lens = Lens.of(interior)
+    pixel = rng.uniform([0.0, 0.0], [interior.width_px - 1.0, interior.height_px - 1.0], (300, 2))
+    ray = rays_of(lens, pixel)
+    assert np.abs(np.linalg.norm(ray, axis=1) - 1.0).max() < 1e-12
+    if interior.model == "perspective":
+        (fx, fy), (cx, cy) = interior.focal_px, interior.principal_px
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        back = cv2.projectPoints(7.0 * ray, np.zeros(3), np.zeros(3), matrix, np.array(interior.distortion))[0]
+        back = back.reshape(-1, 2)
+    else:  # spherical trigonometry: the middle looks ahead, a quarter of the width is a right angle to the right
+        longitude = (pixel[:, 0] - 799.5) * 360.0 / 1600.0
+        assert np.allclose(np.degrees(np.arctan2(ray[:, 0], ray[:, 2])), longitude, atol=1e-9)
+        assert np.allclose(np.degrees(np.arcsin(ray[:, 1])), (pixel[:, 1] - 399.5) * 180.0 / 800.0, atol=1e-9)
+        back = pixel
+    assert np.abs(back - pixel).max() < 1e-6 and np.abs(pixels_of(lens, 5.0 * ray) - pixel).max() < 1e-6
 
 
 def test_the_first_ground_hides_what_is_behind() -> None:

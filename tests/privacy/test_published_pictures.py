@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from roadscan.cli import app
 from roadscan.core.errors import ConfigError
+from roadscan.privacy.hider import decoded, hider_of
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate
@@ -153,6 +154,9 @@ def test_what_a_network_finds_is_hidden(street: Drive, tmp_path: Path) -> None:
     after = cv2.imread(str(made.folder / "pictures" / "0" / "000001.jpg")).astype(float)
     assert after[300:330, 100:130, 2].max() - after[300:330, 100:130, 2].min() > 10.0  # no square with sharp edges
     assert np.abs(np.diff(after[315, 90:140, 2])).max() < 40.0
+    cut = decoded((raw / file).read_bytes())[280:350, 80:150]
+    hidden_there = (hider_of(session).hide_found(cut) != cut).any(axis=2)
+    assert hidden_there[20:50, 20:50].mean() > 0.5 and not hidden_there[:8].any()
     out = tmp_path / "copies"
     argued = ["export", "pictures", str(one.survey_file.with_name("PRIVACY.toml")), "--out", str(out), "--blurred"]
     copied = CliRunner().invoke(app, argued)

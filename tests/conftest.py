@@ -13,11 +13,13 @@ import typer.testing
 from hypothesis import settings
 
 from tests.drawing import blank
+from tests.measuring.drive import measured_drive
 from tests.surveys import adjusted, finished, raw_site, simulated
 from tests.workshop import damage, far_apart_place, place, places, workshop
 
 __all__ = [
-    "adjusted", "damage", "far_apart_place", "finished", "place", "places", "raw_site", "simulated", "workshop"
+    "adjusted", "damage", "far_apart_place", "finished", "measured_drive", "place", "places", "raw_site", "simulated",
+    "workshop",
 ]  # fmt: skip
 """Fixtures of surveys and of products."""
 

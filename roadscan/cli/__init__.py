@@ -73,7 +73,14 @@ app.command("view")(pages.view)
 app.command("publish")(pages.publish)
 app.command("sql")(queries.sql)
 app.command("where")(queries.where)
-app.command("export")(exports.export)
+
+export = typer.Typer(
+    cls=exports.Exports, help="Readings and pictures as files of other programs.", no_args_is_help=True
+)
+for exported in (exports.readings, exports.pictures, exports.colmap, exports.opensfm):
+    export.command(exported.__name__)(exported)
+app.add_typer(export, name="export")
+
 app.command("classes")(exports.classes)
 app.command("formats")(logs.list_formats)
 app.command("inspect")(logs.inspect_files)

@@ -4,12 +4,23 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from roadscan.cli.arguments import SurveyFile, options_apart
 from roadscan.cli.terminal import new_reporter, print_table
+
+if TYPE_CHECKING:
+    from roadscan.export.export import Exported
+
+Out = Annotated[Path, typer.Option(help="Folder to write to; new or empty.")]
+Run = Annotated[str | None, typer.Option("--run", help="This run alone.")]
+Camera = Annotated[str | None, typer.Option(help="This camera of the rig alone.")]
+Points = Annotated[
+    Path | None, typer.Option(help="CSV of points: easting_m, northing_m, height_m on the survey's map (metres).")
+]
 
 
 @dataclass(frozen=True)
@@ -28,8 +39,18 @@ class GridOptions:
     encoding: Annotated[str, typer.Option(help="opencrg: KRBI, KDBI, LRFI or LDFI.")] = "KRBI"
 
 
+class Exports(TyperGroup):
+    """The exports; `roadscan export SURVEY.toml --format …` without the word `readings` means that one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the word in where none of the commands is named."""
+        if args and args[0] not in (*self.commands, "--help"):
+            args = ["readings", *args]
+        return list(super().parse_args(ctx, args))
+
+
 @options_apart
-def export(
+def readings(
     survey_file: SurveyFile,
     format_: Annotated[str, typer.Option("--format", help="psi (a run's profiles) or opencrg (a pass's heights).")],
     run_id: Annotated[str, typer.Option("--run", help="Run.")],
@@ -76,3 +97,56 @@ def classes(
     counts = write_classes(loaded, store, run, sensor, out, lambda d, t: reporter.progress("classes", d, t))
     reporter.close()
     print_table(("class", "readings"), [(name, f"{count:,}") for name, count in counts.items()])
+
+
+def pictures(
+    survey_file: SurveyFile,
+    out: Out,
+    run_id: Run = None,
+    camera: Camera = None,
+    exif: Annotated[bool, typer.Option(help="With place, direction and time as EXIF and XMP.")] = True,
+    undistorted: Annotated[bool, typer.Option("--undistorted", help="As a pinhole sees them.")] = False,
+    blurred: Annotated[
+        bool, typer.Option("--blurred", help="With people and vehicles hidden, as [privacy] says where they are.")
+    ] = False,
+) -> None:
+    """Copies of pictures with their places in them, a table of their poses, and the cameras' lenses."""
+    from roadscan.export.pictures.chosen import Choice
+    from roadscan.export.pictures.copies import CopySettings, export_pictures
+    from roadscan.run.session import Session
+
+    reporter = new_reporter()
+    written = export_pictures(
+        Session.open(survey_file), out, Choice(run_id, camera), CopySettings(exif, undistorted, blurred),
+        lambda done, total: reporter.progress("pictures", done, total),
+    )  # fmt: skip
+    reporter.close()
+    _tell(written, out)
+
+
+def colmap(survey_file: SurveyFile, out: Out, run_id: Run = None, camera: Camera = None, points: Points = None) -> None:
+    """Cameras and poses of pictures as COLMAP's text files, in a local frame, so that its dense matching can go on."""
+    from roadscan.export.pictures.chosen import Choice
+    from roadscan.export.pictures.reconstructions import export_colmap
+    from roadscan.run.session import Session
+
+    _tell(export_colmap(Session.open(survey_file), out, Choice(run_id, camera), points), out)
+
+
+def opensfm(
+    survey_file: SurveyFile, out: Out, run_id: Run = None, camera: Camera = None, points: Points = None
+) -> None:
+    """Cameras and poses of pictures as OpenSfM's reconstruction, which OpenDroneMap reads, in a local frame."""
+    from roadscan.export.pictures.chosen import Choice
+    from roadscan.export.pictures.reconstructions import export_opensfm
+    from roadscan.run.session import Session
+
+    _tell(export_opensfm(Session.open(survey_file), out, Choice(run_id, camera), points), out)
+
+
+def _tell(written: Exported, out: Path) -> None:
+    from roadscan.core.counted import counted
+
+    for note in written.notes:
+        typer.echo(note)
+    typer.echo(f"{counted(len(written.files), 'file')} in {out}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -22,6 +22,10 @@ class SiteOptions:
     finest: Annotated[float, typer.Option(help="Leave out rasters with finer pixels than this (m).")] = 0.0
     clouds: Annotated[bool, typer.Option(help="With the points.")] = True
     pictures: Annotated[bool, typer.Option(help="With the pictures of cameras.")] = True
+    privacy: Annotated[
+        str | None,
+        typer.Option(help="blur or off, in place of privacy.pictures of the survey file; without either no pictures."),
+    ] = None
     edit: Annotated[
         bool, typer.Option("--edit", help="With edits of the inventory; the page saves them as a file to be pulled.")
     ] = False
@@ -46,6 +50,7 @@ def publish(
     from roadscan.site.material import Material, Wishes, box_from_text, box_of_road
     from roadscan.site.single import write_single
     from roadscan.site.site import publish as published
+    from roadscan.site.site_pictures import has_pictures
     from roadscan.site.web_part import HOW_TO_BUILD, web_folder
 
     if (out is None) == (single is None):
@@ -57,8 +62,11 @@ def publish(
         raise ConfigError("--box and --road are both given", expected="one of them")
     near = box_from_text(asked.box) if asked.box is not None else None
     near = near if asked.road is None else box_of_road(Material(session), asked.road)
-    wishes = Wishes(asked.clouds, asked.pictures, asked.finest, near, "file" if asked.edit else "")
+    edits: Literal["", "file"] = "file" if asked.edit else ""
+    wishes = Wishes(asked.clouds, asked.pictures, asked.finest, near, edits, _privacy(asked.privacy))
     material = Material(session, wishes, tuple(others))
+    if asked.pictures and material.privacy == "unstated" and has_pictures(material):
+        typer.echo('note: no picture is published: state privacy.pictures = "blur" or "off", or --privacy')
     if asked.edit:
         material.check_edits()
     reporter = new_reporter()
@@ -79,6 +87,16 @@ def publish(
         typer.echo(f"site: {out} ({counted(made.files, 'file')}, {made.made:,} new, {made.bytes / 1e6:,.1f} MB)")
         if made.failures:
             raise typer.Exit(1)
+
+
+def _privacy(stated: str | None) -> Literal["", "blur", "off"]:
+    """What is done with people and vehicles in pictures, as the option says."""
+    from roadscan.core.errors import ConfigError
+
+    known: dict[str | None, Literal["", "blur", "off"]] = {None: "", "blur": "blur", "off": "off"}
+    if stated in known:
+        return known[stated]
+    raise ConfigError(f"--privacy {stated}", expected="blur or off")
 
 
 def view(

@@ -338,6 +338,69 @@ class OpenSurvey:
         names = [f.name for f in dataclasses.fields(PictureOfPlace)]
         return pandas.DataFrame([{n: getattr(one, n) for n in names} for one in found], columns=names)
 
+    def measured(
+        self, picture: str | Path, pixels: Sequence[Sequence[float]], *, sigma_px: float = 0.5, reach_m: float = 60.0
+    ) -> pd.DataFrame:
+        """Return the places on the surveyed ground that pixels (u, v) of a picture show, in their order.
+
+        Parameters
+        ----------
+        picture : its path, or RUN/CAMERA/FILE.
+        pixels : counted from the centre of the upper left one, u to the right and v downwards.
+        sigma_px : 1 σ of a measured pixel, on each axis.
+        reach_m : how far a ray is followed (m).
+
+        Returns
+        -------
+        A row a pixel: u_px, v_px, easting_m, northing_m, height_m, sigma_easting_m, sigma_northing_m, sigma_height_m,
+        distance_m, incidence_deg (between ray and ground), reason (why there is no place; its numbers are NaN then),
+        warning. `attrs["covariance_m2"]` holds the covariances (n, 3, 3), `attrs["assumed"]` the σ that nothing states.
+
+        Raises
+        ------
+        RoadscanError
+            where the picture is unknown or has no pose, or a pixel lies outside it.
+        """
+        import pandas
+
+        from roadscan.measuring.measure import measure
+        from roadscan.measuring.words import COLUMNS, place_rows
+
+        found = measure(self.session, picture, pixels, sigma_px, reach_m)
+        frame = pandas.DataFrame(place_rows(found.places), columns=list(COLUMNS))
+        frame.attrs["covariance_m2"] = [one.covariance_m2.tolist() for one in found.places]
+        frame.attrs["assumed"] = found.assumed
+        return frame
+
+    def met(
+        self,
+        first: str | Path,
+        first_pixel: Sequence[float],
+        second: str | Path,
+        second_pixel: Sequence[float],
+        *,
+        sigma_px: float = 0.5,
+    ) -> pd.Series:
+        """Return the place where the rays of pixels of two pictures meet; no ground takes part.
+
+        Returns
+        -------
+        The entries of a row of :meth:`measured`, and `gap_m`, by which the rays pass each other. `warning` names rays
+        that meet at less than 5° or pass each other by more than their σ explains.
+
+        Raises
+        ------
+        RoadscanError
+            where a picture is unknown, both are the same, or the rays do not meet before the cameras.
+        """
+        import pandas
+
+        from roadscan.measuring.measure import meet
+        from roadscan.measuring.words import place_rows
+
+        place, gap_m = meet(self.session, (first, second), (first_pixel, second_pixel), sigma_px)
+        return pandas.Series({**place_rows([place])[0], "gap_m": gap_m})
+
     @property
     def products(self) -> dict[str, MadeProduct]:
         """Return products that have files, by name."""
@@ -543,5 +606,5 @@ def _frame(rows: pa.Table, crs: str | None) -> pd.DataFrame:
     return cast("pd.DataFrame", geopandas.GeoDataFrame(frame, geometry=shapes[0], crs=crs))
 
 
-_GEOMETRIES = ("geometry", "outline", "line", "centre")
+_GEOMETRIES = ("geometry", "outline", "line", "centre", "footprint")
 """Columns of GeoParquet tables that DuckDB returns as WKB."""

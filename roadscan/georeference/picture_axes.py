@@ -27,6 +27,16 @@ def camera_from_map(
     """
     axes = world_from_ned(world, eye_world_m)
     place = frame.map_from_world(world, eye_world_m)
-    ends = [frame.map_from_world(world, eye_world_m + sign * axes[:, :, k]) for k in range(3) for sign in (0.5, -0.5)]
-    map_from_ned = np.stack([ends[2 * k] - ends[2 * k + 1] for k in range(3)], axis=-1)
-    return place, opencv_from_world @ axes @ np.linalg.inv(map_from_ned)
+    return place, opencv_from_world @ axes @ np.linalg.inv(map_from_ned(frame, world, eye_world_m))
+
+
+def map_from_ned(frame: MapFrame, world: str, position_world_m: Float64) -> Float64:
+    """Return derivatives (n, 3, 3) of the map (easting, northing, height) by north, east, down at positions (n, 3; m).
+
+    They are taken over a metre and include convergence and scale of the map.
+    """
+    axes = world_from_ned(world, position_world_m)
+    ends = [
+        frame.map_from_world(world, position_world_m + sign * axes[:, :, k]) for k in range(3) for sign in (0.5, -0.5)
+    ]
+    return np.stack([ends[2 * k] - ends[2 * k + 1] for k in range(3)], axis=-1)

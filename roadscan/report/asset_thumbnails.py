@@ -22,6 +22,7 @@ from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.evidence import CLASSIFIED
 from roadscan.assets.tasks.picture_work import CUT_OUTS
 from roadscan.assets.tasks.plan import asset_grid
+from roadscan.privacy.settings import publishes_as_they_are
 from roadscan.run.session import Session
 from roadscan.store.manifest import read_recorded
 
@@ -34,13 +35,17 @@ _ABOVE_PLATE_M: Final = 1.0  # height above a plate's place that is shown (m)
 
 
 class Thumbnails:
-    """Draws thumbnails of a survey's assets; points of a square are read once for neighbouring assets."""
+    """Draws thumbnails of a survey's assets; points of a square are read once for neighbouring assets.
+
+    A report is handed on: cut-outs of pictures stand in it only where `privacy.pictures` is off.
+    """
 
     def __init__(self, session: Session) -> None:
         config = AssetsConfig.stated(session.survey)
         self._session = session
         self._grid = None if config is None else asset_grid(session.survey, config)
-        self._cut_outs = {r.path: r for r in session.manifest.of(CUT_OUTS).values()}
+        shown = session.manifest.of(CUT_OUTS).values() if publishes_as_they_are(session.survey) else ()
+        self._cut_outs = {r.path: r for r in shown}
         self._points = {unit: r for unit, r in session.manifest.of(CLASSIFIED).items() if r.path}
         self._read: OrderedDict[str, tuple[Any, Any, Any]] = OrderedDict()
 

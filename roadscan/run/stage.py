@@ -120,6 +120,10 @@ class Stage(ABC):
             return True
         return survey.has(self.section) and getattr(getattr(survey.config, self.section), "on", True)
 
+    def why_not_asked(self, survey: Survey) -> str:
+        """Why a run passes over it, where :meth:`is_asked` is false."""
+        return f"[{self.section}] {'is off' if survey.has(self.section) else 'is not in the survey file'}"
+
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """What the witnesses of its inputs said: told during a run, in the summary, by `status` and in the report.
 

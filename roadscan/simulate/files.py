@@ -59,6 +59,8 @@ def write_survey(
     if scene.roadside.targets:
         lines += ["[adjust.targets.codes]", f'{PLATE} = {{ shape = "pictures" }}', ""]
     lines += _picture_targets(scene, control_marks(scene, surface))
+    if scene.camera.on:
+        lines += ["[privacy]", 'pictures = "off" # nobody real is in simulated pictures', ""]
     file.write_text("\n".join(lines), encoding="utf-8")
 
 

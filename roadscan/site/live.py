@@ -100,7 +100,7 @@ def open_survey(
     ----------
     over : surveys that are shown over it; edited : whether people may edit the survey's inventory.
     """
-    wishes = Wishes(edits="post" if edited else "")
+    wishes = Wishes(edits="post" if edited else "", stays_here=True)
 
     def opened() -> Material:
         sessions = [Session.open(file) for file in (survey_file, *over)]

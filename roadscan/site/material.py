@@ -18,6 +18,7 @@ from roadscan.core.ids import TileId
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.inventory.of_survey import truth_of
 from roadscan.inventory.state import State
+from roadscan.privacy.settings import PrivacyConfig
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import asset_schema
@@ -55,6 +56,10 @@ class Wishes:
     """Only what is in this box of the map; everything where it is None."""
     edits: Literal["", "file", "post"] = ""
     """Whether people may edit assets, and the destination of their edits: a file, or the server."""
+    privacy: Literal["", "blur", "off"] = ""
+    """What is done with people and vehicles in pictures; as the survey file states where it is empty."""
+    stays_here: bool = False
+    """The site is shown on this machine alone, to those who have the pictures themselves: nothing is hidden."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,13 @@ class Material:
                 raise ConfigError(f"the survey '{name}' is there twice", expected="surveys with ids of their own")
             known.add(name)
         return found
+
+    @property
+    def privacy(self) -> Literal["blur", "off", "stays here", "unstated"]:
+        """What is done with people and vehicles in pictures; unstated: no picture is published."""
+        if self.wishes.stays_here:
+            return "stays here"
+        return self.wishes.privacy or PrivacyConfig.of(self.session.survey).pictures or "unstated"
 
     @property
     def store(self) -> Store:

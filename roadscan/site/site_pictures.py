@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 from roadscan.assets.tasks.picture_work import CUT_OUTS
@@ -12,6 +13,7 @@ from roadscan.core.grid import Bounds
 from roadscan.pictures.placed import Pictures as PlacedPictures
 from roadscan.pictures.placed import plan_pictures
 from roadscan.pictures.views import PictureRule
+from roadscan.privacy.hider import Hider, hider_of
 from roadscan.site.material import Material
 from roadscan.store.manifest import OutputRecord
 
@@ -23,8 +25,8 @@ SHOWN_AS_THEY_ARE: Final = {".jpg": ".jpg", ".jpeg": ".jpg", ".png": ".png", ".w
 
 @functools.lru_cache(maxsize=2)
 def placed_pictures(material: Material) -> PlacedPictures | None:
-    """Return pictures with poses; None where there are none, or none are requested."""
-    if not material.wishes.pictures:
+    """Return pictures with poses; None where there are none, or none are requested or may be published."""
+    if not material.wishes.pictures or material.privacy == "unstated":
         return None
     try:
         held = plan_pictures(material.plan, _RULE)
@@ -36,9 +38,27 @@ def placed_pictures(material: Material) -> PlacedPictures | None:
     return held if any(held.path(number).is_file() for number in range(len(held))) else None
 
 
-def picture_url(held: PlacedPictures, number: int) -> str:
-    """Return the path of a picture in the site."""
-    suffix = SHOWN_AS_THEY_ARE.get(held.path(number).suffix.lower(), ".jpg")
+def has_pictures(material: Material) -> bool:
+    """Return True where the survey has pictures with poses, whether or not they may be published."""
+    stated = replace(material, wishes=replace(material.wishes, stays_here=True))
+    return placed_pictures(stated) is not None
+
+
+def hider_for(material: Material) -> Hider | None:
+    """Return what hides people and vehicles in pictures; None where nothing is hidden.
+
+    Raises
+    ------
+    ConfigError
+        where they are to be hidden and nothing says where they are.
+    """
+    return hider_of(material.session) if material.privacy == "blur" else None
+
+
+def picture_url(material: Material, held: PlacedPictures, number: int) -> str:
+    """Return the path of a picture in the site; pictures in which something may be hidden are JPEG."""
+    known = SHOWN_AS_THEY_ARE if material.privacy != "blur" else {}
+    suffix = known.get(held.path(number).suffix.lower(), ".jpg")
     return f"pictures/{int(held.log[number])}/{number:06d}{suffix}"
 
 
@@ -48,14 +68,22 @@ def picture_urls(material: Material) -> Mapping[tuple[str, str, str], str]:
     held = placed_pictures(material)
     logs = () if held is None else (held.logs[number] for number in held.log.tolist())
     return {
-        (log.run, log.sensor, held.files[k]): picture_url(held, k) for k, log in enumerate(logs) if held is not None
+        (log.run, log.sensor, held.files[k]): picture_url(material, held, k)
+        for k, log in enumerate(logs)
+        if held is not None
     }
 
 
 @functools.lru_cache(maxsize=2)
 def cut_out_records(material: Material) -> Mapping[str, OutputRecord]:
-    """Return records of cut-outs, by path; none where no pictures are shown."""
+    """Return records of cut-outs, by path; none where no pictures are shown.
+
+    Where people and vehicles are hidden, cut-outs need a network: returns are known in whole pictures alone.
+    """
     if placed_pictures(material) is None:
+        return {}
+    hider = hider_for(material)
+    if hider is not None and hider.detector is None:
         return {}
     return {one.path: one for one in material.session.manifest.of(CUT_OUTS).values() if one.path}
 

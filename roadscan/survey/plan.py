@@ -159,9 +159,7 @@ class _Known:
         one = PlannedStage(stage.name, stage.title, stage.after, CURRENT, stage.units)
         state = self._status.stages.get(stage.name)
         if not stage.is_asked(self._survey) and not (state and state.stale):
-            is_there = self._survey.has(stage.section)
-            note = f"[{stage.section}] {'is off' if is_there else 'is not in the survey file'}"
-            return dataclasses.replace(one, state=PASSED_OVER, note=note)
+            return dataclasses.replace(one, state=PASSED_OVER, note=stage.why_not_asked(self._survey))
         earlier = [b.name for b in before.values() if b.state == DUE and _is_after(stage, b, before)]
         waits_for = earlier[-1] if earlier else ""
         if state is None:

@@ -520,6 +520,32 @@ def test_the_catalogue_is_stac(survey_file: Path, published: Published) -> None:
     assert placed == pytest.approx([west, south, east, north], abs=0.01)
 
 
+def test_pictures_are_stac_items(survey_file: Path, published: Published) -> None:
+    pystac = pytest.importorskip("pystac", reason="pystac is not installed")
+    told = read(published, "survey.json")["picture_items"]
+    collection = pystac.Collection.from_file(str(published.folder / told))
+    items = list(collection.get_items())
+    known = truth.load(survey_file.parent)
+    runs = [(run, pq.read_table(known.camera_file(run)).to_pylist()) for run in ("run-1", "run-2")]
+    poses = [(run, pose) for run, rows in runs for pose in rows]
+    assert len(items) == len(poses) == 6
+    to_map = pyproj.Transformer.from_crs("OGC:CRS84", "EPSG:32632", always_xy=True)
+    for item, (run, pose) in zip(items, poses, strict=True):
+        assert item.properties["title"] == f"{run}/camera/{pose['file']}"
+        picture = Path(item.assets["picture"].get_absolute_href())
+        assert picture.is_file() and picture.suffix == ".jpg"
+        eye = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:32632", always_xy=True).transform(
+            *(pose[f"{a}_world_m"] for a in "xyz")
+        )
+        own = [item.properties[f"roadscan:{n}_m"] for n in ("easting", "northing")]
+        assert np.allclose(own, eye[:2], atol=0.02)
+        seen = shapely.transform(shapely.geometry.shape(item.geometry), lambda c: np.stack(to_map.transform(*c.T), -1))
+        assert seen.geom_type == "Polygon" and 0.5 < seen.distance(shapely.Point(own)) < 6.0
+        item.stac_extensions.clear()
+        item.validate()
+    collection.validate()
+
+
 def test_the_virtual_point_cloud_names_the_sheets(published: Published) -> None:
     virtual, index = read(published, "catalog/points.vpc"), read(published, "clouds/index.json")
     assert sum(f["properties"]["pc:count"] for f in virtual["features"]) == index["points"]

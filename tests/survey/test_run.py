@@ -139,6 +139,7 @@ def test_second_run_does_nothing(finished: Simulated) -> None:
         "adjust:",
         "strips:",
         "tiles:",
+        "pictures:",
         "surfaces:",
         "products:",
         "condition:",

@@ -100,7 +100,8 @@ def recorded_street(recording: Path, folder: Path) -> RecordedStreet:
     with (folder / "pictures.csv").open("w", newline="") as file:
         csv.writer(file).writerows([("file", "time"), *(n for n in names if (recording / "image_0" / n[0]).is_file())])
     (folder / "rig.toml").write_text(_rig())
-    (folder / "SURVEY.toml").write_text(SURVEY + _PICTURES)
+    privacy = '\n[privacy]\npictures = "off" # published by their makers\n'
+    (folder / "SURVEY.toml").write_text(SURVEY + _PICTURES + privacy)
     survey = Survey.load(folder / "SURVEY.toml")
     session = Session(survey, Store(survey.store_url, survey.config.id), Inline())
     run_stages(session, [stage_named(name) for name in ("ingest", "footprints", "tiles", "products")])

@@ -30,7 +30,7 @@ from roadscan.site.parts.features import features_url
 from roadscan.site.parts.vectors import site_layers
 from roadscan.store.codecs import SOFTWARE
 
-_STAC: Final = "1.1.0"
+STAC: Final = "1.1.0"
 _PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
 _POINT_CLOUD: Final = "https://stac-extensions.github.io/pointcloud/v2.0.0/schema.json"
 _COPC_TYPE: Final = "application/vnd.laszip+copc"
@@ -54,7 +54,7 @@ class Catalog(SitePart):
 
     def members(self, material: Material) -> Mapping[str, Any]:
         """Return the paths of its files."""
-        if not _is_placed(material):
+        if not is_placed(material):
             return {"catalog": None}
         points = "catalog/points.vpc" if cloud_sheets(material) else None
         return {
@@ -63,7 +63,7 @@ class Catalog(SitePart):
 
     def documents(self, material: Material) -> Iterator[Document]:
         """Yield all documents."""
-        if not _is_placed(material):
+        if not is_placed(material):
             return
         items = [_item(material, name, tiles) for name, tiles in material.sheets.items()]
         yield json_document("catalog/collection.json", _collection(material, items))
@@ -76,7 +76,8 @@ class Catalog(SitePart):
             yield json_document("catalog/points.vpc", {"type": "FeatureCollection", "features": features})
 
 
-def _is_placed(material: Material) -> bool:
+def is_placed(material: Material) -> bool:
+    """Return True where the survey has tiles and its map a place on the Earth."""
     return bool(material.tiles) and material.context.map.crs is not None
 
 
@@ -126,7 +127,7 @@ def _item(material: Material, name: str, tiles: Sequence[TileId]) -> dict[str, A
     first, last = _times(material, tiles)
     unit_m = frame.horizontal_unit_m
     return {
-        "type": "Feature", "stac_version": _STAC, "stac_extensions": [_PROJECTION], "id": name,
+        "type": "Feature", "stac_version": STAC, "stac_extensions": [_PROJECTION], "id": name,
         "geometry": {"type": "Polygon", "coordinates": [ring]},
         "bbox": [round(v, 8) for v in border.bounds],
         "properties": {
@@ -156,6 +157,11 @@ def _assets(material: Material, sheet: str, up: str) -> Iterator[tuple[str, dict
             yield f"{record.product}-{title}", asset
 
 
+def projection_of(frame: MapFrame) -> tuple[list[str], dict[str, Any]]:
+    """Return the extension and the properties by which an item tells its map."""
+    return [_PROJECTION], {"proj:code": _code(frame), **({} if _code(frame) else {"proj:wkt2": frame.wkt()})}
+
+
 def _code(frame: MapFrame) -> str | None:
     """Return authority and number of the horizontal CRS, where it has one."""
     found = crs_from_text(frame.crs or "").to_authority() if frame.crs else None
@@ -169,7 +175,7 @@ def _collection(material: Material, items: Sequence[Mapping[str, Any]]) -> dict[
     links = [{"rel": "root", "href": "./collection.json", "type": "application/json"}]
     links += [{"rel": "item", "href": f"./items/{i['id']}.json", "type": "application/geo+json"} for i in items]
     return {
-        "type": "Collection", "stac_version": _STAC, "stac_extensions": [], "id": material.context.survey_id,
+        "type": "Collection", "stac_version": STAC, "stac_extensions": [], "id": material.context.survey_id,
         "title": material.context.title or material.context.survey_id,
         "description": f"Road survey {material.context.survey_id}, a sheet a kilometre of the map.",
         "license": "other", "keywords": ["road survey", "point cloud", "pavement"],

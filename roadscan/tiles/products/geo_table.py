@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,25 +29,30 @@ def write_geo_table(
     context: ProductContext,
     *,
     counterclockwise: bool = False,
+    more: Mapping[str, tuple[npt.NDArray[Any], list[str]]] | None = None,
 ) -> None:
-    """Write rows with their geometry, in the CRS's unit.
+    """Write rows with their geometry, in the CRS's unit; a geometry that is None is null.
 
     Parameters
     ----------
     columns : the plain columns; geometry : name of the geometry's column.
     shapes_m : (n,) shapely geometries on the map (m); kinds : their types, such as ``["Polygon"]``.
     counterclockwise : whether the outer rings of all polygons run that way, which the file then states.
+    more : further geometries by name, each with its types.
     """
-    shapes = in_crs_unit(shapes_m, context)
-    field = pa.field(geometry, pa.binary(), nullable=False)
-    table = columns.append_column(field, pa.array(shapely.to_wkb(shapes), pa.binary()))
-    column = {"encoding": "WKB", "geometry_types": kinds, "crs": _crs(context), "edges": "planar"}
-    if counterclockwise:
-        column["orientation"] = "counterclockwise"
-    if len(shapes):
-        column["bbox"] = [float(v) for v in shapely.total_bounds(shapes)]
-    about = {"version": "1.1.0", "primary_column": geometry, "columns": {geometry: column}}
-    table = table.replace_schema_metadata({"geo": json.dumps(about, sort_keys=True)})
+    table, about = columns, {}
+    for name, (own_m, own_kinds) in {geometry: (shapes_m, kinds), **(more or {})}.items():
+        shapes = in_crs_unit(own_m, context)
+        known = ~shapely.is_missing(shapes)
+        field = pa.field(name, pa.binary(), nullable=not known.all())
+        table = table.append_column(field, pa.array(shapely.to_wkb(shapes), pa.binary()))
+        about[name] = {"encoding": "WKB", "geometry_types": own_kinds, "crs": _crs(context), "edges": "planar"}
+        if counterclockwise:
+            about[name]["orientation"] = "counterclockwise"
+        if known.any():
+            about[name]["bbox"] = [float(v) for v in shapely.total_bounds(shapes)]
+    whole = {"version": "1.1.0", "primary_column": geometry, "columns": about}
+    table = table.replace_schema_metadata({"geo": json.dumps(whole, sort_keys=True)})
     pq.write_table(
         table, path, compression="zstd", row_group_size=_ROW_GROUP_ROWS, write_page_checksum=True, version="2.6"
     )

@@ -1,0 +1,1 @@
+"""Pictures with their poses as files of other programs."""

@@ -1,0 +1,126 @@
+"""The pictures that an export is about, and a local frame for their poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.crs import LOCAL_WORLD, crs_from_text
+from roadscan.core.errors import ConfigError, nearest
+from roadscan.measuring.measure import posed_pictures
+from roadscan.measuring.poses import PicturePoses
+from roadscan.measuring.work import picked_poses
+from roadscan.pictures.views import HEIGHT, WIDTH, Lens
+from roadscan.poses.trajectory import world_from_ned
+from roadscan.run.session import Session
+
+Float64 = npt.NDArray[np.float64]
+
+_ENU_FROM_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_WHOLE_M: Final = 1.0
+"""The local frame's origin lies at whole multiples of this on the map."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which pictures."""
+
+    run: str | None = None
+    camera: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LocalFrame:
+    """A topocentric frame (x east, y north, z up; m) near the pictures, without the map's scale and curvature."""
+
+    world: str
+    origin_map_m: Float64
+    """(3,) easting, northing, height of its origin."""
+    origin_world_m: Float64
+    local_from_world: Float64
+    """(3, 3) rotation."""
+
+    @property
+    def lon_lat_height(self) -> Float64 | None:
+        """Longitude, latitude (degrees, WGS 84) and ellipsoidal height (m) of the origin; None of a local map."""
+        return wgs84(self.world, self.origin_world_m[None])[0] if self.world != LOCAL_WORLD else None
+
+    def points(self, world_m: Float64) -> Float64:
+        """Return places (n, 3) of the world frame in this one."""
+        return np.asarray((world_m - self.origin_world_m) @ self.local_from_world.T)
+
+
+def chosen_pictures(session: Session, choice: Choice) -> PicturePoses:
+    """Return the poses of the chosen pictures, in order of time.
+
+    Raises
+    ------
+    ConfigError
+        where no picture is of that run and camera.
+    """
+    poses = posed_pictures(session)
+    logs = poses.pictures.logs
+    for word, asked, known in (("run", choice.run, {log.run for log in logs}),
+                               ("camera", choice.camera, {log.sensor for log in logs})):  # fmt: skip
+        if asked is not None and asked not in known:
+            raise ConfigError(
+                f"no picture with a pose is of {word} '{asked}'{nearest(asked, sorted(known))}",
+                expected="one of: " + ", ".join(sorted(known)),
+            )
+    kept = [
+        k
+        for k, log in enumerate(poses.pictures.log.tolist())
+        if choice.run in (None, logs[log].run) and choice.camera in (None, logs[log].sensor)
+    ]
+    if not kept:
+        raise ConfigError(f"run '{choice.run}' has no picture of '{choice.camera}' with a pose")
+    return picked_poses(poses, np.array(kept, np.int64))
+
+
+def local_frame(poses: PicturePoses) -> LocalFrame:
+    """Return a local frame whose origin is the least easting, northing and height of the pictures, in whole metres.
+
+    Raises
+    ------
+    ConfigError
+        where the pictures' trajectories are in different world frames.
+    """
+    worlds = {poses.pictures.worlds[k] for k in poses.pictures.views.world.tolist()}
+    if len(worlds) != 1:
+        raise ConfigError(
+            f"the pictures' trajectories are in {len(worlds)} frames: {', '.join(sorted(worlds))}",
+            expected="pictures in one", change="choose a run",
+        )  # fmt: skip
+    world = worlds.pop()
+    origin_map = np.floor(poses.place_m.min(axis=0) / _WHOLE_M) * _WHOLE_M
+    origin = poses.pictures.map.world_from_map(world, origin_map[None])[0]
+    turn = _ENU_FROM_NED @ world_from_ned(world, origin[None])[0].T
+    return LocalFrame(world, origin_map, origin, turn)
+
+
+def wgs84(world: str, world_m: Float64) -> Float64:
+    """Return longitude, latitude (degrees) and ellipsoidal height (n, 3) in WGS 84 of places of a geocentric frame."""
+    from pyproj import Transformer
+
+    to_wgs84 = Transformer.from_crs(crs_from_text(world), "EPSG:4978", always_xy=True)
+    to_degrees = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    return np.stack(to_degrees.transform(*to_wgs84.transform(*world_m.T)), axis=-1)
+
+
+def relative_name(poses: PicturePoses, number: int) -> str:
+    """Return the name of a picture in an export: RUN/CAMERA/FILE."""
+    return PurePosixPath(poses.pictures.name(number)).as_posix()
+
+
+def lens_of(poses: PicturePoses, number: int) -> Lens:
+    """Return the lens of a picture."""
+    return poses.pictures.views.lenses[int(poses.pictures.views.lens[number])]
+
+
+def size_px(lens: Lens) -> tuple[int, int]:
+    """Return width and height of a lens's pictures."""
+    return round(lens.parameters[WIDTH]), round(lens.parameters[HEIGHT])

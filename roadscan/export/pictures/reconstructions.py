@@ -1,0 +1,219 @@
+"""Text files of COLMAP and OpenSfM (OpenDroneMap): cameras, poses of pictures and points, in a local frame.
+
+Formats: COLMAP's documentation, *Output format*, text (colmap.github.io/format.html); OpenSfM's documentation,
+*Dataset structure* and *Geometric models* (opensfm.readthedocs.io). COLMAP's pixels count from the corner of the upper
+left one, OpenSfM's from the picture's middle in units of its longer side.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from roadscan.core.errors import ConfigError
+from roadscan.core.frames import quaternion_from_rotation
+from roadscan.core.gpstime import utc_from_gps_ns
+from roadscan.export.export import Exported, published
+from roadscan.export.pictures.chosen import (
+    Choice,
+    LocalFrame,
+    chosen_pictures,
+    lens_of,
+    local_frame,
+    relative_name,
+    size_px,
+)
+from roadscan.georeference.picture_axes import map_from_ned
+from roadscan.measuring.poses import PicturePoses
+from roadscan.pictures.views import Lens
+from roadscan.run.session import Session
+
+Float64 = npt.NDArray[np.float64]
+
+OFFSET_FILE: Final = "offset.json"
+"""Where the local frame lies."""
+_ENU_FROM_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_GREY: Final = 128  # Colour of points that have none.
+
+
+def export_colmap(session: Session, out: Path, choice: Choice, points: Path | None = None) -> Exported:
+    """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt`` of COLMAP, and where their frame lies.
+
+    Parameters
+    ----------
+    points : CSV with columns easting_m, northing_m, height_m (metres of the survey's map); no points without it.
+
+    Raises
+    ------
+    ConfigError
+        where `out` holds something, no picture is chosen, or all are pictures of 360°, which COLMAP does not know.
+    """
+    poses = chosen_pictures(session, choice)
+    flat = [k for k in range(len(poses)) if not lens_of(poses, k).is_around]
+    if not flat:
+        raise ConfigError("all pictures are of 360°, for which COLMAP has no camera", expected="perspective pictures")
+    frame, lenses = local_frame(poses), _lenses(poses, flat)
+    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", f"# Number of cameras: {len(lenses)}"]
+    cameras += [_colmap_camera(number, lens) for number, (lens, _) in lenses.items()]
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", f"# Number of images: {len(flat)}"]
+    for number, k in enumerate(flat, start=1):
+        turn, shift = _camera_from_local(poses, frame, k)
+        values = " ".join(repr(float(v)) for v in (*quaternion_from_rotation(turn), *shift))
+        images += [f"{number} {values} {int(poses.pictures.views.lens[k]) + 1} {relative_name(poses, k)}", ""]
+    places = _points(poses, frame, points)
+    listed = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", f"# Number of points: {len(places)}"]
+    listed += [
+        f"{number} {' '.join(repr(float(v)) for v in place)} {_GREY} {_GREY} {_GREY} 0"
+        for number, place in enumerate(places, start=1)
+    ]
+    texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": listed}
+    written = {name: "\n".join(lines) + "\n" for name, lines in texts.items()}
+    written[OFFSET_FILE] = _json(_offset(poses, frame))
+    notes = [] if len(flat) == len(poses) else [f"{len(poses) - len(flat):,} pictures of 360° are left out"]
+    return _written(out, written, [*notes, *_where_pictures_are(poses)])
+
+
+def export_opensfm(session: Session, out: Path, choice: Choice, points: Path | None = None) -> Exported:
+    """Write ``reconstruction.json``, ``camera_models.json`` and ``reference_lla.json`` of OpenSfM.
+
+    Parameters
+    ----------
+    points : as in :func:`export_colmap`.
+
+    Raises
+    ------
+    ConfigError
+        where `out` holds something, no picture is chosen, or the survey's map is a local frame.
+    """
+    poses = chosen_pictures(session, choice)
+    frame = local_frame(poses)
+    origin = frame.lon_lat_height
+    if origin is None:
+        raise ConfigError("the survey's poses are in a local frame", expected="poses with a place on the Earth",
+                          change="use `roadscan export colmap`, which needs none")  # fmt: skip
+    lenses = _lenses(poses, range(len(poses)))
+    cameras = {f"roadscan {title}": _opensfm_camera(lens) for lens, title in lenses.values()}
+    reference = {"longitude": float(origin[0]), "latitude": float(origin[1]), "altitude": float(origin[2])}
+    shots = {}
+    for k in range(len(poses)):
+        turn, shift = _camera_from_local(poses, frame, k)
+        moment = utc_from_gps_ns(int(poses.pictures.epochs_gps_ns[k]))
+        spread = float(np.sqrt(np.trace(poses.covariance[k, :3, :3]) / 3.0))
+        shots[relative_name(poses, k)] = {
+            "rotation": Rotation.from_matrix(turn).as_rotvec().tolist(), "translation": shift.tolist(),
+            "camera": f"roadscan {lenses[int(poses.pictures.views.lens[k]) + 1][1]}", "orientation": 1,
+            "capture_time": moment.timestamp(), "gps_dop": spread,
+            "gps_position": _eye(poses, frame, k).tolist(),
+        }  # fmt: skip
+    places = {
+        str(number): {"coordinates": place.tolist(), "color": [_GREY] * 3}
+        for number, place in enumerate(_points(poses, frame, points))
+    }
+    whole = [{"cameras": cameras, "shots": shots, "points": places, "reference_lla": reference}]
+    written = {
+        "reconstruction.json": _json(whole), "camera_models.json": _json(cameras),
+        "reference_lla.json": _json(reference), OFFSET_FILE: _json(_offset(poses, frame)),
+    }  # fmt: skip
+    return _written(out, written, _where_pictures_are(poses))
+
+
+def _written(out: Path, contents: dict[str, str], notes: Sequence[str]) -> Exported:
+    with published(out) as folder:
+        for name, text in contents.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    return Exported(tuple(out / name for name in contents), tuple(notes))
+
+
+def _lenses(poses: PicturePoses, numbers: Sequence[int]) -> dict[int, tuple[Lens, str]]:
+    """Return lenses with the name of their camera, by number from 1."""
+    views, found = poses.pictures.views, {}
+    for k in numbers:
+        lens = int(views.lens[k])
+        found[lens + 1] = (views.lenses[lens], poses.pictures.logs[poses.pictures.log[k]].sensor)
+    return dict(sorted(found.items()))
+
+
+def _colmap_camera(number: int, lens: Lens) -> str:
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = lens.parameters[:9].tolist()
+    width, height = size_px(lens)
+    values = [fx, fy, cx + 0.5, cy + 0.5, k1, k2, p1, p2]
+    model = "OPENCV"
+    if k3 != 0.0:  # OpenCV's model in COLMAP ends with p2; the full one has the denominator's coefficients as well
+        model, values = "FULL_OPENCV", [*values, k3, 0.0, 0.0, 0.0]
+    return f"{number} {model} {width} {height} " + " ".join(repr(v) for v in values)
+
+
+def _opensfm_camera(lens: Lens) -> dict[str, Any]:
+    width, height = size_px(lens)
+    if lens.is_around:
+        return {"projection_type": "spherical", "width": width, "height": height}
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = lens.parameters[:9].tolist()
+    longer = float(max(width, height))
+    return {
+        "projection_type": "brown", "width": width, "height": height, "focal_x": fx / longer, "focal_y": fy / longer,
+        "c_x": (cx + 0.5 - width / 2.0) / longer, "c_y": (cy + 0.5 - height / 2.0) / longer,
+        "k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3,
+    }  # fmt: skip
+
+
+def _eye(poses: PicturePoses, frame: LocalFrame, number: int) -> Float64:
+    return np.asarray(frame.points(poses.pictures.views.eye_world_m[number][None])[0])
+
+
+def _camera_from_local(poses: PicturePoses, frame: LocalFrame, number: int) -> tuple[Float64, Float64]:
+    """Return rotation (3, 3) and translation (3,) from the local frame to camera axes (right, down, ahead)."""
+    turn = poses.pictures.views.opencv_from_world[number] @ frame.local_from_world.T
+    return turn, -turn @ _eye(poses, frame, number)
+
+
+def _points(poses: PicturePoses, frame: LocalFrame, file: Path | None) -> Float64:
+    """Return the points (n, 3) of a file in the local frame."""
+    if file is None:
+        return np.zeros((0, 3))
+    import pandas as pd
+
+    names = ["easting_m", "northing_m", "height_m"]
+    try:
+        places = pd.read_csv(file)[names].to_numpy(np.float64)
+    except (OSError, KeyError, ValueError) as error:
+        raise ConfigError(
+            f"no points can be read: {error}", expected="a CSV with " + ", ".join(names), file=file
+        ) from error
+    if not np.isfinite(places).all():
+        raise ConfigError("a point has no number", expected="numbers in " + ", ".join(names), file=file)
+    return frame.points(poses.pictures.map.world_from_map(frame.world, places))
+
+
+def _offset(poses: PicturePoses, frame: LocalFrame) -> dict[str, Any]:
+    """Return where the local frame lies, and by how much the map's own axes differ from it."""
+    chart = poses.pictures.map
+    level = map_from_ned(chart, frame.world, frame.origin_world_m[None])[0] @ _ENU_FROM_NED
+    eyes = frame.points(poses.pictures.views.eye_world_m)
+    apart = frame.origin_map_m + eyes @ level.T - poses.place_m
+    told: dict[str, Any] = {
+        "meaning": "local = rotation · (world − origin_world_m); about: map = origin_map_m + map_from_local · local",
+        "axes": "x east, y north, z up at the origin (metres)",
+        "origin_map_m": frame.origin_map_m.tolist(), "map_crs": chart.crs, "map_height": chart.height,
+        "world": frame.world, "origin_world_m": frame.origin_world_m.tolist(),
+        "rotation": frame.local_from_world.tolist(), "map_from_local": level.tolist(),
+        "map_from_local_error_m": float(np.abs(apart).max()),
+    }  # fmt: skip
+    origin = frame.lon_lat_height
+    if origin is not None:
+        told["origin_wgs84"] = dict(zip(("longitude_deg", "latitude_deg", "height_m"), origin.tolist(), strict=True))
+    return told
+
+
+def _where_pictures_are(poses: PicturePoses) -> list[str]:
+    folders = sorted({f"{log.run}/{log.sensor}: {log.folder}" for log in poses.pictures.logs})
+    return ["pictures are named RUN/CAMERA/FILE; `roadscan export pictures` copies them so", *folders]
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n"

@@ -1,0 +1,1 @@
+"""Loops of measuring in pictures."""

@@ -1,0 +1,183 @@
+"""Rows of the table `pictures`, and the files that hold them."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+
+from roadscan.assets.files.layers import Layer, write_geopackage
+from roadscan.core.frames import quaternion_from_rotation
+from roadscan.core.gpstime import utc_from_gps_ns
+from roadscan.measuring.footprint import footprint
+from roadscan.measuring.ground import Ground
+from roadscan.measuring.listed import Unplaced
+from roadscan.measuring.orientation import omega_phi_kappa_deg, yaw_pitch_roll_deg
+from roadscan.measuring.poses import PicturePoses
+from roadscan.pictures.views import HEIGHT, WIDTH
+from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+from roadscan.tiles.product import ProductContext
+from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
+from roadscan.tiles.tasks.tile_files import publish_file
+
+Float64 = npt.NDArray[np.float64]
+
+PRODUCT: Final = "pictures"
+"""Name in the manifest, and of the table."""
+GEOPACKAGE: Final = "pictures.gpkg"
+_NUDGE_RAD: Final = 1e-6  # Small turn with which derivatives of angles are taken.
+_UPRIGHT_DEG: Final = 89.0
+"""Beyond this middle angle the outer two of three angles are not told apart, and have no σ."""
+
+
+@dataclass(frozen=True, eq=False)
+class PictureRows:
+    """Some pictures of a camera whose rows make a file. Sent to workers: it holds no picture."""
+
+    store: Store
+    context: ProductContext
+    unit: str
+    """Name of the file."""
+    key: str
+    poses: PicturePoses | None
+    """Those with a pose."""
+    ground: Ground | None
+    """The ground around them."""
+    unplaced: tuple[Unplaced, ...]
+    logs: tuple[str, ...]
+    """Paths of the logs that the poses name by number."""
+    reach_m: float
+
+
+def write_rows(task: PictureRows) -> OutputRecord:
+    """Write a file of the table (runs on a worker)."""
+    rows, places, prints = picture_rows(task)
+    schema = table_schema(PRODUCT)
+    table = pa.Table.from_pylist(rows, schema=schema.arrow())
+    figures = f'{{"pictures": {len(rows)}, "without_pose": {len(task.unplaced)}}}'
+    with task.store.scratch() as folder:
+        path = folder / task.unit
+        write_geo_table(
+            path, table, "geometry", places, ["Point Z"], task.context, counterclockwise=True,
+            more={"footprint": (prints, ["Polygon Z"])},
+        )  # fmt: skip
+        target = f"{schema.location}/{task.unit}"
+        return publish_file(task.store, path, target, PRODUCT, task.unit, task.key, figures)
+
+
+def picture_rows(task: PictureRows) -> tuple[list[dict[str, Any]], npt.NDArray[Any], npt.NDArray[Any]]:
+    """Return rows of `schemas/pictures.toml` in order of time, projection centres and footprints (None of none)."""
+    rows: list[dict[str, Any]] = []
+    shapes: list[tuple[Any, Any]] = []
+    if task.poses is not None and task.ground is not None:
+        angles = _angles(task.poses)
+        for number in range(len(task.poses)):
+            seen = footprint(task.poses, task.ground, number, task.reach_m)
+            row = _row(task, task.poses, number) | {name: values[number] for name, values in angles.items()}
+            if seen.polygon_m is not None:
+                row |= {"footprint_m2": seen.polygon_m.area, "footprint_on_ground": seen.on_ground}
+            rows.append({name: _plain(value) for name, value in row.items()})
+            shapes.append((shapely.Point(task.poses.place_m[number]), seen.polygon_m))
+    for one in task.unplaced:
+        size = {"width_px": one.size_px[0] or None, "height_px": one.size_px[1] or None}
+        names = {"run": one.run, "camera": one.camera, "file": one.file, "log": one.log, "without_pose": one.reason}
+        rows.append({**names, "epoch_gps_ns": one.epoch_gps_ns, "utc": utc_text(one.epoch_gps_ns), **size})
+        shapes.append((None, None))
+    order = sorted(range(len(rows)), key=lambda k: tuple(rows[k][name] for name in table_schema(PRODUCT).sort))
+    places, prints = (np.array([shapes[k][which] for k in order] + [None], object)[:-1] for which in (0, 1))
+    return [rows[k] for k in order], places, prints
+
+
+def utc_text(epoch_gps_ns: int) -> str:
+    """Return an epoch as UTC, ISO 8601 to the microsecond."""
+    return utc_from_gps_ns(epoch_gps_ns).astimezone(dt.UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+
+
+def _row(task: PictureRows, poses: PicturePoses, number: int) -> dict[str, Any]:
+    """Return a row without its angles."""
+    pictures = poses.pictures
+    log = pictures.logs[pictures.log[number]]
+    lens = pictures.views.lenses[pictures.views.lens[number]]
+    values = lens.parameters
+    epoch = int(pictures.epochs_gps_ns[number])
+    slope = poses.map_from_ned[number]
+    spread = np.sqrt(np.diag(slope @ poses.covariance[number, :3, :3] @ slope.T))
+    quaternion = quaternion_from_rotation(poses.map_from_camera[number])
+    named = zip(("longitude_deg", "latitude_deg", "ellipsoidal_height_m"), poses.geographic[number], strict=True)
+    return {
+        "run": log.run, "camera": log.sensor, "file": pictures.files[number], "log": task.logs[pictures.log[number]],
+        "epoch_gps_ns": epoch, "utc": utc_text(epoch),
+        **dict(zip(("easting_m", "northing_m", "height_m"), poses.place_m[number], strict=True)), **dict(named),
+        **dict(zip(("qw", "qx", "qy", "qz"), quaternion, strict=True)),
+        **dict(zip(("sigma_easting_m", "sigma_northing_m", "sigma_height_m"), spread, strict=True)),
+        "sigma_assumed": poses.told[number] or None,
+        "model": "equirectangular" if lens.is_around else "perspective",
+        "width_px": round(values[WIDTH]), "height_px": round(values[HEIGHT]),
+        "focal_x_px": values[0], "focal_y_px": values[1],
+    }  # fmt: skip
+
+
+def _angles(poses: PicturePoses) -> dict[str, Float64]:
+    """Return the columns (n,) of orientations with their σ."""
+    of_map, of_level = poses.map_from_camera, poses.ned_from_camera
+    level = of_map @ of_level.transpose(0, 2, 1)  # map from NED, without scale
+    covariance = poses.covariance[:, 3:, 3:]
+    opk, yaw = omega_phi_kappa_deg(of_map), yaw_pitch_roll_deg(of_level)
+    out = dict(zip(("omega_deg", "phi_deg", "kappa_deg"), opk.T, strict=True))
+    out |= dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), yaw.T, strict=True))
+    slopes = np.empty((2, len(poses), 3, 3))
+    for axis in range(3):
+        turn = np.eye(3)
+        one, other = [k for k in range(3) if k != axis]
+        sign = 1.0 if axis != 1 else -1.0
+        turn[one, other], turn[other, one] = -sign * _NUDGE_RAD, sign * _NUDGE_RAD
+        for which, told, base in ((0, omega_phi_kappa_deg(level @ turn @ of_level), opk),
+                                  (1, yaw_pitch_roll_deg(turn @ of_level), yaw)):  # fmt: skip
+            slopes[which, :, :, axis] = (np.mod(told - base + 180.0, 360.0) - 180.0) / _NUDGE_RAD
+    for which, names, angles in ((0, ("omega", "phi", "kappa"), opk), (1, ("yaw", "pitch", "roll"), yaw)):
+        spread = np.sqrt(np.einsum("nij,njk,nik->ni", slopes[which], covariance, slopes[which]))
+        steep = np.abs(angles[:, 1]) > _UPRIGHT_DEG
+        for k, name in enumerate(names):
+            out[f"sigma_{name}_deg"] = spread[:, k] if k == 1 else np.where(steep, np.nan, spread[:, k])
+    return out
+
+
+def _plain(value: Any) -> Any:
+    """Return a number that is NaN as null."""
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value
+
+
+def write_picture_package(
+    store: Store, context: ProductContext, records: Sequence[OutputRecord], key: str
+) -> OutputRecord:
+    """Write the GeoPackage of all files of the table: a layer of projection centres, and one of footprints."""
+    parts, places, prints = [], [], []
+    for record in records:
+        rows, shapes = read_geo_table(read_recorded(store, record), context)
+        prints.append(shapely.from_wkb(np.array(rows["footprint"].to_pylist(), object)))
+        parts.append(rows.drop_columns(["footprint"]).replace_schema_metadata(None))
+        places.append(shapes)
+    rows = pa.concat_tables(parts, promote_options="permissive")
+    seen = np.concatenate(prints)
+    known = ~shapely.is_missing(seen)
+    unit_m = context.map.horizontal_unit_m
+    in_metres = shapely.transform(seen[known], lambda xyz: xyz * [unit_m, unit_m, context.map.vertical_unit_m],
+                                  include_z=True)  # fmt: skip
+    names = ["run", "camera", "file", "epoch_gps_ns", "utc", "footprint_m2", "footprint_on_ground"]
+    layers = [Layer("pictures", "PointZ", rows, np.concatenate(places))]
+    if known.any():
+        layers.append(Layer("footprints", "PolygonZ", rows.select(names).filter(pa.array(known)), in_metres))
+    with store.scratch() as folder:
+        path = folder / GEOPACKAGE
+        write_geopackage(path, layers, context)
+        return publish_file(store, path, f"{table_schema(PRODUCT).location}/{GEOPACKAGE}", PRODUCT, GEOPACKAGE, key)

@@ -1,0 +1,185 @@
+"""Places and orientations of pictures on the map, with the uncertainty that trajectory and mounting state."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
+from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
+from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.ids import of_run
+from roadscan.core.rig import Sensor
+from roadscan.georeference.picture_axes import camera_from_map, map_from_ned
+from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
+from roadscan.georeference.sources import load_mountings
+from roadscan.measuring.orientation import nearest_rotation
+from roadscan.navigation.tasks.pose_sigma import pose_sigma, stated_pose_sigma
+from roadscan.navigation.tasks.trajectories import TrajectorySource, load_corrections, load_trajectory
+from roadscan.pictures.placed import Pictures
+from roadscan.poses.trajectory import world_from_ned
+from roadscan.store.small_tables import read_small
+
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+
+_SIGMA_COLUMNS: Final = (
+    "sigma_lever_forward_m", "sigma_lever_right_m", "sigma_lever_down_m",
+    "sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg",
+)  # fmt: skip
+"""σ of a calibrated mounting in the table `mountings`."""
+_WORDS: Final = {0: "position", 3: "roll, pitch, heading"}
+"""Words for the components of a pose, by the first of each."""
+
+
+@dataclass(frozen=True, eq=False)
+class PicturePoses:
+    """Poses of n pictures; the order is that of `pictures`."""
+
+    pictures: Pictures
+    place_m: Float64
+    """(n, 3) easting, northing, height of the projection centres."""
+    geographic: Float64
+    """(n, 3) longitude, latitude (degrees), ellipsoidal height (m) in the trajectory's datum; NaN of local frames."""
+    camera_from_map: Float64
+    """(n, 3, 3) from differences on the map to camera axes: a rotation with the map's scale in it."""
+    map_from_ned: Float64
+    """(n, 3, 3) derivative of the map by north, east, down."""
+    ned_from_camera: Float64
+    """(n, 3, 3) rotations."""
+    influence: Float64
+    """(n, 6, 12) how errors (of position by north, east, down; of attitude, lever arm, boresight by body axes)
+    move the camera (north, east, down; m) and turn it (about north, east, down; rad)."""
+    sigma: Float64
+    """(n, 12) 1 σ of those errors (m and rad)."""
+    told: tuple[str, ...]
+    """(n,) which σ are assumed because nothing states them; "" where all are stated."""
+    correlation_s: float
+    """Time after which errors of poses are correlated by 1/e (s)."""
+
+    def __len__(self) -> int:
+        """Return the number of pictures."""
+        return len(self.told)
+
+    @functools.cached_property
+    def map_from_camera(self) -> Float64:
+        """Rotations (n, 3, 3) from camera axes to easting, northing, height, without the map's scale."""
+        return nearest_rotation(self.map_from_ned) @ self.ned_from_camera
+
+    @functools.cached_property
+    def covariance(self) -> Float64:
+        """Covariance (n, 6, 6) of place (north, east, down; m) and small turn (about these axes; rad)."""
+        scaled = self.influence * self.sigma[:, None, :]
+        return scaled @ scaled.transpose(0, 2, 1)
+
+    def correlation(self, first: int, second: int) -> Float64:
+        """Return the correlation (12,) of the errors of two pictures.
+
+        Errors of poses fade over time within a run and are independent between runs; a mounting is one error.
+        """
+        pictures = self.pictures
+        one, other = (pictures.logs[pictures.log[k]] for k in (first, second))
+        apart_s = abs(int(pictures.epochs_gps_ns[first]) - int(pictures.epochs_gps_ns[second])) / NS_PER_S
+        out = np.zeros(12)
+        out[:6] = np.exp(-apart_s / self.correlation_s) if one.run == other.run else 0.0
+        out[6:] = 1.0 if one.sensor == other.sensor else 0.0
+        return out
+
+
+def picture_poses(plan: SurveyPlan, pictures: Pictures) -> PicturePoses:
+    """Return the poses of a survey's pictures on the map with their σ."""
+    views, count = pictures.views, len(pictures)
+    place, geographic = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
+    from_map, slope, level = (np.full((count, 3, 3), np.nan) for _ in range(3))
+    for number, world in enumerate(pictures.worlds):
+        own = np.flatnonzero(views.world == number)
+        if not own.size:
+            continue
+        eye, turn = views.eye_world_m[own], views.opencv_from_world[own]
+        place[own], from_map[own] = camera_from_map(pictures.map, world, eye, turn)
+        slope[own] = map_from_ned(pictures.map, world, eye)
+        level[own] = world_from_ned(world, eye).transpose(0, 2, 1) @ turn.transpose(0, 2, 1)
+        if world != LOCAL_WORLD:
+            geographic[own] = geodetic_from_world(world, eye)
+    influence, sigma = np.zeros((count, 6, 12)), np.zeros((count, 12))
+    told = np.full(count, "", object)
+    for number in np.unique(pictures.log).tolist():
+        own = np.flatnonzero(pictures.log == number)
+        influence[own], sigma[own], told[own] = _errors(plan, pictures, number, own, level[own])
+    settings = plan.survey.config.navigation.calibration
+    return PicturePoses(
+        pictures, place, geographic, from_map, slope, level, influence, sigma, tuple(told.tolist()),
+        settings.traverse_time_constant_s,
+    )  # fmt: skip
+
+
+def _errors(
+    plan: SurveyPlan, pictures: Pictures, number: int, own: Int64, ned_from_camera: Float64
+) -> tuple[Float64, Float64, str]:
+    """Return influence (k, 6, 12) and σ (k, 12) of the errors of a log's pictures, and what is assumed of them."""
+    log, epochs = pictures.logs[number], pictures.epochs_gps_ns[own]
+    camera, calibrated = plan.survey.rig.sensors[log.sensor], load_mountings(plan.store)
+    mountings = mountings_of(log.run, log.sensor, camera.mounting(), calibrated)
+    influence = np.zeros((own.size, 6, 12))
+    for part, mounting in mountings.pieces(epochs):
+        rotation, lever = mounting.arrays()
+        body = ned_from_camera[part] @ (rotation @ SENSOR_FROM_OPENCV).T
+        influence[part, :3, 3:6] = -body @ _cross(lever)
+        influence[part, :3, 6:9] = body
+        influence[part, 3:, 3:6] = influence[part, 3:, 9:] = body
+    influence[:, :3, :3] = np.eye(3)
+    poses, assumed = _pose_sigma(plan, trajectory_source(log.run, plan.records), epochs)
+    mounted, unknown = _mounting_sigma(plan, log.run, log.sensor, camera, epochs)
+    told = "; ".join(filter(None, (assumed, unknown)))
+    return influence, np.hstack([poses, mounted]), told
+
+
+def _pose_sigma(plan: SurveyPlan, source: TrajectorySource, epochs: Int64) -> tuple[Float64, str]:
+    """Return 1 σ (k, 6; m and rad) of poses: adjusted, else stated, else those of the settings."""
+    settings, store = plan.survey.config.navigation.calibration, plan.store
+    sigma = pose_sigma(store, plan.records, source, epochs, settings)
+    _, stated = stated_pose_sigma(store, plan.records, source)
+    known = [bool(np.isfinite(stated[:, k]).any()) for k in range(6)]
+    span = (int(epochs.min()), int(epochs.max()))
+    corrections = load_corrections(store, source.run)
+    trajectory = load_trajectory(store, source, [span], plan.ground.max_gap_s)
+    if trajectory.sigma_ned_m is not None and np.isfinite(trajectory.sigma_ned_m).all() and trajectory.sigma_ned_m.size:
+        since = (trajectory.epochs_gps_ns - span[0]).astype(np.float64)
+        for k in range(3):
+            sigma[:, k] = np.interp((epochs - span[0]).astype(np.float64), since, trajectory.sigma_ned_m[:, k])
+        known[:3] = [True] * 3
+    if corrections is not None and corrections.sigma is not None and np.isfinite(corrections.sigma[:, 3:]).all():
+        since = (corrections.epochs_gps_ns - span[0]).astype(np.float64)
+        for k in range(3, 6):
+            sigma[:, k] = np.interp((epochs - span[0]).astype(np.float64), since, corrections.sigma[:, k])
+        known[3:] = [True] * 3
+    missing = [words for first, words in _WORDS.items() if not all(known[first : first + 3])]
+    return sigma, f"σ of {' and '.join(missing)} as in navigation.calibration" if missing else ""
+
+
+def _mounting_sigma(plan: SurveyPlan, run: str, sensor: str, camera: Sensor, epochs: Int64) -> tuple[Float64, str]:
+    """Return 1 σ (k, 6; m and rad) of a camera's mounting: calibrated, else the rig file's; 0 where none is stated."""
+    lever, turn = camera.lever_arm_sigma_m, camera.boresight_sigma_deg
+    stated = np.array([*(lever or (np.nan,) * 3), *np.radians(turn or (np.nan,) * 3)])
+    sigma = np.tile(stated, (epochs.size, 1))
+    table = read_small(plan.store, "mountings")
+    rows: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for row in () if table is None else table.sort_by("valid_from_gps_ns").to_pylist():
+        rows.setdefault((row["run"], row["sensor"]), []).append(row)
+    for row in of_run(rows, run, sensor) or ():
+        values = np.array([np.nan if row[name] is None else row[name] for name in _SIGMA_COLUMNS])
+        values[3:] = np.radians(values[3:])
+        sigma[epochs >= row["valid_from_gps_ns"]] = values
+    unknown = bool(np.isnan(sigma).any())
+    return np.nan_to_num(sigma), "mounting without σ, taken as 0" if unknown else ""
+
+
+def _cross(vector: Float64) -> Float64:
+    """Return the matrix (3, 3) of the cross product with a vector (3,)."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.survey import Survey
-from roadscan.georeference.plan.plan import plan_survey
+from roadscan.georeference.plan.plan import plan_without_readings
 from roadscan.pictures.placed import plan_pictures
 from roadscan.pictures.views import PictureRule
 from roadscan.store.store import Store
@@ -122,7 +122,7 @@ def placed(survey_file: Path) -> Float64:
     """Returns poses (n, 3, 4) of the pictures, as products place them: OpenCV's axes in the local frame."""
     survey = Survey.load(survey_file)
     store = Store(survey.store_url, survey.config.id)
-    plan = plan_survey(survey, store, needs_readings=False)
+    plan = plan_without_readings(survey, store)
     views = plan_pictures(plan, PictureRule((), 50.0, -90.0, 1)).views
     return np.concatenate([views.opencv_from_world.transpose(0, 2, 1), views.eye_world_m[:, :, None]], axis=2)
 

@@ -129,9 +129,7 @@ def approached(
     return Approached(pictures, rows, place, weight, sigma, number, settled)
 
 
-def _judged(
-    pictures: PictureEvidence, rows: Rows, found: Adjustment, others: int
-) -> tuple[Float64, float]:
+def _judged(pictures: PictureEvidence, rows: Rows, found: Adjustment, others: int) -> tuple[Float64, float]:
     """Returns the length (m,) of each measurement's residual against the prediction of all others, in σ, NaN where it
     did not enter; and the root of the squares of tie points over their redundancy, in the σ of their rows.
     """

@@ -95,11 +95,13 @@ class Work:
     """Control points of the survey."""
     hand: HandWork
     """Ties by hand."""
+    of_pictures: frozenset[int] = frozenset()
+    """Numbers of control points that pictures alone can see: plates on walls and posts."""
 
     @property
     def own_points(self) -> list[ControlPoint]:
-        """Returns the points that do not stand for a surveyed line."""
-        return [point for point in self.points if not point.is_of_line]
+        """Returns the points that passes may see: neither of a surveyed line nor of pictures alone."""
+        return [point for point in self.points if not point.is_of_line and point.number not in self.of_pictures]
 
 
 class Seen(NamedTuple):
@@ -307,7 +309,8 @@ def plan_work(plan: SurveyPlan, sources: Sources, priors: Sequence[RunPrior]) ->
     ties = tie_tasks(plan, sources, places, runs_of(plan), config.ties)
     control = control_tasks(plan, sources, tracks, points, priors)
     hand = hand_work(plan, sources, tracks, priors, len(points))
-    return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points), hand)
+    plates = frozenset(one.number for one in points if config.targets.of_code(one.code).shape == "pictures")
+    return Work(tuple(tracks), tuple(ties), tuple(control), tuple(points), hand, plates)
 
 
 def _places(tracks: Sequence[Track], settings: PlaceSettings) -> list[Place]:

@@ -20,17 +20,16 @@ from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.navigation.tasks.taken_pictures import taken_pictures
 from roadscan.pictures.exposures import Exposures, exposures_of
+from roadscan.pictures.points import TABLE, measured_points
 from roadscan.pictures.settings import PictureTiesConfig
 from roadscan.pictures.ties.work import ALL, TRACKS
 from roadscan.store.manifest import Manifest, read_recorded
-from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-POINTS: Final = "picture_points"
-"""Table of control points measured in pictures."""
+_NAMED: Final = 5  # Names that a note lists.
 _START_PX: Final = 0.5
 """1 σ of a tie point (px) until its residuals show it."""
 _BLUNT_PX: Final = 8.0
@@ -76,7 +75,7 @@ def pictures_key(plan: SurveyPlan, manifest: Manifest) -> list[Any]:
     cameras = [
         [name, one.model_dump(mode="json")] for name, one in sorted(plan.survey.rig.sensors.items()) if _has_lens(one)
     ]
-    logs = [[r.key, r.run, r.sensor] for r in plan.records if r.tables.get("images") or r.tables.get(POINTS)]
+    logs = [[r.key, r.run, r.sensor] for r in plan.records if r.tables.get("images") or r.tables.get(TABLE)]
     return ["" if tracks is None else tracks.digest, cameras, logs]
 
 
@@ -181,48 +180,27 @@ def _control(
     plan: SurveyPlan, priors: CameraPriors, index: dict[tuple[str, str, str], int], points: Sequence[ControlPoint]
 ) -> tuple[_Part, Int64, list[str]]:
     """Returns measurements of control points, the control point of each point, and notes on those left out."""
-    rows = [
-        row
-        for record in plan.records
-        for file in record.tables.get(POINTS, ())
-        for row in read_groups(plan.store, file.path, range(len(file.group_rows))).to_pylist()
-    ]
+    found = measured_points(plan.store, plan.records, plan.survey.rig)
     known = {one.name: k for k, one in enumerate(points) if not one.is_of_line}
-    cameras = sorted({key[:2] for key in index})
-    picture, pixel, sigma, point = list[int](), list[list[float]](), list[float](), list[int]()
-    unknown, unseen = set[str](), set[str]()
-    for row in rows:
-        at = _picture_of(row, index, cameras)
+    unknown, unplaced = set[str](), set[str]()
+    picture, point, values = list[int](), list[int](), list[tuple[float, float, float]]()
+    for row in found.rows.to_pylist():
+        at = index.get((row["run"], row["sensor"], row["picture"]))
         if row["point"] not in known:
             unknown.add(row["point"])
         elif at is None:
-            unseen.add(row["picture"])
+            unplaced.add(row["picture"])
         else:
             picture.append(at)
-            pixel.append([row["u_px"], row["v_px"]])
-            sigma.append(row["sigma_px"] or priors.sigma_control_px)
             point.append(known[row["point"]])
+            values.append((row["u_px"], row["v_px"], row["sigma_px"] or priors.sigma_control_px))
     number, own = np.unique(np.array(point, np.int64), return_inverse=True)
-    notes = [f"no control point is called {', '.join(sorted(unknown)[:5])}: not used"] if unknown else []
-    notes += [f"no picture with a pose is called {', '.join(sorted(unseen)[:5])}: not used"] if unseen else []
-    part = _Part(
-        np.array(picture, np.int64), np.array(pixel, np.float64).reshape(-1, 2), np.array(sigma), own.astype(np.int64)
-    )
+    notes = [*found.notes]
+    notes += [f"no control point is called {', '.join(sorted(unknown)[:_NAMED])}: not used"] if unknown else []
+    notes += [f"no pose for {', '.join(sorted(unplaced)[:_NAMED])}: points in it are not used"] if unplaced else []
+    measured = np.array(values, np.float64).reshape(-1, 3)
+    part = _Part(np.array(picture, np.int64), measured[:, :2], measured[:, 2], own.astype(np.int64))
     return part, number.astype(np.int64), notes
-
-
-def _picture_of(
-    row: dict[str, Any], index: dict[tuple[str, str, str], int], cameras: Sequence[tuple[str, str]]
-) -> int | None:
-    """Returns the number of the picture that a row names; run and camera may be left out where one has such a file."""
-    fits = [
-        index[run, sensor, row["picture"]]
-        for run, sensor in cameras
-        if row.get("run") in (None, "", run)
-        and row.get("sensor") in (None, "", sensor)
-        and (run, sensor, row["picture"]) in index
-    ]
-    return fits[0] if len(fits) == 1 else None
 
 
 def _world(plan: SurveyPlan, exposures: Exposures, points: Sequence[ControlPoint]) -> Float64:

@@ -90,17 +90,12 @@ class SurveyPlan:
 
 
 def plan_survey(
-    survey: Survey,
-    store: Store,
-    calibrated: DatedMountings | None = None,
-    records: Sequence[LogRecord] | None = None,
-    *,
-    needs_readings: bool = True,
+    survey: Survey, store: Store, calibrated: DatedMountings | None = None, records: Sequence[LogRecord] | None = None
 ) -> SurveyPlan:
     """Build the plan from the tables and the survey file; reads no readings.
 
     `calibrated` stand in for the table of mountings where they are given, `records` for those of the survey's logs and
-    trajectories. `needs_readings` is false for what pictures alone serve for.
+    trajectories.
 
     Raises
     ------
@@ -121,7 +116,7 @@ def plan_survey(
     sources = tuple(_sources(survey, store, used, ground, known, corrections))
     if not sources and apart and any(r.tables.get(t) for r in records for t in DATA_TABLES):
         raise NothingPlacedError.of(apart)
-    if not sources and needs_readings:
+    if not sources:
         if not any(yields_readings(r.format) for r in records):
             raise NothingToPlaceError(
                 "nothing to place: the survey has no log of scans, returns or points",
@@ -349,4 +344,4 @@ def poses_plan_of(session: Session) -> SurveyPlan:
     except NothingToPlaceError:
         if not session.survey.has("picture_ties"):
             raise
-        return plan_survey(session.survey, session.store, records=records_of(session), needs_readings=False)
+        return plan_without_readings(session.survey, session.store)

@@ -25,8 +25,11 @@ _ROUNDS: Final = 2
 """Rounds of weights of the other observations in a solution on the way; the last solution takes as many as it needs."""
 _WIDE: Final = np.array([4.0, 2.0, 1.5])
 """Factors of the limits of judgement in the first solutions, which poses still distort."""
+_FASTER: Final = 16.0
+"""Factor by which correlation times are shortened on the way: measurements are judged by one another, not by how slowly
+the errors of poses are thought to vary; the last solution tells how fast they do."""
 _LEAST: Final = 0.02  # A weight below this is none.
-_SETTLED_PX: Final = 0.02
+_SETTLED_PX: Final = 0.05
 """Where residuals change by less than this from solution to solution (px, 95 %), rows are linear enough."""
 _MEDIAN: Final = 1.1774
 """Median of the length of two standard normal numbers (Rayleigh)."""
@@ -104,6 +107,7 @@ def approached(
     """
     first = places(pictures, others[1])
     quiet = settings.model_copy(update={"estimate_variance_components": False, "max_rounds": _ROUNDS})
+    priors = [one.faster(_FASTER, _FASTER) for one in priors]
     state, weight, heavy = State(), _at_start(pictures), 1.0
     before, settled = np.zeros((0, 2)), False
     for number in range(1, _MOST + 1):

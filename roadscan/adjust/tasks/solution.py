@@ -296,13 +296,13 @@ def _adjusted(
                 for one in priors
             )
             continue
-        off = disproved(found.mountings)
+        off = disproved(found.mountings) & ~_filmed(evidence, found)[:, None]
         if not off.any():
             break
         sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
         priors = tuple(replace(one, sigma=own) for one, own in zip(priors, sigma, strict=True))
     stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, len(MOUNTED))
-    filmed = np.array([name in evidence.mounted.cameras for _, name in found.mountings.sensors], bool)
+    filmed = _filmed(evidence, found)
     estimated, wrong = found.mountings, contradicted(found.mountings, evidence.mounted.cameras)
     named = causes(found.mountings.of(~filmed))
     if priors and not wrong.all():
@@ -317,6 +317,11 @@ def _adjusted(
             sigma=np.where(wrong[:, None], found.mountings.sigma, estimated.sigma),
         )
     return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named, approach
+
+
+def _filmed(evidence: Evidence, found: Adjustment) -> Bool:
+    """Returns a mask (s,) of the mountings of cameras."""
+    return np.array([name in evidence.mounted.cameras for _, name in found.mountings.sensors], bool)
 
 
 def _without(sigma: Float64, axes: Sequence[int]) -> Float64:

@@ -1,11 +1,13 @@
-"""Poses from pictures: a recorded drive whose poses are disturbed, and a simulated street with control in pictures.
+"""Poses from pictures: a recorded drive whose poses are disturbed, and simulated streets with control in pictures.
 
-Surveys are written as a user would, `roadscan run` takes them with default settings, and figures come from its products.
+Surveys are written as a user would, `roadscan run` takes them with default settings, and figures come from products.
 Draws 0 to 2 were looked at when the judgement of tie points was built; 10 to 12 are only scored.
 """
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,14 +23,49 @@ from benchmarks.timing import Figure
 
 ERRORS: Final = (0.1, 0.2)
 """1 σ of the disturbed poses (m, degrees)."""
+SCENES: Final = {"street_with_cameras": 0.03, "street_without_gnss": 0.05}
+"""Simulated streets, and the bar of their check points in space (m)."""
+MEASURED: Final = """[[runs.logs]]
+path = "measured.csv"
+format = "picture_points_csv"
+sensor = "camera"
+
+[picture_ties]
+
+[[passes]]"""
+"""What is added to a simulated survey: the targets that were found in its pictures, and tie points."""
 DRAWS: Final = (10, 11, 12)
 
 
 def figures(folder: Path) -> Iterator[Figure]:
-    """Each draw of the recorded drive."""
+    """Each draw of the recorded drive, then the simulated streets."""
     recording = recording_folder().parent / picture_drive.RECORDING
     for seed in DRAWS:
         yield from of_draw(recording, bench_folder(folder) / f"draw-{seed}", seed)
+    for scene, bar in SCENES.items():
+        yield from of_scene(scene, bench_folder(folder) / scene, bar)
+
+
+def of_scene(scene: str, folder: Path, bar_m: float) -> Iterator[Figure]:
+    """Check points, whose rays meet away from their survey, before and after; χ² of the tie points."""
+    if not (folder / "SURVEY.toml").is_file():
+        _roadscan("simulate", scene, "--out", str(folder))
+    file = folder / "SURVEY.toml"
+    if not (folder / "measured.csv").is_file():
+        _roadscan("ingest", str(file))
+        _roadscan("camera", "targets", str(file), "--out", str(folder / "measured.csv"))
+        file.write_text(file.read_text().replace("[[passes]]", MEASURED, 1))
+    picture_drive.run(file)
+    rows = pq.read_table(next(folder.glob("store/*/tables/picture_control/*.parquet"))).to_pandas()
+    check = rows[rows.role == "check"]
+    for word in ("before", "after"):
+        away = np.linalg.norm(check[[f"{word}_{axis}_m" for axis in ("north", "east", "down")]].to_numpy(), axis=1)
+        yield Figure(f"{scene}: check points in space, {word}, RMS", 1e3 * _rms(away), "mm", 1e3 * bar_m, "the bar")
+        yield Figure(f"{scene}: the same, largest", 1e3 * float(away.max()), "mm")
+
+
+def _roadscan(*words: str) -> None:
+    subprocess.run([sys.executable, "-m", "roadscan", *words], check=True)
 
 
 def of_draw(recording: Path, folder: Path, seed: int) -> Iterator[Figure]:

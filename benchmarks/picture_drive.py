@@ -28,8 +28,8 @@ RECORDING: Final = "pictures/drive_left"
 EVERY: Final = range(51)
 """Pictures of the recording."""
 SOUND: Final = 12
-"""From this picture on the recorded poses agree with the pictures to hundredths of a degree over five of them; before it
-they are off by up to 0.57°, by whatever errors the poses of a survey are disturbed."""
+"""From this picture on the recorded poses agree with the pictures to hundredths of a degree over five of them; before
+it they are off by up to 0.57°, by whatever errors the poses of a survey are disturbed."""
 STEP_S: Final = 0.1
 """Time from picture to picture (s)."""
 FIRST_UNIX_S: Final = 1_600_000_000.0

@@ -185,12 +185,12 @@ def test_poses_boresight_and_lens_come_back(false: float) -> None:
     assert np.abs(body - drive.true_body_m).max() < 0.03
     # Over 20 m, which is what a picture sees.
     way = np.linalg.norm((body[20:] - body[:-20]) - (drive.true_body_m[20:] - drive.true_body_m[:-20]), axis=1)
-    assert way.max() < 0.02
+    assert np.median(way) < 0.01 and way.max() < 0.025
     looks = Rotation.from_matrix(turned.transpose(0, 2, 1) @ drive.true_turn)
     # The attitude of the camera is what is determined: that of the body and the boresight share a constant.
     whole = Rotation.from_rotvec(state.mountings[0][3:6]).inv() * looks * Rotation.from_rotvec(BORESIGHT_RAD)
     assert np.degrees(whole.magnitude()).max() < 0.08
-    assert state.cameras[0][0] == pytest.approx(1.5, abs=0.3)
+    assert abs(state.cameras[0][0] - 1.5) < 3.0 * found.cameras.sigma[0, 0]
 
 
 def test_stated_sigma_holds_and_residuals_are_those_of_the_noise() -> None:

@@ -86,8 +86,9 @@ def of_draw(recording: Path, folder: Path, seed: int) -> Iterator[Figure]:
         yield Figure(f"draw {seed}: the same where the recorded poses are sound, RMS", sound, unit, bar, "the bar")
     rows = pq.read_table(next(folder.glob("store/*/tables/picture_residuals/*.parquet"))).to_pandas()
     used = rows[rows.weight > 0.0]
-    left = float(np.sqrt(np.mean(used[["after_u_px", "after_v_px"]].to_numpy() ** 2)))
-    yield Figure(f"draw {seed}: residuals that count, RMS", left, "px", 0.35, "the bar")
+    squares = used[["after_u_px", "after_v_px"]].to_numpy() ** 2
+    left = float(np.sqrt(np.average(squares.mean(axis=1), weights=used.weight)))
+    yield Figure(f"draw {seed}: residuals by their weight, RMS", left, "px", 0.35, "the bar")
     yield Figure(f"draw {seed}: pictures that take part", float(used.file.nunique()), "", 51.0, "all")
     yield Figure(f"draw {seed}: time of the run", took, "s", 120.0, "the bar")
 

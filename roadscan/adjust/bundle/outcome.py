@@ -63,11 +63,13 @@ class PictureOutcome:
     notes: tuple[str, ...]
 
     def rms_px(self, *, after: bool) -> float:
-        """Returns the root mean square of each coordinate of the tie points that count."""
-        used = (self.weight > 0.0) & self.measured.is_tie
-        values = (self.after_px if after else self.before_px)[used]
-        values = values[np.isfinite(values).all(axis=1)]
-        return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+        """Returns the root mean square of each coordinate of tie points, each counting by its weight."""
+        values = self.after_px if after else self.before_px
+        used = (self.weight > 0.0) & self.measured.is_tie & np.isfinite(values).all(axis=1)
+        weight = self.weight[used]
+        if not weight.size:
+            return float("nan")
+        return float(np.sqrt((weight[:, None] * values[used] ** 2).sum() / (2.0 * weight.sum())))
 
 
 def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[ControlPoint]) -> PictureOutcome:

@@ -1,0 +1,141 @@
+"""What pictures show: from the points around a picture, which distances are hidden, at an edge, or have moved away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.colours.kernels.depths import grow, nearest_in_pixels
+from roadscan.colours.kernels.looks import FOCAL_X, FOCAL_Y, HEIGHT, LEAST_M, STEPS, UNKNOWN, WIDTH, Camera, project
+from roadscan.core.extras import cv2
+
+Float32 = npt.NDArray[np.float32]
+Int64 = npt.NDArray[np.int64]
+UInt16 = npt.NDArray[np.uint16]
+
+_MOST_PIXELS: Final = 500_000
+"""Most pixels of a depth image: its pixels stand for so many of the picture's that it has no more."""
+_BLOCK: Final = 16
+"""Edge of the blocks (pixels) in which the gaps between points are measured."""
+_MOST_GAP: Final = 8.0
+"""Wider gaps (pixels from the nearest point) are not closed: nothing may be there."""
+_OF_GAPS: Final = 80.0
+"""Percentile of the distances to the nearest point in a block that counts as its gap."""
+_THICKNESS_M: Final = 0.15
+"""A point may lie so far behind the nearest one and still be seen (m): noise of ranges and poses, rough surfaces."""
+_THICKNESS: Final = 0.01
+"""The same as a share of its distance."""
+_MOVED_M: Final = 0.5
+"""What was seen so far behind a place (m) was seen through it."""
+_MOVED: Final = 0.05
+"""The same as a share of its distance."""
+_FAR: Final = np.float32(1e9)  # Stands for inf where OpenCV filters images (m).
+
+
+@dataclass(frozen=True)
+class DepthRule:
+    """How depth images are made."""
+
+    moment_ns: int
+    """Points seen within this of the picture show where things that move were."""
+    grazing_deg: float
+    """Least angle between a ray and a surface that is seen."""
+    edge_px: float
+    """Points nearer to an edge in depth (pixels of the picture) do not count as seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImages:
+    """What a picture shows, as `Depths` of the kernels has it: (rows, columns) stored distances."""
+
+    nearest: UInt16
+    farthest: UInt16
+    moved: UInt16
+    factor: int
+    """Pixels of the picture along the edge of one of theirs."""
+
+
+def depth_factor(lens: npt.NDArray[np.float64]) -> int:
+    """Returns how many pixels of a picture lie along the edge of a pixel of its depth images."""
+    return max(1, int(np.ceil(np.sqrt(lens[WIDTH] * lens[HEIGHT] / _MOST_PIXELS))))
+
+
+def depth_images(
+    point_m: Float32, epoch_gps_ns: Int64, camera: Camera, own_epoch_gps_ns: int, reach_m: float, rule: DepthRule
+) -> DepthImages:
+    """Returns what a picture shows, from points (n, 3; map, from the origin of the camera) with their epochs (n,).
+
+    Points of the moment come first. Points of other times count unless something was seen through them at the moment:
+    such were things that moved. Nearest points of each pixel grow to cones that close the gaps between them (`grow`).
+    """
+    factor = depth_factor(camera.lens)
+    shape = (-(-int(camera.lens[HEIGHT]) // factor), -(-int(camera.lens[WIDTH]) // factor))
+    pixel, distance = np.empty((len(point_m), 2), np.float32), np.empty(len(point_m), np.float32)
+    project(point_m, camera, reach_m, pixel, distance)
+    at_once = np.abs(epoch_gps_ns - own_epoch_gps_ns) <= rule.moment_ns
+    slope = factor / (np.tan(np.radians(rule.grazing_deg)) * np.sqrt(camera.lens[FOCAL_X] * camera.lens[FOCAL_Y]))
+    moment = _nearest(pixel, distance, np.flatnonzero(at_once), factor, shape)
+    around = _grown(moment, slope)[0]
+    other = _nearest(pixel, distance, np.flatnonzero(~at_once), factor, shape)
+    with np.errstate(invalid="ignore"):
+        seen_through = np.isfinite(around) & (around > other * (1.0 + _MOVED) + _MOVED_M)
+    other[seen_through] = np.inf
+    front, radius = _grown(np.minimum(moment, other), slope)
+    margin = rule.edge_px / factor
+    behind = _farthest(front, radius, margin)
+    reach_px = np.repeat(np.repeat(radius, _BLOCK, axis=0), _BLOCK, axis=1)[: shape[0], : shape[1]] + margin
+    known = np.isfinite(front)
+    nearest = np.where(known, (behind - _THICKNESS_M) / (1.0 + _THICKNESS + slope * reach_px), 0.0)
+    farthest = np.where(known, front * (1.0 + _THICKNESS) + _THICKNESS_M, np.inf)
+    moved = np.where(np.isfinite(around), (around - _MOVED_M) / (1.0 + _MOVED), 0.0)
+    return DepthImages(_stored(nearest), _stored(farthest), _stored(moved), factor)
+
+
+def _nearest(pixel: Float32, distance_m: Float32, rows: Int64, factor: int, shape: tuple[int, int]) -> Float32:
+    image = np.full(shape, np.inf, np.float32)
+    nearest_in_pixels(pixel, distance_m, rows, float(factor), image)
+    return image
+
+
+def _grown(sample_m: Float32, slope: float) -> tuple[Float32, Float32]:
+    """Returns samples (height, width) with their gaps closed, and the radius of the cones by block (pixels)."""
+    radius = _gaps(sample_m)
+    out = np.empty_like(sample_m)
+    grow(sample_m, radius, _BLOCK, slope, out)
+    return out, radius
+
+
+def _gaps(sample_m: Float32) -> Float32:
+    """Returns the gap between samples by block of pixels (rows, columns): from 1 to the widest that is closed."""
+    empty = (~np.isfinite(sample_m)).astype(np.uint8)
+    height, width = sample_m.shape
+    rows, columns = -(-height // _BLOCK), -(-width // _BLOCK)
+    if empty.all():
+        return np.ones((rows, columns), np.float32)
+    away = np.full((rows * _BLOCK, columns * _BLOCK), np.nan, np.float32)
+    away[:height, :width] = np.minimum(cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), _MOST_GAP)
+    blocks = away.reshape(rows, _BLOCK, columns, _BLOCK).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
+    return np.clip(np.nanpercentile(blocks, _OF_GAPS, axis=-1) + 1.0, 1.0, _MOST_GAP).astype(np.float32)
+
+
+def _farthest(front_m: Float32, radius: Float32, margin: float) -> npt.NDArray[np.float64]:
+    """Returns the farthest distance (height, width) within the radius of the cones and the margin beside an edge."""
+    height, width = front_m.shape
+    whole = np.ceil(np.repeat(np.repeat(radius, _BLOCK, axis=0), _BLOCK, axis=1)[:height, :width] + margin)
+    finite = np.where(np.isfinite(front_m), front_m, _FAR)
+    out = np.empty((height, width))
+    for reach in np.unique(whole).astype(int).tolist():
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        own = whole == reach
+        out[own] = cv2.dilate(finite, disc, borderType=cv2.BORDER_REPLICATE)[own]
+    return np.where(out >= _FAR, np.inf, out)
+
+
+def _stored(distance_m: npt.NDArray[np.floating]) -> UInt16:
+    """Returns distances as they are stored; inf stands for any."""
+    with np.errstate(divide="ignore"):
+        steps = STEPS * np.log(np.maximum(distance_m, LEAST_M) / LEAST_M)
+    return np.where(np.isfinite(distance_m), np.minimum(steps, UNKNOWN - 1), UNKNOWN).astype(np.uint16)

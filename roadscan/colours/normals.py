@@ -1,0 +1,37 @@
+"""Normals of points from the plane that fits those in the same cube best."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+Float32 = npt.NDArray[np.float32]
+
+_CUBE_M: Final = 0.5
+"""Edge of the cubes (m); they are anchored at the tile's corner and at height 0."""
+_LEAST_POINTS: Final = 8  # Fewest points of a plane.
+_FLAT: Final = 0.1
+"""Largest share of the variance that may lie across a plane: more is a shrub, or a corner."""
+
+
+def normals_of(point_m: npt.NDArray[np.float64]) -> Float32:
+    """Returns unit normals (n, 3) of points (n, 3); NaN where those around lie in no plane."""
+    cube = np.floor(point_m / _CUBE_M).astype(np.int64)
+    cube -= cube.min(axis=0) if len(cube) else 0
+    size = cube.max(axis=0) + 1 if len(cube) else np.ones(3, np.int64)
+    _, which, count = np.unique(
+        (cube[:, 2] * size[1] + cube[:, 1]) * size[0] + cube[:, 0], return_inverse=True, return_counts=True
+    )
+    middle = np.stack([np.bincount(which, point_m[:, k], count.size) for k in range(3)], axis=-1)
+    middle /= np.maximum(count, 1)[:, None]
+    off = point_m - middle[which]
+    spread = np.empty((count.size, 3, 3))
+    for i in range(3):
+        for j in range(i, 3):
+            spread[:, i, j] = spread[:, j, i] = np.bincount(which, off[:, i] * off[:, j], count.size)
+    values, vectors = np.linalg.eigh(spread)
+    flat = (count >= _LEAST_POINTS) & (values[:, 0] <= _FLAT * values[:, 1]) & (values[:, 1] > 0.0)
+    normal = np.where(flat[:, None], vectors[:, :, 0], np.nan)
+    return np.asarray(normal[which], np.float32)

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.colours.kernels.depths import grow, nearest_in_pixels
+from roadscan.colours.kernels.depths import grow, nearest_in_pixels, slopes
 from roadscan.colours.kernels.looks import FOCAL_X, FOCAL_Y, HEIGHT, LEAST_M, STEPS, UNKNOWN, WIDTH, Camera, project
 from roadscan.core.extras import cv2
 
@@ -32,6 +32,11 @@ _MOVED_M: Final = 0.5
 """What was seen so far behind a place (m) was seen through it."""
 _MOVED: Final = 0.05
 """The same as a share of its distance."""
+_AROUND: Final = 12
+"""Something was seen through a place where nothing as near was seen within so many pixels of it at the moment: leaves,
+wires and the like are seen through, and stay."""
+_UNKNOWN_SLOPE: Final = 2.7
+"""Slope (m a m across the ray) of a surface whose normal is not known: it is seen at 20 degrees."""
 _FAR: Final = np.float32(1e9)  # Stands for inf where OpenCV filters images (m).
 
 
@@ -45,6 +50,21 @@ class DepthRule:
     """Least angle between a ray and a surface that is seen."""
     edge_px: float
     """Points nearer to an edge in depth (pixels of the picture) do not count as seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Points (n,) around some pictures."""
+
+    point_m: Float32
+    """(n, 3) map, from the origin of the cameras."""
+    normal: Float32
+    """(n, 3) unit normals of their surfaces, NaN where unknown."""
+    epoch_gps_ns: Int64
+
+    def part(self, rows: slice) -> Seen:
+        """Returns some of them."""
+        return Seen(self.point_m[rows], self.normal[rows], self.epoch_gps_ns[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,47 +84,63 @@ def depth_factor(lens: npt.NDArray[np.float64]) -> int:
 
 
 def depth_images(
-    point_m: Float32, epoch_gps_ns: Int64, camera: Camera, own_epoch_gps_ns: int, reach_m: float, rule: DepthRule
+    points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: float, rule: DepthRule
 ) -> DepthImages:
-    """Returns what a picture shows, from points (n, 3; map, from the origin of the camera) with their epochs (n,).
+    """Returns what a picture shows, from the points around it.
 
-    Points of the moment come first. Points of other times count unless something was seen through them at the moment:
-    such were things that moved. Nearest points of each pixel grow to cones that close the gaps between them (`grow`).
+    Points of the moment come first. Points of other times count unless something was seen through their place at the
+    moment: such were things that moved. Nearest points of each pixel grow to discs that close the gaps (`grow`).
     """
     factor = depth_factor(camera.lens)
     shape = (-(-int(camera.lens[HEIGHT]) // factor), -(-int(camera.lens[WIDTH]) // factor))
-    pixel, distance = np.empty((len(point_m), 2), np.float32), np.empty(len(point_m), np.float32)
-    project(point_m, camera, reach_m, pixel, distance)
-    at_once = np.abs(epoch_gps_ns - own_epoch_gps_ns) <= rule.moment_ns
-    slope = factor / (np.tan(np.radians(rule.grazing_deg)) * np.sqrt(camera.lens[FOCAL_X] * camera.lens[FOCAL_Y]))
-    moment = _nearest(pixel, distance, np.flatnonzero(at_once), factor, shape)
-    around = _grown(moment, slope)[0]
-    other = _nearest(pixel, distance, np.flatnonzero(~at_once), factor, shape)
-    with np.errstate(invalid="ignore"):
-        seen_through = np.isfinite(around) & (around > other * (1.0 + _MOVED) + _MOVED_M)
-    other[seen_through] = np.inf
-    front, radius = _grown(np.minimum(moment, other), slope)
+    pixel, distance = np.empty((len(points.point_m), 2), np.float32), np.empty(len(points.point_m), np.float32)
+    project(points.point_m, camera, reach_m, pixel, distance)
+    at_once = np.abs(points.epoch_gps_ns - own_epoch_gps_ns) <= rule.moment_ns
+    pixel_rad = float(factor / np.sqrt(camera.lens[FOCAL_X] * camera.lens[FOCAL_Y]))
+    steepest = float(1.0 / np.tan(np.radians(rule.grazing_deg)))
+    moment, which = _nearest(pixel, distance, np.flatnonzero(at_once), factor, shape)
+    around = _grown(moment, _slopes(moment, which, points, camera, (pixel_rad, steepest)))[0]
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _AROUND + 1, 2 * _AROUND + 1))
+    seen = np.isfinite(around)
+    around = np.where(seen, cv2.erode(np.where(seen, around, _FAR), disc), np.inf).astype(np.float32)
+    other, others = _nearest(pixel, distance, np.flatnonzero(~at_once), factor, shape)
+    other[seen & (around > other * (1.0 + _MOVED) + _MOVED_M)] = np.inf
+    closer = other < moment
+    front, which = np.where(closer, other, moment), np.where(closer, others, which)
+    front, radius = _grown(front, _slopes(front, which, points, camera, (pixel_rad, steepest)))
     margin = rule.edge_px / factor
     behind = _farthest(front, radius, margin)
     reach_px = np.repeat(np.repeat(radius, _BLOCK, axis=0), _BLOCK, axis=1)[: shape[0], : shape[1]] + margin
     known = np.isfinite(front)
-    nearest = np.where(known, (behind - _THICKNESS_M) / (1.0 + _THICKNESS + slope * reach_px), 0.0)
+    leap = _THICKNESS + steepest * pixel_rad * reach_px
+    nearest = np.where(known, (behind - _THICKNESS_M) / (1.0 + leap), 0.0)
     farthest = np.where(known, front * (1.0 + _THICKNESS) + _THICKNESS_M, np.inf)
-    moved = np.where(np.isfinite(around), (around - _MOVED_M) / (1.0 + _MOVED), 0.0)
+    moved = np.where(seen, (around - _MOVED_M) / (1.0 + _MOVED), 0.0)
     return DepthImages(_stored(nearest), _stored(farthest), _stored(moved), factor)
 
 
-def _nearest(pixel: Float32, distance_m: Float32, rows: Int64, factor: int, shape: tuple[int, int]) -> Float32:
-    image = np.full(shape, np.inf, np.float32)
-    nearest_in_pixels(pixel, distance_m, rows, float(factor), image)
-    return image
+def _nearest(
+    pixel: Float32, distance_m: Float32, rows: Int64, factor: int, shape: tuple[int, int]
+) -> tuple[Float32, npt.NDArray[np.int32]]:
+    image, which = np.full(shape, np.inf, np.float32), np.zeros(shape, np.int32)
+    nearest_in_pixels(pixel, distance_m, rows, float(factor), image, which)
+    return image, which
 
 
-def _grown(sample_m: Float32, slope: float) -> tuple[Float32, Float32]:
-    """Returns samples (height, width) with their gaps closed, and the radius of the cones by block (pixels)."""
+def _slopes(
+    sample_m: Float32, which: npt.NDArray[np.int32], points: Seen, camera: Camera, turned: tuple[float, float]
+) -> Float32:
+    """Returns how the surfaces at samples lie, as `slopes` has it; `turned`: angle of a pixel, steepest slope."""
+    out = np.empty((*sample_m.shape, 3), np.float32)
+    slopes(sample_m, which, points.point_m, points.normal, camera.eye_m, camera.axes, *turned, _UNKNOWN_SLOPE, out)
+    return out
+
+
+def _grown(sample_m: Float32, slope: Float32) -> tuple[Float32, Float32]:
+    """Returns samples (height, width) with their gaps closed, and the radius of the discs by block (pixels)."""
     radius = _gaps(sample_m)
     out = np.empty_like(sample_m)
-    grow(sample_m, radius, _BLOCK, slope, out)
+    grow(sample_m, slope, radius, _BLOCK, out)
     return out, radius
 
 
@@ -122,7 +158,7 @@ def _gaps(sample_m: Float32) -> Float32:
 
 
 def _farthest(front_m: Float32, radius: Float32, margin: float) -> npt.NDArray[np.float64]:
-    """Returns the farthest distance (height, width) within the radius of the cones and the margin beside an edge."""
+    """Returns the farthest distance (height, width) within the radius of the discs and the margin beside an edge."""
     height, width = front_m.shape
     whole = np.ceil(np.repeat(np.repeat(radius, _BLOCK, axis=0), _BLOCK, axis=1)[:height, :width] + margin)
     finite = np.where(np.isfinite(front_m), front_m, _FAR)

@@ -10,13 +10,13 @@ import numpy.typing as npt
 Float32 = npt.NDArray[np.float32]
 
 _CUBE_M: Final = 0.5
-"""Edge of the cubes (m); they are anchored at the tile's corner and at height 0."""
+"""Edge of the cubes (m); they are anchored at the origin of the points."""
 _LEAST_POINTS: Final = 8  # Fewest points of a plane.
 _FLAT: Final = 0.1
 """Largest share of the variance that may lie across a plane: more is a shrub, or a corner."""
 
 
-def normals_of(point_m: npt.NDArray[np.float64]) -> Float32:
+def normals_of(point_m: npt.NDArray[np.floating]) -> Float32:
     """Returns unit normals (n, 3) of points (n, 3); NaN where those around lie in no plane."""
     cube = np.floor(point_m / _CUBE_M).astype(np.int64)
     cube -= cube.min(axis=0) if len(cube) else 0
@@ -26,7 +26,7 @@ def normals_of(point_m: npt.NDArray[np.float64]) -> Float32:
     )
     middle = np.stack([np.bincount(which, point_m[:, k], count.size) for k in range(3)], axis=-1)
     middle /= np.maximum(count, 1)[:, None]
-    off = point_m - middle[which]
+    off = (point_m - middle[which]).astype(np.float64)
     spread = np.empty((count.size, 3, 3))
     for i in range(3):
         for j in range(i, 3):

@@ -12,9 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.colours.cameras import cameras_of, eyes_m
-from roadscan.colours.depth import DepthImages, DepthRule, depth_images
+from roadscan.colours.depth import DepthImages, DepthRule, Seen, depth_images
 from roadscan.colours.gains import PictureSample, cells_of, is_compared, sample_of
 from roadscan.colours.kernels.looks import Camera, Depths, Limits, look
+from roadscan.colours.normals import normals_of
 from roadscan.colours.tasks.plan import DEPTHS, Batch, ColourPlan, reach_beyond_m
 from roadscan.core.extras import cv2
 from roadscan.core.gpstime import NS_PER_S
@@ -79,7 +80,8 @@ def depth_task(plan: ColourPlan, batch: Batch) -> DepthTask:
 def write_depths(task: DepthTask) -> OutputRecord:
     """Make the depth images of a batch, and write them (runs on a worker)."""
     origin = np.floor(eyes_m(task.pictures)[0])
-    point_m, epochs = _points(task, origin)
+    seen = _points(task, origin)
+    point_m, epochs = seen.point_m, seen.epoch_gps_ns
     cell = cells_of(point_m.astype(np.float64) + origin)
     compared = is_compared(cell)
     source, rows = ColourSource(task.pictures), []
@@ -87,7 +89,7 @@ def write_depths(task: DepthTask) -> OutputRecord:
     for number, camera in enumerate(cameras_of(task.pictures, origin)):
         own = int(task.pictures.epochs_gps_ns[number])
         near = slice(*np.searchsorted(epochs, [own - window, own + window + 1]).tolist())
-        images = depth_images(point_m[near], epochs[near], camera, own, task.beyond_m, task.rule)
+        images = depth_images(seen.part(near), camera, own, task.beyond_m, task.rule)
         picture = source.picture(task.pictures, number)
         sharpness, sample = 0.0, PictureSample(np.zeros(0, np.int64), np.zeros((0, 3), np.float32))
         if picture is not None:
@@ -158,13 +160,14 @@ def read_samples(store: Store, record: OutputRecord) -> Sampled:
     return Sampled(*(table[name].to_pylist() for name in _SAMPLED[:5]), samples)
 
 
-def _points(task: DepthTask, origin_m: Float64) -> tuple[Float32, Int64]:
-    """Returns points (n, 3) around the pictures, from an origin in the map, and their epochs (n,), which ascend."""
+def _points(task: DepthTask, origin_m: Float64) -> Seen:
+    """Returns the points around the pictures, from an origin in the map, in the order of time."""
     parts = list(_parts(task, origin_m))
     point = np.concatenate([np.zeros((0, 3), np.float32), *(p for p, _ in parts)])
     epochs = np.concatenate([np.zeros(0, np.int64), *(e for _, e in parts)])
     order = np.argsort(epochs, kind="stable")
-    return point[order], epochs[order]
+    point = point[order]
+    return Seen(point, normals_of(point), epochs[order])
 
 
 def _parts(task: DepthTask, origin_m: Float64) -> Iterator[tuple[Float32, Int64]]:

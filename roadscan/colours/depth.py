@@ -37,6 +37,13 @@ _AROUND: Final = 12
 wires and the like are seen through, and stay."""
 _UNKNOWN_SLOPE: Final = 2.7
 """Slope (m a m across the ray) of a surface whose normal is not known: it is seen at 20 degrees."""
+_HALF_OF_FAR: Final = 1.5
+"""Before nothing, such as the sky, an edge reaches from its near side to so many times its distance."""
+_OPENING_M: Final = 0.4
+"""Openings up to twice as wide and high (m) are closed: a pane of a car is so high."""
+_NEAREST_CLOSED_M, _CLOSED_WITHIN_M = 3.0, 40.0
+"""Distances of the things whose openings are closed (m)."""
+_CLOSED_STEP: Final = 2.0**0.5  # Openings are closed by distance, in steps of this factor.
 _FAR: Final = np.float32(1e9)  # Stands for inf where OpenCV filters images (m).
 
 
@@ -108,13 +115,10 @@ def depth_images(
     closer = other < moment
     front, which = np.where(closer, other, moment), np.where(closer, others, which)
     front, radius = _grown(front, _slopes(front, which, points, camera, (pixel_rad, steepest)))
-    margin = rule.edge_px / factor
-    behind = _farthest(front, radius, margin)
-    reach_px = np.repeat(np.repeat(radius, _BLOCK, axis=0), _BLOCK, axis=1)[: shape[0], : shape[1]] + margin
+    at_edge = _edges(front, radius, rule.edge_px / factor, steepest * pixel_rad)
     known = np.isfinite(front)
-    leap = _THICKNESS + steepest * pixel_rad * reach_px
-    nearest = np.where(known, (behind - _THICKNESS_M) / (1.0 + leap), 0.0)
-    farthest = np.where(known, front * (1.0 + _THICKNESS) + _THICKNESS_M, np.inf)
+    nearest = np.where(known, at_edge, 0.0)
+    farthest = np.where(known, _without_holes(front, pixel_rad) * (1.0 + _THICKNESS) + _THICKNESS_M, np.inf)
     moved = np.where(seen, (around - _MOVED_M) / (1.0 + _MOVED), 0.0)
     return DepthImages(_stored(nearest), _stored(farthest), _stored(moved), factor)
 
@@ -157,17 +161,45 @@ def _gaps(sample_m: Float32) -> Float32:
     return np.clip(np.nanpercentile(blocks, _OF_GAPS, axis=-1) + 1.0, 1.0, _MOST_GAP).astype(np.float32)
 
 
-def _farthest(front_m: Float32, radius: Float32, margin: float) -> npt.NDArray[np.float64]:
-    """Returns the farthest distance (height, width) within the radius of the discs and the margin beside an edge."""
-    height, width = front_m.shape
-    whole = np.ceil(np.repeat(np.repeat(radius, _BLOCK, axis=0), _BLOCK, axis=1)[:height, :width] + margin)
+def _without_holes(front_m: Float32, pixel_rad: float) -> Float32:
+    """Returns a depth image without what is seen through narrow openings: panes of cars, crowns of trees, fences.
+
+    A lidar passes glass and leaves, and what it saw behind is not what a picture shows there. Openings are closed for
+    the near things first, and for farther ones with fewer pixels.
+    """
+    out = front_m.copy()
     finite = np.where(np.isfinite(front_m), front_m, _FAR)
-    out = np.empty((height, width))
+    limit = _NEAREST_CLOSED_M
+    while limit < _CLOSED_WITHIN_M:
+        whole = round(_OPENING_M / limit / pixel_rad)
+        if whole < 1:
+            break
+        box = np.ones((2 * whole + 1, 2 * whole + 1), np.uint8)
+        near = np.where(finite <= limit, finite, _FAR)
+        out = np.minimum(out, cv2.dilate(cv2.erode(near, box), box))
+        limit *= _CLOSED_STEP
+    return np.where(out >= _FAR, np.inf, out).astype(np.float32)
+
+
+def _edges(front_m: Float32, radius: Float32, margin: float, steepest: float) -> Float32:
+    """Returns the distance (height, width) below which a point lies at an edge; 0 far from edges.
+
+    An edge is where the distance leaps from a pixel to the next by more than a surface does. Its near side reaches
+    beyond the outermost point by the radius of the discs, so points within that and the margin are at the edge, if they
+    lie nearer than half of the leap.
+    """
+    height, width = front_m.shape
+    finite = np.where(np.isfinite(front_m), front_m, _FAR)
+    beside = cv2.dilate(finite, np.ones((3, 3), np.uint8))
+    leaps = (finite < _FAR) & (beside > finite * (1.0 + _THICKNESS + 1.5 * steepest) + _THICKNESS_M)
+    half = np.where(leaps, np.minimum(0.5 * (finite + beside), _HALF_OF_FAR * finite), 0.0).astype(np.float32)
+    whole = np.rint(np.repeat(np.repeat(radius, _BLOCK, axis=0), _BLOCK, axis=1)[:height, :width] + margin)
+    out = np.zeros((height, width), np.float32)
     for reach in np.unique(whole).astype(int).tolist():
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         own = whole == reach
-        out[own] = cv2.dilate(finite, disc, borderType=cv2.BORDER_REPLICATE)[own]
-    return np.where(out >= _FAR, np.inf, out)
+        out[own] = cv2.dilate(half, disc)[own]
+    return out
 
 
 def _stored(distance_m: npt.NDArray[np.floating]) -> UInt16:

@@ -22,7 +22,7 @@ _BLOCK: Final = 16
 """Edge of the blocks (pixels) in which the gaps between points are measured."""
 _MOST_GAP: Final = 8.0
 """Wider gaps (pixels from the nearest point) are not closed: nothing may be there."""
-_OF_GAPS: Final = 80.0
+_OF_GAPS: Final = 92.0
 """Percentile of the distances to the nearest point in a block that counts as its gap."""
 _THICKNESS_M: Final = 0.15
 """A point may lie so far behind the nearest one and still be seen (m): noise of ranges and poses, rough surfaces."""

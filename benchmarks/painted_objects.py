@@ -71,7 +71,10 @@ def labelled_pictures() -> Iterator[None]:
     lossless = mock.Mock(wraps=cv2)
     lossless.imencode = lambda _end, picture, _options: real(".png", picture)
     lossless.IMWRITE_JPEG_QUALITY = cv2.IMWRITE_JPEG_QUALITY
-    with mock.patch.object(simulated_camera, "picture", _labelled), mock.patch.object(simulated_camera, "cv2", lossless):
+    with (
+        mock.patch.object(simulated_camera, "picture", _labelled),
+        mock.patch.object(simulated_camera, "cv2", lossless),
+    ):
         yield
 
 

@@ -90,9 +90,7 @@ def depth_factor(lens: npt.NDArray[np.float64]) -> int:
     return max(1, int(np.ceil(np.sqrt(lens[WIDTH] * lens[HEIGHT] / _MOST_PIXELS))))
 
 
-def depth_images(
-    points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: float, rule: DepthRule
-) -> DepthImages:
+def depth_images(points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: float, rule: DepthRule) -> DepthImages:
     """Returns what a picture shows, from the points around it.
 
     Points of the moment come first. Points of other times count unless something was seen through their place at the

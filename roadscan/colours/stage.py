@@ -9,9 +9,10 @@ from typing import Final
 from roadscan.colours.settings import ColoursConfig
 from roadscan.colours.tasks.depths import write_depths
 from roadscan.colours.tasks.gains import GAINS
+from roadscan.colours.tasks.orthophoto import ORTHOPHOTO, make_photo
 from roadscan.colours.tasks.plan import DEPTHS, check_cameras
 from roadscan.colours.tasks.points import POINTS, colour_points
-from roadscan.colours.tasks.work import MADE, ColourWork, make_gains, plan_work
+from roadscan.colours.tasks.work import MADE, ColourWork, make_gains, make_mosaic, plan_work
 from roadscan.core.errors import RoadscanError
 from roadscan.core.extras import need
 from roadscan.core.survey import Survey
@@ -33,7 +34,7 @@ class Colours(Stage):
     section = "colours"
     units = "outputs"
     reads = ("cells", "scans", "returns", "cloud", "trajectory", "corrections", "footprints", "images")
-    writes = (DEPTHS, GAINS, POINTS)
+    writes = (DEPTHS, GAINS, POINTS, ORTHOPHOTO)
 
     def run(self, session: Session) -> None:
         """Make what is missing or stale: what pictures show, how bright they are, coloured points."""
@@ -52,6 +53,9 @@ class Colours(Stage):
         make_gains(session, work.plan)
         work = plan_work(session)
         self._points(session, work)
+        self._photos(session, work)
+        if work.plan is not None:
+            make_mosaic(session, work.plan)
         self._notes(session, work)
 
     def _points(self, session: Session, work: ColourWork) -> None:
@@ -62,6 +66,16 @@ class Colours(Stage):
             colour_points, points.tasks(due), len(due), points.singly, session.manifest, session.compute,
             session.bar("tiles whose points get colours"),
         )  # fmt: skip
+        session.failed(self.name, failures)
+
+    def _photos(self, session: Session, work: ColourWork) -> None:
+        due, photos = work.photos_due, work.photos
+        if photos is None or not due:
+            return
+        tasks = [photos.task(tile) for tile in due]
+        bar = session.bar("tiles of the orthophoto")
+        failures = run_tasks(make_photo, tasks, len(due), lambda tiles: [photos.task(t) for t in tiles],
+                             session.manifest, session.compute, bar)  # fmt: skip
         session.failed(self.name, failures)
 
     def _notes(self, session: Session, work: ColourWork) -> None:
@@ -91,10 +105,10 @@ class Colours(Stage):
         if work.plan is None:
             return StageState()
         made = session.manifest.files()
-        due = len(work.depths_due) + work.gains_due + len(work.points_due)
+        due = len(work.depths_due) + work.gains_due + len(work.points_due) + len(work.photos_due)
         why = Counter({"missing or out of date": due} if due else {})
         return StageState(max(sum(made.get(name, 0) for name in MADE) - due, 0), due, why=why)
 
     def folders(self) -> Sequence[str]:
         """Returns folders: what pictures show, their gains, coloured points."""
-        return ("tables/picture_depths", "tables/picture_gains", "products/coloured_points")
+        return ("tables/picture_depths", "tables/picture_gains", "products/coloured_points", "products/orthophoto")

@@ -9,6 +9,8 @@ from typing import Final
 from roadscan.colours.settings import ColoursConfig
 from roadscan.colours.tasks.depths import DepthTask, depth_task
 from roadscan.colours.tasks.gains import GAINS, PictureGains, plan_gains, read_gains, write_gains
+from roadscan.colours.tasks.mosaic import MOSAIC, UNIT, plan_mosaic, write_mosaic
+from roadscan.colours.tasks.orthophoto import ORTHOPHOTO, PICTURES_OF, PhotoPlan, plan_photos
 from roadscan.colours.tasks.plan import DEPTHS, ColourPlan, plan_colours
 from roadscan.colours.tasks.points import POINTS, PointsPlan, plan_points
 from roadscan.colours.tasks.share import Shares
@@ -20,7 +22,7 @@ from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_plan import tiles_of
 
-MADE: Final = (DEPTHS, GAINS, POINTS)
+MADE: Final = (DEPTHS, GAINS, POINTS, ORTHOPHOTO, PICTURES_OF, MOSAIC)
 """Names of all outputs in the manifest."""
 
 
@@ -34,6 +36,8 @@ class ColourWork:
     gains_due: int = 0
     points: PointsPlan | None = None
     points_due: Sequence[TileId] = ()
+    photos: PhotoPlan | None = None
+    photos_due: Sequence[TileId] = ()
     gains: PictureGains | None = None
     gone: Sequence[OutputRecord] = field(default=())
     """Outputs that are no longer wanted."""
@@ -65,15 +69,33 @@ def plan_work(session: Session) -> ColourWork:
     tables = plan_gains(plan, manifest)
     gains = read_gains(plan, manifest, tables)
     gains_due = sum(not manifest.is_current(GAINS, one.run, one.key) for one in tables)
-    points = plan_points(plan, Shares(plan, manifest, gains))
-    chosen = _selected(session, points.keys)
-    points_due = [t for t in chosen if not manifest.is_current(POINTS, str(t), points.keys[t])]
-    if session.selection is not None:
-        points_due = chosen
+    shares = Shares(plan, manifest, gains)
+    points, photos = plan_points(plan, shares), plan_photos(plan, shares, manifest)
     return ColourWork(
-        plan, [depth_task(plan, one) for one in due], gains_due, points, points_due, gains,
-        _gone(plan, points, manifest),
+        plan, [depth_task(plan, one) for one in due], gains_due, points, _due(session, POINTS, points.keys), photos,
+        _due(session, ORTHOPHOTO, photos.keys), gains, _gone(plan, points, photos, manifest),
     )  # fmt: skip
+
+
+def make_mosaic(session: Session, plan: ColourPlan) -> None:
+    """Write the mosaic of the orthophotos where it is missing or stale."""
+    photo, manifest = plan.config.orthophoto, session.manifest
+    if photo is None:
+        return
+    mosaic = plan_mosaic(manifest, plan.context, photo.cell_m)
+    if not mosaic.tiles:
+        manifest.remove(manifest.beside({MOSAIC}, ()))
+    elif not manifest.is_current(MOSAIC, UNIT, mosaic.key):
+        manifest.add([write_mosaic(session.store, mosaic, plan.context, photo.cell_m)])
+    manifest.settle()
+
+
+def _due(session: Session, product: str, keys: dict[TileId, str]) -> list[TileId]:
+    """Returns the tiles whose output is missing or stale; with a selection, those that are chosen."""
+    chosen = _selected(session, keys)
+    if session.selection is not None:
+        return chosen
+    return [t for t in chosen if not session.manifest.is_current(product, str(t), keys[t])]
 
 
 def make_gains(session: Session, plan: ColourPlan) -> None:
@@ -93,9 +115,11 @@ def _selected(session: Session, known: dict[TileId, str]) -> list[TileId]:
     return [t for t in known if t in chosen]
 
 
-def _gone(plan: ColourPlan, points: PointsPlan, manifest: Manifest) -> list[OutputRecord]:
+def _gone(plan: ColourPlan, points: PointsPlan, photos: PhotoPlan, manifest: Manifest) -> list[OutputRecord]:
     return [
         *manifest.beside({DEPTHS}, {one.unit for one in plan.batches}),
         *manifest.beside({GAINS}, {one.run for one in plan.batches}),
         *manifest.beside({POINTS}, set(map(str, points.keys))),
+        *manifest.beside({ORTHOPHOTO, PICTURES_OF}, set(map(str, photos.keys))),
+        *manifest.beside({MOSAIC} if not photos.keys else set(), ()),
     ]

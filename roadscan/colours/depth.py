@@ -33,7 +33,7 @@ _MOVED_M: Final = 0.5
 _MOVED: Final = 0.05
 """The same as a share of its distance."""
 _AROUND: Final = 12
-"""Something was seen through a place where nothing as near was seen within so many pixels of it at the moment: leaves,
+"""Something was seen through a place where an opening of more than twice so many pixels was at the moment: leaves,
 wires and the like are seen through, and stay."""
 _UNKNOWN_SLOPE: Final = 2.7
 """Slope (m a m across the ray) of a surface whose normal is not known: it is seen at 20 degrees."""
@@ -107,17 +107,19 @@ def depth_images(points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: f
     around = _grown(moment, _slopes(moment, which, points, camera, (pixel_rad, steepest)))[0]
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _AROUND + 1, 2 * _AROUND + 1))
     seen = np.isfinite(around)
-    around = np.where(seen, cv2.erode(np.where(seen, around, _FAR), disc), np.inf).astype(np.float32)
+    around = cv2.dilate(cv2.erode(np.where(seen, around, _FAR), disc), disc)
+    around = np.where(seen & (around < _FAR), around, np.inf).astype(np.float32)
     other, others = _nearest(pixel, distance, np.flatnonzero(~at_once), factor, shape)
-    other[seen & (around > other * (1.0 + _MOVED) + _MOVED_M)] = np.inf
+    other[np.isfinite(around) & (around > other * (1.0 + _MOVED) + _MOVED_M)] = np.inf
     closer = other < moment
     front, which = np.where(closer, other, moment), np.where(closer, others, which)
     front, radius = _grown(front, _slopes(front, which, points, camera, (pixel_rad, steepest)))
-    at_edge = _edges(front, radius, rule.edge_px / factor, steepest * pixel_rad)
     known = np.isfinite(front)
+    closed = _without_holes(front, pixel_rad)
+    at_edge = _edges(np.where(known, front, closed), radius, rule.edge_px / factor, steepest * pixel_rad)
     nearest = np.where(known, at_edge, 0.0)
-    farthest = np.where(known, _without_holes(front, pixel_rad) * (1.0 + _THICKNESS) + _THICKNESS_M, np.inf)
-    moved = np.where(seen, (around - _MOVED_M) / (1.0 + _MOVED), 0.0)
+    farthest = np.where(known, closed * (1.0 + _THICKNESS) + _THICKNESS_M, np.inf)
+    moved = np.where(np.isfinite(around), (around - _MOVED_M) / (1.0 + _MOVED), 0.0)
     return DepthImages(_stored(nearest), _stored(farthest), _stored(moved), factor)
 
 
@@ -162,8 +164,9 @@ def _gaps(sample_m: Float32) -> Float32:
 def _without_holes(front_m: Float32, pixel_rad: float) -> Float32:
     """Returns a depth image without what is seen through narrow openings: panes of cars, crowns of trees, fences.
 
-    A lidar passes glass and leaves, and what it saw behind is not what a picture shows there. Openings are closed for
-    the near things first, and for farther ones with fewer pixels.
+    A lidar passes glass and leaves, and what it saw behind is not what a picture shows there. An opening counts as
+    narrow by its size in metres, at the distance of what is around it. A road that recedes has no opening: a window on
+    it finds nothing nearer than its lower edge.
     """
     out = front_m.copy()
     finite = np.where(np.isfinite(front_m), front_m, _FAR)
@@ -173,8 +176,8 @@ def _without_holes(front_m: Float32, pixel_rad: float) -> Float32:
         if whole < 1:
             break
         box = np.ones((2 * whole + 1, 2 * whole + 1), np.uint8)
-        near = np.where(finite <= limit, finite, _FAR)
-        out = np.minimum(out, cv2.dilate(cv2.erode(near, box), box))
+        opened = cv2.dilate(cv2.erode(finite, box), box)
+        out = np.where(opened <= limit, np.minimum(out, opened), out)
         limit *= _CLOSED_STEP
     return np.where(out >= _FAR, np.inf, out).astype(np.float32)
 

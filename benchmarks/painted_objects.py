@@ -142,3 +142,16 @@ def judged(survey_folder: Path, products: Path, run: str = "run-1") -> Judged:
     row = np.minimum(row, len(hits) - 1)
     ids = np.where(known & ~hits.is_mixed.to_numpy()[row], hits.object_id.to_numpy()[row], -9)
     return Judged(place, epoch, colour, count, ids.astype(np.int32))
+
+
+def photographed_street(length_m: float = 24.0, **changes: Any) -> Scene:
+    """A street with painted lines, an upright lidar and a camera that looks down ahead of the vehicle."""
+    return Scene.load("urban_street").changed(
+        length_m=length_m, passes=[{"lane": 2}],
+        **{key: {"on": False} for key in ("profilers", "sick", "imu", "gnss", "encoder")},
+        lidar={"range_max_m": 25.0, "model": "HDL-32E", "divergence_deg": 0.0,
+               "mount": {"lever_arm_body_m": (0.0, 0.0, -1.9), "roll_deg": 0.2, "pitch_deg": 0.0, "heading_deg": 0.5}},
+        camera={"on": True, "every_m": 2.0, "width_px": 1400, "height_px": 900, "focal_px": 1000.0,
+                "mount": {"lever_arm_body_m": (0.9, -0.25, -1.8), "pitch_deg": -35.0}},
+        noise={"position_m": 0.0, "attitude_deg": 0.0, "lidar_range_m": 0.01},
+    ).changed(**changes)  # fmt: skip

@@ -15,9 +15,12 @@ _LEAST_POINTS: Final = 8  # Fewest points of a plane.
 _FLAT: Final = 0.1
 """Largest share of the variance that may lie across a plane: more is a shrub, or a corner."""
 
+_LOW_RELIEF_M: Final = 0.08
+"""Points whose heights vary by no more (m, 1 σ) and that lie in no plane are ground with a kerb: it lies level."""
+
 
 def normals_of(point_m: npt.NDArray[np.floating]) -> Float32:
-    """Returns unit normals (n, 3) of points (n, 3); NaN where those around lie in no plane."""
+    """Returns unit normals (n, 3) of points (n, 3); NaN where those around lie in no plane and are not level."""
     cube = np.floor(point_m / _CUBE_M).astype(np.int64)
     cube -= cube.min(axis=0) if len(cube) else 0
     size = cube.max(axis=0) + 1 if len(cube) else np.ones(3, np.int64)
@@ -33,5 +36,6 @@ def normals_of(point_m: npt.NDArray[np.floating]) -> Float32:
             spread[:, i, j] = spread[:, j, i] = np.bincount(which, off[:, i] * off[:, j], count.size)
     values, vectors = np.linalg.eigh(spread)
     flat = (count >= _LEAST_POINTS) & (values[:, 0] <= _FLAT * values[:, 1]) & (values[:, 1] > 0.0)
-    normal = np.where(flat[:, None], vectors[:, :, 0], np.nan)
+    low = (count >= _LEAST_POINTS) & (spread[:, 2, 2] <= _LOW_RELIEF_M**2 * count)
+    normal = np.where(flat[:, None], vectors[:, :, 0], np.where(low[:, None], [0.0, 0.0, 1.0], np.nan))
     return np.asarray(normal[which], np.float32)

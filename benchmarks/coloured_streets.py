@@ -38,6 +38,15 @@ _RECTIFIED: Final = np.array([
     [-9.869795e-03, 9.999421e-01, -4.278459e-03],
     [7.402527e-03, 4.351614e-03, 9.999631e-01],
 ])  # fmt: skip
+GREY_SIZE_PX: Final = (1241, 376)
+GREY_FOCAL_PX: Final = 718.856
+GREY_PRINCIPAL_PX: Final = (607.1928, 185.2157)
+GREY_FROM_VELODYNE: Final = np.array([
+    [4.276802385584e-04, -9.999672484946e-01, -8.084491683471e-03, -1.198459927713e-02],
+    [-7.210626507497e-03, 8.081198471645e-03, -9.999413164504e-01, -5.403984729748e-02],
+    [9.999738645903e-01, 4.859485810390e-04, -7.206933692422e-03, -2.921968648686e-01],
+])  # fmt: skip
+"""Rotation and translation of `semantic_kitti_00` from the lidar to its camera."""
 _BODY_FROM_VELODYNE: Final = np.diag([1.0, -1.0, -1.0])
 _SENSOR_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _REGISTERED_WITHIN_M: Final = 50.0  # Farther returns do not help (m).
@@ -111,6 +120,26 @@ def colour_and_lidar(recording: Path, folder: Path, sections: str, frames: Seque
     (folder / "rig.toml").write_text(rig(*camera_from_velodyne(), COLOUR_SIZE_PX, COLOUR_FOCAL_PX, COLOUR_PRINCIPAL_PX))
     turn = f'turn = "azimuth", period_s = {PERIOD_S}'
     (folder / "SURVEY.toml").write_text(SURVEY.format(name="colour_and_lidar", turn=turn) + sections)
+    return folder / "SURVEY.toml"
+
+
+def semantic_kitti(recording: Path, folder: Path, sections: str) -> Path:
+    """Write the survey of the labelled street with its grey pictures below a folder; returns its survey file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(recording / "poses.csv", folder / "poses.csv")
+    shutil.copytree(recording / "image_0", folder / "pictures")
+    (folder / "sweeps").mkdir()
+    with tarfile.open(recording / "sweeps.tar.xz") as archive:
+        archive.extractall(folder / "sweeps", filter="data")
+    rows = [line.split(",")[:2] for line in (recording / "poses.csv").read_text().splitlines()[1:]]
+    held = {int(p.stem) for p in (folder / "sweeps/velodyne_points/data").glob("*.bin")}
+    _write(folder / "stamps.csv", [("frame", "unix_utc_s"), *((n, t) for n, t in rows if int(n) in held)])
+    names = [(f"{int(n):06d}.png", t) for n, t in rows if (folder / "pictures" / f"{int(n):06d}.png").is_file()]
+    _write(folder / "pictures.csv", [("file", "time"), *names])
+    turn, arm = GREY_FROM_VELODYNE[:, :3], GREY_FROM_VELODYNE[:, 3]
+    (folder / "rig.toml").write_text(rig(turn, arm, GREY_SIZE_PX, GREY_FOCAL_PX, GREY_PRINCIPAL_PX))
+    text = SURVEY.format(name="semantic_kitti_00", turn='turn = "compensated"')
+    (folder / "SURVEY.toml").write_text(text + sections)
     return folder / "SURVEY.toml"
 
 

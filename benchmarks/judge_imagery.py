@@ -19,6 +19,7 @@ Float32 = npt.NDArray[np.float32]
 
 _SOUGHT_M: Final = 0.10  # Shifts are sought within this (m).
 _WINDOW_M: Final = 0.30  # Half of the window around a corner (m).
+_TOLD: Final = 0.05  # Least fall of the correlation over 8 cm in a direction in which a shift is told.
 _LEAST_CORRELATION: Final = 0.6  # Windows that correlate less show something else.
 
 
@@ -118,26 +119,30 @@ def intensity_shifts_m(
 
 
 def _bright_places(xy: Float64, light: Float64, half_m: float) -> list[Float64]:
-    """Middles of squares in which one to five in ten returns are far brighter than the rest."""
-    cell = np.floor(xy / (2.0 * half_m)).astype(int)
+    """Middles of windows, half a window apart, in which some returns are far brighter than the rest."""
     places = []
-    for one in np.unique(cell, axis=0):
-        own = light[(cell == one).all(axis=1)]
-        if own.size < 60:
-            continue
-        usual = np.median(own)
-        bright = np.mean(own > usual + 4.0 * 1.4826 * np.median(np.abs(own - usual)))
-        if 0.04 <= bright <= 0.5:
-            places.append((one + 0.5) * 2.0 * half_m)
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    for north in np.arange(low[1], high[1], half_m):
+        for east in np.arange(low[0], high[0], half_m):
+            own = light[(np.abs(xy - (east, north)) < half_m).all(axis=1)]
+            if own.size < 100:
+                continue
+            usual = np.median(own)
+            bright = own > usual + max(4.0 * 1.4826 * np.median(np.abs(own - usual)), 0.5 * usual)
+            if bright.sum() >= 12 and bright.mean() <= 0.4:
+                places.append(np.array([east, north]))
     return places
 
 
 def _best_shift(
     xy: Float64, light: Float64, grey: Float32, place: rasterio.Affine, step_m: float
 ) -> tuple[float, float] | None:
-    """Shift (east, north; m) of the picture against the returns; None where it is not told in both directions."""
-    steps = np.arange(-_SOUGHT_M * 2, _SOUGHT_M * 2 + step_m / 2, step_m)
-    light = np.minimum(light, np.percentile(light, 95))
+    """Shift (east, north; m) of the picture against the returns; NaN along a line, which does not tell it.
+
+    None where nothing agrees.
+    """
+    steps = np.arange(-2.0 * _SOUGHT_M, 2.0 * _SOUGHT_M + step_m / 2, step_m)
+    light = np.minimum(light, np.percentile(light, 97))
     scores = np.empty((steps.size, steps.size))
     for i, north in enumerate(steps):
         for j, east in enumerate(steps):
@@ -147,10 +152,52 @@ def _best_shift(
     i, j = np.unravel_index(np.argmax(scores), scores.shape)
     if scores[i, j] < _LEAST_CORRELATION or not (0 < i < steps.size - 1 and 0 < j < steps.size - 1):
         return None
-    # A line alone does not tell how far along it things lie.
-    along = scores[i, j] - min(scores[i].max(initial=-1.0, where=np.abs(steps - steps[j]) > 0.08),
-                               1.0), scores[i, j] - scores[:, j].max(initial=-1.0, where=np.abs(steps - steps[i]) > 0.08)  # fmt: skip
-    if min(along) < 0.02:
-        return None
+    away = round(0.08 / step_m)
+    east_told = scores[i, j] - max(scores[i, max(j - away, 0)], scores[i, min(j + away, steps.size - 1)])
+    north_told = scores[i, j] - max(scores[max(i - away, 0), j], scores[min(i + away, steps.size - 1), j])
     x, y = _peak(scores[i, j - 1 : j + 2]), _peak(scores[i - 1 : i + 2, j])
-    return float(steps[j] + x * step_m), float(steps[i] + y * step_m)
+    return (
+        float(steps[j] + x * step_m) if east_told >= _TOLD else np.nan,
+        float(steps[i] + y * step_m) if north_told >= _TOLD else np.nan,
+    )
+
+
+_TILE_PX: Final = 32  # Edge of the windows of a picture (pixels) in which colours of a cloud are sought.
+_AWAY_PX: Final = 5  # Shifts are sought within this (pixels).
+
+
+def edge_shifts_px(pixel: Float64, light: Float64, picture: npt.NDArray[np.uint8]) -> Float64:
+    """How far (n, 2: right, down; pixels) edges of a cloud's grey values lie from those of a picture.
+
+    Windows of a picture that hold 60 points or more and differ by 12 grey values or more are moved until they agree
+    best with the points.
+
+    Parameters
+    ----------
+    pixel : (m, 2) where points that the picture shows are in it.
+    light : (m,) their grey values in the cloud.
+    picture : (height, width) grey.
+    """
+    smooth = gaussian_filter(picture.astype(np.float64), 0.7)
+    window = np.floor(pixel / _TILE_PX).astype(int)
+    steps = np.arange(-_AWAY_PX, _AWAY_PX + 0.25, 0.5)
+    found = []
+    for one in np.unique(window, axis=0):
+        rows = np.flatnonzero((window == one).all(axis=1))
+        if rows.size < 60 or light[rows].std() < 12.0:
+            continue
+        u, v = pixel[rows].T
+        scores = np.empty((steps.size, steps.size))
+        for i, down in enumerate(steps):
+            for j, right in enumerate(steps):
+                values = map_coordinates(smooth, [v + down, u + right], order=1, mode="nearest")
+                scores[i, j] = np.corrcoef(values, light[rows])[0, 1]
+        i, j = np.unravel_index(np.nanargmax(scores), scores.shape)
+        if scores[i, j] < _LEAST_CORRELATION or not (0 < i < steps.size - 1 and 0 < j < steps.size - 1):
+            continue
+        away = round(2.0 / 0.5)
+        told_x = scores[i, j] - max(scores[i, max(j - away, 0)], scores[i, min(j + away, steps.size - 1)]) >= _TOLD
+        told_y = scores[i, j] - max(scores[max(i - away, 0), j], scores[min(i + away, steps.size - 1), j]) >= _TOLD
+        x, y = _peak(scores[i, j - 1 : j + 2]), _peak(scores[i - 1 : i + 2, j])
+        found.append((steps[j] + 0.5 * x if told_x else np.nan, steps[i] + 0.5 * y if told_y else np.nan))
+    return np.array(found).reshape(-1, 2)

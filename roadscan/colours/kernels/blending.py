@@ -36,9 +36,9 @@ def blend(held_colour, held_weight, held_number, median, count, colour, number):
             if held_weight[i, k] <= 0.0:
                 continue
             if count[i] >= VOTES:
-                off = 0
+                off = 0.0
                 for c in range(3):
-                    off = max(off, abs(int(held_colour[i, k, c]) - int(median[i, c])))
+                    off = max(off, abs(float(held_colour[i, k, c]) - float(median[i, c])))
                 if off > AGREES:
                     continue
             if best < 0 or held_weight[i, k] > held_weight[i, best]:
@@ -49,7 +49,7 @@ def blend(held_colour, held_weight, held_number, median, count, colour, number):
                     best = k
             number[i] = held_number[i, best]
             for c in range(3):
-                colour[i, c] = max(1, int(median[i, c]))
+                colour[i, c] = max(median[i, c], np.uint8(1))
             continue
         number[i] = held_number[i, best]
         total = 0.0
@@ -57,9 +57,9 @@ def blend(held_colour, held_weight, held_number, median, count, colour, number):
         for k in range(most):
             if held_weight[i, k] <= 0.0:
                 continue
-            off = 0
+            off = 0.0
             for c in range(3):
-                off = max(off, abs(int(held_colour[i, k, c]) - int(held_colour[i, best, c])))
+                off = max(off, abs(float(held_colour[i, k, c]) - float(held_colour[i, best, c])))
             if off > AGREES:
                 continue
             share = (held_weight[i, k] / held_weight[i, best]) ** SHARE

@@ -31,6 +31,12 @@ def grey_of(path: Path) -> tuple[Float32, rasterio.Affine]:
         return np.where(number > 0, grey, np.nan).astype(np.float32), raster.transform
 
 
+def pixels_of(place: rasterio.Affine, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> tuple[Float64, Float64]:
+    """Column and row (n,) of places in a raster that is north up."""
+    column, row = (np.asarray(easting_m) - place.c) / place.a, (np.asarray(northing_m) - place.f) / place.e
+    return column, row
+
+
 def shift_px(shown: Float32, expected: Float32) -> tuple[float, float, float]:
     """Shift (columns, rows) of a picture against a smaller one with the same middle, and their correlation."""
     scores = cv2.matchTemplate(shown.astype(np.float32), expected.astype(np.float32), cv2.TM_CCOEFF_NORMED)
@@ -71,17 +77,22 @@ def corner_shifts_m(orthophoto: Path, known: Truth) -> Float64:
     grey, place = grey_of(orthophoto)
     cell = place.a
     rows, columns = np.nonzero(~np.isnan(grey))
-    west, north = place * (columns.min(), rows.min())
-    east, south = place * (columns.max(), rows.max())
+    (west, east), (south, north) = (
+        sorted((first + step * low, first + step * high))
+        for first, step, low, high in (
+            (place.c, place.a, columns.min(), columns.max()), (place.f, place.e, rows.min(), rows.max())
+        )
+    )  # fmt: skip
     wide, narrow = round((_WINDOW_M + _SOUGHT_M) / cell), round(_WINDOW_M / cell)
     found = []
     for at in painted_corners(known, (west, south, east, north)):
-        column, row = (int(v) for v in ~place * tuple(at))
+        column, row = (int(v) for v in pixels_of(place, at[0], at[1]))
         window = grey[row - wide : row + wide + 1, column - wide : column + wide + 1]
         if window.shape != (2 * wide + 1,) * 2 or np.isnan(window).any():
             continue
         steps = np.arange(-narrow, narrow + 1)
-        x, y = place * tuple(np.array(np.meshgrid(column + steps + 0.5, row + steps + 0.5)))
+        across, along = np.meshgrid(column + steps + 0.5, row + steps + 0.5)
+        x, y = place.c + place.a * across, place.f + place.e * along
         expected = gaussian_filter(known.intensity(x, y), 0.7).astype(np.float32)
         right, down, same = shift_px(window, expected)
         if same >= _LEAST_CORRELATION and not np.isnan(right):
@@ -89,9 +100,7 @@ def corner_shifts_m(orthophoto: Path, known: Truth) -> Float64:
     return np.array(found).reshape(-1, 2)
 
 
-def intensity_shifts_m(
-    orthophoto: Path, points: list[Path], *, half_m: float = 0.8, step_m: float = 0.01
-) -> Float64:
+def intensity_shifts_m(orthophoto: Path, points: list[Path], *, half_m: float = 0.8, step_m: float = 0.01) -> Float64:
     """How far (n, 2: east, north; m) paint in an orthophoto lies from where lidar returns are bright.
 
     Windows of `half_m` to each side lie around bright returns of the road; each shift maximises the correlation of the
@@ -105,7 +114,7 @@ def intensity_shifts_m(
     xy = np.concatenate([np.column_stack([p.x, p.y]) for p in parts])
     light = np.concatenate([np.asarray(p.intensity, np.float64) for p in parts])
     coloured = np.concatenate([np.asarray(p["pictures"]) for p in parts]) > 0
-    column, row = ~place * tuple(xy.T)
+    column, row = pixels_of(place, *xy.T)
     inside = coloured & (column > 1) & (row > 1) & (column < grey.shape[1] - 1) & (row < grey.shape[0] - 1)
     inside[inside] &= known[row[inside].astype(int), column[inside].astype(int)]
     xy, light = xy[inside], light[inside]
@@ -146,7 +155,7 @@ def _best_shift(
     scores = np.empty((steps.size, steps.size))
     for i, north in enumerate(steps):
         for j, east in enumerate(steps):
-            column, row = ~place * (xy[:, 0] + east, xy[:, 1] + north)
+            column, row = pixels_of(place, xy[:, 0] + east, xy[:, 1] + north)
             values = map_coordinates(grey, [row - 0.5, column - 0.5], order=1, mode="nearest")
             scores[i, j] = np.corrcoef(values, light)[0, 1]
     i, j = np.unravel_index(np.argmax(scores), scores.shape)

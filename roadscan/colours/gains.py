@@ -106,8 +106,8 @@ def _pairs(samples: list[PictureSample]) -> tuple[Int64, Int64, Float64, Float64
     if not found:
         none = np.zeros(0, np.int64)
         return none, none, np.zeros((0, 3)), np.zeros(0)
-    i, j, middle, sigma = zip(*found, strict=True)
-    return np.array(i), np.array(j), np.array(middle), np.array(sigma)
+    first, second, middles, sigmas = zip(*found, strict=True)
+    return np.array(first), np.array(second), np.array(middles), np.array(sigmas)
 
 
 def _solved(count: int, first: Int64, second: Int64, ratio: Float64, weight: Float64) -> Float64:

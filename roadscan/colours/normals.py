@@ -27,8 +27,8 @@ def normals_of(point_m: npt.NDArray[np.floating]) -> Float32:
     _, which, count = np.unique(
         (cube[:, 2] * size[1] + cube[:, 1]) * size[0] + cube[:, 0], return_inverse=True, return_counts=True
     )
-    middle = np.stack([np.bincount(which, point_m[:, k], count.size) for k in range(3)], axis=-1)
-    middle /= np.maximum(count, 1)[:, None]
+    totals = np.stack([np.bincount(which, point_m[:, k], count.size) for k in range(3)], axis=-1)
+    middle = totals / np.maximum(count, 1)[:, None]
     off = (point_m - middle[which]).astype(np.float64)
     spread = np.empty((count.size, 3, 3))
     for i in range(3):

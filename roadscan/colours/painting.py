@@ -27,7 +27,7 @@ _RAMP: Final = 0.05
 class Places:
     """Places of the map that want a colour, of one piece of it."""
 
-    point_m: Float32
+    point_m: npt.NDArray[np.floating]
     """(n, 3) from the origin of all pieces."""
     normal: Float32
     """(n, 3) unit normals, NaN where unknown."""
@@ -124,7 +124,7 @@ class _Box:
     high: Float64
 
     @classmethod
-    def of(cls, point_m: Float32) -> Self:
+    def of(cls, point_m: npt.NDArray[np.floating]) -> Self:
         if not len(point_m):
             return cls(np.full(3, np.inf), np.full(3, -np.inf))
         return cls(point_m.min(axis=0).astype(np.float64), point_m.max(axis=0).astype(np.float64))

@@ -6,17 +6,21 @@ import csv
 import json
 from pathlib import Path
 
+import cv2
 import laspy
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import rasterio
+from scipy.spatial.transform import Rotation
 
-from benchmarks.painted_objects import code_of, judged, nearest_code, scene, written
+from benchmarks.painted_objects import Judged, code_of, judged, nearest_code, scene, written
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import truth
+from roadscan.simulate.earth import Earth
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from tests.surface.test_surfaces import TwoThreads
@@ -33,8 +37,8 @@ class Street:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         small = scene(
-            18.0, camera={"every_m": 2.0, "width_px": 480, "height_px": 300, "focal_px": 410.0},
-            vehicle={"standstill_s": 0.0}, lidar={"range_max_m": 20.0},
+            10.0, camera={"every_m": 2.0, "width_px": 320, "height_px": 200, "focal_px": 270.0},
+            vehicle={"standstill_s": 0.0}, lidar={"range_max_m": 15.0}, roadside={"trees": []},
         )  # fmt: skip
         self.survey = Survey.load(written(folder, SECTIONS, small))
         self.run(self.survey, stages=STAGES)
@@ -63,38 +67,34 @@ def test_points_have_the_colours_of_what_they_lie_on(street: Street, coloured: S
     assert not coloured.failures
     found = judged(street.folder, Path(coloured.store.path("products/coloured_points")))
     assert found.coloured.sum() > 100_000
-    assert found.wrong.sum() <= 0.002 * found.coloured.sum()
+    assert found.wrong.sum() <= 0.002 * found.coloured.sum()  # a pixel is 4 mrad here
     known = truth.load(street.folder)
     _, offset = known.station_offset_m(*found.place_m[:, :2].T)
     lane = (found.object_id == 0) & (np.abs(offset) < 2.5) & seen_by_truth(street, found)
     assert lane.sum() > 10_000
-    assert np.mean(found.pictures[lane] > 0) >= 0.99
+    assert np.mean(found.pictures[lane] > 0) >= 0.98  # the rest lies beside the car ahead, within a coarse pixel or two
 
 
-def seen_by_truth(street: Street, found: object) -> np.ndarray:
-    """Points that lie in the middle of a picture of the road's colour, by the camera's true pose."""
-    import cv2
-    import pyarrow.parquet as pq
-    import pyproj
-    from scipy.spatial.transform import Rotation
-
-    known, place = truth.load(street.folder), found.place_m  # type: ignore[attr-defined]
-    to_world = pyproj.Transformer.from_crs(pyproj.CRS(known.scene.map.crs).to_3d(), "EPSG:4978", always_xy=True)
-    world = np.stack(to_world.transform(*place.T), axis=-1)
-    seen, road = np.zeros(len(place), bool), int(code_of(np.array([0]))[0])
+def seen_by_truth(street: Street, found: Judged) -> np.ndarray:
+    """Points that lie in the middle of a patch of the road's colour in a picture, by the camera's true pose."""
+    known = truth.load(street.folder)
+    world = Earth(known.scene.map.crs).ecef_from_map(found.place_m)
+    seen, road = np.zeros(len(world), bool), int(code_of(np.array([0]))[0])
     camera = known.scene.camera
+    size = camera.width_px, camera.height_px
     for pose in pq.read_table(known.camera_file("run-1")).to_pylist():
         turn = Rotation.from_quat([pose[q] for q in ("qx", "qy", "qz", "qw")]).as_matrix()
         ahead, right, down = ((world - [pose[f"{a}_world_m"] for a in "xyz"]) @ turn).T
         with np.errstate(divide="ignore", invalid="ignore"):
-            u = camera.focal_px * right / ahead + (camera.width_px - 1) / 2
-            v = camera.focal_px * down / ahead + (camera.height_px - 1) / 2
-        inside = (ahead > 2) & (ahead < 15) & (u > 15) & (u < camera.width_px - 16) & (v > 15) & (v < camera.height_px - 16)
+            pixel = [camera.focal_px * a / ahead + (n - 1) / 2 for a, n in zip((right, down), size, strict=True)]
+        inside = (ahead > 2) & (ahead < 15)
+        for place, count in zip(pixel, size, strict=True):
+            inside &= (place > 15) & (place < count - 16)
         picture = cv2.imread(str(street.folder / "raw/run-1/camera" / pose["file"]))[:, :, ::-1]
         same = (nearest_code(picture.reshape(-1, 3)) == road).reshape(picture.shape[:2]).astype(np.uint8)
-        wide = cv2.erode(same, np.ones((9, 9), np.uint8))
+        wide = cv2.erode(same, np.ones((5, 5), np.uint8)) > 0
         rows = np.flatnonzero(inside)
-        seen[rows] |= wide[np.rint(v[rows]).astype(int), np.rint(u[rows]).astype(int)] > 0
+        seen[rows] |= wide[np.rint(pixel[1][rows]).astype(int), np.rint(pixel[0][rows]).astype(int)]
     return seen
 
 
@@ -128,7 +128,7 @@ def test_orthophoto_is_one_raster_with_the_pictures_it_came_from(street: Street,
     for file in folder.glob("*.tif"):
         with rasterio.open(file) as one:
             colour, number = np.moveaxis(one.read([1, 2, 3]), 0, -1), one.read(4)
-        rows = list(csv.DictReader(file.with_suffix(".csv").open()))
+        rows = list(csv.DictReader(file.with_suffix(".csv").read_text().splitlines()))
         assert {int(r["picture"]) for r in rows} == set(np.unique(number[number > 0]).tolist())
         assert {r["file"] for r in rows} <= names
         assert all(int(r["pixels"]) == int((number == int(r["picture"])).sum()) for r in rows)
@@ -139,7 +139,7 @@ def test_orthophoto_is_one_raster_with_the_pictures_it_came_from(street: Street,
     with rasterio.open(folder / "orthophoto.vrt") as whole:
         rows, columns = np.nonzero(whole.read(4))
         values, place = np.moveaxis(whole.read([1, 2, 3]), 0, -1)[rows, columns], whole.transform
-    _, offset = known.station_offset_m(*(place * (columns + 0.5, rows + 0.5)))
+    _, offset = known.station_offset_m(place.c + place.a * (columns + 0.5), place.f + place.e * (rows + 0.5))
     lane = np.abs(offset) < 2.5  # cars stand and drive elsewhere, or are left out by their depth
     road = nearest_code(values[lane]) == code_of(np.array([0]))[0]
     assert lane.sum() > 20_000

@@ -116,5 +116,4 @@ def grow(sample_m, slope, radius, block, image_m):
                         continue
                     inverse = max(1.0 + right * (m - j) + down * (k - i), 0.2)
                     value = np.float32(tip / inverse * (1.0 + beside * math.sqrt(square)))
-                    if value < image_m[k, m]:
-                        image_m[k, m] = value
+                    image_m[k, m] = min(image_m[k, m], value)

@@ -39,7 +39,7 @@ class Camera(NamedTuple):
 
 
 class Depths(NamedTuple):
-    """What a picture shows, in pixels that stand for `factor` squared ones: (rows, columns) uint16, stored distances."""
+    """What a picture shows: (rows, columns) stored distances, in pixels that stand for `factor` squared ones."""
 
     nearest: npt.NDArray[np.uint16]
     """A point nearer than this lies in front of what is seen beside it, at an edge."""
@@ -136,7 +136,7 @@ def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden
 
     Parameters
     ----------
-    point_m : (n, 3) float32, map, from the origin of the camera.
+    point_m : (n, 3) float32 or float64, map, from the origin of the camera.
     epoch_ns : (n,) int64, when they were seen; empty: they were always there.
     normal : (n, 3) float32, unit normals of the surface, NaN where unknown.
     camera, own_epoch_ns : the picture, and when it was taken.
@@ -169,16 +169,16 @@ def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden
             continue
         if code > depths.farthest[row, column] and depths.farthest[row, column] < UNKNOWN:
             continue
-        if epoch_ns.size > 0 and abs(epoch_ns[i] - own_epoch_ns) > limits.moment_ns:
-            if code < depths.moved[row, column]:
-                continue
+        is_other = epoch_ns.size > 0 and abs(epoch_ns[i] - own_epoch_ns) > limits.moment_ns
+        if is_other and code < depths.moved[row, column]:
+            continue
         cosine = NO_NORMAL
         if not math.isnan(normal[i, 0]):
             cosine = abs(x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2]) / math.sqrt(x * x + y * y + z * z)
             if cosine < limits.least_sine:
                 continue
             cosine = max(cosine, LEAST_COSINE)
-        inside = min(min(u - limits.border_px, right - u), min(v - limits.border_px, bottom - v))
+        inside = min(u - limits.border_px, right - u, v - limits.border_px, bottom - v)
         ramp = min(1.0, (inside + 1.0) / (limits.ramp_px + 1.0))
         weight[i] = cosine * ramp * limits.weight * focal_square / square
         x0, y0 = int(u), int(v)

@@ -134,7 +134,8 @@ def read_shown(store: Store, record: OutputRecord) -> list[Shown]:
     found = []
     for row in table.select(["rows", "columns", "factor", *_IMAGES]).to_pylist():
         shape = row["rows"], row["columns"]
-        found.append(Shown(DepthImages(*(np.frombuffer(row[n], "<u2").reshape(shape) for n in _IMAGES), row["factor"])))
+        nearest, farthest, moved = (np.frombuffer(row[name], "<u2").reshape(shape) for name in _IMAGES)
+        found.append(Shown(DepthImages(nearest, farthest, moved, row["factor"])))
     return found
 
 
@@ -157,7 +158,8 @@ def read_samples(store: Store, record: OutputRecord) -> Sampled:
         PictureSample(np.asarray(c, np.int64), np.asarray(v, np.float32).reshape(-1, 3))
         for c, v in zip(table["cell"].to_pylist(), table["colour"].to_pylist(), strict=True)
     ]
-    return Sampled(*(table[name].to_pylist() for name in _SAMPLED[:5]), samples)
+    cameras, files, epochs, sharpness, reasons = (table[name].to_pylist() for name in _SAMPLED[:5])
+    return Sampled(cameras, files, epochs, sharpness, reasons, samples)
 
 
 def _points(task: DepthTask, origin_m: Float64) -> Seen:

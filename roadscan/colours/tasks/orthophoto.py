@@ -232,17 +232,17 @@ def _numbered(number: npt.NDArray[np.int32], share: PictureShare) -> tuple[npt.N
 
 def _write(path: Path, bands: Sequence[npt.NDArray[np.uint8]], task: PhotoTask) -> None:
     edge, cell_m = bands[0].shape[0], task.photo.cell_m
-    images = [bytes_image(bands)]
-    for factor in _REDUCED:
-        if edge // factor >= _LEAST_OVERVIEW and edge % factor == 0:
-            images.append(
-                bytes_image(
-                    [*(_mean(b, factor) for b in bands[:3]), bands[3][factor // 2 :: factor, factor // 2 :: factor]]
-                )
-            )
+    factors = [f for f in _REDUCED if edge // f >= _LEAST_OVERVIEW and edge % f == 0]
+    images = [bytes_image(bands), *(bytes_image(_reduced(bands, f)) for f in factors)]
     grid = TileGrid(task.grid.size_m, cell_m)
     place = CellBox.around([task.tile], grid).transform(replace(task.context, grid=grid))
     write_cog(path, images, about(place, BANDS, task.context, task.tile))
+
+
+def _reduced(bands: Sequence[npt.NDArray[np.uint8]], factor: int) -> list[npt.NDArray[np.uint8]]:
+    """Returns larger pixels: mean colours, and the number of the picture in the middle."""
+    middle = factor // 2
+    return [*(_mean(b, factor) for b in bands[:3]), np.ascontiguousarray(bands[3][middle::factor, middle::factor])]
 
 
 def _mean(band: npt.NDArray[np.uint8], factor: int) -> npt.NDArray[np.uint8]:

@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.colours.cameras import eyes_m
 from roadscan.colours.depth import DepthRule
 from roadscan.colours.settings import ColoursConfig
 from roadscan.core.errors import ConfigError
@@ -143,7 +142,7 @@ def _grouped(pictures: Pictures) -> tuple[list[tuple[str, int, npt.NDArray[np.in
     order = np.lexsort((np.arange(number.size), number, runs))
     new = np.flatnonzero(np.append(True, (runs[order][1:] != runs[order][:-1]) | (np.diff(number[order]) != 0)))
     batch_of = np.empty(number.size, np.int64)
-    groups = []
+    groups: list[tuple[str, int, npt.NDArray[np.int64]]] = []
     for first, end in itertools.pairwise([*new.tolist(), number.size]):
         rows = order[first:end]
         batch_of[rows] = len(groups)
@@ -195,11 +194,6 @@ def within(pictures: Pictures, reach_m: float) -> Pictures:
 def numbers_near(plan: ColourPlan, boxes: Sequence[Bounds], reach_m: float) -> npt.NDArray[np.int64]:
     """Returns the pictures, by number, that may show a point in one of some boxes of the map."""
     return within(plan.pictures, reach_m).numbers_near(*boxes)
-
-
-def heights_of_eyes(pictures: Pictures) -> npt.NDArray[np.float64]:
-    """Returns easting, northing, height (n, 3) of the cameras (m)."""
-    return eyes_m(pictures)
 
 
 def jsonable(config: ColoursConfig) -> Mapping[str, Any]:

@@ -35,6 +35,8 @@ POINTS: Final = "coloured_points"
 _LOOKS: Final = 8
 """Looks of which the median is taken: farther ones blur."""
 _AT_ONCE: Final = 1_500_000  # Points coloured at a time.
+_ORIGIN_M: Final = np.zeros(3)
+"""Points count from the map's origin, so that no colour depends on which tiles are coloured together."""
 _EIGHT_TO_SIXTEEN_BITS: Final = 257  # LAS stores colours with 16 bits.
 _SEEN_BY: Final = "pictures"
 """Extra dimension of the files: of how many pictures a colour is the median, 0 without a colour."""
@@ -135,23 +137,17 @@ def colour_points(task: PointsTask) -> TaskResult:
     return TaskResult.of(records, failures, damaged)
 
 
-def _origin_m(task: PointsTask) -> npt.NDArray[np.float64]:
-    """Returns the place from which the points of a task count: it changes no colour."""
-    grid, box = task.readings.ground.grid, task.block.box()
-    return np.array([box[0] * grid.size_m, box[1] * grid.size_m, 0.0])
-
-
 def _places(points: TilePoints, task: PointsTask) -> Places:
     own = np.stack([points.x_quanta, points.y_quanta, points.height_quanta], axis=-1) * QUANTUM_M
     normal = normals_of(own)
     corner = np.array([points.tile.column, points.tile.row, 0.0]) * task.readings.ground.grid.size_m
-    return Places(own + (corner - _origin_m(task)), normal, points.epoch_gps_ns)
+    return Places(own + corner, normal, points.epoch_gps_ns)
 
 
 def _written(
     task: PointsTask, held: Sequence[tuple[TilePoints, Places]], keys: dict[TileId, str], folder: Path
 ) -> Iterator[OutputRecord]:
-    looks = paint(task.share.palette(task.readings.store), [p for _, p in held], _origin_m(task), task.rule)
+    looks = paint(task.share.palette(task.readings.store), [p for _, p in held], _ORIGIN_M, task.rule)
     for (points, _), own in zip(held, looks, strict=True):
         colour, count = own.medians()
         seen = int(np.count_nonzero(count))

@@ -1,9 +1,10 @@
 """Coloured clouds and orthophotos of recordings, held against their own pictures and returns.
 
-python -m benchmarks.bench_imagery [FOLDER]
+python -m benchmarks.bench_imagery [recorded | simulated] [FOLDER]
 
-`colour_and_lidar`: a cloud with the colours of every second picture, against the other pictures; the orthophoto against
-the intensities of the lidar.
+recorded, `colour_and_lidar`: a cloud with the colours of every second picture, against the other pictures; the
+orthophoto against the intensities of the lidar. simulated: a street whose objects have colours of their own, and
+painted corners in an orthophoto.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ import cv2
 import laspy
 import numpy as np
 import numpy.typing as npt
+import pyarrow.parquet as pq
 
 from benchmarks.coloured_streets import colour_and_lidar
-from benchmarks.judge_imagery import edge_shifts_px, intensity_shifts_m
+from benchmarks.judge_imagery import corner_shifts_m, edge_shifts_px, intensity_shifts_m
+from benchmarks.painted_objects import code_of, judged, nearest_code, photographed_street, scene, seen_by_truth, written
 from roadscan.colours.cameras import cameras_of
 from roadscan.colours.kernels.looks import Limits, look, project
 from roadscan.colours.tasks.share import Shares
@@ -28,10 +31,11 @@ from roadscan.colours.tasks.work import plan_work
 from roadscan.core.grid import Bounds
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
+from roadscan.simulate import simulate, truth
 from roadscan.survey.run import run_stages
 
 FRAMES: Final = tuple(range(0, 37, 3))
-STAGES: Final = ("ingest", "footprints", "tiles", "colours")
+STAGES: Final = ("ingest", "navigate", "footprints", "tiles", "colours")
 SECTIONS: Final = "\n[colours]\n[colours.orthophoto]\n"
 
 
@@ -81,19 +85,58 @@ def edges_px(cloud: Session, whole: Session, frames: tuple[int, ...]) -> npt.NDA
     return np.concatenate(found)
 
 
-def main(arguments: list[str]) -> None:
-    """Print the figures."""
+def recorded(folder: Path) -> None:
+    """Print the figures of the recording."""
     data = Path(os.environ.get("ROADSCAN_DATA", "../shared/data")) / "pictures" / "colour_and_lidar"
+    half = run(colour_and_lidar(data, folder / "half", SECTIONS, FRAMES[::2]))
+    whole = run(colour_and_lidar(data, folder / "whole", SECTIONS))
+    shifts = edges_px(half, whole, FRAMES[1::2])
+    size = np.hypot(*np.nan_to_num(shifts[~np.isnan(shifts).all(axis=1)]).T)
+    print(f"colour edges: {size.size} windows, median {np.median(size):.2f} px, mean {np.nanmean(shifts, axis=0)}")
+    photo = Path(whole.store.path("products/orthophoto/orthophoto.vrt"))
+    told = intensity_shifts_m(photo, clouds(whole))
+    print(f"orthophoto against intensity: {len(told)} windows, {told.round(3).tolist()}")
+
+
+def simulated(folder: Path) -> None:
+    """Print the figures of the simulated streets."""
+    street = run(written(folder / "street", "\n[colours]\n", scene()))
+    known, found = truth.load(folder / "street"), judged(folder / "street", clouds(street)[0].parent)
+    objects = pq.read_table(known.objects_file).to_pandas()
+    trees = objects.object_id[objects.kind == "tree"].to_numpy()
+    leafy = np.isin(found.object_id, trees) | np.isin(nearest_code(found.colour), code_of(trees))
+    print(
+        f"colour of another object: {found.wrong.sum() / found.coloured.sum():.4%} of {found.coloured.sum():,} points"
+    )
+    bare = found.coloured & ~np.isin(found.object_id, trees)
+    print(f"where no tree is involved: {(found.wrong & ~leafy).sum() / bare.sum():.4%}")
+    ground, seen = found.object_id == 0, seen_by_truth(folder / "street", found)
+    _, offset = known.station_offset_m(*found.place_m[:, :2].T)
+    for name, own in (("lanes", ground & seen & (np.abs(offset) < 3.0)), ("all ground", ground & seen)):
+        print(
+            f"points of {name} that a picture shows: {own.sum():,}, with a colour {np.mean(found.pictures[own] > 0):.2%}"
+        )
+    photo = run_photo(folder / "photo")
+    away = np.hypot(*corner_shifts_m(photo, truth.load(folder / "photo")).T)
+    print(f"painted corners: {away.size}, median {np.median(away):.4f} m, 95 % {np.percentile(away, 95):.4f}, "
+          f"largest {away.max():.4f}")  # fmt: skip
+
+
+def run_photo(folder: Path) -> Path:
+    """Run the street whose orthophoto is judged; returns its mosaic."""
+    file = simulate(photographed_street(), folder).survey_file
+    with file.open("a") as stream:
+        stream.write("\n[colours]\npoints = false\n[colours.orthophoto]\n")
+    return Path(run(file).store.path("products/orthophoto/orthophoto.vrt"))
+
+
+def main(arguments: list[str]) -> None:
+    """Print the figures that are asked for."""
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(arguments[0] if arguments else temporary)
-        half = run(colour_and_lidar(data, folder / "half", SECTIONS, FRAMES[::2]))
-        whole = run(colour_and_lidar(data, folder / "whole", SECTIONS))
-        shifts = edges_px(half, whole, FRAMES[1::2])
-        size = np.hypot(*np.nan_to_num(shifts[~np.isnan(shifts).all(axis=1)]).T)
-        print(f"colour edges: {size.size} windows, median {np.median(size):.2f} px, mean {np.nanmean(shifts, axis=0)}")
-        photo = Path(whole.store.path("products/orthophoto/orthophoto.vrt"))
-        told = intensity_shifts_m(photo, clouds(whole))
-        print(f"orthophoto against intensity: {len(told)} windows, {told.round(3).tolist()}")
+        folder = Path(arguments[1] if len(arguments) > 1 else temporary)
+        for name, judge in (("recorded", recorded), ("simulated", simulated)):
+            if not arguments or arguments[0] == name:
+                judge(folder)
 
 
 if __name__ == "__main__":

@@ -19,9 +19,11 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow.parquet as pq
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from roadscan.core.gpstime import ADJUSTED_OFFSET_S, NS_PER_S
 from roadscan.simulate import Scene, simulate, truth
+from roadscan.simulate.earth import Earth
 from roadscan.simulate.sensors import camera as simulated_camera
 from roadscan.simulate.sensors.picture import _Eye
 
@@ -142,6 +144,31 @@ def judged(survey_folder: Path, products: Path, run: str = "run-1") -> Judged:
     row = np.minimum(row, len(hits) - 1)
     ids = np.where(known & ~hits.is_mixed.to_numpy()[row], hits.object_id.to_numpy()[row], -9)
     return Judged(place, epoch, colour, count, ids.astype(np.int32))
+
+
+def seen_by_truth(
+    survey_folder: Path, found: Judged, nearest_m: float = 2.0, farthest_m: float = 40.0
+) -> npt.NDArray[np.bool_]:
+    """Points that lie in the middle of a patch of the road's colour in a picture, by the camera's true pose."""
+    known = truth.load(survey_folder)
+    world = Earth(known.scene.map.crs).ecef_from_map(found.place_m)
+    seen, road = np.zeros(len(world), bool), int(code_of(np.array([0]))[0])
+    camera = known.scene.camera
+    size = camera.width_px, camera.height_px
+    for pose in pq.read_table(known.camera_file("run-1")).to_pylist():
+        turn = Rotation.from_quat([pose[q] for q in ("qx", "qy", "qz", "qw")]).as_matrix()
+        ahead, right, down = ((world - [pose[f"{a}_world_m"] for a in "xyz"]) @ turn).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixel = [camera.focal_px * a / ahead + (n - 1) / 2 for a, n in zip((right, down), size, strict=True)]
+        inside = (ahead > nearest_m) & (ahead < farthest_m)
+        for place, count in zip(pixel, size, strict=True):
+            inside &= (place > 8) & (place < count - 9)
+        picture = cv2.imread(str(survey_folder / "raw/run-1/camera" / pose["file"]))[:, :, ::-1]
+        same = (nearest_code(picture.reshape(-1, 3)) == road).reshape(picture.shape[:2]).astype(np.uint8)
+        wide = cv2.erode(same, np.ones((3, 3), np.uint8)) > 0
+        rows = np.flatnonzero(inside)
+        seen[rows] |= wide[np.rint(pixel[1][rows]).astype(int), np.rint(pixel[0][rows]).astype(int)]
+    return seen
 
 
 def photographed_street(length_m: float = 24.0, **changes: Any) -> Scene:

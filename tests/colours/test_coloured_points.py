@@ -6,21 +6,17 @@ import csv
 import json
 from pathlib import Path
 
-import cv2
 import laspy
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 import rasterio
-from scipy.spatial.transform import Rotation
 
-from benchmarks.painted_objects import Judged, code_of, judged, nearest_code, scene, written
+from benchmarks.painted_objects import code_of, judged, nearest_code, scene, seen_by_truth, written
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import truth
-from roadscan.simulate.earth import Earth
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from tests.surface.test_surfaces import TwoThreads
@@ -70,32 +66,9 @@ def test_points_have_the_colours_of_what_they_lie_on(street: Street, coloured: S
     assert found.wrong.sum() <= 0.002 * found.coloured.sum()  # a pixel is 4 mrad here
     known = truth.load(street.folder)
     _, offset = known.station_offset_m(*found.place_m[:, :2].T)
-    lane = (found.object_id == 0) & (np.abs(offset) < 2.5) & seen_by_truth(street, found)
+    lane = (found.object_id == 0) & (np.abs(offset) < 2.5) & seen_by_truth(street.folder, found, farthest_m=15.0)
     assert lane.sum() > 10_000
     assert np.mean(found.pictures[lane] > 0) >= 0.98  # the rest lies beside the car ahead, within a coarse pixel or two
-
-
-def seen_by_truth(street: Street, found: Judged) -> np.ndarray:
-    """Points that lie in the middle of a patch of the road's colour in a picture, by the camera's true pose."""
-    known = truth.load(street.folder)
-    world = Earth(known.scene.map.crs).ecef_from_map(found.place_m)
-    seen, road = np.zeros(len(world), bool), int(code_of(np.array([0]))[0])
-    camera = known.scene.camera
-    size = camera.width_px, camera.height_px
-    for pose in pq.read_table(known.camera_file("run-1")).to_pylist():
-        turn = Rotation.from_quat([pose[q] for q in ("qx", "qy", "qz", "qw")]).as_matrix()
-        ahead, right, down = ((world - [pose[f"{a}_world_m"] for a in "xyz"]) @ turn).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pixel = [camera.focal_px * a / ahead + (n - 1) / 2 for a, n in zip((right, down), size, strict=True)]
-        inside = (ahead > 2) & (ahead < 15)
-        for place, count in zip(pixel, size, strict=True):
-            inside &= (place > 15) & (place < count - 16)
-        picture = cv2.imread(str(street.folder / "raw/run-1/camera" / pose["file"]))[:, :, ::-1]
-        same = (nearest_code(picture.reshape(-1, 3)) == road).reshape(picture.shape[:2]).astype(np.uint8)
-        wide = cv2.erode(same, np.ones((5, 5), np.uint8)) > 0
-        rows = np.flatnonzero(inside)
-        seen[rows] |= wide[np.rint(pixel[1][rows]).astype(int), np.rint(pixel[0][rows]).astype(int)]
-    return seen
 
 
 def test_files_say_what_has_no_colour(coloured: Session) -> None:

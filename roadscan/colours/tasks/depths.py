@@ -44,6 +44,8 @@ _TABLE: Final = pa.schema(
 )
 """A row a picture, in the order of the batch: depth images as rows of 16-bit numbers, colours of cubes."""
 _SAMPLED: Final = ["camera", "file", "epoch_gps_ns", "sharpness", "reason", "cell", "colour"]
+_MOST_POINTS: Final = 6_000_000
+"""Points around the pictures of a batch, about: of more, which fast lidars see, a share is used. It bounds memory."""
 _SAMPLE_REACH: Final = 0.6
 """Pictures are compared on places within this share of the reach."""
 
@@ -181,6 +183,7 @@ def _parts(task: DepthTask, origin_m: Float64) -> Iterator[tuple[Float32, Int64]
     eyes = eyes_m(task.pictures)[:, :2] - origin_m[:2]
     low, high = eyes.min(axis=0) - task.beyond_m, eyes.max(axis=0) + task.beyond_m
     size_m = readings.ground.grid.size_m
+    share = _MOST_POINTS / max(readings.readings, 1)
     placer = Georeferencer(readings.store, readings.ground, readings.slices)
     for one in readings.slices:
         for _, placed in placer.place(one, Window(*readings.block.box())):
@@ -188,8 +191,19 @@ def _parts(task: DepthTask, origin_m: Float64) -> Iterator[tuple[Float32, Int64]
             corner = np.column_stack([placed.tiles * size_m, np.zeros(len(placed.tiles))]) - origin_m
             point = corner + placed.quanta * QUANTUM_M
             kept &= ((point[:, :2] >= low) & (point[:, :2] <= high)).all(axis=1)
+            kept &= _kept(placed.epoch_gps_ns, placed.quanta, share)
             if kept.any():
                 yield point[kept].astype(np.float32), placed.epoch_gps_ns[kept]
+
+
+def _kept(epoch_gps_ns: Int64, quanta: npt.NDArray[np.int32], share: float) -> npt.NDArray[np.bool_]:
+    """Returns a mask (n,) of about a share of points, spread evenly; it follows from time and place of each alone."""
+    if share >= 1.0:
+        return np.ones(epoch_gps_ns.size, np.bool_)
+    mixed = epoch_gps_ns.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    for k in range(3):
+        mixed = (mixed ^ quanta[:, k].astype(np.uint64)) * np.uint64(0xC2B2AE3D27D4EB4F)
+    return np.asarray((mixed >> np.uint64(40)) < np.uint64(share * 2**24))
 
 
 def _sample(

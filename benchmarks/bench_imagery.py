@@ -113,9 +113,8 @@ def simulated(folder: Path) -> None:
     ground, seen = found.object_id == 0, seen_by_truth(folder / "street", found)
     _, offset = known.station_offset_m(*found.place_m[:, :2].T)
     for name, own in (("lanes", ground & seen & (np.abs(offset) < 3.0)), ("all ground", ground & seen)):
-        print(
-            f"points of {name} that a picture shows: {own.sum():,}, with a colour {np.mean(found.pictures[own] > 0):.2%}"
-        )
+        share = np.mean(found.pictures[own] > 0)
+        print(f"points of {name} that a picture shows: {own.sum():,}, with a colour {share:.2%}")
     photo = run_photo(folder / "photo")
     away = np.hypot(*corner_shifts_m(photo, truth.load(folder / "photo")).T)
     print(f"painted corners: {away.size}, median {np.median(away):.4f} m, 95 % {np.percentile(away, 95):.4f}, "

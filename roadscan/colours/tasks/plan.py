@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.colours.depth import DepthRule
 from roadscan.colours.settings import ColoursConfig
-from roadscan.core.errors import ConfigError
+from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
@@ -117,7 +117,11 @@ def plan_colours(
     RunError
         where no picture is in the store, or none has a pose.
     """
-    pictures = plan_pictures(plan, picture_rule(config))
+    try:
+        pictures = plan_pictures(plan, picture_rule(config))
+    except RunError as error:
+        change = "list a log of pictures with stamps in the survey file, or leave out [colours]"
+        raise RunError(f"[colours] {error.arrived}", expected=error.expected, change=change) from error
     context = product_context(plan)
     groups, batch_of = _grouped(pictures)
     common = key_of(

@@ -30,7 +30,7 @@ class Colours(Stage):
 
     name = "colours"
     title = "colours of the cameras' pictures for points and the road: coloured clouds, orthophoto"
-    after = ("tiles",)
+    after = ("assets",)
     section = "colours"
     units = "outputs"
     reads = ("cells", "scans", "returns", "cloud", "trajectory", "corrections", "footprints", "images")

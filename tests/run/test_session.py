@@ -68,7 +68,7 @@ def test_stages_come_after_those_that_they_need() -> None:
     names = [stage.name for stage in stages()]
     assert [n for n in names if n != "levels"] == [
         "ingest", "navigate", "footprints", "adjust", "strips", "tiles", "surfaces", "products", "condition",
-        "assets",
+        "assets", "colours",
     ]  # fmt: skip
     for stage in stages():
         assert all(names.index(before) < names.index(stage.name) for before in stage.after)

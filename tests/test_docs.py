@@ -397,7 +397,8 @@ def test_contributed_formats_stay_off_the_pages(plugin: Path) -> None:
 
 def test_the_contributed_stage(plugin: Path, finished: Simulated, tmp_path: Path) -> None:
     survey = finished.copy_with_store_to(tmp_path / "survey").survey_file
-    assert [s.name for s in stages()][-6:] == ["levels", "pictures", "surfaces", "products", "condition", "assets"]
+    ends = ["levels", "pictures", "surfaces", "products", "condition", "assets", "colours"]
+    assert [s.name for s in stages()][-7:] == ends
 
     def due() -> int:
         return survey_status(Session.open(survey)).of("levels").stale

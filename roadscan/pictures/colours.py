@@ -65,6 +65,10 @@ class ColourSource:
         told = tuple(f"{pictures.name(n)}: {reason}" for n, reason in sorted(unreadable.items()))
         return PointColours(colour, seen, len(used), told)
 
+    def reason(self, pictures: Pictures, number: int) -> str:
+        """Returns why a picture could not be read; empty where it could, or was not read."""
+        return self._unreadable.get(pictures.name(number), "")
+
     def picture(self, pictures: Pictures, number: int) -> UInt8 | None:
         """Returns a picture (height, width, 3), red first; None where it cannot be read."""
         name = pictures.name(number)

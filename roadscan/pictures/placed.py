@@ -87,15 +87,23 @@ class Pictures:
 
     def near(self, *boxes: Bounds) -> Pictures:
         """Returns those that may show a point in one of some boxes of the map, in the same order."""
+        return self._picked(self.numbers_near(*boxes))
+
+    def numbers_near(self, *boxes: Bounds) -> Int64:
+        """Returns the numbers (k,) of those that may show a point in one of some boxes of the map, ascending."""
         if not len(self) or not boxes:
-            return self._picked(np.zeros(0, np.int64))
+            return np.zeros(0, np.int64)
         own = np.array([[b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m] for b in boxes])
         widest = float(self.reach_m.max())
         wide = shapely.box(*(own + widest * np.array([-1.0, -1.0, 1.0, 1.0])).T)
         box, picture = self._places.query(wide)
         beyond = np.maximum(own[box, :2] - self.place_m[picture], self.place_m[picture] - own[box, 2:])
         far = np.hypot(*np.maximum(beyond, 0.0).T)
-        return self._picked(np.unique(picture[far <= self.reach_m[picture]]))
+        return np.unique(picture[far <= self.reach_m[picture]])
+
+    def chosen(self, numbers: Int64) -> Pictures:
+        """Returns those of some numbers (k,), in their order."""
+        return self._picked(numbers)
 
     def key(self) -> str:
         """Returns a hash of all that colours from these pictures depend on, except the rule."""

@@ -43,6 +43,7 @@ _SAMPLES, _PLANES, _SOFTWARE, _DATE, _PREDICTOR, _BLOCK_WIDTH, _BLOCK_HEIGHT = 2
 _EXTRA_SAMPLES, _SAMPLE_FORMAT, _PIXEL_SCALE, _TIE_POINT, _GDAL_METADATA, _GDAL_NODATA = (
     338, 339, 33550, 33922, 42112, 42113
 )  # fmt: skip
+_COLOURS: Final = 3  # bands of bytes that are red, green and blue; further ones are something else
 _GEO_KEYS: Final = (34735, 34736, 34737)  # TIFF tags of the GeoTIFF keys
 
 Pixels = npt.NDArray[Any]
@@ -110,6 +111,21 @@ def dense_image(bands: Sequence[npt.NDArray[np.float32]]) -> Image:
         for left in range(0, width, edge)
     ]
     return Image(width, height, edge, "float32", blocks)
+
+
+def bytes_image(bands: Sequence[npt.NDArray[np.uint8]]) -> Image:
+    """Return compressed bands (rows, columns) of bytes, north up, 0 where no data is."""
+    height, width = bands[0].shape
+    edge = _block_edge(max(height, width))
+    blocks: list[bytes | None] = []
+    for band in bands:
+        for top in range(0, height, edge):
+            for left in range(0, width, edge):
+                part = band[top : top + edge, left : left + edge]
+                whole = np.zeros((edge, edge), np.uint8)
+                whole[: part.shape[0], : part.shape[1]] = part
+                blocks.append(compressed(_predicted(whole)) if part.any() else None)
+    return Image(width, height, edge, "uint8", blocks)
 
 
 def sparse_image(
@@ -304,19 +320,21 @@ def _halved(block: Pixels) -> Pixels:
 def _layout(image: Image, bands: int, reduced: bool) -> tuple[Tag, ...]:
     """Return the tags of an image whose bands have separate blocks, without the places of the blocks."""
     floats = image.dtype == "float32"
+    colours = not floats and bands >= _COLOURS
+    beside = bands - (_COLOURS if colours else 1)
     return (
         Tag(_NEW_SUBFILE, "I", [int(reduced)]),
         Tag(_WIDTH, "I", [image.width]),
         Tag(_HEIGHT, "I", [image.height]),
         Tag(_BITS, "H", [32 if floats else 8] * bands),
         Tag(_COMPRESSION, "H", [image.compression]),
-        Tag(_PHOTOMETRIC, "H", [1]),
+        Tag(_PHOTOMETRIC, "H", [2 if colours else 1]),
         Tag(_SAMPLES, "H", [bands]),
         Tag(_PLANES, "H", [2]),
         Tag(_PREDICTOR, "H", [3 if floats else 2]),
         Tag(_BLOCK_WIDTH, "I", [image.edge]),
         Tag(_BLOCK_HEIGHT, "I", [image.edge]),
-        *([Tag(_EXTRA_SAMPLES, "H", [0] * (bands - 1))] if bands > 1 else []),
+        *([Tag(_EXTRA_SAMPLES, "H", [0] * beside)] if beside else []),
         Tag(_SAMPLE_FORMAT, "H", [3 if floats else 1] * bands),
         Tag(_GDAL_NODATA, "s", [b"nan" if floats else b"0"]),
     )

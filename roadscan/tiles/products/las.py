@@ -109,6 +109,7 @@ def write_las(
     context: ProductContext,
     facts: Mapping[str, Any],
     class_names: Mapping[int, str],
+    meanings: Mapping[str, str] | None = None,
 ) -> None:
     """Write points (one or more) of a tile of the context's grid, as :class:`Las` does.
 
@@ -116,9 +117,12 @@ def write_las(
     ----------
     facts : what the record of the user ``roadscan`` states beside the rounding errors.
     class_names : names of classes that the file holds in its Classification Lookup, up to 15 letters each.
+    meanings : what extra dimensions say, by name, up to 31 letters; others are as recorded.
     """
     axes = _axes(points, options.scale_m, context)
-    layout = replace(_layout(points, axes, context), class_names=tuple(sorted(class_names.items())))
+    layout = _layout(points, axes, context)
+    further = tuple((name, kind, (meanings or {}).get(name, told)) for name, kind, told in layout.further)
+    layout = replace(layout, further=further, class_names=tuple(sorted(class_names.items())))
     records = _record(points, axes, layout.header).array
     stated = {
         **facts, "rounding_error_max_m": rounding_errors(axes), "gps_time_step_ns": _gps_time_step_ns(points)

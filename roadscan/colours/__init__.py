@@ -1,0 +1,1 @@
+"""Colours of pictures for points and for the road: coloured clouds, and the orthophoto."""

@@ -1,0 +1,210 @@
+"""What pictures show: from the points around a picture, which distances are hidden, at an edge, or have moved away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.colours.kernels.depths import grow, nearest_in_pixels, slopes
+from roadscan.colours.kernels.looks import FOCAL_X, FOCAL_Y, HEIGHT, LEAST_M, STEPS, UNKNOWN, WIDTH, Camera, project
+from roadscan.core.extras import cv2
+
+Float32 = npt.NDArray[np.float32]
+Int64 = npt.NDArray[np.int64]
+UInt16 = npt.NDArray[np.uint16]
+
+_MOST_PIXELS: Final = 500_000
+"""Most pixels of a depth image: its pixels stand for so many of the picture's that it has no more."""
+_BLOCK: Final = 16
+"""Edge of the blocks (pixels) in which the gaps between points are measured."""
+_MOST_GAP: Final = 8.0
+"""Wider gaps (pixels from the nearest point) are not closed: nothing may be there."""
+_OF_GAPS: Final = 92.0
+"""Percentile of the distances to the nearest point in a block that counts as its gap."""
+_THICKNESS_M: Final = 0.15
+"""A point may lie so far behind the nearest one and still be seen (m): noise of ranges and poses, rough surfaces."""
+_THICKNESS: Final = 0.01
+"""The same as a share of its distance."""
+_MOVED_M: Final = 0.5
+"""What was seen so far behind a place (m) was seen through it."""
+_MOVED: Final = 0.05
+"""The same as a share of its distance."""
+_AROUND: Final = 12
+"""Something was seen through a place where an opening of more than twice so many pixels was at the moment: leaves,
+wires and the like are seen through, and stay."""
+_UNKNOWN_SLOPE: Final = 2.7
+"""Slope (m a m across the ray) of a surface whose normal is not known: it is seen at 20 degrees."""
+_HALF_OF_FAR: Final = 1.5
+"""Before nothing, such as the sky, an edge reaches from its near side to so many times its distance."""
+_OPENING_M: Final = 0.4
+"""Openings up to twice as wide and high (m) are closed: a pane of a car is so high."""
+_NEAREST_CLOSED_M, _CLOSED_WITHIN_M = 3.0, 40.0
+"""Distances of the things whose openings are closed (m)."""
+_CLOSED_STEP: Final = 2.0**0.5  # Openings are closed by distance, in steps of this factor.
+_FAR: Final = np.float32(1e9)  # Stands for inf where OpenCV filters images (m).
+
+
+@dataclass(frozen=True)
+class DepthRule:
+    """How depth images are made."""
+
+    moment_ns: int
+    """Points seen within this of the picture show where things that move were."""
+    grazing_deg: float
+    """Least angle between a ray and a surface that is seen."""
+    edge_px: float
+    """Points nearer to an edge in depth (pixels of the picture) do not count as seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Points (n,) around some pictures."""
+
+    point_m: Float32
+    """(n, 3) map, from the origin of the cameras."""
+    normal: Float32
+    """(n, 3) unit normals of their surfaces, NaN where unknown."""
+    epoch_gps_ns: Int64
+
+    def part(self, rows: slice) -> Seen:
+        """Returns some of them."""
+        return Seen(self.point_m[rows], self.normal[rows], self.epoch_gps_ns[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImages:
+    """What a picture shows, as `Depths` of the kernels has it: (rows, columns) stored distances."""
+
+    nearest: UInt16
+    farthest: UInt16
+    moved: UInt16
+    factor: int
+    """Pixels of the picture along the edge of one of theirs."""
+
+
+def depth_factor(lens: npt.NDArray[np.float64]) -> int:
+    """Returns how many pixels of a picture lie along the edge of a pixel of its depth images."""
+    return max(1, int(np.ceil(np.sqrt(lens[WIDTH] * lens[HEIGHT] / _MOST_PIXELS))))
+
+
+def depth_images(points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: float, rule: DepthRule) -> DepthImages:
+    """Returns what a picture shows, from the points around it.
+
+    Points of the moment come first. Points of other times count unless something was seen through their place at the
+    moment: such were things that moved. Nearest points of each pixel grow to discs that close the gaps (`grow`).
+    """
+    factor = depth_factor(camera.lens)
+    shape = (-(-int(camera.lens[HEIGHT]) // factor), -(-int(camera.lens[WIDTH]) // factor))
+    pixel, distance = np.empty((len(points.point_m), 2), np.float32), np.empty(len(points.point_m), np.float32)
+    project(points.point_m, camera, reach_m, pixel, distance)
+    at_once = np.abs(points.epoch_gps_ns - own_epoch_gps_ns) <= rule.moment_ns
+    pixel_rad = float(factor / np.sqrt(camera.lens[FOCAL_X] * camera.lens[FOCAL_Y]))
+    steepest = float(1.0 / np.tan(np.radians(rule.grazing_deg)))
+    moment, which = _nearest(pixel, distance, np.flatnonzero(at_once), factor, shape)
+    around = _grown(moment, _slopes(moment, which, points, camera, (pixel_rad, steepest)))[0]
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _AROUND + 1, 2 * _AROUND + 1))
+    seen = np.isfinite(around)
+    around = cv2.dilate(cv2.erode(np.where(seen, around, _FAR), disc), disc)
+    around = np.where(seen & (around < _FAR), around, np.inf).astype(np.float32)
+    other, others = _nearest(pixel, distance, np.flatnonzero(~at_once), factor, shape)
+    other[np.isfinite(around) & (around > other * (1.0 + _MOVED) + _MOVED_M)] = np.inf
+    closer = other < moment
+    front, which = np.where(closer, other, moment), np.where(closer, others, which)
+    front, radius = _grown(front, _slopes(front, which, points, camera, (pixel_rad, steepest)))
+    known = np.isfinite(front)
+    closed = _without_holes(front, pixel_rad)
+    at_edge = _edges(np.where(known, front, closed), radius, rule.edge_px / factor, steepest * pixel_rad)
+    nearest = np.where(known, at_edge, 0.0)
+    farthest = np.where(known, closed * (1.0 + _THICKNESS) + _THICKNESS_M, np.inf)
+    moved = np.where(np.isfinite(around), (around - _MOVED_M) / (1.0 + _MOVED), 0.0)
+    return DepthImages(_stored(nearest), _stored(farthest), _stored(moved), factor)
+
+
+def _nearest(
+    pixel: Float32, distance_m: Float32, rows: Int64, factor: int, shape: tuple[int, int]
+) -> tuple[Float32, npt.NDArray[np.int32]]:
+    image, which = np.full(shape, np.inf, np.float32), np.zeros(shape, np.int32)
+    nearest_in_pixels(pixel, distance_m, rows, float(factor), image, which)
+    return image, which
+
+
+def _slopes(
+    sample_m: Float32, which: npt.NDArray[np.int32], points: Seen, camera: Camera, turned: tuple[float, float]
+) -> Float32:
+    """Returns how the surfaces at samples lie, as `slopes` has it; `turned`: angle of a pixel, steepest slope."""
+    out = np.empty((*sample_m.shape, 3), np.float32)
+    slopes(sample_m, which, points.point_m, points.normal, camera.eye_m, camera.axes, *turned, _UNKNOWN_SLOPE, out)
+    return out
+
+
+def _grown(sample_m: Float32, slope: Float32) -> tuple[Float32, Float32]:
+    """Returns samples (height, width) with their gaps closed, and the radius of the discs by block (pixels)."""
+    radius = _gaps(sample_m)
+    out = np.empty_like(sample_m)
+    grow(sample_m, slope, radius, _BLOCK, out)
+    return out, radius
+
+
+def _gaps(sample_m: Float32) -> Float32:
+    """Returns the gap between samples by block of pixels (rows, columns): from 1 to the widest that is closed."""
+    empty = (~np.isfinite(sample_m)).astype(np.uint8)
+    height, width = sample_m.shape
+    rows, columns = -(-height // _BLOCK), -(-width // _BLOCK)
+    if empty.all():
+        return np.ones((rows, columns), np.float32)
+    away = np.full((rows * _BLOCK, columns * _BLOCK), np.nan, np.float32)
+    away[:height, :width] = np.minimum(cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), _MOST_GAP)
+    blocks = away.reshape(rows, _BLOCK, columns, _BLOCK).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
+    return np.clip(np.nanpercentile(blocks, _OF_GAPS, axis=-1) + 1.0, 1.0, _MOST_GAP).astype(np.float32)
+
+
+def _without_holes(front_m: Float32, pixel_rad: float) -> Float32:
+    """Returns a depth image without what is seen through narrow openings: panes of cars, crowns of trees, fences.
+
+    A lidar passes glass and leaves, and what it saw behind is not what a picture shows there. An opening counts as
+    narrow by its size in metres, at the distance of what is around it. A road that recedes has no opening: a window on
+    it finds nothing nearer than its lower edge.
+    """
+    out = front_m.copy()
+    finite = np.where(np.isfinite(front_m), front_m, _FAR)
+    limit = _NEAREST_CLOSED_M
+    while limit < _CLOSED_WITHIN_M:
+        whole = round(_OPENING_M / limit / pixel_rad)
+        if whole < 1:
+            break
+        box = np.ones((2 * whole + 1, 2 * whole + 1), np.uint8)
+        opened = cv2.dilate(cv2.erode(finite, box), box)
+        out = np.where(opened <= limit, np.minimum(out, opened), out)
+        limit *= _CLOSED_STEP
+    return np.where(out >= _FAR, np.inf, out).astype(np.float32)
+
+
+def _edges(front_m: Float32, radius: Float32, margin: float, steepest: float) -> Float32:
+    """Returns the distance (height, width) below which a point lies at an edge; 0 far from edges.
+
+    An edge is where the distance leaps from a pixel to the next by more than a surface does. Its near side reaches
+    beyond the outermost point by the radius of the discs, so points within that and the margin are at the edge, if they
+    lie nearer than half of the leap.
+    """
+    height, width = front_m.shape
+    finite = np.where(np.isfinite(front_m), front_m, _FAR)
+    beside = cv2.dilate(finite, np.ones((3, 3), np.uint8))
+    leaps = (finite < _FAR) & (beside > finite * (1.0 + _THICKNESS + 1.5 * steepest) + _THICKNESS_M)
+    half = np.where(leaps, np.minimum(0.5 * (finite + beside), _HALF_OF_FAR * finite), 0.0).astype(np.float32)
+    whole = np.rint(np.repeat(np.repeat(radius, _BLOCK, axis=0), _BLOCK, axis=1)[:height, :width] + margin)
+    out = np.zeros((height, width), np.float32)
+    for reach in np.unique(whole).astype(int).tolist():
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        own = whole == reach
+        out[own] = cv2.dilate(half, disc)[own]
+    return out
+
+
+def _stored(distance_m: npt.NDArray[np.floating]) -> UInt16:
+    """Returns distances as they are stored; inf stands for any."""
+    with np.errstate(divide="ignore"):
+        steps = STEPS * np.log(np.maximum(distance_m, LEAST_M) / LEAST_M)
+    return np.where(np.isfinite(distance_m), np.minimum(steps, UNKNOWN - 1), UNKNOWN).astype(np.uint16)

@@ -1,0 +1,252 @@
+"""Where points are in a picture, whether it shows them, and their colours there.
+
+A picture is a pinhole with Brown–Conrady distortion (Brown 1971; axes of OpenCV: x right, y down, z ahead), or
+equirectangular. Points are processed one by one, so the result for one does not depend on the others.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.compute.kernel_options import inlined, kernel
+
+FOCAL_X, FOCAL_Y, CENTRE_X, CENTRE_Y, K1, K2, P1, P2, K3, FOLD, WIDTH, HEIGHT, AROUND = range(13)
+"""Indices of a lens's parameters, as in `roadscan.pictures.kernels.picture_colours`."""
+LEAST_AHEAD_M = 0.1  # Least depth of a point in front of the camera (m).
+STEPS = 6000.0
+"""Steps of a stored distance in which it grows e-fold: 0.02 % each."""
+LEAST_M = 0.1
+"""Distance of the first step (m); shorter ones are stored as 0."""
+UNKNOWN = 65535
+"""Stored distance that stands for any distance, however far."""
+NO_NORMAL = 0.5  # Cosine of the incidence where no normal is known.
+LEAST_COSINE = 0.05  # Least cosine of the incidence in weights.
+
+
+class Camera(NamedTuple):
+    """A picture as the kernels take it."""
+
+    eye_m: npt.NDArray[np.float64]
+    """(3,) projection centre, from the origin of the points."""
+    axes: npt.NDArray[np.float64]
+    """(3, 3) camera axes from the map."""
+    lens: npt.NDArray[np.float64]
+    """(13,) in the order above."""
+
+
+class Depths(NamedTuple):
+    """What a picture shows: (rows, columns) stored distances, in pixels that stand for `factor` squared ones."""
+
+    nearest: npt.NDArray[np.uint16]
+    """A point nearer than this lies in front of what is seen beside it, at an edge."""
+    farthest: npt.NDArray[np.uint16]
+    """A point farther than this is hidden."""
+    moved: npt.NDArray[np.uint16]
+    """A point nearer than this, and seen at another time, was not there: what is behind it was seen."""
+    factor: float
+
+
+class Limits(NamedTuple):
+    """Which pixels and distances count, and how they weigh."""
+
+    reach_m: float
+    border_px: float
+    ramp_px: float
+    """Width of the strip inside the border in which weights rise to 1."""
+    least_sine: float
+    """Least cosine of the angle between the ray and a known normal."""
+    moment_ns: int
+    """Points seen within this of the picture were there."""
+    weight: float
+    """Sharpness of the picture among those of its run, 0 to 1."""
+
+
+@inlined
+def place_of(x, y, z, axes, lens):
+    """Return u, v (pixels) and the square of the distance of a point from the eye; u is NaN where it is not shown."""
+    a = axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z
+    b = axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z
+    ahead = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z
+    square = a * a + b * b + ahead * ahead
+    u, v = np.nan, np.nan
+    if lens[AROUND] > 0.0:
+        if square >= LEAST_AHEAD_M * LEAST_AHEAD_M:
+            u = lens[FOCAL_X] * math.atan2(a, ahead) + lens[CENTRE_X]
+            v = lens[FOCAL_Y] * math.atan2(b, math.hypot(a, ahead)) + lens[CENTRE_Y]
+    elif ahead >= LEAST_AHEAD_M:
+        a /= ahead
+        b /= ahead
+        r2 = a * a + b * b
+        if r2 < lens[FOLD]:
+            radial = 1.0 + r2 * (lens[K1] + r2 * (lens[K2] + r2 * lens[K3]))
+            u = a * radial + 2.0 * lens[P1] * a * b + lens[P2] * (r2 + 2.0 * a * a)
+            v = b * radial + lens[P1] * (r2 + 2.0 * b * b) + 2.0 * lens[P2] * a * b
+            u = lens[FOCAL_X] * u + lens[CENTRE_X]
+            v = lens[FOCAL_Y] * v + lens[CENTRE_Y]
+    return u, v, square
+
+
+@inlined
+def stored(distance_m):
+    """Return a distance as it is stored: steps of its logarithm."""
+    if distance_m <= LEAST_M:
+        return 0.0
+    return min(STEPS * math.log(distance_m / LEAST_M), 65535.0)
+
+
+@kernel
+def project(point_m, camera, reach_m, pixel, distance_m):
+    """Compute where points are in a picture.
+
+    Parameters
+    ----------
+    point_m : (n, 3) float32, map, from the origin of the camera.
+    camera : its picture.
+    reach_m : farther points are left out.
+    pixel : (n, 2) float32, u and v from the centre of the upper left pixel; written, NaN where a point is not shown.
+    distance_m : (n,) float32, written, NaN likewise.
+    """
+    lens = camera.lens
+    for i in range(point_m.shape[0]):
+        x = point_m[i, 0] - camera.eye_m[0]
+        y = point_m[i, 1] - camera.eye_m[1]
+        z = point_m[i, 2] - camera.eye_m[2]
+        pixel[i, 0] = np.nan
+        pixel[i, 1] = np.nan
+        distance_m[i] = np.nan
+        if x * x + y * y + z * z > reach_m * reach_m:
+            continue
+        u, v, square = place_of(x, y, z, camera.axes, lens)
+        if -0.5 <= u < lens[WIDTH] - 0.5 and -0.5 <= v < lens[HEIGHT] - 0.5:
+            pixel[i, 0] = u
+            pixel[i, 1] = v
+            distance_m[i] = math.sqrt(square)
+
+
+@kernel
+def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden, picture, colour, weight):
+    """Compute the colours that a picture gives to points, and their weights.
+
+    Weights are the cosine of the incidence over the square of the size of a pixel at the point, times a ramp beside the
+    border and the picture's sharpness.
+
+    Parameters
+    ----------
+    point_m : (n, 3) float32 or float64, map, from the origin of the camera.
+    epoch_ns : (n,) int64, when they were seen; empty: they were always there.
+    normal : (n, 3) float32, unit normals of the surface, NaN where unknown.
+    camera, own_epoch_ns : the picture, and when it was taken.
+    depths, limits : what it shows, and what counts.
+    hidden : (height, width) bool, pixels that are not used; (0, 0) where there are none.
+    picture : (height, width, 3) uint8.
+    colour : (n, 3) float32, written where the weight is not 0.
+    weight : (n,) float32, written, 0 where the picture does not show a point.
+    """
+    lens = camera.lens
+    right, bottom = lens[WIDTH] - 1.0 - limits.border_px, lens[HEIGHT] - 1.0 - limits.border_px
+    focal_square = lens[FOCAL_X] * lens[FOCAL_Y]
+    for i in range(point_m.shape[0]):
+        weight[i] = 0.0
+        x = point_m[i, 0] - camera.eye_m[0]
+        y = point_m[i, 1] - camera.eye_m[1]
+        z = point_m[i, 2] - camera.eye_m[2]
+        if x * x + y * y + z * z > limits.reach_m * limits.reach_m:
+            continue
+        u, v, square = place_of(x, y, z, camera.axes, lens)
+        if not (limits.border_px <= u <= right and limits.border_px <= v <= bottom):
+            continue
+        if hidden.size > 0 and hidden[int(v + 0.5), int(u + 0.5)]:
+            continue
+        distance = math.sqrt(square)
+        row, column = int((v + 0.5) / depths.factor), int((u + 0.5) / depths.factor)
+        row, column = min(row, depths.nearest.shape[0] - 1), min(column, depths.nearest.shape[1] - 1)
+        code = stored(distance)
+        if code < depths.nearest[row, column]:
+            continue
+        if code > depths.farthest[row, column] and depths.farthest[row, column] < UNKNOWN:
+            continue
+        is_other = epoch_ns.size > 0 and abs(epoch_ns[i] - own_epoch_ns) > limits.moment_ns
+        if is_other and code < depths.moved[row, column]:
+            continue
+        cosine = NO_NORMAL
+        if not math.isnan(normal[i, 0]):
+            cosine = abs(x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2]) / math.sqrt(x * x + y * y + z * z)
+            if cosine < limits.least_sine:
+                continue
+            cosine = max(cosine, LEAST_COSINE)
+        inside = min(u - limits.border_px, right - u, v - limits.border_px, bottom - v)
+        ramp = min(1.0, (inside + 1.0) / (limits.ramp_px + 1.0))
+        weight[i] = cosine * ramp * limits.weight * focal_square / square
+        x0, y0 = int(u), int(v)
+        s, t = u - x0, v - y0
+        for c in range(3):
+            above = (1.0 - s) * picture[y0, x0, c] + s * picture[y0, x0 + 1, c]
+            under = (1.0 - s) * picture[y0 + 1, x0, c] + s * picture[y0 + 1, x0 + 1, c]
+            colour[i, c] = (1.0 - t) * above + t * under
+
+
+@kernel
+def keep_best(colour, weight, gain, number, held_colour, held_weight, held_number):
+    """Put the colours of a picture among the best of each point: those with the largest weights, of equals the first.
+
+    Parameters
+    ----------
+    colour : (n, 3) float32; weight : (n,) float32, 0: none.
+    gain : (3,) factors of the picture's channels.
+    number : the picture's number.
+    held_colour : (n, k, 3) uint8; held_weight : (n, k) float32, 0: none; held_number : (n, k) int32. Read and written.
+    """
+    most = held_weight.shape[1]
+    for i in range(weight.shape[0]):
+        if weight[i] <= 0.0:
+            continue
+        least = 0
+        for k in range(1, most):
+            if held_weight[i, k] < held_weight[i, least]:
+                least = k
+        if weight[i] <= held_weight[i, least]:
+            continue
+        held_weight[i, least] = weight[i]
+        held_number[i, least] = number
+        for c in range(3):
+            held_colour[i, least, c] = np.uint8(min(255.0, colour[i, c] * gain[c] + 0.5))
+
+
+@kernel
+def weighted_medians(held_colour, held_weight, colour, count):
+    """Compute the weighted median of each channel: the least value with half of the weight at it or below.
+
+    Parameters
+    ----------
+    held_colour : (n, k, 3) uint8; held_weight : (n, k) float32, 0: none.
+    colour : (n, 3) uint8, written; 0 where there is none.
+    count : (n,) uint8, written: number of pictures.
+    """
+    most = held_weight.shape[1]
+    for i in range(held_weight.shape[0]):
+        total = 0.0
+        count[i] = 0
+        for k in range(most):
+            if held_weight[i, k] > 0.0:
+                total += held_weight[i, k]
+                count[i] += 1
+        for c in range(3):
+            colour[i, c] = 0
+            if count[i] == 0:
+                continue
+            best = 256
+            for k in range(most):
+                value = int(held_colour[i, k, c])
+                if held_weight[i, k] <= 0.0 or value >= best:
+                    continue
+                below = 0.0
+                for j in range(most):
+                    if held_weight[i, j] > 0.0 and held_colour[i, j, c] <= value:
+                        below += held_weight[i, j]
+                if below >= 0.5 * total * (1.0 - 1e-6):
+                    best = value
+            colour[i, c] = best

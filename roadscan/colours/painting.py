@@ -1,0 +1,135 @@
+"""Colours of places from many pictures, which are read one by one: the best of each place are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.colours.cameras import cameras_of
+from roadscan.colours.kernels.looks import Camera, Depths, Limits, keep_best, look, weighted_medians
+from roadscan.pictures.colours import ColourSource
+from roadscan.pictures.placed import Pictures
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+UInt8 = npt.NDArray[np.uint8]
+
+_RAMP: Final = 0.05
+"""Share of a picture's shorter edge in which weights rise from the border."""
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Places of the map that want a colour, of one piece of it."""
+
+    point_m: npt.NDArray[np.floating]
+    """(n, 3) from the origin of all pieces."""
+    normal: Float32
+    """(n, 3) unit normals, NaN where unknown."""
+    epoch_gps_ns: Int64
+    """(n,) when they were seen; empty for places that are always there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """The best looks at n places: k each."""
+
+    colour: UInt8
+    """(n, k, 3) balanced."""
+    weight: Float32
+    """(n, k), 0: none."""
+    number: npt.NDArray[np.int32]
+    """(n, k) number of the picture."""
+
+    @classmethod
+    def none(cls, count: int, most: int) -> Self:
+        """Returns looks at so many places before any picture was seen."""
+        return cls(
+            np.zeros((count, most, 3), np.uint8), np.zeros((count, most), np.float32),
+            np.full((count, most), -1, np.int32),
+        )  # fmt: skip
+
+    def medians(self) -> tuple[UInt8, UInt8]:
+        """Returns weighted medians (n, 3), 0 without a look, and the number of looks (n,)."""
+        colour, count = np.zeros((len(self.weight), 3), np.uint8), np.zeros(len(self.weight), np.uint8)
+        weighted_medians(self.colour, self.weight, colour, count)
+        return colour, count
+
+
+@dataclass(frozen=True)
+class PaintRule:
+    """Which looks count."""
+
+    reach_m: float
+    border_px: int
+    least_angle_deg: float
+    """Least angle between a ray and a surface whose normal is known."""
+    moment_ns: int
+    most: int
+    """Looks that are kept of a place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Palette:
+    """Pictures with all that their colours need."""
+
+    pictures: Pictures
+    number: Int64
+    """(n,) number of each in the survey."""
+    gain: Float64
+    """(n, 3)."""
+    weight: Float64
+    """(n,)."""
+    depths: Callable[[], Iterator[Depths]]
+    """Yields what each of them shows, in their order."""
+
+
+def paint(palette: Palette, pieces: Sequence[Places], origin_m: Float64, rule: PaintRule) -> list[Looks]:
+    """Returns the best looks at the places of each piece. Each picture is read once, and one after the other."""
+    found = [Looks.none(len(one.point_m), rule.most) for one in pieces]
+    boxes = [_Box.of(one.point_m) for one in pieces]
+    source, pictures = ColourSource(palette.pictures), palette.pictures
+    cameras = cameras_of(pictures, origin_m)
+    for n, (camera, depths) in enumerate(zip(cameras, palette.depths(), strict=True)):
+        near = [k for k, box in enumerate(boxes) if box.away_m(camera) <= rule.reach_m]
+        picture = source.picture(pictures, n) if near else None
+        if picture is None:
+            continue
+        lens = pictures.views.lenses[pictures.views.lens[n]]
+        limits = Limits(
+            rule.reach_m, float(rule.border_px), _RAMP * min(picture.shape[:2]),
+            float(np.sin(np.radians(rule.least_angle_deg))), rule.moment_ns, float(palette.weight[n]),
+        )  # fmt: skip
+        for k in near:
+            one, held = pieces[k], found[k]
+            colour, weight = np.empty((len(one.point_m), 3), np.float32), np.empty(len(one.point_m), np.float32)
+            look(
+                one.point_m, one.epoch_gps_ns, one.normal, camera, int(pictures.epochs_gps_ns[n]), depths, limits,
+                lens.hidden, picture, colour, weight,
+            )  # fmt: skip
+            keep_best(colour, weight, palette.gain[n], int(palette.number[n]), held.colour, held.weight, held.number)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Box:
+    """The box of some points."""
+
+    low: Float64
+    high: Float64
+
+    @classmethod
+    def of(cls, point_m: npt.NDArray[np.floating]) -> Self:
+        if not len(point_m):
+            return cls(np.full(3, np.inf), np.full(3, -np.inf))
+        return cls(point_m.min(axis=0).astype(np.float64), point_m.max(axis=0).astype(np.float64))
+
+    def away_m(self, camera: Camera) -> float:
+        """Returns the distance from a camera to the box; 0 within."""
+        out = np.maximum(np.maximum(self.low - camera.eye_m, camera.eye_m - self.high), 0.0)
+        return float(np.sqrt((out**2).sum()))

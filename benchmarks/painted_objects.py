@@ -25,7 +25,7 @@ from roadscan.core.gpstime import ADJUSTED_OFFSET_S, NS_PER_S
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.sensors import camera as simulated_camera
-from roadscan.simulate.sensors.picture import _Eye
+from roadscan.simulate.sensors.picture import Studio, _Eye
 
 Float64 = npt.NDArray[np.float64]
 
@@ -53,10 +53,10 @@ def code_of(object_id: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.int64]:
     return nearest_code(colour_of(object_id))
 
 
-def _labelled(world: Any, drive: Any, epoch_gps_ns: int, number: int, tints: Any = None) -> npt.NDArray[np.float32]:
+def _labelled(studio: Studio, drive: Any, epoch_gps_ns: int, number: int) -> npt.NDArray[np.float32]:
     """Picture (height, width, 3) of the objects' colours."""
-    eye = _Eye(world, drive, epoch_gps_ns, number, None)
-    camera = world.scene.camera
+    eye = _Eye(studio, drive, epoch_gps_ns, number)
+    camera = studio.camera
     rows, columns = (a.ravel() for a in np.indices((camera.height_px, camera.width_px), dtype=np.float32))
     total = np.zeros((rows.size, 3), np.float32)
     for i in _SUB:

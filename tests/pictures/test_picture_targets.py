@@ -136,8 +136,9 @@ def test_where_there_is_no_target_none_is_found(yard: Path, tmp_path: Path) -> N
     bare = YARD.changed(road={"targets": []}, roadside={"targets": []})
     folder = simulate(bare, tmp_path / "bare").folder
     (folder / "control.csv").write_bytes((yard.parent / "control.csv").read_bytes())
-    told_of_targets = (yard.read_text()).partition("[picture_targets.names]")
-    (folder / "SURVEY.toml").write_text((folder / "SURVEY.toml").read_text() + "".join(told_of_targets[1:]))
+    told_of_targets = yard.read_text().partition("[picture_targets.names]")[1:]
+    only_targets = "".join(told_of_targets).partition("[privacy]")[0]
+    (folder / "SURVEY.toml").write_text((folder / "SURVEY.toml").read_text() + only_targets)
     rows, told = targets(ready(folder), tmp_path / "none.csv", "--misses")
     assert rows == []
     assert told.count("run-1/camera/") >= 9, "no reasons are told"

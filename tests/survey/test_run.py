@@ -136,6 +136,7 @@ def test_second_run_does_nothing(finished: Simulated) -> None:
         "ingest:",
         "navigate:",
         "footprints:",
+        "picture_ties:",
         "adjust:",
         "strips:",
         "tiles:",
@@ -144,6 +145,7 @@ def test_second_run_does_nothing(finished: Simulated) -> None:
         "products:",
         "condition:",
         "assets:",
+        "colours:",
     )
     assert all(line.startswith(("known:", "report:", *stages)) for line in _lines(run))
     assert {p: store.fs.modified(store.path(p)) for p in outputs(store)} == before

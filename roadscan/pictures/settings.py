@@ -87,7 +87,7 @@ class PictureTiesConfig(SurveySection):
     """… that were taken within this distance (m) …"""
     revisit_deg: float = Field(default=40.0, gt=0.0, le=90.0)
     """… with optical axes that differ by no more than this (degrees)."""
-    measurements: int = Field(default=120, ge=10, le=5_000)
+    measurements: int = Field(default=200, ge=10, le=5_000)
     """Measurements of tie points that a picture keeps, at most about; long tracks first, spread evenly over it."""
     reach_m: float = Field(default=80.0, gt=1.0, le=500.0)
     """Tie points farther than this from a camera are left out (m)."""

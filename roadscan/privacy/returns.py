@@ -63,6 +63,7 @@ class _Seen:
         return _Seen(self.place_m[rows], self.code[rows], self.epoch_gps_ns[rows], self.stays[rows])
 
 
+# Returns of a picture that none was near.
 _NONE: Final = _Seen(np.zeros((0, 3)), np.zeros(0, np.uint8), np.zeros(0, np.int64), np.zeros(0, np.bool_))
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import ConfigError, nearest
+from roadscan.core.frames import ENU_FROM_NED
 from roadscan.measuring.measure import posed_pictures
 from roadscan.measuring.poses import PicturePoses
 from roadscan.measuring.work import picked_poses
@@ -20,7 +21,6 @@ from roadscan.run.session import Session
 
 Float64 = npt.NDArray[np.float64]
 
-_ENU_FROM_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _WHOLE_M: Final = 1.0
 """The local frame's origin lies at whole multiples of this on the map."""
 
@@ -98,7 +98,7 @@ def local_frame(poses: PicturePoses) -> LocalFrame:
     world = worlds.pop()
     origin_map = np.floor(poses.place_m.min(axis=0) / _WHOLE_M) * _WHOLE_M
     origin = poses.pictures.map.world_from_map(world, origin_map[None])[0]
-    turn = _ENU_FROM_NED @ world_from_ned(world, origin[None])[0].T
+    turn = ENU_FROM_NED @ world_from_ned(world, origin[None])[0].T
     return LocalFrame(world, origin_map, origin, turn)
 
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import ConfigError
-from roadscan.core.frames import quaternion_from_rotation
+from roadscan.core.frames import ENU_FROM_NED, quaternion_from_rotation
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.export.export import Exported, published
 from roadscan.export.pictures.chosen import (
@@ -38,7 +38,6 @@ Float64 = npt.NDArray[np.float64]
 
 OFFSET_FILE: Final = "offset.json"
 """Where the local frame lies."""
-_ENU_FROM_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _GREY: Final = 128  # Colour of points that have none.
 
 
@@ -193,7 +192,7 @@ def _points(poses: PicturePoses, frame: LocalFrame, file: Path | None) -> Float6
 def _offset(poses: PicturePoses, frame: LocalFrame) -> dict[str, Any]:
     """Return where the local frame lies, and by how much the map's own axes differ from it."""
     chart = poses.pictures.map
-    level = map_from_ned(chart, frame.world, frame.origin_world_m[None])[0] @ _ENU_FROM_NED
+    level = map_from_ned(chart, frame.world, frame.origin_world_m[None])[0] @ ENU_FROM_NED
     eyes = frame.points(poses.pictures.views.eye_world_m)
     apart = frame.origin_map_m + eyes @ level.T - poses.place_m
     told: dict[str, Any] = {

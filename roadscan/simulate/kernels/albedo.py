@@ -32,8 +32,8 @@ OFFSET = 1 << 30
 """Added to numbers of nodes, so that they are positive."""
 # A rotation that lays no axis of the noise along the map's axes: 35° about east, 28° about north, 41° about up.
 R00, R01, R02 = 0.66636901, -0.33418554, 0.66653760
-R10, R11, R12 = 0.57926574, 0.79488404, -0.18058394
-R20, R21, R22 = -0.46947156, 0.50643793, 0.72326833
+R10, R11, R12 = 0.57926574, 0.79488404, -0.18058394  # its second row
+R20, R21, R22 = -0.46947156, 0.50643793, 0.72326833  # its third row
 
 
 class Octaves(NamedTuple):

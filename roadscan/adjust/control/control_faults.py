@@ -73,16 +73,22 @@ def datum_fault(sightings: Sequence[Sighting], largest_m: float) -> str:
     )
 
 
-def far_in_height(sightings: Sequence[Sighting], largest_m: float) -> dict[str, float]:
+def far_in_height(
+    sightings: Sequence[Sighting], largest_m: float, sigma_m: Sequence[float] | None = None
+) -> dict[str, float]:
     """Returns points, by name, whose height differs by more than that from what most passes measured: surveyed minus
     (m).
+
+    sigma_m : 1 σ of the recorded height at each sighting; in an outage a point may differ by four of them.
     """
     found: dict[str, list[float]] = {}
-    for one in sightings:
+    allowed: dict[str, float] = {}
+    for one, sigma in zip(sightings, sigma_m or [0.0] * len(sightings), strict=True):
         if np.isfinite(one.height_m):
             found.setdefault(one.point.name, []).append(one.point.height_m - one.height_m)
+            allowed[one.point.name] = max(allowed.get(one.point.name, largest_m), _SIGMAS * sigma)
     middle = {name: float(np.median(values)) for name, values in found.items()}
-    return {name: away for name, away in middle.items() if abs(away) > largest_m}
+    return {name: away for name, away in middle.items() if abs(away) > allowed[name]}
 
 
 def swapped(wrong: Sequence[WrongPoint]) -> list[tuple[str, str]]:

@@ -199,7 +199,11 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     sightings = _by_observation(evidence.sightings)
     role = np.array([one.point.role == "gcp" for one in sightings], bool)
     datum = datum_fault(evidence.sightings, config.control.largest_m)
-    far = {} if datum else far_in_height(evidence.sightings, config.control.largest_m)
+    recorded = [
+        0.0 if one.status == "unseen" else float(evidence.priors[one.run].sigma_at(_epoch(one))[0, 2])
+        for one in evidence.sightings
+    ]
+    far = {} if datum else far_in_height(evidence.sightings, config.control.largest_m, recorded)
     names = np.array([one.point.name for one in sightings], dtype=object)
     entering = role & ~np.isin(names, list(far)) & (config.control.on and not datum)
     entering &= ~np.isin(control.run.max(axis=1), list(evidence.useless))

@@ -141,7 +141,7 @@ def _of_log(plan: SurveyPlan, rig: Sensor, taken: TakenPictures, number: int) ->
         (int((~found & first).sum()), "no recorded pose at their time"),
     ):
         if count:
-            notes.append(f"{count} of {rows.size} pictures left out: {why}")
+            notes.append(f"{count} of {order.size} pictures left out: {why}")
     lever, axes = np.empty((epochs.size, 3)), np.empty((epochs.size, 3, 3))
     mountings = mountings_of(record.run, record.sensor, rig.mounting(), load_mountings(plan.store))
     for part, mounting in mountings.pieces(epochs):

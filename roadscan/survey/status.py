@@ -122,7 +122,7 @@ def survey_status(session: Session) -> Status:
             break
         except NothingToPlaceError as nothing:
             status.places_nothing = str(nothing)
-            break
+            continue
         except RoadscanError as error:
             status.note = str(error)  # a survey may have tables only: poses without readings, readings without poses
             break

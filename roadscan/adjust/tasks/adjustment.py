@@ -18,8 +18,8 @@ from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
 from roadscan.adjust.settings import AdjustConfig
-from roadscan.adjust.tasks.bundle import pictures_key, pictures_of
-from roadscan.adjust.tasks.cameras import picture_lines, picture_rows, publish_cameras
+from roadscan.adjust.tasks.bundle import asks_pictures, pictures_key, pictures_of
+from roadscan.adjust.tasks.cameras import picture_findings, picture_lines, picture_rows, publish_cameras
 from roadscan.adjust.tasks.control_lines import lines_line
 from roadscan.adjust.tasks.control_work import (
     SIGHTINGS,
@@ -255,6 +255,9 @@ def adjust_survey(session: Session) -> None:
     pictured = evidence.pictures is not None and config.mode == "joint"
     if not (pictured or evidence.ties.accepted.any() or any(one.point.role == "gcp" for one in evidence.sightings)):
         lines = [f"nothing to adjust: {_no_ties(work)}, {_seen(work, evidence.sightings)}"]
+        if asks_pictures(plan.survey):
+            of_mode = f"; pictures take part in mode 'joint' alone, not in '{config.mode}'"
+            lines[0] += of_mode if config.mode != "joint" else ", no tie point in pictures"
         held: Held = publish(session.store, {}, config)
         publish_mountings(session.store, None, config)
         publish_cameras(session.store, None)
@@ -281,6 +284,7 @@ def adjust_survey(session: Session) -> None:
     if config.mode in ("joint", "vertical"):
         doubts += failed_ties(evidence.ties, solution.tie_weight)
     doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings)]
+    doubts += picture_findings(solution.pictures)
     doubts += _of_points(work, evidence.sightings)
     _keep(session, key, held, (lines, doubts), failed=collector.lacks)
 

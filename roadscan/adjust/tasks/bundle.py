@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -71,12 +72,18 @@ def pictures_key(plan: SurveyPlan, manifest: Manifest) -> list[Any]:
     """Returns what the evidence of pictures depends on, for the key of the solution."""
     if not asks_pictures(plan.survey):
         return []
-    tracks = manifest.get(TRACKS, ALL)
+    tracks, (exposures, _) = manifest.get(TRACKS, ALL), exposures_of(plan)
+    posed = hashlib.blake2b(digest_size=8)
+    for values in (
+        exposures.camera, exposures.epoch_gps_ns, exposures.body_world_m, exposures.world_from_body,
+        exposures.lever_body_m, exposures.body_from_opencv,
+    ):  # fmt: skip
+        posed.update(np.ascontiguousarray(values).tobytes())
     cameras = [
         [name, one.model_dump(mode="json")] for name, one in sorted(plan.survey.rig.sensors.items()) if _has_lens(one)
     ]
     logs = [[r.key, r.run, r.sensor] for r in plan.records if r.tables.get("images") or r.tables.get(TABLE)]
-    return ["" if tracks is None else tracks.digest, cameras, logs]
+    return ["" if tracks is None else tracks.digest, posed.hexdigest(), cameras, logs]
 
 
 def camera_sigma(camera: Sensor, own: CameraPriors) -> tuple[Float64, Float64]:
@@ -122,7 +129,9 @@ def pictures_of(
         np.array([sensors.index(camera.sensor) for camera in exposures.cameras], np.int32),
     )
     index = {_named(exposures, k): k for k in range(len(exposures))}
-    tracks = _tracks(plan.store, manifest, index)
+    logs = [camera.log for camera in exposures.cameras]
+    of_logs = {(logs[c], str(f)): k for k, (c, f) in enumerate(zip(exposures.camera, exposures.file, strict=True))}
+    tracks = _tracks(plan.store, manifest, of_logs)
     control, number, more = _control(plan, priors, index, points)
     notes = (*notes, *more)
     tied = int(tracks.point.max(initial=-1)) + 1
@@ -161,13 +170,13 @@ def _joined(tracks: _Part, control: _Part, tied: int) -> _Part:
     )  # fmt: skip
 
 
-def _tracks(store: Store, manifest: Manifest, index: dict[tuple[str, str, str], int]) -> _Part:
-    """Returns the measurements of tie points."""
+def _tracks(store: Store, manifest: Manifest, index: dict[tuple[str, str], int]) -> _Part:
+    """Returns the measurements of tie points; `index` numbers pictures by log and file."""
     record = manifest.get(TRACKS, ALL)
     if record is None or not record.path:
         return _Part(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
     rows = store.parse_table(read_recorded(store, record), record.path)
-    names = zip(*(rows.column(c).to_pylist() for c in ("run", "sensor", "file")), strict=True)
+    names = zip(*(rows.column(c).to_pylist() for c in ("log", "file")), strict=True)
     picture = np.array([index.get(one, -1) for one in names], np.int64)
     here = picture >= 0
     pixel = np.stack([rows.column(c).to_numpy() for c in ("u_px", "v_px")], axis=-1).astype(np.float64)

@@ -11,6 +11,7 @@ from roadscan.adjust.adjustment import CameraErrors
 from roadscan.adjust.bundle.outcome import ControlOfPictures, PictureOutcome
 from roadscan.adjust.tasks.figures import Rows
 from roadscan.core.counted import counted
+from roadscan.core.witness import Finding, Witness
 from roadscan.pictures.camera_changes import COLUMNS, TABLE
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
@@ -21,6 +22,17 @@ _SAME: Final = 0.01
 """Values that change by no more than this share of their σ stay, so that what rests on them stays current."""
 _KNOWN: Final = 0.7
 """A value whose σ fell below this share of the stated one is determined: its variance is halved."""
+_LEAST_SHARE: Final = 0.7
+"""Share of the measurements of tie points that count, at least: of right pictures it is 0.85 to 0.92."""
+_MOST_PX: Final = 1.0  # RMS of tie points (px), at most: of right pictures it is 0.3 to 0.5.
+PICTURE_FIT: Final = Witness(
+    "picture_fit",
+    input="pictures",
+    fault="Stamps, lens or mounting of a camera are wrong by more than the adjustment can take out.",
+    asks="tie points: how many of their measurements agree with one another, and to how many pixels",
+    does="it is told; the measurements that disagree do not count",
+    told=("findings",),
+)
 _WORDS: Final = {
     "focal_x_px": ("focal length", 1.0, "px"), "centre_x_px": ("principal point, right", 1.0, "px"),
     "centre_y_px": ("principal point, down", 1.0, "px"), "k1": ("k1", 1.0, ""), "clock_s": ("clock", 1e3, "ms"),
@@ -94,6 +106,21 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
+def picture_findings(found: PictureOutcome | None) -> list[Finding]:
+    """Returns a finding where pictures do not fit to one another, whatever the poses."""
+    if found is None or not found.measured.is_tie.any():
+        return []
+    tie = found.measured.is_tie
+    share, left = float((found.weight[tie] > 0.0).mean()), found.rms_px(after=True)
+    if share >= _LEAST_SHARE and left <= _MOST_PX:
+        return []
+    said = (
+        f"{share:.0%} of the measurements of tie points agree with one another, to {left:.2f} px: of right stamps, "
+        f"lens and mounting it is {_LEAST_SHARE:.0%} or more, to {_MOST_PX:g} px; corrections of the poses rest on them"
+    )
+    return [PICTURE_FIT.finds("pictures", said)]
+
+
 def picture_lines(found: PictureOutcome | None, cameras: CameraErrors | None) -> list[str]:
     """Returns what pictures said, in words."""
     if found is None:
@@ -130,6 +157,8 @@ def _camera_lines(cameras: CameraErrors | None) -> list[str]:
         for name, (word, factor, unit) in _WORDS.items():
             column = COLUMNS.index(name)
             error, sigma, prior = (v[k, column] for v in (cameras.error, cameras.sigma, cameras.prior_sigma))
+            if name == "focal_x_px" and prior > 0.0 and sigma >= _KNOWN * prior:
+                words.append("its focal length is not checked by these pictures")
             if prior > 0.0 and sigma < _KNOWN * prior:
                 words.append(f"{word} {factor * error:+.3g} {unit} (σ {factor * sigma:.2g})".replace("  ", " "))
         if words:

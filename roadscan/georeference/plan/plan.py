@@ -342,6 +342,7 @@ def poses_plan_of(session: Session) -> SurveyPlan:
     try:
         return plan_of(session)
     except NothingToPlaceError:
-        if not session.survey.has("picture_ties"):
+        # Where pictures improved the poses before, what they made is withdrawn.
+        if not session.survey.has("picture_ties") and not session.manifest.of("adjustment"):
             raise
         return plan_without_readings(session.survey, session.store)

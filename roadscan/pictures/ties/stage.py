@@ -45,6 +45,20 @@ ODD_PICTURES: Final = Witness(
 )
 
 
+_MOST_BEHIND: Final = 0.3
+"""Share of tie points that lie behind the camera: of right stamps and directions it is a few in a hundred, by the noise
+of rays that are nearly parallel."""
+
+WRONG_WAY: Final = Witness(
+    "pictures_wrong_way",
+    input="pictures",
+    fault="The stamps of the pictures are of other pictures, or the camera looks another way than the rig file says.",
+    asks="the poses, by which the rays of a tie point should meet before the camera",
+    does="it is told; what does not fit takes no part in the adjustment",
+    told=("findings",),
+)
+
+
 class PictureTies(Stage):
     """The stage of tie points: a file of features and one of matches a picture, and the tracks of the survey."""
 
@@ -116,20 +130,33 @@ class PictureTies(Stage):
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """Returns a finding on pictures that give no tie points."""
         record = manifest.get(TRACKS, ALL)
-        odd = [] if record is None else json.loads(record.detail).get("odd", [])
-        if not odd:
-            return ()
-        named = "; ".join(f"{name}: {why}" for name, why in odd[:_NAMED])
-        more = f" and {len(odd) - _NAMED:,} more" if len(odd) > _NAMED else ""
-        return (
-            ODD_PICTURES.finds(
-                "pictures", f"{len(odd):,} pictures give no tie point: {named}{more}", left_out=len(odd)
-            ),
-        )
+        own = {} if record is None else json.loads(record.detail)
+        return (*_of_odd(own.get("odd", [])), *_of_behind(own.get("behind", 0), own.get("found", 0)))
 
     def folders(self) -> Sequence[str]:
         """Returns the folders of features, matches and tracks."""
         return [str(table_schema(name).location) for name in (FEATURES, MATCHES, TRACKS)]
+
+
+def _of_odd(odd: list[tuple[str, str]]) -> list[Finding]:
+    """Returns a finding on pictures that give no tie points."""
+    if not odd:
+        return []
+    named = "; ".join(f"{name}: {why}" for name, why in odd[:_NAMED])
+    more = f" and {len(odd) - _NAMED:,} more" if len(odd) > _NAMED else ""
+    said = f"{len(odd):,} pictures give no tie point: {named}{more}"
+    return [ODD_PICTURES.finds("pictures", said, left_out=len(odd))]
+
+
+def _of_behind(behind: int, found: int) -> list[Finding]:
+    """Returns a finding where many tie points lie behind the cameras that saw them."""
+    if behind <= _MOST_BEHIND * found:
+        return []
+    said = (
+        f"{behind:,} of {found:,} tie points lie behind the camera by the poses: the stamps of the pictures are of "
+        "others or in another order, or the camera looks another way than the rig file says"
+    )
+    return [WRONG_WAY.finds("pictures", said)]
 
 
 def _lines(work: TieWork, manifest: Manifest) -> list[str]:

@@ -74,8 +74,7 @@ class FeatureTask:
 class Partner:
     """A picture that another one is compared with."""
 
-    name: str
-    record: str
+    unit: str
     """Unit of its features."""
     interior: Interior
     relative: Relative
@@ -122,9 +121,9 @@ def plan_ties(plan: SurveyPlan) -> TieWork:
     for number in range(len(exposures)):
         camera = exposures.cameras[exposures.camera[number]]
         interior = _interior(camera.rig.interior)
-        unit = key_of(camera.run, camera.sensor, str(exposures.file[number]))
-        key = key_of(code, camera.log, unit, settings.features, camera.rig.own_vehicle_px)
+        unit = key_of(camera.run, camera.sensor, camera.log, str(exposures.file[number]))
         size = interior.width_px, interior.height_px
+        key = key_of(code, camera.log, unit, settings.features, size, camera.rig.own_vehicle_px)
         units.append(unit)
         tasks.append(
             FeatureTask(
@@ -218,7 +217,7 @@ def match_tasks(work: TieWork, manifest: Manifest) -> list[MatchTask]:
         if record is None or not record.path or first in left_out or not found:
             continue
         partners = tuple(_partner(work, first, k) for k, _ in found)
-        shaping = [[p.name, p.relative.turn.round(6).tolist(), p.relative.base.round(4).tolist()] for p in partners]
+        shaping = [[p.unit, p.relative.turn.round(6).tolist(), p.relative.base.round(4).tolist()] for p in partners]
         sigmas = [[p.relative.sigma_turn_rad, p.relative.sigma_direction_rad] for p in partners]
         lenses = [_interior_of(work, k).model_dump(mode="json") for k in (first, *(k for k, _ in found))]
         key = key_of(code, record.digest, [r.digest for _, r in found], shaping, sigmas, lenses)
@@ -252,7 +251,7 @@ def _partner(work: TieWork, first: int, second: int) -> Partner:
     if one.sensor != other.sensor:
         turn = float(np.hypot(turn, boresight))
     relative = Relative(turns[1].T @ turns[0], base, turn, float(np.hypot(shift, boresight)))
-    return Partner(work.exposures.name(second), work.units[second], _interior_of(work, second), relative)
+    return Partner(work.units[second], _interior_of(work, second), relative)
 
 
 def match_picture(task: MatchTask) -> OutputRecord:
@@ -265,7 +264,7 @@ def match_picture(task: MatchTask) -> OutputRecord:
         other = _load(task.store, record)
         second = rays(partner.interior, other.pixel.astype(np.float64)), other.descriptor
         found = matches(first, second, partner.relative, pixel_rad)
-        names += [partner.name] * len(found)
+        names += [partner.unit] * len(found)
         rows.append(found)
     joined = np.concatenate(rows)
     table = pa.Table.from_arrays(
@@ -311,7 +310,7 @@ def tracks_key(work: TieWork, tasks: Sequence[MatchTask], manifest: Manifest) ->
 
 def write_tracks(work: TieWork, tasks: Sequence[MatchTask], manifest: Manifest, store: Store) -> OutputRecord:
     """Join all matches to tracks, and write those that are kept."""
-    number = {work.exposures.name(k): k for k in range(len(work.units))}
+    number = {unit: k for k, unit in enumerate(work.units)}
     counts = np.zeros(len(work.units), np.int64)
     for k, unit in enumerate(work.units):
         record = manifest.get(FEATURES, unit)
@@ -363,7 +362,7 @@ def _kept(work: TieWork, track: Int64, picture: Int64, pixel: Float64) -> tuple[
     A tie point has to lie before its cameras, within reach, and be seen from directions far enough apart.
     """
     if not track.size:
-        return np.zeros(0, bool), {"tracks": 0, "found": 0, "flat": 0}
+        return np.zeros(0, bool), {"tracks": 0, "found": 0, "behind": 0}
     sight = np.empty((track.size, 3))
     sizes = np.empty((track.size, 2))
     for camera in range(len(work.exposures.cameras)):
@@ -377,13 +376,15 @@ def _kept(work: TieWork, track: Int64, picture: Int64, pixel: Float64) -> tuple[
     wide = widest_parallax_rad(track, eye, found.place_m) >= np.radians(work.settings.least_parallax_deg)
     near = np.ones(len(found.place_m), bool)
     near[track[~((found.distance_m > 0.0) & (found.distance_m < work.settings.reach_m))]] = False
+    behind = np.zeros(len(found.place_m), bool)
+    behind[track[found.distance_m <= 0.0]] = True
     good = np.flatnonzero(wide & near)
     own = np.isin(track, good)
     number = np.searchsorted(good, track[own])
     chosen = spread(number, picture[own], pixel[own], sizes[own], work.settings.measurements)
     kept = np.zeros(track.size, bool)
     kept[np.flatnonzero(own)[chosen[number]]] = True
-    figures = {"tracks": int(chosen.sum()), "found": len(near), "flat": int((~wide | ~near).sum())}
+    figures = {"tracks": int(chosen.sum()), "found": len(near), "behind": int(behind.sum())}
     return kept, figures
 
 
@@ -397,6 +398,7 @@ def _rows(work: TieWork, track: Int64, picture: Int64, of_feature: tuple[Float64
         [
             pa.array(np.unique(track[order], return_inverse=True)[1], pa.int64()),
             pa.array([c.run for c in cameras], pa.string()), pa.array([c.sensor for c in cameras], pa.string()),
+            pa.array([c.log for c in cameras], pa.string()),
             pa.array(exposures.file[rows].tolist(), pa.string()), pa.array(pixel[order, 0], pa.float32()),
             pa.array(pixel[order, 1], pa.float32()), pa.array(size[order], pa.float32()),
         ],

@@ -57,6 +57,7 @@ def test_a_second_run_makes_nothing(place: Place, drive: tuple[Path, list[str]])
     assert {one: (one.stat().st_mtime_ns, one.read_bytes()) for one in tables} == before
 
 
+@pytest.mark.witness("odd_pictures")
 def test_bad_pictures_are_named_and_the_others_go_on(place: Place, recording: Path, tmp_path: Path) -> None:
     file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(8))
     pictures = tmp_path / "pictures"
@@ -68,3 +69,22 @@ def test_bad_pictures_are_named_and_the_others_go_on(place: Place, recording: Pa
     assert "000004.png" in said and "the same picture as" in said
     assert "another size" in said
     assert "5 of 7 pictures take part" in said
+
+
+@pytest.mark.witness("pictures_wrong_way")
+def test_a_camera_that_looks_the_other_way_is_told(place: Place, recording: Path, tmp_path: Path) -> None:
+    file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(14, 22))
+    rig = (tmp_path / "rig.toml").read_text()
+    (tmp_path / "rig.toml").write_text(rig.replace("heading_deg = 0.0", "heading_deg = 180.0"))
+    assert any("lie behind the camera" in line for line in place.run(file))
+
+
+@pytest.mark.witness("picture_fit")
+def test_stamps_of_other_pictures_are_told(place: Place, recording: Path, tmp_path: Path) -> None:
+    file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(14, 22))
+    stamps = tmp_path / "pictures" / "stamps.csv"
+    head, *rows = stamps.read_text().splitlines()
+    names, times = zip(*(row.split(",") for row in rows), strict=True)
+    rows = [f"{name},{time}" for name, time in zip(reversed(names), times, strict=True)]
+    stamps.write_text("\n".join([head, *rows]) + "\n")
+    assert any("of the measurements of tie points agree" in line for line in place.run(file))

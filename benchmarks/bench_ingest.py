@@ -188,8 +188,9 @@ def makers() -> dict[str, Callable[[Path], Log]]:
 
 UNTIMED = frozenset({
     "gnss_csv", "gpx", "grafnav", "hesai_scans", "inertial_explorer", "novatel_bestpos", "novatel_ins",
-    "odm_gcp", "opensfm_gcp", "ouster_bag", "ouster_bag_imu", "ouster_imu", "pcd", "pcd_cloud",
-    "pospac_text", "ppk", "qinertia", "ros_gnss", "ros_imu", "ros_livox", "ros_nmea", "ros_poses",
+    "odm_gcp", "odm_picture_points", "opensfm_gcp", "opensfm_picture_points",
+    "ouster_bag", "ouster_bag_imu", "ouster_imu", "pcd", "pcd_cloud",
+    "picture_points_csv", "pospac_text", "ppk", "qinertia", "ros_gnss", "ros_imu", "ros_livox", "ros_nmea", "ros_poses",
     "robosense_pcap", "robosense_scans", "velodyne_scans",
 })  # fmt: skip
 """Formats that have no maker of logs here yet."""

@@ -18,6 +18,9 @@ import shapely
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import in_crs_unit
 
+_COUNTERS: Final = (24, 92)
+"""Places in a file of SQLite (bytes) of its number of changes, and of that for which its size holds: both agree."""
+_COUNTED: Final = (1).to_bytes(4, "big")  # one change
 _WRITTEN: Final = "2000-01-01T00:00:00.000Z"
 """Time of change that a GeoPackage states of its layers: equal tables give equal bytes."""
 _DEGREE_DECIMALS: Final = 9
@@ -45,7 +48,12 @@ def write_geopackage(path: Path, layers: Sequence[Layer], context: ProductContex
         _write(path, one, context, "GPKG", append=number > 0)
     with sqlite3.connect(path) as file:
         file.execute("UPDATE gpkg_contents SET last_change = ?", (_WRITTEN,))
+    file.execute("VACUUM")
     file.close()
+    with path.open("r+b") as content:  # GDAL writes in more or fewer steps, and SQLite counts them
+        for place in _COUNTERS:
+            content.seek(place)
+            content.write(_COUNTED)
 
 
 def write_geojson(path: Path, layer: Layer, context: ProductContext) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.core.strict import Strict
+from roadscan.core.strict import Strict, pattern_in_words
 from roadscan.simulate.scene.rig import ClockError, Mount
 
 
@@ -118,10 +118,16 @@ class Camera(Strict):
         )
 
 
+_FURTHER: Final = pattern_in_words(
+    r"^camera_[a-z0-9_]{1,24}$", "camera_ and 1 to 24 small letters (a–z), digits or '_', such as camera_left"
+)
+"""Names of further cameras."""
+
+
 class FurtherCamera(Camera):
     """A further camera of the rig, with its own mounting, lens and clock."""
 
     on: bool = True
     """Whether the rig carries it."""
-    name: str = Field(pattern=r"^camera_[a-z0-9_]{1,24}$")
+    name: str = Field(pattern=_FURTHER)
     """Its name in the rig file, and that of its folder: camera_ and what tells it apart."""

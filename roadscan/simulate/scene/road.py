@@ -5,14 +5,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.core.strict import Strict
+from roadscan.core.strict import Strict, pattern_in_words
 
 Shade = Annotated[float, Field(ge=0, le=255)]
 """Intensity of a surface, in digital numbers of a profiler."""
+
+
+TARGET_NAME: Final = pattern_in_words(
+    r"^[A-Za-z0-9_-]{0,16}$", "up to 16 letters (A–Z, a–z), digits, '_' or '-', or nothing: then it is numbered"
+)
+"""Names of targets."""
 
 
 class Element(Strict):
@@ -401,7 +407,7 @@ class Target(Strict):
     style: TargetStyle = "disc"
     """disc: white with a black centre; ring: a black ring, from 0.4 to 0.8 of the square, on white; checker: 2 × 2
     squares, along and across the road, two of them black."""
-    name: str = Field(default="", pattern=r"^[A-Za-z0-9_-]{0,16}$")
+    name: str = Field(default="", pattern=TARGET_NAME)
     """Name in the survey; made of its role and number where left out."""
 
 

@@ -10,7 +10,7 @@ from typing import Literal, Self, TypeAlias
 from pydantic import Field, model_validator
 
 from roadscan.core.strict import Strict
-from roadscan.simulate.scene.road import Shade, TargetStyle
+from roadscan.simulate.scene.road import TARGET_NAME, Shade, TargetStyle
 
 SignColour: TypeAlias = Literal["white", "red", "blue", "yellow", "green", "brown", "orange", "black"]
 
@@ -71,7 +71,7 @@ class TargetPlate(Standing):
     """Whether it is on a post; without one it hangs where it is, before a wall."""
     role: Literal["gcp", "check"] = "gcp"
     """Whether the survey states it as a control point or as a check point."""
-    name: str = Field(default="", pattern=r"^[A-Za-z0-9_-]{0,16}$")
+    name: str = Field(default="", pattern=TARGET_NAME)
     """Name in the survey; made of its role and number where left out."""
     shade: Shade = 200.0
     """Intensity of its white parts; the black ones have a twelfth of it."""

@@ -24,6 +24,7 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.pictures.camera_changes import COLUMNS
 from roadscan.poses.mounting_change import Seat
 
 Float64 = npt.NDArray[np.float64]
@@ -46,9 +47,7 @@ MOUNTED: Final = ("forward_m", "right_m", "down_m", "roll_rad", "pitch_rad", "he
 """The unknowns of a mounting: lever arm and a turn that follows the boresight, both along the axes of the body, and the
 share by which ranges are longer."""
 
-CAMERA: Final = (
-    "focal_x_px", "focal_y_px", "centre_x_px", "centre_y_px", "k1", "k2", "p1", "p2", "k3", "clock_s", "line_time_s",
-)  # fmt: skip
+CAMERA: Final = COLUMNS
 """The unknowns of a camera beside its mounting: its lens (OpenCV's parameters), what is added to the stamps of its
 pictures, and to the time between the exposures of two rows."""
 

@@ -33,7 +33,7 @@ def cameras_of(pictures: Pictures, origin_m: Float64) -> list[Camera]:
         return []
     views, eyes = pictures.views, eyes_m(pictures)
     return [
-        Camera(eyes[n] - origin_m, _axes(pictures, n, eyes[n]), views.lenses[views.lens[n]].parameters)
+        Camera(eyes[n] - origin_m, _axes(pictures, n, eyes[n]), views.lens_of(n).parameters)
         for n in range(len(pictures))
     ]
 

@@ -100,7 +100,7 @@ def paint(palette: Palette, pieces: Sequence[Places], origin_m: Float64, rule: P
         picture = source.picture(pictures, n) if near else None
         if picture is None:
             continue
-        lens = pictures.views.lenses[pictures.views.lens[n]]
+        lens = pictures.views.lens_of(n)
         limits = Limits(
             rule.reach_m, float(rule.border_px), _RAMP * min(picture.shape[:2]),
             float(np.sin(np.radians(rule.least_angle_deg))), rule.moment_ns, float(palette.weight[n]),

@@ -12,7 +12,7 @@ import shapely
 from roadscan.measuring.ground import Ground
 from roadscan.measuring.measure import ground_hits
 from roadscan.measuring.poses import PicturePoses
-from roadscan.measuring.rays import rays_of
+from roadscan.pictures.lens import rays_of
 from roadscan.pictures.views import HEIGHT, WIDTH, Lens
 
 Float64 = npt.NDArray[np.float64]
@@ -50,7 +50,7 @@ def footprint(poses: PicturePoses, ground: Ground, number: int, reach_m: float) 
     road_m = next((h for h in heights if math.isfinite(h)), math.nan)
     if not math.isfinite(road_m) or road_m >= place[2]:
         return _NONE
-    lens = poses.pictures.views.lenses[poses.pictures.views.lens[number]]
+    lens = poses.pictures.views.lens_of(number)
     if lens.is_around:
         turn = np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
         circle = place[:2] + _BOTTOM_SHARE * reach_m * np.column_stack([np.cos(turn), np.sin(turn)])

@@ -105,7 +105,7 @@ def _row(task: PictureRows, poses: PicturePoses, number: int) -> dict[str, Any]:
     """Return a row without its angles."""
     pictures = poses.pictures
     log = pictures.logs[pictures.log[number]]
-    lens = pictures.views.lenses[pictures.views.lens[number]]
+    lens = pictures.views.lens_of(number)
     values = lens.parameters
     epoch = int(pictures.epochs_gps_ns[number])
     slope = poses.map_from_ned[number]

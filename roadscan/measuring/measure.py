@@ -22,7 +22,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, poses_plan_of
 from roadscan.measuring.ground import Ground, Plane
 from roadscan.measuring.kernels.march import BELOW, first_hits
 from roadscan.measuring.poses import PicturePoses, picture_poses
-from roadscan.measuring.rays import ray_slopes, rays_of
+from roadscan.pictures.lens import ray_slopes, rays_of
 from roadscan.pictures.placed import Pictures, plan_pictures
 from roadscan.pictures.views import HEIGHT, WIDTH, PictureRule
 from roadscan.run.session import Session, found_once
@@ -162,7 +162,7 @@ def measured_places(
     poses: PicturePoses, ground: Ground, number: int, pixel: Float64, sigma_px: float, reach_m: float
 ) -> list[MeasuredPlace]:
     """Return the places of pixels (m, 2) of a picture with its number, as :func:`measure` does."""
-    lens = poses.pictures.views.lenses[poses.pictures.views.lens[number]]
+    lens = poses.pictures.views.lens_of(number)
     ray = rays_of(lens, pixel)
     slope = ray_slopes(lens, pixel)
     hit_m = ground_hits(poses, ground, number, ray, reach_m)
@@ -234,7 +234,7 @@ def meet(
         raise ConfigError("both pixels are of one picture", expected="two pictures from different places")
     rays, slopes = [], []
     for number, pixel in zip(numbers, pixels, strict=True):
-        lens = poses.pictures.views.lenses[poses.pictures.views.lens[number]]
+        lens = poses.pictures.views.lens_of(number)
         own = _checked(poses, number, [pixel])
         rays.append(rays_of(lens, own)[0])
         slopes.append(_pixel_covariance(ray_slopes(lens, own)[0], sigma_px))
@@ -296,7 +296,7 @@ def _met(
 def _checked(poses: PicturePoses, number: int, pixel: Sequence[Sequence[float]] | Float64) -> Float64:
     """Return pixels as an array (m, 2); raises where one is outside the picture."""
     own = np.array(pixel, np.float64).reshape(-1, 2)
-    lens = poses.pictures.views.lenses[poses.pictures.views.lens[number]].parameters
+    lens = poses.pictures.views.lens_of(number).parameters
     size = np.array([lens[WIDTH], lens[HEIGHT]])
     outside = ~((own >= -0.5) & (own <= size - 0.5)).all(axis=1)
     if outside.any():

@@ -9,17 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.camera import Interior
-from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.rig import Sensor
-from roadscan.pictures.lens import PARAMETERS, parameters, with_parameters
+from roadscan.pictures.lens import PARAMETERS
 from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
 
 TABLE: Final = "camera_corrections"
-LENS: Final = PARAMETERS
 COLUMNS: Final = (*PARAMETERS, "clock_s", "line_time_s")
 """Columns of the table, in the order of the values."""
 
@@ -31,19 +28,14 @@ def load_camera_changes(store: Store) -> Mapping[str, Float64]:
     return {row["sensor"]: np.array([float(row[name]) for name in COLUMNS]) for row in rows}
 
 
-def interior_of(camera: Sensor, change: Float64 | None) -> Interior:
-    """Returns the interior orientation of a camera with a change (11,) of its lens and row time.
-
-    Raises
-    ------
-    ConfigError
-        where the rig file states none.
-    """
-    if camera.interior is None:
-        raise ConfigError("a camera has no interior orientation")
+def changed(interior: Interior, change: Float64 | None) -> Interior:
+    """Returns an interior orientation with a change (11,) of its lens; clock and row time are applied to epochs."""
     if change is None or not np.any(change):
-        return camera.interior
-    return with_parameters(camera.interior, parameters(camera.interior) + change[: len(LENS)])
+        return interior
+    stated = [*interior.focal_px, *interior.principal_px, *interior.distortion]
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (np.array(stated) + change[: len(PARAMETERS)]).tolist()
+    update = {"focal_px": (fx, fy), "principal_px": (cx, cy), "distortion": (k1, k2, p1, p2, k3)}
+    return interior.model_copy(update=update)
 
 
 def clock_ns(change: Float64 | None) -> int:

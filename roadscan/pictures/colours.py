@@ -10,10 +10,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.extras import cv2
+from roadscan.pictures.files import read_picture
 from roadscan.pictures.placed import Pictures
-from roadscan.pictures.views import HEIGHT, NO_VIEW, WIDTH, Shown, best_views, sampled
-from roadscan.store.codecs.image_files import ImageError, image_size
+from roadscan.pictures.views import NO_VIEW, Shown, best_views, sampled
+from roadscan.store.codecs.image_files import ImageError
 
 UInt8 = npt.NDArray[np.uint8]
 Float64 = npt.NDArray[np.float64]
@@ -77,7 +77,7 @@ class ColourSource:
         picture = self._kept.pop(name, None)
         if picture is None:
             try:
-                picture = _read(pictures, number)
+                picture = read_picture(pictures.path(number), pictures.views.lens_of(number).size_px)
             except (ImageError, OSError) as error:
                 self._unreadable[name] = str(error)
                 return None
@@ -102,18 +102,3 @@ def world_places(pictures: Pictures, world: str, enh_m: Float64) -> Float64:
     if len(enh_m) == 1:  # NumPy multiplies a single row in another order than several
         return world_places(pictures, world, np.repeat(enh_m, 2, axis=0))[:1]
     return np.ascontiguousarray(pictures.map.world_from_map(world, enh_m))
-
-
-def _read(pictures: Pictures, number: int) -> UInt8:
-    """Returns a decoded picture in the orientation of the sensor, whatever its orientation tag."""
-    path = pictures.path(number)
-    lens = pictures.views.lenses[pictures.views.lens[number]].parameters
-    expected = round(lens[WIDTH]), round(lens[HEIGHT])
-    size = image_size(path)  # detects truncated files, which a decoder would fill up
-    if (size.width_px, size.height_px) != expected:
-        raise ImageError(f"{size.width_px} × {size.height_px} pixels, not {expected[0]} × {expected[1]}")
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    picture = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if picture is None or picture.shape != (expected[1], expected[0], 3):
-        raise ImageError("the image cannot be decoded")
-    return np.ascontiguousarray(picture[:, :, ::-1])

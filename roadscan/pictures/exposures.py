@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,12 +13,14 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
+from roadscan.core.camera import Interior
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import Sensor
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
 from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
+from roadscan.pictures.views import Lens
 from roadscan.poses.trajectory import world_from_ned
 
 Float64 = npt.NDArray[np.float64]
@@ -40,9 +43,16 @@ class Camera:
     """Key of the log of its pictures."""
     folder: Path
     rig: Sensor
-    """What the rig file states of it; it has an interior orientation."""
+    """What the rig file states of it."""
+    interior: Interior
+    """Its interior orientation, as the rig file states it."""
     world: str
     """World frame of the run's poses."""
+
+    @functools.cached_property
+    def lens(self) -> Lens:
+        """Returns the lens of that interior orientation."""
+        return Lens.of(self.interior, self.rig.own_vehicle_px)
 
 
 @dataclass(frozen=True)
@@ -115,18 +125,20 @@ def exposures_of(plan: SurveyPlan) -> tuple[Exposures, tuple[str, ...]]:
                 why = "no interior orientation in the rig file" if sensor.interior is None else "frames of a video"
                 notes.append(f"{where}: {len(taken.files)} pictures left out: {why}")
                 continue
-            own, said = _of_log(plan, sensor, taken, len(cameras))
+            own, said = _of_log(plan, (sensor, sensor.interior), taken, len(cameras))
             parts.append(own)
             cameras += own.cameras
             notes += [f"{where}: {one}" for one in said]
     return _joined(parts, cameras), tuple(notes)
 
 
-def _of_log(plan: SurveyPlan, rig: Sensor, taken: TakenPictures, number: int) -> tuple[Exposures, list[str]]:
+def _of_log(
+    plan: SurveyPlan, camera: tuple[Sensor, Interior], taken: TakenPictures, number: int
+) -> tuple[Exposures, list[str]]:
     """Returns the pictures of a log, and how many were left out."""
-    record, interior = taken.record, rig.interior
+    record, (rig, interior) = taken.record, camera
     source = trajectory_source(record.run, plan.records)
-    size = (0, 0) if interior is None else (interior.width_px, interior.height_px)
+    size = interior.width_px, interior.height_px
     fits = ((taken.size_px == 0) | (taken.size_px == size)).all(axis=1)
     order = np.argsort(taken.epochs_gps_ns, kind="stable")
     rows = order[fits[order]]
@@ -147,10 +159,11 @@ def _of_log(plan: SurveyPlan, rig: Sensor, taken: TakenPictures, number: int) ->
     for part, mounting in mountings.pieces(epochs):
         rotation, lever[part] = mounting.arrays()
         axes[part] = rotation @ SENSOR_FROM_OPENCV
-    camera = Camera(record.run, record.sensor, record.key, plan.survey.resolve(Path(record.path)), rig, source.world)
+    folder = plan.survey.resolve(Path(record.path))
+    own_camera = Camera(record.run, record.sensor, record.key, folder, rig, interior, source.world)
     level = np.einsum("nji,njk->nik", world_from_ned(source.world, body[kept]), turned[kept])
     own = Exposures(
-        (camera,), np.full(int(kept.sum()), number), epochs[kept],
+        (own_camera,), np.full(int(kept.sum()), number), epochs[kept],
         np.array([taken.files[i] for i in rows[kept].tolist()], dtype=object),
         body[kept], turned[kept], velocity[kept], rate[kept], level, lever[kept], axes[kept],
     )  # fmt: skip

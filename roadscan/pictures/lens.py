@@ -1,7 +1,8 @@
-"""A camera's lens on arrays: rays of pixels, pixels of points, and how these change with points and parameters.
+"""Rays of pixels, pixels of points, and how these change with points and with the lens.
 
-Axes are OpenCV's (x right, y down, z along the optical axis). A perspective lens distorts as Brown (1971) has it, with
-OpenCV's signs; a picture of 360° has even steps of longitude and latitude (Snyder 1987, plate carrée).
+Axes are OpenCV's (x right, y down, z along the optical axis); pixels count from the centre of the upper left one. A
+perspective lens distorts as Brown (1971) has it, with OpenCV's signs; a picture of 360° has even steps of longitude and
+latitude (Snyder 1987, plate carrée).
 """
 
 from __future__ import annotations
@@ -11,121 +12,123 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.camera import Interior
+from roadscan.core.extras import cv2
+from roadscan.pictures.views import Lens
 
 Float64 = npt.NDArray[np.float64]
 
 PARAMETERS: Final = ("focal_x_px", "focal_y_px", "centre_x_px", "centre_y_px", "k1", "k2", "p1", "p2", "k3")
 """The parameters of a lens in the order of its derivatives."""
-_STEPS: Final = 20  # Steps of Newton's method towards an undistorted place; 6 suffice within 60° of the axis.
-_WITHIN: Final = 1e-12  # Change of a tangent at which they end.
+_ROUNDS, _SETTLED = 200, 1e-13
+"""The inversion of the distortion ends after so many steps, or at a smaller change of the tangents."""
+_INVERTED_PX: Final = 1e-3
+"""Largest error of the inversion (pixels); a pixel beyond has no ray, as beyond the fold of the lens."""
+_OF_SHIFT, _OF_LENS = slice(3, 6), slice(6, 15)
+"""Columns of OpenCV's derivatives: by a shift of the points, and by `PARAMETERS`."""
 
 
-def parameters(interior: Interior) -> Float64:
-    """Returns the parameters (9,) of a lens, `PARAMETERS`."""
-    return np.array([*interior.focal_px, *interior.principal_px, *interior.distortion])
+def rays_of(lens: Lens, pixel: Float64) -> Float64:
+    """Returns unit vectors (m, 3) of pixels (m, 2: u, v); NaN where the distortion has no inverse."""
+    pixel = np.ascontiguousarray(pixel, np.float64).reshape(-1, 2)
+    if lens.is_around:
+        longitude, latitude = ((pixel - lens.parameters[2:4]) / lens.parameters[:2]).T
+        level = np.cos(latitude)
+        return np.column_stack([np.sin(longitude) * level, np.sin(latitude), np.cos(longitude) * level])
+    found = straightened(lens, pixel)
+    ray = np.column_stack([found, np.ones(len(found))])
+    wrong = ~(np.linalg.norm(projected(lens, ray) - pixel, axis=1) < _INVERTED_PX)
+    wrong |= (found**2).sum(axis=1) >= lens.fold
+    ray[wrong] = np.nan
+    return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True), np.float64)
 
 
-def with_parameters(interior: Interior, values: Float64) -> Interior:
-    """Returns a lens with other parameters (9,)."""
-    fx, fy, cx, cy, *distortion = (float(v) for v in values)
-    k1, k2, p1, p2, k3 = distortion
-    update = {"focal_px": (fx, fy), "principal_px": (cx, cy), "distortion": (k1, k2, p1, p2, k3)}
-    return interior.model_copy(update=update)
+def ray_slopes(lens: Lens, pixel: Float64) -> Float64:
+    """Returns derivatives (m, 3, 2) of the unit vectors by u and v, over a pixel about each (m, 2)."""
+    steps = 0.5 * np.eye(2)
+    return np.stack([rays_of(lens, pixel + step) - rays_of(lens, pixel - step) for step in steps], axis=-1)
 
 
-def rays(interior: Interior, pixel: Float64) -> Float64:
-    """Returns unit vectors (n, 3), OpenCV's axes, of pixels (n, 2: u, v); NaN where the lens has no ray."""
-    bent = (pixel - interior.principal_px) / np.array(interior.focal_px)
-    if interior.model == "equirectangular":
-        turn, dip = bent.T
-        return np.stack([np.cos(dip) * np.sin(turn), np.sin(dip), np.cos(dip) * np.cos(turn)], axis=-1)
-    straight = bent.copy()
-    for _ in range(_STEPS):
-        found, slope = _distorted(interior, straight)
-        away = found - bent
-        area = slope[:, 0, 0] * slope[:, 1, 1] - slope[:, 0, 1] * slope[:, 1, 0]
-        step = np.stack(
-            [
-                (slope[:, 1, 1] * away[:, 0] - slope[:, 0, 1] * away[:, 1]) / area,
-                (slope[:, 0, 0] * away[:, 1] - slope[:, 1, 0] * away[:, 0]) / area,
-            ],
-            axis=-1,
-        )
-        straight = straight - step
-        if np.nanmax(np.abs(step), initial=0.0) < _WITHIN:
-            break
-    folded = (np.abs(_distorted(interior, straight)[0] - bent) > 1e-6).any(axis=1)
-    straight[folded] = np.nan
-    ray = np.column_stack([straight, np.ones(len(straight))])
-    return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+def pixels_of(lens: Lens, point: Float64) -> Float64:
+    """Returns pixels (m, 2: u, v) of points (m, 3); NaN behind the camera and beyond the lens's fold."""
+    point = np.ascontiguousarray(point, np.float64).reshape(-1, 3)
+    if lens.is_around:
+        return lens.parameters[:2] * _angles(point) + lens.parameters[2:4]
+    out = np.full((len(point), 2), np.nan)
+    ahead = _is_seen(lens, point)
+    out[ahead] = projected(lens, point[ahead])
+    return out
 
 
-def projected(interior: Interior, point: Float64) -> Float64:
-    """Returns pixels (n, 2: u, v) of points (n, 3), OpenCV's axes; NaN of points that are not in front of the lens."""
-    return derivatives(interior, point)[0]
-
-
-def derivatives(interior: Interior, point: Float64) -> tuple[Float64, Float64, Float64]:
-    """Returns pixels (n, 2) of points (n, 3), and their derivatives by the point (n, 2, 3) and by `PARAMETERS`
-    (n, 2, 9).
+def derivatives(lens: Lens, point: Float64) -> tuple[Float64, Float64, Float64]:
+    """Returns pixels (m, 2) of points (m, 3), and their derivatives by the point (m, 2, 3) and by `PARAMETERS`
+    (m, 2, 9); NaN behind the camera and beyond the lens's fold.
     """
-    focal = np.array(interior.focal_px)
-    if interior.model == "equirectangular":
-        bent, by_point = _angles(point)
-        by_lens = np.zeros((len(point), 2, len(PARAMETERS)))
-    else:
-        ahead = np.where(point[:, 2] > 0.0, point[:, 2], np.nan)
-        straight = point[:, :2] / ahead[:, None]
-        bent, slope = _distorted(interior, straight)
-        by_straight = np.zeros((len(point), 2, 3))
-        by_straight[:, 0, 0] = by_straight[:, 1, 1] = 1.0 / ahead
-        by_straight[:, :, 2] = -straight / ahead[:, None]
-        by_point = slope @ by_straight
-        by_lens = _by_distortion(straight)
-    by_lens[:, :, 4:] *= focal[:, None]
-    by_lens[:, 0, 0], by_lens[:, 1, 1] = bent.T
-    by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
-    return focal * bent + interior.principal_px, focal[:, None] * by_point, by_lens
+    point = np.ascontiguousarray(point, np.float64).reshape(-1, 3)
+    if lens.is_around:
+        return _derivatives_around(lens, point)
+    pixel, by_point = np.full((len(point), 2), np.nan), np.full((len(point), 2, 3), np.nan)
+    by_lens = np.full((len(point), 2, len(PARAMETERS)), np.nan)
+    ahead = _is_seen(lens, point)
+    if ahead.any():
+        found, slopes = cv2.projectPoints(point[ahead], *_NO_TURN, matrix_of(lens), lens.parameters[4:9])
+        slopes = np.asarray(slopes).reshape(-1, 2, slopes.shape[1])
+        pixel[ahead], by_point[ahead] = found.reshape(-1, 2), slopes[:, :, _OF_SHIFT]
+        by_lens[ahead] = slopes[:, :, _OF_LENS]
+    return pixel, by_point, by_lens
 
 
-def _distorted(interior: Interior, straight: Float64) -> tuple[Float64, Float64]:
-    """Returns distorted tangents (n, 2) of straight ones, and their derivatives (n, 2, 2)."""
-    k1, k2, p1, p2, k3 = interior.distortion
-    x, y = straight.T
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    grows = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
-    across = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    down = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    bent = np.stack([across, down], axis=-1)
-    slope = np.empty((len(straight), 2, 2))
-    slope[:, 0, 0] = radial + x * x * grows + 2.0 * p1 * y + 6.0 * p2 * x
-    slope[:, 0, 1] = slope[:, 1, 0] = x * y * grows + 2.0 * p1 * x + 2.0 * p2 * y
-    slope[:, 1, 1] = radial + y * y * grows + 6.0 * p1 * y + 2.0 * p2 * x
-    return bent, slope
+def straightened(lens: Lens, pixel: Float64) -> Float64:
+    """Returns tangents (m, 2) of pixels (m, 2) of a perspective lens, where its distortion has an inverse."""
+    if not len(pixel):
+        return np.zeros((0, 2))
+    settled = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ROUNDS, _SETTLED)
+    flat = np.ascontiguousarray(pixel, np.float64).reshape(-1, 1, 2)
+    found = cv2.undistortPoints(flat, matrix_of(lens), lens.parameters[4:9].copy(), criteria=settled)
+    return np.asarray(found, np.float64).reshape(-1, 2)
 
 
-def _by_distortion(straight: Float64) -> Float64:
-    """Returns derivatives (n, 2, 9) of distorted tangents by the lens; those of focal length and centre are 0."""
-    x, y = straight.T
-    r2 = x * x + y * y
-    found = np.zeros((len(straight), 2, len(PARAMETERS)))
-    found[:, :, 4] = r2[:, None] * straight
-    found[:, :, 5] = (r2**2)[:, None] * straight
-    found[:, :, 8] = (r2**3)[:, None] * straight
-    found[:, 0, 6], found[:, 1, 6] = 2.0 * x * y, r2 + 2.0 * y * y
-    found[:, 0, 7], found[:, 1, 7] = r2 + 2.0 * x * x, 2.0 * x * y
-    return found
+def projected(lens: Lens, point: Float64) -> Float64:
+    """Returns pixels (m, 2) of points (m, 3) of a perspective lens, which lie ahead."""
+    if not len(point):
+        return np.zeros((0, 2))
+    ahead = np.ascontiguousarray(point, np.float64).reshape(-1, 1, 3)
+    found, _ = cv2.projectPoints(ahead, *_NO_TURN, matrix_of(lens), lens.parameters[4:9].copy())
+    return np.asarray(found, np.float64).reshape(-1, 2)
 
 
-def _angles(point: Float64) -> tuple[Float64, Float64]:
-    """Returns longitude and latitude (n, 2) of points around the camera, and their derivatives (n, 2, 3)."""
+def matrix_of(lens: Lens) -> Float64:
+    """Returns the camera matrix (3, 3) of a perspective lens."""
+    fx, fy, cx, cy = lens.parameters[:4]
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+_NO_TURN: Final = (np.zeros(3), np.zeros(3))  # Points are in the camera's axes already: no turn, no shift.
+
+
+def _is_seen(lens: Lens, point: Float64) -> npt.NDArray[np.bool_]:
+    """Returns a mask (m,) of the points that lie ahead, before the fold of the lens."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = (point[:, 0] ** 2 + point[:, 1] ** 2) / point[:, 2] ** 2
+    return np.asarray((point[:, 2] > 0.0) & (square < lens.fold))
+
+
+def _angles(point: Float64) -> Float64:
+    """Returns longitude and latitude (m, 2) of points (m, 3) around the camera."""
+    x, y, z = point.T
+    return np.column_stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))])
+
+
+def _derivatives_around(lens: Lens, point: Float64) -> tuple[Float64, Float64, Float64]:
+    """Returns the same of a picture of 360°, which has no distortion."""
     x, y, z = point.T
     level2 = x * x + z * z
     level, whole2 = np.sqrt(level2), level2 + y * y
-    by_point = np.zeros((len(point), 2, 3))
+    by_point, by_lens = np.zeros((len(point), 2, 3)), np.zeros((len(point), 2, len(PARAMETERS)))
     by_point[:, 0, 0], by_point[:, 0, 2] = z / level2, -x / level2
     by_point[:, 1, 0], by_point[:, 1, 2] = -x * y / (level * whole2), -z * y / (level * whole2)
     by_point[:, 1, 1] = level / whole2
-    return np.stack([np.arctan2(x, z), np.arctan2(y, level)], axis=-1), by_point
+    angles = _angles(point)
+    by_lens[:, 0, 0], by_lens[:, 1, 1] = angles.T
+    by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
+    focal, centre = lens.parameters[:2], lens.parameters[2:4]
+    return focal * angles + centre, focal[:, None] * by_point, by_lens

@@ -23,7 +23,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory
 from roadscan.georeference.sources import change_of, load_mounting_changes, load_mountings
 from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
-from roadscan.pictures.camera_changes import clock_ns, interior_of, load_camera_changes
+from roadscan.pictures.camera_changes import changed, clock_ns, load_camera_changes
 from roadscan.pictures.views import Lens, PictureRule, Views
 from roadscan.poses.trajectory import Poses, world_from_ned
 
@@ -230,7 +230,9 @@ def _camera_logs(plan: SurveyPlan, rule: PictureRule) -> list[tuple[Sensor, Take
 
 def _changed(camera: Sensor, change: Float64 | None) -> Sensor:
     """Returns a camera with the lens that an adjustment found."""
-    return camera if change is None else camera.model_copy(update={"interior": interior_of(camera, change)})
+    if camera.interior is None:
+        return camera
+    return camera.model_copy(update={"interior": changed(camera.interior, change)})
 
 
 def _is_video(taken: TakenPictures) -> bool:

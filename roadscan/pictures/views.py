@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.core.camera import Interior
 from roadscan.core.extras import cv2
-from roadscan.pictures.kernels.picture_colours import AROUND, HEIGHT, WIDTH, sample, take_better
+from roadscan.pictures.kernels.picture_colours import AROUND, FOLD, HEIGHT, WIDTH, sample, take_better
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -64,6 +64,16 @@ class Lens:
         return cls(np.array(lens), own_vehicle_px)
 
     @property
+    def size_px(self) -> tuple[int, int]:
+        """Returns width and height of the pictures."""
+        return round(float(self.parameters[WIDTH])), round(float(self.parameters[HEIGHT]))
+
+    @property
+    def fold(self) -> float:
+        """Returns the square of the tangent from which on the distortion is ambiguous."""
+        return float(self.parameters[FOLD])
+
+    @property
     def is_around(self) -> bool:
         """Returns True for pictures of 360°."""
         return bool(self.parameters[AROUND])
@@ -73,7 +83,7 @@ class Lens:
         """Mask (height, width) of pixels that show the vehicle; (0, 0) where none does. Computed on demand."""
         if not self.own_vehicle_px:
             return np.zeros((0, 0), np.bool_)
-        drawn = np.zeros((round(self.parameters[HEIGHT]), round(self.parameters[WIDTH])), np.uint8)
+        drawn = np.zeros(self.size_px[::-1], np.uint8)
         for polygon in self.own_vehicle_px:
             cv2.fillPoly(drawn, [np.rint(polygon).astype(np.int32)], 1)
         return drawn.astype(np.bool_)
@@ -105,6 +115,10 @@ class Views:
     def __len__(self) -> int:
         """Returns the number of pictures."""
         return len(self.lens)
+
+    def lens_of(self, number: int) -> Lens:
+        """Returns the lens of a picture."""
+        return self.lenses[int(self.lens[number])]
 
     def picked(self, index: Int64) -> Views:
         """Returns a subset."""
@@ -140,7 +154,7 @@ def best_views(
     for number in range(len(views)):
         if number in without:
             continue
-        lens = views.lenses[views.lens[number]]
+        lens = views.lens_of(number)
         take_better(
             point_world_m[views.world[number]], views.eye_world_m[number], views.opencv_from_world[number],
             views.up_world[number], lens.parameters, limits, lens.hidden, number, best, chosen, pixel,
@@ -199,7 +213,7 @@ def sights(
     for number, items in near:
         if not items.size:
             continue
-        world, lens = int(views.world[number]), views.lenses[views.lens[number]]
+        world, lens = int(views.world[number]), views.lens_of(number)
         places = places_world_m[world][items]
         count = places.shape[0] * places.shape[1]
         best, chosen, pixel = np.full(count, np.inf), np.full(count, NO_VIEW, np.int32), np.full((count, 2), np.nan)

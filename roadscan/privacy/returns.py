@@ -21,8 +21,8 @@ from roadscan.assets.tasks.plan import asset_grid
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
-from roadscan.measuring.rays import pixels_of
 from roadscan.pictures.colours import world_places
+from roadscan.pictures.lens import pixels_of
 from roadscan.pictures.placed import Pictures
 from roadscan.pictures.views import HEIGHT, WIDTH
 from roadscan.privacy.hiding import Region
@@ -158,7 +158,7 @@ def _covered(pictures: Pictures, number: int, place_m: Float64, what: str) -> li
         return []
     count, thing = _things(place_m)
     views = pictures.views
-    lens = views.lenses[views.lens[number]]
+    lens = views.lens_of(number)
     world = world_places(pictures, pictures.worlds[views.world[number]], place_m)
     own = (world - views.eye_world_m[number]) @ views.opencv_from_world[number].T
     ahead = np.linalg.norm(own, axis=1) if lens.is_around else own[:, 2]

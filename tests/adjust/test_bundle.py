@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.adjustment import Adjustment, adjust
-from roadscan.adjust.bundle.measurements import Measurements, Numbers, State, met_at, rows_of, seen
+from roadscan.adjust.bundle.measurements import Measurements, Numbers, State, met_at, residuals_px, rows_of, seen
 from roadscan.adjust.bundle.solve import PictureEvidence, approached, state_of
 from roadscan.adjust.observations import CAMERA, Observations
 from roadscan.adjust.process import CameraPrior, GaussMarkov, MountingPrior, RunPrior
@@ -22,7 +22,8 @@ from roadscan.core.frames import ENU_FROM_NED
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import Sensor
 from roadscan.pictures.exposures import Camera, Exposures
-from roadscan.pictures.lens import projected
+from roadscan.pictures.lens import pixels_of
+from roadscan.pictures.views import Lens
 from roadscan.poses.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
@@ -84,7 +85,7 @@ def _drive(seed: int, false: float = 0.0, lens_error: Float64 | None = None) -> 
     shift, turn = 0.1 * np.array(error)[:, :3], np.radians(0.2) * np.array(error)[:, 3:]
     recorded = turned @ Rotation.from_rotvec(turn).as_matrix()
     exposures = Exposures(
-        (Camera("a", "left", "key", Path(), RIG, LOCAL_WORLD),), np.zeros(n, np.int64),
+        (Camera("a", "left", "key", Path(), RIG, LENS, LOCAL_WORLD),), np.zeros(n, np.int64),
         FIRST_NS + STEP_NS * np.arange(n), np.array([f"{k}.png" for k in range(n)], dtype=object), body + shift,
         recorded, np.gradient(body, 0.1, axis=0), np.zeros((n, 3)), ENU_FROM_NED.T @ recorded,
         np.tile(LEVER_M, (n, 1)), np.tile(stated_axes, (n, 1, 1)),
@@ -121,7 +122,7 @@ def _measured(
     pictures, pixels, numbers = [], [], []
     for k in range(len(body)):
         camera = (points - body[k] - turned[k] @ LEVER_M) @ (turned[k] @ axes)
-        pixel = projected(lens, np.where(camera[:, 2:] > 2.0, camera, np.nan))
+        pixel = pixels_of(Lens.of(lens), np.where(camera[:, 2:] > 2.0, camera, np.nan))
         inside = (pixel > 5.0).all(axis=1) & (pixel < [1018.0, 634.0]).all(axis=1) & (camera[:, 2] < 30.0)
         pictures.append(np.full(int(inside.sum()), k))
         pixels.append(pixel[inside])
@@ -162,13 +163,13 @@ def test_rows_are_the_derivatives_of_residuals() -> None:
     about = np.concatenate([[0.03, -0.02, 0.05], [0.002, -0.003, 0.001], [0.01] * 3, [0.003] * 3, [1.0, -1.0, 2.0, 1.0],
                             [0.01, 0.01, 1e-3, 1e-3, 0.01, 2e-3, 1e-5]])  # fmt: skip
     first = np.arange(len(place))
-    rows = rows_of(measured, state(about), numbers, place, first)
+    rows = rows_of(measured, seen(measured, state(about), numbers), numbers, place, first)
     own = rows.observations
     by = np.concatenate([own.partials[:, 0], own.mount_partials[:, 0, :6], own.camera_partials], axis=1)
     steps = [*[1e-4] * 3, *[1e-6] * 3] * 2 + [1e-2] * 4 + [1e-4] * 2 + [1e-5] * 2 + [1e-4, 1e-5, 1e-7]
     for k, step in enumerate(steps):
         ends_px = [
-            rows_of(measured, state(about + sign * step * np.eye(len(about))[k]), numbers, place, first).residual_px
+            residuals_px(measured, seen(measured, state(about + sign * step * np.eye(len(about))[k]), numbers), place)
             for sign in (1, -1)
         ]
         change = (ends_px[0] - ends_px[1])[rows.measurement[::2]].ravel() / rows.px_per_m / (2 * step)

@@ -18,7 +18,7 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
 from roadscan.measuring.kernels.march import BELOW, NO_GROUND, first_hits
 from roadscan.measuring.measure import measure, meet
-from roadscan.measuring.rays import pixels_of, rays_of
+from roadscan.pictures.lens import pixels_of, rays_of
 from roadscan.pictures.views import Lens
 from roadscan.run.session import Session
 from roadscan.store.small_tables import write_small

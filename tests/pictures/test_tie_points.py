@@ -20,14 +20,14 @@ PIXEL_RAD = 1.0 / 700.0
 def test_features_are_spread_and_keep_off_what_is_hidden() -> None:
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 255, (40, 60), dtype=np.uint8).repeat(8, axis=0).repeat(8, axis=1)
-    seen = np.full(picture.shape, 255, np.uint8)
-    seen[200:] = 0
-    found = features_of(picture, 300, seen)
+    hidden = np.zeros(picture.shape, bool)
+    hidden[200:] = True
+    found = features_of(picture, 300, hidden)
     assert len(found) == 300
     assert found.pixel[:, 1].max() < 200
     columns = np.bincount((found.pixel[:, 0] * 6 / picture.shape[1]).astype(int), minlength=6)
     assert columns.min() > 30
-    again = features_of(picture, 300, seen)
+    again = features_of(picture, 300, hidden)
     np.testing.assert_array_equal(found.descriptor, again.descriptor)
 
 

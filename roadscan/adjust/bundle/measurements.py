@@ -11,7 +11,7 @@ time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -19,12 +19,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from roadscan.adjust.observations import CAMERA, FIXED, KINDS, MOUNTED, Observations
+from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, Observations
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.pictures.camera_changes import LENS, interior_of
+from roadscan.pictures.camera_changes import changed
 from roadscan.pictures.exposures import Exposures
-from roadscan.pictures.lens import derivatives, rays
+from roadscan.pictures.lens import PARAMETERS, derivatives, pixels_of, rays_of
 from roadscan.pictures.ties.tracks import places_of
+from roadscan.pictures.views import Lens
 from roadscan.poses.trajectory import Corrections, world_from_ned
 
 Float64 = npt.NDArray[np.float64]
@@ -94,8 +95,18 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Seen:
-    """Where the cameras were and looked when each of m measurements was exposed."""
+    """Where the cameras were and looked when each of m measurements was exposed, by a state."""
 
+    own: Exposures
+    """(m,) the picture of each measurement."""
+    lenses: tuple[Lens, ...]
+    """Of each camera."""
+    correction: Float64
+    """(m, 6) what the state adds to the pose, `COMPONENTS` …"""
+    mounting: Float64
+    """(m, 7) … to the mounting, `MOUNTED` …"""
+    filming: Float64
+    """(m, 11) … and to lens and clock, `CAMERA`."""
     epoch_gps_ns: Int64
     """(m,) of the row of the picture."""
     since_middle_px: Float64
@@ -108,55 +119,61 @@ class Seen:
     """(m, 3)"""
     body_from_opencv: Float64
     """(m, 3, 3)"""
-    ray_world: Float64
-    """(m, 3) unit vectors of the pixels."""
 
     @property
     def eye_world_m(self) -> Float64:
         """Returns projection centres (m, 3)."""
         return np.asarray(self.body_world_m + np.einsum("nij,nj->ni", self.world_from_body, self.lever_body_m))
 
+    def rays_world(self, pixel: Float64) -> Float64:
+        """Returns unit vectors (m, 3) of the pixels (m, 2)."""
+        ray = np.empty((self.own.camera.size, 3))
+        for here, lens in self.by_lens():
+            ray[here] = rays_of(lens, pixel[here])
+        return np.asarray(np.einsum("nij,njk,nk->ni", self.world_from_body, self.body_from_opencv, ray))
+
+    def by_lens(self) -> Iterator[tuple[Bool, Lens]]:
+        """Yields the measurements (m,) of each camera, and its lens."""
+        for k, lens in enumerate(self.lenses):
+            yield self.own.camera == k, lens
+
+    def arms_m(self, place_m: Float64) -> Float64:
+        """Returns places (m, 3), world frame, in the axes of the body."""
+        return np.asarray(np.einsum("nji,nj->ni", self.world_from_body, place_m - self.body_world_m))
+
+    def in_camera_m(self, arm_m: Float64) -> Float64:
+        """Returns places (m, 3), axes of the body, in those of the camera."""
+        return np.asarray(np.einsum("nji,nj->ni", self.body_from_opencv, arm_m - self.lever_body_m))
+
 
 def seen(measured: Measurements, state: State, numbers: Numbers) -> Seen:
     """Returns poses of the cameras at the measurements, by a state."""
     own = measured.exposures.at(measured.picture)
-    by_camera = np.zeros((own.camera.size, len(CAMERA)))
-    mounted = np.zeros((own.camera.size, len(MOUNTED)))
-    ray, middle, line = np.empty((own.camera.size, 3)), np.empty(own.camera.size), np.empty(own.camera.size)
+    m, lenses = own.camera.size, list[Lens]()
+    mounted, filmed, middle, line = np.zeros((m, len(MOUNTED))), np.zeros((m, len(CAMERA))), np.empty(m), np.empty(m)
     for k, camera in enumerate(own.cameras):
-        here = own.camera == k
-        by_camera[here] = state.cameras.get(int(numbers.camera[k]), np.zeros(len(CAMERA)))
+        here, change = own.camera == k, state.cameras.get(int(numbers.camera[k]))
+        interior = changed(camera.interior, change)
+        lenses.append(Lens.of(interior))
+        filmed[here] = 0.0 if change is None else change
         mounted[here] = state.mountings.get(int(numbers.sensor[k]), np.zeros(len(MOUNTED)))
-        lens = interior_of(camera.rig, state.cameras.get(int(numbers.camera[k])))
-        ray[here] = rays(lens, measured.pixel[here])
-        middle[here], line[here] = (lens.height_px - 1) / 2, 1e-6 * lens.line_time_us
+        middle[here], line[here] = (interior.height_px - 1) / 2, 1e-6 * interior.line_time_us
     since_px = measured.pixel[:, 1] - middle
-    later_s = by_camera[:, _CLOCK] + since_px * (line + by_camera[:, _LINE])
+    later_s = filmed[:, _CLOCK] + since_px * (line + filmed[:, _LINE])
     epochs = own.epoch_gps_ns + np.rint(later_s * NS_PER_S).astype(np.int64)
     body = own.body_world_m + later_s[:, None] * own.velocity_world_m_s
     turned = own.world_from_body @ Rotation.from_rotvec(later_s[:, None] * own.rate_body_rad_s).as_matrix()
-    shift, turn = _corrections(state, own, epochs)
-    for world in {camera.world for camera in own.cameras}:
-        here = np.flatnonzero([own.cameras[k].world == world for k in own.camera.tolist()])
-        axes = world_from_ned(world, body[here])
-        body[here] += np.einsum("nij,nj->ni", axes, shift[here])
-    turned = turned @ Rotation.from_rotvec(turn).as_matrix()
-    axes = Rotation.from_rotvec(mounted[:, 3:6]).as_matrix() @ own.body_from_opencv
-    return Seen(
-        epochs, since_px, body, turned, own.lever_body_m + mounted[:, :3], axes,
-        np.einsum("nij,njk,nk->ni", turned, axes, ray),
-    )  # fmt: skip
-
-
-def _corrections(state: State, own: Exposures, epochs_gps_ns: Int64) -> tuple[Float64, Float64]:
-    """Returns shifts (m, 3; north, east, down) and turns (m, 3) of the poses at epochs."""
-    shift, turn = np.zeros((own.camera.size, 3)), np.zeros((own.camera.size, 3))
+    correction = np.zeros((m, len(COMPONENTS)))
     for k, camera in enumerate(own.cameras):
-        known = state.corrections.get(camera.run)
+        here, known = own.camera == k, state.corrections.get(camera.run)
         if known is not None:
-            here = own.camera == k
-            shift[here], turn[here] = known.at(epochs_gps_ns[here])
-    return shift, turn
+            correction[here] = np.concatenate(known.at(epochs[here]), axis=1)
+            axes = world_from_ned(camera.world, body[here])
+            body[here] += np.einsum("nij,nj->ni", axes, correction[here, :3])
+    turned = turned @ Rotation.from_rotvec(correction[:, 3:]).as_matrix()
+    axes = Rotation.from_rotvec(mounted[:, 3:6]).as_matrix() @ own.body_from_opencv
+    lever = own.lever_body_m + mounted[:, :3]
+    return Seen(own, tuple(lenses), correction, mounted, filmed, epochs, since_px, body, turned, lever, axes)
 
 
 def met_at(measured: Measurements, where: Seen, weight: Float64) -> Float64:
@@ -166,7 +183,9 @@ def met_at(measured: Measurements, where: Seen, weight: Float64) -> Float64:
     point, number = np.unique(measured.point[rows], return_inverse=True)
     if point.size:
         scaled = weight[rows] / measured.sigma_px[rows] ** 2
-        place[point] = places_of(number, where.eye_world_m[rows], where.ray_world[rows], scaled).place_m
+        place[point] = places_of(
+            number, where.eye_world_m[rows], where.rays_world(measured.pixel)[rows], scaled
+        ).place_m
     return place
 
 
@@ -183,25 +202,33 @@ class Rows:
     """(m, 2) observed minus computed, by the state; NaN where the point is not before the camera."""
 
 
-def rows_of(measured: Measurements, state: State, numbers: Numbers, place_m: Float64, first_place: Int64) -> Rows:
+def residuals_px(measured: Measurements, where: Seen, place_m: Float64) -> Float64:
+    """Returns observed minus computed pixels (m, 2) of points (p, 3); NaN where one is not before the camera."""
+    in_camera = where.in_camera_m(where.arms_m(place_m[measured.point]))
+    pixel = np.full((len(in_camera), 2), np.nan)
+    for here, lens in where.by_lens():
+        pixel[here] = pixels_of(lens, in_camera[here])
+    return np.asarray(measured.pixel - pixel)
+
+
+def rows_of(measured: Measurements, where: Seen, numbers: Numbers, place_m: Float64, first_place: Int64) -> Rows:
     """Returns the observations of measurements, linear about a state; observed values are as if that were 0.
 
     Parameters
     ----------
+    where : the cameras by that state.
     place_m : (p, 3) of the points, world frame.
     first_place : (p,) number of each point as a place of the adjustment.
     """
-    where = seen(measured, state, numbers)
-    own = measured.exposures.at(measured.picture)
-    arm = np.einsum("nji,nj->ni", where.world_from_body, place_m[measured.point] - where.body_world_m)
-    in_camera = np.einsum("nji,nj->ni", where.body_from_opencv, arm - where.lever_body_m)
+    own, arm = where.own, where.arms_m(place_m[measured.point])
+    in_camera = where.in_camera_m(arm)
     pixel, by_point = np.full((len(arm), 2), np.nan), np.full((len(arm), 2, 3), np.nan)
-    by_lens = np.full((len(arm), 2, len(LENS)), np.nan)
+    by_lens = np.full((len(arm), 2, len(PARAMETERS)), np.nan)
     level = np.empty((len(arm), 3, 3))
+    for here, lens in where.by_lens():
+        pixel[here], by_point[here], by_lens[here] = derivatives(lens, in_camera[here])
     for k, camera in enumerate(own.cameras):
         here = own.camera == k
-        lens = interior_of(camera.rig, state.cameras.get(int(numbers.camera[k])))
-        pixel[here], by_point[here], by_lens[here] = derivatives(lens, in_camera[here])
         axes = world_from_ned(camera.world, where.body_world_m[here])
         level[here] = np.einsum("nji,njk->nik", axes, where.world_from_body[here])
     residual = measured.pixel - pixel
@@ -220,7 +247,7 @@ def rows_of(measured: Measurements, state: State, numbers: Numbers, place_m: Flo
         axis=2,
     )
     posed = np.concatenate([in_level, turns], axis=2)
-    known = (np.concatenate(_corrections(state, own, where.epoch_gps_ns), axis=1), *_known(own, state, numbers))
+    known = where.correction, where.mounting, where.filming
     observed = -residual / steep
     for partial, values in zip((posed, mounted, filmed), known, strict=True):
         observed = observed + np.einsum("nai,ni->na", partial, values)
@@ -230,16 +257,6 @@ def rows_of(measured: Measurements, state: State, numbers: Numbers, place_m: Flo
     )  # fmt: skip
     twice = np.repeat(sound, 2)
     return Rows(observations, twice, steep[sound].ravel(), residual)
-
-
-def _known(own: Exposures, state: State, numbers: Numbers) -> tuple[Float64, Float64]:
-    """Returns what the state adds to mounting (m, 7) and camera (m, 11) of each measurement."""
-    mounted, filmed = np.zeros((own.camera.size, len(MOUNTED))), np.zeros((own.camera.size, len(CAMERA)))
-    for k in range(len(own.cameras)):
-        here = own.camera == k
-        mounted[here] = state.mountings.get(int(numbers.sensor[k]), np.zeros(len(MOUNTED)))
-        filmed[here] = state.cameras.get(int(numbers.camera[k]), np.zeros(len(CAMERA)))
-    return mounted, filmed
 
 
 def _observations(

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.special import chdtri
 
 from roadscan.adjust.adjustment import Adjustment
-from roadscan.adjust.bundle.measurements import Measurements, State, met_at, rows_of, seen
+from roadscan.adjust.bundle.measurements import Measurements, State, met_at, residuals_px, seen
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, state_of
 from roadscan.adjust.control.control import ControlPoint
 from roadscan.adjust.observations import KINDS
@@ -23,6 +23,10 @@ Int64 = npt.NDArray[np.int64]
 
 _BOUNDS: Final = (0.025, 0.975)
 """Chances below and above which χ² is out of its bounds: 95 % of right solutions lie between."""
+
+
+_SINGULAR: Final = 1e12
+"""Condition from which on a place is not determined: σ along the rays is then a million times that across them."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,6 @@ class PictureOutcome:
     """Weighted squares over redundancy of all rows of pictures; 1 where all is as stated."""
     bounds: tuple[float, float]
     """Between which it lies with a chance of 95 %."""
-    solutions: int
     notes: tuple[str, ...]
 
     def rms_px(self, *, after: bool) -> float:
@@ -94,14 +97,14 @@ def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[Cont
     names = tuple(named[k].name if k >= 0 else "" for k in pictures.control.tolist())
     return PictureOutcome(
         measured, before, after, np.where(pictures.enters, weight, np.nan), tuple(control), names, approach.sigma_px,
-        squares / degrees, (low, high), approach.solutions, pictures.notes,
+        squares / degrees, (low, high), pictures.notes,
     )  # fmt: skip
 
 
 def _residuals(pictures: PictureEvidence, state: State, weight: Float64) -> Float64:
     measured = pictures.measured
-    place = met_at(measured, seen(measured, state, pictures.numbers), weight)
-    return rows_of(measured, state, pictures.numbers, place, np.zeros(len(place), np.int64)).residual_px
+    where = seen(measured, state, pictures.numbers)
+    return residuals_px(measured, where, met_at(measured, where, weight))
 
 
 def _control(
@@ -110,32 +113,22 @@ def _control(
     """Returns where the rays of one control point meet, by the recorded poses and by the adjusted ones."""
     measured = pictures.measured.at(np.flatnonzero(pictures.measured.point == number))
     surveyed = measured.surveyed_world_m[number]
-    away, sigma, none = list[Float64](), np.full(3, np.nan), np.full(3, np.nan)
+    nowhere = np.full(3, np.nan)
+    if measured.point.size < 2:
+        return ControlOfPictures(point, int(measured.point.size), nowhere, nowhere, nowhere)
+    cameras = [measured.exposures.cameras[k] for k in measured.exposures.camera[measured.picture].tolist()]
+    weight = (np.array([np.mean(camera.interior.focal_px) for camera in cameras]) / measured.sigma_px) ** 2
+    axes = world_from_ned(cameras[0].world, surveyed[None])[0]
+    met = []
     for state in states:
-        where = seen(measured, state, pictures.numbers)
-        if measured.point.size < 2:
-            away.append(none)
-            continue
-        focal = [float(np.mean(_focal(measured, k))) for k in measured.picture.tolist()]
-        weight = (np.array(focal) / measured.sigma_px) ** 2
-        found = places_of(np.zeros(measured.point.size, np.int64), where.eye_world_m, where.ray_world, weight)
-        world = measured.exposures.cameras[measured.exposures.camera[measured.picture[0]]].world
-        axes = world_from_ned(world, surveyed[None])[0]
-        away.append(axes.T @ (found.place_m[0] - surveyed))
-        sigma = _meeting_sigma(where.eye_world_m, where.ray_world, found.place_m[0], weight, axes)
-    return ControlOfPictures(point, int(measured.point.size), away[0], away[1], sigma)
+        where, alone = seen(measured, state, pictures.numbers), np.zeros(measured.point.size, np.int64)
+        met.append(places_of(alone, where.eye_world_m, where.rays_world(measured.pixel), weight))
+    before, after = (axes.T @ (own.place_m[0] - surveyed) for own in met)
+    return ControlOfPictures(point, int(measured.point.size), before, after, _sigma_of(met[1].precision[0], axes))
 
 
-def _focal(measured: Measurements, picture: int) -> tuple[float, float]:
-    interior = measured.exposures.cameras[measured.exposures.camera[picture]].rig.interior
-    return (1.0, 1.0) if interior is None else interior.focal_px
-
-
-def _meeting_sigma(eye_m: Float64, ray: Float64, place_m: Float64, weight: Float64, axes: Float64) -> Float64:
-    """Returns 1 σ (3,; north, east, down) of where rays meet, weights being those of angles (1 / rad²)."""
-    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
-    distance = np.linalg.norm(place_m - eye_m, axis=1)
-    matrix = np.einsum("n,nij->ij", weight / distance**2, across)
-    if not np.isfinite(matrix).all() or np.linalg.cond(matrix) > 1e12:
+def _sigma_of(precision: Float64, axes: Float64) -> Float64:
+    """Returns 1 σ (3,; north, east, down) of a place; NaN where its inverse covariance has no inverse."""
+    if not np.isfinite(precision).all() or np.linalg.cond(precision) > _SINGULAR:
         return np.full(3, np.nan)
-    return np.asarray(np.sqrt(np.diag(axes.T @ np.linalg.inv(matrix) @ axes)))
+    return np.asarray(np.sqrt(np.diag(axes.T @ np.linalg.inv(precision) @ axes)))

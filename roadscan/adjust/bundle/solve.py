@@ -10,7 +10,17 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, adjust
-from roadscan.adjust.bundle.measurements import Measurements, Numbers, Rows, State, met_at, rows_of, seen
+from roadscan.adjust.bundle.measurements import (
+    Measurements,
+    Numbers,
+    Rows,
+    Seen,
+    State,
+    met_at,
+    residuals_px,
+    rows_of,
+    seen,
+)
 from roadscan.adjust.observations import Observations
 from roadscan.adjust.process import CameraPrior, MountingPrior, RunPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
@@ -62,14 +72,10 @@ class Approached:
     """With the σ of tie points that was measured."""
     rows: Rows
     """Of the measurements that enter."""
-    place_m: Float64
-    """(p, 3) of the points."""
     weight: Float64
     """(m,) of each measurement."""
     sigma_px: float
     """1 σ of a tie point; NaN where there is none."""
-    solutions: int
-    settled: bool
 
 
 def state_of(found: Adjustment) -> State:
@@ -112,8 +118,8 @@ def approached(
     before, settled = np.zeros((0, 2)), False
     for number in range(1, _MOST + 1):
         measured = pictures.measured
-        place = met_at(measured, seen(measured, state, pictures.numbers), weight)
-        rows = _entering(pictures, state, (place, first), weight, heavy)
+        where = seen(measured, state, pictures.numbers)
+        rows = _entering(pictures, where, (met_at(measured, where, weight), first), weight, heavy)
         if len(before):
             settled = number > _WIDE.size and _change(before, rows.residual_px, weight) < _SETTLED_PX
         if settled or number == _MOST:
@@ -130,7 +136,7 @@ def approached(
         pictures = _with_sigma(pictures, factor)
     tied = pictures.measured.sigma_px[pictures.measured.is_tie]
     sigma = float(np.median(tied)) if tied.size else float("nan")
-    return Approached(pictures, rows, place, weight, sigma, number, settled)
+    return Approached(pictures, rows, weight, sigma)
 
 
 def _judged(pictures: PictureEvidence, rows: Rows, found: Adjustment, others: int) -> tuple[Float64, float]:
@@ -167,8 +173,8 @@ def _weights(
     limits : σ of one number up to which a measurement counts wholly, and from which on it does not.
     """
     measured, (lengths, weight) = pictures.measured, before
-    place = met_at(measured, seen(measured, state, pictures.numbers), weight)
-    away = _lengths(pictures, state, place) / measured.sigma_px
+    where = seen(measured, state, pictures.numbers)
+    away = _lengths_px(measured, where, weight) / measured.sigma_px
     away = np.where(np.isnan(lengths), away, lengths)
     every = measured.is_tie & pictures.enters & np.isfinite(away)
     factor = float(np.median(away[every])) / _MEDIAN if every.any() else 1.0
@@ -182,10 +188,9 @@ def _weights(
 def _at_start(pictures: PictureEvidence) -> Float64:
     """Returns weights (m,): 0 of measurements that pass their point by far more than the others do."""
     measured = pictures.measured
-    weight = pictures.enters.astype(np.float64)
+    weight, where = pictures.enters.astype(np.float64), seen(measured, State(), pictures.numbers)
     for _ in range(2):
-        place = met_at(measured, seen(measured, State(), pictures.numbers), weight)
-        away = _lengths(pictures, State(), place)
+        away = _lengths_px(measured, where, weight)
         known = (weight > 0.0) & measured.is_tie & np.isfinite(away)
         usual = float(np.median(away[known])) if known.any() else 0.0
         far = measured.is_tie & ~(away <= _GROSS * max(usual, 0.5))
@@ -193,15 +198,16 @@ def _at_start(pictures: PictureEvidence) -> Float64:
     return weight
 
 
-def _lengths(pictures: PictureEvidence, state: State, place_m: Float64) -> Float64:
-    """Returns residuals (m,) as lengths (px); infinite of points that do not lie before the camera."""
-    rows = rows_of(pictures.measured, state, pictures.numbers, place_m, np.zeros(len(place_m), np.int64))
-    away = np.hypot(*rows.residual_px.T)
+def _lengths_px(measured: Measurements, where: Seen, weight: Float64) -> Float64:
+    """Returns residuals (m,) as lengths (px) from where the rays meet that count; infinite of points that do not lie
+    before the camera.
+    """
+    away = np.hypot(*residuals_px(measured, where, met_at(measured, where, weight)).T)
     return np.where(np.isfinite(away), away, np.inf)
 
 
 def _entering(
-    pictures: PictureEvidence, state: State, points: tuple[Float64, Int64], weight: Float64, heavy: float
+    pictures: PictureEvidence, where: Seen, points: tuple[Float64, Int64], weight: Float64, heavy: float
 ) -> Rows:
     """Returns the rows of measurements that count; a weight below 1 is a larger σ of a tie point.
 
@@ -219,7 +225,7 @@ def _entering(
     enter = (weight > 0.0) & (known[measured.point] | ~measured.is_tie)
     larger = np.where(measured.is_tie, heavy, 1.0) / np.sqrt(np.where(enter, weight, 1.0))
     scaled = replace(measured, sigma_px=measured.sigma_px * larger)
-    whole = rows_of(scaled, state, pictures.numbers, place_m, first_place)
+    whole = rows_of(scaled, where, pictures.numbers, place_m, first_place)
     kept = enter[whole.measurement]
     return replace(
         whole, observations=whole.observations.chosen(kept), measurement=whole.measurement[kept],

@@ -141,7 +141,7 @@ class _Search:
         cut: list[CutOut] = []
         for view, resolution in zip(found.view.tolist(), found.resolution_m.tolist(), strict=True):
             pixels = best_views(worlds, pictures.views.picked(np.array([view])), pictures.rule)
-            lens = pictures.views.lenses[pictures.views.lens[view]]
+            lens = pictures.views.lens_of(view)
             torn = lens.is_around and np.ptp(pixels.pixel[:, 0]) > lens.parameters[WIDTH] / 2  # by the picture's ends
             if torn or (pixels.view == NO_VIEW).any():
                 continue

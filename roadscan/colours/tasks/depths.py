@@ -212,7 +212,7 @@ def _sample(
 ) -> PictureSample:  # fmt: skip
     """Returns the colours of the picture in the cubes that are compared."""
     point_m, epochs, cell = points
-    lens = task.pictures.views.lenses[task.pictures.views.lens[number]]
+    lens = task.pictures.views.lens_of(number)
     limits = Limits(_SAMPLE_REACH * task.reach_m, float(task.border_px), 0.0, 0.0, task.rule.moment_ns, 1.0)
     colour, weight = np.zeros((len(point_m), 3), np.float32), np.zeros(len(point_m), np.float32)
     unknown = np.full((len(point_m), 3), np.nan, np.float32)

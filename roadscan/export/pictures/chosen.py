@@ -15,7 +15,6 @@ from roadscan.core.frames import ENU_FROM_NED
 from roadscan.measuring.measure import posed_pictures
 from roadscan.measuring.poses import PicturePoses
 from roadscan.measuring.work import picked_poses
-from roadscan.pictures.views import HEIGHT, WIDTH, Lens
 from roadscan.poses.trajectory import world_from_ned
 from roadscan.run.session import Session
 
@@ -114,13 +113,3 @@ def wgs84(world: str, world_m: Float64) -> Float64:
 def relative_name(poses: PicturePoses, number: int) -> str:
     """Return the name of a picture in an export: RUN/CAMERA/FILE."""
     return PurePosixPath(poses.pictures.name(number)).as_posix()
-
-
-def lens_of(poses: PicturePoses, number: int) -> Lens:
-    """Return the lens of a picture."""
-    return poses.pictures.views.lenses[int(poses.pictures.views.lens[number])]
-
-
-def size_px(lens: Lens) -> tuple[int, int]:
-    """Return width and height of a lens's pictures."""
-    return round(lens.parameters[WIDTH]), round(lens.parameters[HEIGHT])

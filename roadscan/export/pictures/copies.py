@@ -18,10 +18,10 @@ from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.extras import cv2, need
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.export.export import Exported, published
-from roadscan.export.pictures.chosen import Choice, chosen_pictures, lens_of, relative_name, size_px, wgs84
+from roadscan.export.pictures.chosen import Choice, chosen_pictures, relative_name, wgs84
 from roadscan.measuring.orientation import yaw_pitch_roll_deg
 from roadscan.measuring.poses import PicturePoses
-from roadscan.measuring.rays import matrix_of
+from roadscan.pictures.lens import matrix_of
 from roadscan.pictures.views import Lens
 from roadscan.privacy.hider import Hider, decoded, encoded, hider_of
 from roadscan.run.session import Session
@@ -95,7 +95,7 @@ def export_pictures(
 
 def _copy(poses: PicturePoses, number: int, folder: Path, settings: CopySettings, hider: Hider | None) -> str:
     """Write a copy; return its name."""
-    source, lens = poses.pictures.path(number), lens_of(poses, number)
+    source, lens = poses.pictures.path(number), poses.pictures.views.lens_of(number)
     undistorts = settings.undistorted and not lens.is_around
     content, name = source.read_bytes(), relative_name(poses, number)
     if undistorts or hider is not None or source.suffix.lower() not in _JPEG:
@@ -132,7 +132,7 @@ def tags_of(poses: PicturePoses, number: int, lens: Lens) -> tuple[bytes, bytes]
     from PIL import ExifTags, Image
 
     moment = utc_from_gps_ns(int(poses.pictures.epochs_gps_ns[number])).astimezone(dt.UTC)
-    width, height = size_px(lens)
+    width, height = lens.size_px
     focal_mm = float(lens.parameters[0]) * _SENSOR_MM / width
     exif = Image.Exif()
     base, gps = ExifTags.Base, ExifTags.GPS
@@ -174,7 +174,7 @@ def tags_of(poses: PicturePoses, number: int, lens: Lens) -> tuple[bytes, bytes]
 def _xmp(lens: Lens, yaw_pitch_roll: tuple[float, float, float], spread: dict[str, float]) -> bytes:
     """Return an XMP packet (ISO 16684-1) with the orientation, its σ and the lens."""
     yaw, pitch, roll = yaw_pitch_roll
-    width, _ = size_px(lens)
+    width, _ = lens.size_px
     pixel_mm = _SENSOR_MM / width
     camera: dict[str, object] = {
         "Yaw": f"{yaw:.6f}", "Pitch": f"{pitch + _NADIR_DEG:.6f}", "Roll": f"{roll:.6f}",
@@ -236,8 +236,8 @@ def _cameras(poses: PicturePoses, pinholes: bool) -> dict[str, Any]:
     """Return the lenses of the copies by camera: OpenCV's camera matrix and distortion."""
     found: dict[str, Any] = {}
     for k in range(len(poses)):
-        camera, lens = poses.pictures.logs[poses.pictures.log[k]].sensor, lens_of(poses, k)
-        width, height = size_px(lens)
+        camera, lens = poses.pictures.logs[poses.pictures.log[k]].sensor, poses.pictures.views.lens_of(k)
+        width, height = lens.size_px
         own = _pinhole(lens) if pinholes and not lens.is_around else lens
         fx, fy, cx, cy, *distortion = own.parameters[:9].tolist()
         found[camera] = {

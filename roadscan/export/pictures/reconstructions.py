@@ -24,10 +24,8 @@ from roadscan.export.pictures.chosen import (
     Choice,
     LocalFrame,
     chosen_pictures,
-    lens_of,
     local_frame,
     relative_name,
-    size_px,
 )
 from roadscan.georeference.picture_axes import map_from_ned
 from roadscan.measuring.poses import PicturePoses
@@ -54,7 +52,7 @@ def export_colmap(session: Session, out: Path, choice: Choice, points: Path | No
         where `out` holds something, no picture is chosen, or all are pictures of 360°, which COLMAP does not know.
     """
     poses = chosen_pictures(session, choice)
-    flat = [k for k in range(len(poses)) if not lens_of(poses, k).is_around]
+    flat = [k for k in range(len(poses)) if not poses.pictures.views.lens_of(k).is_around]
     if not flat:
         raise ConfigError("all pictures are of 360°, for which COLMAP has no camera", expected="perspective pictures")
     frame, lenses = local_frame(poses), _lenses(poses, flat)
@@ -140,7 +138,7 @@ def _lenses(poses: PicturePoses, numbers: Sequence[int]) -> dict[int, tuple[Lens
 
 def _colmap_camera(number: int, lens: Lens) -> str:
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = lens.parameters[:9].tolist()
-    width, height = size_px(lens)
+    width, height = lens.size_px
     values = [fx, fy, cx + 0.5, cy + 0.5, k1, k2, p1, p2]
     model = "OPENCV"
     if k3 != 0.0:  # OpenCV's model in COLMAP ends with p2; the full one has the denominator's coefficients as well
@@ -149,7 +147,7 @@ def _colmap_camera(number: int, lens: Lens) -> str:
 
 
 def _opensfm_camera(lens: Lens) -> dict[str, Any]:
-    width, height = size_px(lens)
+    width, height = lens.size_px
     if lens.is_around:
         return {"projection_type": "spherical", "width": width, "height": height}
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = lens.parameters[:9].tolist()

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.extras import cv2
+from roadscan.pictures.lens import projected, straightened
 from roadscan.pictures.settings import PictureTarget, PictureTargetsConfig
-from roadscan.pictures.views import HEIGHT, WIDTH, Lens, Views
+from roadscan.pictures.views import Lens, Views
 
 Float64 = npt.NDArray[np.float64]
 
@@ -23,8 +23,6 @@ _FLAT_SIGMA: Final = 0.06  # 1 σ of a road's slope beside the camera's upright 
 _UPRIGHT_SIGMA: Final = 0.35  # 1 σ of an upright target's turn beside the nearest of those directions (tangent)
 _BORDER_PX: Final = 2.0  # a target's middle this near to the picture's border is not looked for (pixels)
 _GRAZING: Final = 0.06  # least sine of the angle at which a target's plane is seen
-_ROUNDS: Final = 100  # most steps of OpenCV's inversion of the distortion
-_SETTLED: Final = 1e-12  # change at which it ends
 
 
 @dataclass(frozen=True)
@@ -53,13 +51,7 @@ class Eye:
     def of(cls, views: Views, number: int) -> Eye:
         """Return the eye of one of the views."""
         turn = views.opencv_from_world[number]
-        return cls(views.eye_world_m[number], turn, turn @ views.up_world[number], views.lenses[views.lens[number]])
-
-    @property
-    def matrix(self) -> Float64:
-        """Return the camera matrix (3, 3)."""
-        fx, fy, cx, cy = self.lens.parameters[:4]
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return cls(views.eye_world_m[number], turn, turn @ views.up_world[number], views.lens_of(number))
 
     @property
     def focal_px(self) -> float:
@@ -69,20 +61,15 @@ class Eye:
     @property
     def size_px(self) -> tuple[int, int]:
         """Return width and height of the picture."""
-        return round(float(self.lens.parameters[WIDTH])), round(float(self.lens.parameters[HEIGHT]))
+        return self.lens.size_px
 
     def pixels(self, point_m: Float64) -> Float64:
         """Return pixels (n, 2) of points (n, 3) in camera axes, which lie ahead."""
-        ahead = np.ascontiguousarray(point_m, np.float64).reshape(-1, 1, 3)
-        found, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), self.matrix, self.lens.parameters[4:9].copy())
-        return np.asarray(found, np.float64).reshape(-1, 2)
+        return projected(self.lens, np.reshape(point_m, (-1, 3)))
 
     def rays(self, pixel: Float64) -> Float64:
         """Return rays (n, 3) of pixels (n, 2) in camera axes, 1 ahead."""
-        settled = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ROUNDS, _SETTLED)
-        distortion = self.lens.parameters[4:9].copy()
-        flat = np.ascontiguousarray(pixel, np.float64).reshape(-1, 1, 2)
-        found = cv2.undistortPoints(flat, self.matrix, distortion, criteria=settled).reshape(-1, 2)
+        found = straightened(self.lens, np.reshape(pixel, (-1, 2)))
         return np.column_stack([found, np.ones(len(found))])
 
 
@@ -150,8 +137,7 @@ def aims(eye: Eye, points_world_m: Float64, points: list[TargetPoint], settings:
 
 def _is_before_fold(eye: Eye, point_m: Float64) -> bool:
     """Return whether a point's tangent lies before the one at which the distortion folds over."""
-    fold = float(eye.lens.parameters[9])
-    return float((point_m[:2] ** 2).sum() / point_m[2] ** 2) < fold
+    return float((point_m[:2] ** 2).sum() / point_m[2] ** 2) < eye.lens.fold
 
 
 def _poses(eye: Eye, middle_m: Float64, target: PictureTarget) -> Iterator[Pose]:

@@ -10,13 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.core.extras import cv2
+from roadscan.pictures.files import read_picture
 from roadscan.pictures.placed import Pictures
 from roadscan.pictures.settings import PictureTargetsConfig
 from roadscan.pictures.targets.aim import Aim, Eye, TargetPoint, aims
 from roadscan.pictures.targets.candidates import Candidate, candidates
 from roadscan.pictures.targets.fit import Fitted, best_turned, fit, is_target
 from roadscan.pictures.targets.shapes import Shape
+from roadscan.store.codecs.image_files import ImageError
 from roadscan.store.schema import table_schema
 
 Float32 = npt.NDArray[np.float32]
@@ -108,12 +109,10 @@ def _reader(pictures: Pictures) -> Read:
 
     def read(number: int) -> Float32 | None:
         try:
-            content = np.frombuffer(pictures.path(number).read_bytes(), np.uint8)
-        except OSError:
+            grey = read_picture(pictures.path(number), pictures.views.lens_of(number).size_px, grey=True)
+        except (ImageError, OSError):
             return None
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        grey = cv2.imdecode(content, flags) if content.size else None
-        return None if grey is None else np.asarray(grey, np.float32)
+        return grey.astype(np.float32)
 
     return read
 

@@ -13,6 +13,7 @@ from roadscan.core.extras import cv2
 Float32 = npt.NDArray[np.float32]
 UInt8 = npt.NDArray[np.uint8]
 Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
 
 DESCRIPTOR: Final = 128
 """Numbers of a descriptor."""
@@ -40,16 +41,17 @@ class Features:
         return len(self.pixel)
 
 
-def features_of(picture: UInt8, most: int, seen: UInt8 | None = None) -> Features:
+def features_of(picture: UInt8, most: int, hidden: Bool | None = None) -> Features:
     """Returns the features of a grey picture (height, width), at most `most` of them.
 
     Parameters
     ----------
-    seen : (height, width) 0 where nothing is looked for, such as on the vehicle itself.
+    hidden : (height, width) True where nothing is looked for, such as on the vehicle itself; (0, 0): nowhere.
     """
     height, width = picture.shape
     finder = cv2.SIFT.create(nfeatures=0, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
-    found = finder.detect(picture, seen)
+    shown = None if hidden is None or not hidden.size else np.where(hidden, 0, 255).astype(np.uint8)
+    found = finder.detect(picture, shown)
     if not found:
         return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, DESCRIPTOR), np.uint8))
     values = np.array([(*one.pt, one.size, one.response, one.angle) for one in found])

@@ -51,8 +51,8 @@ class Places:
 
     place_m: Float64
     """(t, 3) where their rays meet best; NaN where they are parallel."""
-    sigma_rad: Float64
-    """(t,) longest axis of the place's error ellipsoid over the distance, for rays of 1 σ of a radian."""
+    precision: Float64
+    """(t, 3, 3) inverse covariance of the places, where the weight of a ray is that of its angle (1 / rad²)."""
     residual_rad: Float64
     """(m,) angle of each ray to the place."""
     distance_m: Float64
@@ -86,10 +86,7 @@ def places_of(track: Int64, eye_m: Float64, ray: Float64, weight: Float64 | None
     along = np.einsum("ni,ni->n", seen, ray)
     length = np.linalg.norm(seen, axis=1)
     residual = np.arctan2(np.linalg.norm(np.cross(seen, ray), axis=1), along)
-    values = np.linalg.eigvalsh(np.where(np.isfinite(matrix), matrix, 0.0))[:, 0]
-    mean = np.bincount(track, length, minlength=count) / np.maximum(np.bincount(track, minlength=count), 1)
-    sigma = 1.0 / np.sqrt(np.maximum(values, 1e-30)) / np.maximum(mean, 1e-9)
-    return Places(place + centre, sigma, residual, np.where(along > 0.0, length, -length))
+    return Places(place + centre, matrix, residual, np.where(along > 0.0, length, -length))
 
 
 def widest_parallax_rad(track: Int64, eye_m: Float64, place_m: Float64) -> Float64:

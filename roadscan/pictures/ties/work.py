@@ -12,22 +12,21 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.core.camera import Interior
-from roadscan.core.errors import FormatError
-from roadscan.core.extras import cv2
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
-from roadscan.pictures.exposures import Exposures, exposures_of
-from roadscan.pictures.lens import rays
+from roadscan.pictures.exposures import Camera, Exposures, exposures_of
+from roadscan.pictures.files import read_picture
+from roadscan.pictures.lens import rays_of
 from roadscan.pictures.settings import PictureTiesConfig
 from roadscan.pictures.ties.features import DESCRIPTOR, Features, features_of
 from roadscan.pictures.ties.matching import Relative, matches
 from roadscan.pictures.ties.pairs import pairs_of
 from roadscan.pictures.ties.tracks import places_of, spread, tracks_of, widest_parallax_rad
+from roadscan.pictures.views import Lens
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.store.codecs.image_files import ImageError, image_size
+from roadscan.store.codecs.image_files import ImageError
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
@@ -62,9 +61,7 @@ class FeatureTask:
 
     store: Store
     path: Path
-    size_px: tuple[int, int]
-    hidden_px: tuple[tuple[tuple[float, float], ...], ...]
-    """Polygons of the vehicle itself."""
+    lens: Lens
     most: int
     unit: str
     key: str
@@ -76,7 +73,7 @@ class Partner:
 
     unit: str
     """Unit of its features."""
-    interior: Interior
+    lens: Lens
     relative: Relative
 
 
@@ -89,7 +86,7 @@ class MatchTask:
     """Its features."""
     records: tuple[OutputRecord, ...]
     """Features of the others."""
-    interior: Interior
+    lens: Lens
     partners: tuple[Partner, ...]
     number: int
     """Number of the picture."""
@@ -111,6 +108,10 @@ class TieWork:
     sigma: Float64
     """(c, 6) 1 σ of the poses of each camera's run."""
 
+    def camera(self, number: int) -> Camera:
+        """Returns the camera of a picture."""
+        return self.exposures.cameras[int(self.exposures.camera[number])]
+
 
 def plan_ties(plan: SurveyPlan) -> TieWork:
     """Returns the work of a survey's tie points; it reads no picture."""
@@ -120,16 +121,10 @@ def plan_ties(plan: SurveyPlan) -> TieWork:
     units, tasks = [], []
     for number in range(len(exposures)):
         camera = exposures.cameras[exposures.camera[number]]
-        interior = _interior(camera.rig.interior)
         unit = key_of(camera.run, camera.sensor, camera.log, str(exposures.file[number]))
-        size = interior.width_px, interior.height_px
-        key = key_of(code, camera.log, unit, settings.features, size, camera.rig.own_vehicle_px)
+        key = key_of(code, camera.log, unit, settings.features, camera.lens.size_px, camera.rig.own_vehicle_px)
         units.append(unit)
-        tasks.append(
-            FeatureTask(
-                plan.store, exposures.path(number), size, camera.rig.own_vehicle_px, settings.features, unit, key
-            )
-        )
+        tasks.append(FeatureTask(plan.store, exposures.path(number), camera.lens, settings.features, unit, key))
     sigma = [
         usual_pose_sigma(
             plan.store, plan.records, trajectory_source(c.run, plan.records), plan.survey.config.navigation.calibration
@@ -140,21 +135,14 @@ def plan_ties(plan: SurveyPlan) -> TieWork:
     return TieWork(exposures, notes, tuple(units), tuple(tasks), pairs, settings, np.array(sigma).reshape(-1, 6))
 
 
-def _interior(interior: Interior | None) -> Interior:
-    """Returns the interior orientation, which every exposure's camera has."""
-    if interior is None:
-        raise FormatError("a camera has no interior orientation", expected="[sensors.NAME.interior] in the rig file")
-    return interior
-
-
 def find_features(task: FeatureTask) -> OutputRecord:
     """Find the features of a picture and write them (runs on a worker)."""
     try:
-        picture = _grey(task.path, task.size_px)
+        picture = read_picture(task.path, task.lens.size_px, grey=True)
     except (ImageError, OSError) as error:
         # The picture is lost, and named; another one may stand in its place by the next run.
         return OutputRecord(FEATURES, task.unit, task.key, "", 0, "", json.dumps({"features": 0, "why": str(error)}))
-    found = features_of(picture, task.most, _seen(task))
+    found = features_of(picture, task.most, task.lens.hidden)
     detail: dict[str, object] = {"features": len(found), "content": bytes_digest(picture.tobytes())}
     if len(found) < _BLACK:
         grey = f"mean grey value {picture.mean():.0f}"
@@ -172,28 +160,6 @@ def find_features(task: FeatureTask) -> OutputRecord:
         schema=schema.arrow(),
     )  # fmt: skip
     return _written(task.store, FEATURES, task.unit, task.key, rows, json.dumps(detail))
-
-
-def _grey(path: Path, expected: tuple[int, int]) -> UInt8:
-    """Returns a picture (height, width) in grey values, in the orientation of the sensor."""
-    size = image_size(path)  # detects truncated files, which a decoder would fill up
-    if (size.width_px, size.height_px) != expected:
-        raise ImageError(f"{size.width_px} × {size.height_px} pixels, not {expected[0]} × {expected[1]}")
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    picture = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if picture is None or picture.shape != (expected[1], expected[0]):
-        raise ImageError("the image cannot be decoded")
-    return np.asarray(picture, np.uint8)
-
-
-def _seen(task: FeatureTask) -> UInt8 | None:
-    """Returns a mask (height, width), 0 on the vehicle itself; None where the rig file states no such part."""
-    if not task.hidden_px:
-        return None
-    seen = np.full((task.size_px[1], task.size_px[0]), 255, np.uint8)
-    for polygon in task.hidden_px:
-        cv2.fillPoly(seen, [np.rint(np.array(polygon)).astype(np.int32)], 0)
-    return seen
 
 
 def _written(store: Store, product: str, unit: str, key: str, rows: pa.Table, detail: str) -> OutputRecord:
@@ -219,19 +185,15 @@ def match_tasks(work: TieWork, manifest: Manifest) -> list[MatchTask]:
         partners = tuple(_partner(work, first, k) for k, _ in found)
         shaping = [[p.unit, p.relative.turn.round(6).tolist(), p.relative.base.round(4).tolist()] for p in partners]
         sigmas = [[p.relative.sigma_turn_rad, p.relative.sigma_direction_rad] for p in partners]
-        lenses = [_interior_of(work, k).model_dump(mode="json") for k in (first, *(k for k, _ in found))]
+        lenses = [work.camera(k).lens.parameters.tolist() for k in (first, *(k for k, _ in found))]
         key = key_of(code, record.digest, [r.digest for _, r in found], shaping, sigmas, lenses)
         tasks.append(
             MatchTask(
-                work.features[first].store, record, tuple(r for _, r in found), _interior_of(work, first), partners,
+                work.features[first].store, record, tuple(r for _, r in found), work.camera(first).lens, partners,
                 first, work.units[first], key,
             )
         )  # fmt: skip
     return tasks
-
-
-def _interior_of(work: TieWork, number: int) -> Interior:
-    return _interior(work.exposures.cameras[work.exposures.camera[number]].rig.interior)
 
 
 def _partner(work: TieWork, first: int, second: int) -> Partner:
@@ -239,7 +201,7 @@ def _partner(work: TieWork, first: int, second: int) -> Partner:
     own = work.exposures.at(np.array([first, second]))
     turns, eyes = own.world_from_opencv, own.eye_world_m
     base = turns[0].T @ (eyes[1] - eyes[0])
-    one, other = (work.exposures.cameras[k] for k in own.camera)
+    one, other = work.camera(first), work.camera(second)
     apart_s = abs(int(own.epoch_gps_ns[1] - own.epoch_gps_ns[0])) / NS_PER_S
     share = 1.0 if one.run != other.run else 1.0 - float(np.exp(-apart_s / _CORRELATED_S))
     sigma = np.sqrt(2.0 * share) * work.sigma[own.camera].max(axis=0)
@@ -251,18 +213,18 @@ def _partner(work: TieWork, first: int, second: int) -> Partner:
     if one.sensor != other.sensor:
         turn = float(np.hypot(turn, boresight))
     relative = Relative(turns[1].T @ turns[0], base, turn, float(np.hypot(shift, boresight)))
-    return Partner(work.units[second], _interior_of(work, second), relative)
+    return Partner(work.units[second], work.camera(second).lens, relative)
 
 
 def match_picture(task: MatchTask) -> OutputRecord:
     """Compare a picture with others and write what they have in common (runs on a worker)."""
     own = _load(task.store, task.record)
-    pixel_rad = 1.0 / max(task.interior.focal_px)
-    first = rays(task.interior, own.pixel.astype(np.float64)), own.descriptor
+    pixel_rad = 1.0 / float(task.lens.parameters[:2].max())
+    first = rays_of(task.lens, own.pixel.astype(np.float64)), own.descriptor
     names, rows = list[str](), list[Int64]()
     for partner, record in zip(task.partners, task.records, strict=True):
         other = _load(task.store, record)
-        second = rays(partner.interior, other.pixel.astype(np.float64)), other.descriptor
+        second = rays_of(partner.lens, other.pixel.astype(np.float64)), other.descriptor
         found = matches(first, second, partner.relative, pixel_rad)
         names += [partner.unit] * len(found)
         rows.append(found)
@@ -367,9 +329,8 @@ def _kept(work: TieWork, track: Int64, picture: Int64, pixel: Float64) -> tuple[
     sizes = np.empty((track.size, 2))
     for camera in range(len(work.exposures.cameras)):
         own = work.exposures.camera[picture] == camera
-        interior = _interior(work.exposures.cameras[camera].rig.interior)
-        sight[own] = rays(interior, pixel[own])
-        sizes[own] = interior.width_px, interior.height_px
+        lens = work.exposures.cameras[camera].lens
+        sight[own], sizes[own] = rays_of(lens, pixel[own]), lens.size_px
     eye = work.exposures.eye_world_m[picture]
     ray = np.einsum("nij,nj->ni", work.exposures.world_from_opencv[picture], sight)
     found = places_of(track, eye, ray)

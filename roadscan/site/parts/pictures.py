@@ -144,7 +144,7 @@ def _cameras(held: PlacedPictures) -> list[dict[str, Any]]:
         own = np.flatnonzero(held.log == number)
         if not own.size:
             continue
-        lens = held.views.lenses[int(held.views.lens[own[0]])]
+        lens = held.views.lens_of(own[0])
         values = dict(zip(_LENS, lens.parameters.tolist(), strict=False))
         found.append(
             {

@@ -73,9 +73,13 @@ class Groups:
     def igg_iii(self, statistic: Float64, whole: float, reject: float) -> Float64:
         """Returns weights of IGG III: 1 up to `whole` σ, 0 from `reject` σ on."""
         length, rows = self.lengths(statistic)
-        near, far = _limits(whole, rows), _limits(reject, rows)
-        slope = (far - np.minimum(length, far)) / (far - near)
-        return np.where(length <= near, 1.0, near / np.maximum(length, near) * slope**2)
+        return igg_iii(length, _limits(whole, rows), _limits(reject, rows))
+
+
+def igg_iii(length: Float64, near: Float64 | float, far: Float64 | float) -> Float64:
+    """Returns weights (n,) of IGG III (Yang 1994) of residuals by their lengths: 1 up to `near`, 0 from `far` on."""
+    slope = (far - np.minimum(length, far)) / (far - near)
+    return np.where(length <= near, 1.0, near / np.maximum(length, near) * slope**2)
 
 
 def _limits(limit: float, rows: Int64) -> Float64:

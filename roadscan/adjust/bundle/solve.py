@@ -24,6 +24,7 @@ from roadscan.adjust.bundle.measurements import (
 from roadscan.adjust.observations import Observations
 from roadscan.adjust.process import CameraPrior, MountingPrior, RunPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
+from roadscan.adjust.weights import igg_iii
 from roadscan.calibrate.robust import length_limit
 
 Float64 = npt.NDArray[np.float64]
@@ -45,6 +46,8 @@ _MEDIAN: Final = 1.1774
 """Median of the length of two standard normal numbers (Rayleigh)."""
 _SIGMA_PX: Final = (0.05, 3.0)
 """Bounds of the measured σ of a tie point (px): SIFT reaches 0.1 at best, and beyond 3 px nothing was matched."""
+_BEYOND: Final = 1_000_000_000
+"""Number of the first tie point as a place: more control points than this are in no survey, and these come first."""
 _GROSS: Final = 12.0
 """At the start, a measurement farther than so many median residuals from its point is left out."""
 
@@ -90,8 +93,7 @@ def places(pictures: PictureEvidence, first: int) -> Int64:
 
     first : place that stands for control point 0.
     """
-    beyond = first + 1 + int(max(pictures.control.max(initial=-1), 0)) + 1_000_000_000
-    return np.where(pictures.control >= 0, first + pictures.control, beyond + np.arange(pictures.control.size))
+    return np.where(pictures.control >= 0, first + pictures.control, first + _BEYOND + np.arange(pictures.control.size))
 
 
 def approached(
@@ -179,8 +181,7 @@ def _weights(
     every = measured.is_tie & pictures.enters & np.isfinite(away)
     factor = float(np.median(away[every])) / _MEDIAN if every.any() else 1.0
     near, far = (factor * length_limit(limit, 2) for limit in limits)
-    slope = (far - np.minimum(away, far)) / (far - near)
-    judged = np.where(away <= near, 1.0, near / np.maximum(away, near) * slope**2)
+    judged = igg_iii(away, near, far)
     judged = np.where(judged < _LEAST, 0.0, judged)
     return np.where(measured.is_tie, np.where(pictures.enters, judged, 0.0), pictures.enters), factor
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +15,12 @@ from roadscan.adjust.control.control import ControlPoint
 from roadscan.adjust.observations import CAMERA
 from roadscan.adjust.process import CameraPrior
 from roadscan.adjust.settings import AdjustConfig
+from roadscan.core.ids import of_run
 from roadscan.core.rig import Sensor
 from roadscan.core.survey import Survey
-from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
+from roadscan.georeference.sources import load_mountings
+from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.navigation.tasks.taken_pictures import taken_pictures
 from roadscan.pictures.exposures import Exposures, exposures_of
 from roadscan.pictures.points import TABLE, measured_points
@@ -45,45 +47,43 @@ def asks_pictures(survey: Survey) -> bool:
     return survey.has(PictureTiesConfig.table) and PictureTiesConfig.of(survey).on
 
 
-def picture_spans(plan: SurveyPlan) -> dict[str, tuple[int, int]]:
-    """Returns first and last epoch (GPS ns) of the pictures of each run; none where pictures take no part."""
-    spans: dict[str, tuple[int, int]] = {}
-    for record in plan.records if asks_pictures(plan.survey) else ():
-        for file in record.tables.get("images", ()):
-            if file.span is not None and _has_lens(plan.survey.rig.sensors.get(record.sensor)):
-                first, last = spans.get(record.run, file.span)
-                spans[record.run] = (min(first, file.span[0]), max(last, file.span[1]))
-    return {run: (first - _BESIDE_NS, last + _BESIDE_NS) for run, (first, last) in spans.items()}
+def exposure_epochs(plan: SurveyPlan) -> dict[str, Int64]:
+    """Returns the epochs (e,), ascending, of the pictures of each run; none where pictures take no part."""
+    found: dict[str, list[Int64]] = {}
+    for name in adjusted_cameras(plan.survey):
+        for taken in taken_pictures(plan.store, plan.records, name):
+            found.setdefault(taken.record.run, []).append(taken.epochs_gps_ns)
+    epochs = {run: np.unique(np.concatenate(parts)) for run, parts in found.items()}
+    return {run: own for run, own in epochs.items() if own.size}
 
 
-def exposure_epochs(plan: SurveyPlan, run: str) -> Int64:
-    """Returns the epochs (e,), ascending, of the pictures of a run."""
-    cameras = [name for name, one in plan.survey.rig.sensors.items() if _has_lens(one)]
-    taken = [one for name in cameras for one in taken_pictures(plan.store, plan.records, name)]
-    own = [one.epochs_gps_ns for one in taken if one.record.run == run]
-    return np.unique(np.concatenate(own)) if own else np.zeros(0, np.int64)
+def exposure_span(epochs_gps_ns: Int64) -> tuple[int, int]:
+    """Returns first and last epoch (GPS ns) that corrections of pictures reach."""
+    return int(epochs_gps_ns[0]) - _BESIDE_NS, int(epochs_gps_ns[-1]) + _BESIDE_NS
 
 
-def _has_lens(camera: Sensor | None) -> bool:
-    return camera is not None and camera.interior is not None
+def adjusted_cameras(survey: Survey) -> dict[str, Sensor]:
+    """Returns the cameras whose pictures take part, by name: those with an interior orientation."""
+    sensors = sorted(survey.rig.sensors.items()) if asks_pictures(survey) else ()
+    return {name: one for name, one in sensors if one.kind == "camera" and one.interior is not None}
 
 
 def pictures_key(plan: SurveyPlan, manifest: Manifest) -> list[Any]:
-    """Returns what the evidence of pictures depends on, for the key of the solution."""
+    """Returns what the evidence of pictures depends on, for the key of the solution. It reads no pose."""
     if not asks_pictures(plan.survey):
         return []
-    tracks, (exposures, _) = manifest.get(TRACKS, ALL), exposures_of(plan)
-    posed = hashlib.blake2b(digest_size=8)
-    for values in (
-        exposures.camera, exposures.epoch_gps_ns, exposures.body_world_m, exposures.world_from_body,
-        exposures.lever_body_m, exposures.body_from_opencv,
-    ):  # fmt: skip
-        posed.update(np.ascontiguousarray(values).tobytes())
-    cameras = [
-        [name, one.model_dump(mode="json")] for name, one in sorted(plan.survey.rig.sensors.items()) if _has_lens(one)
-    ]
-    logs = [[r.key, r.run, r.sensor] for r in plan.records if r.tables.get("images") or r.tables.get(TABLE)]
-    return ["" if tracks is None else tracks.digest, posed.hexdigest(), cameras, logs]
+    tracks, cameras = manifest.get(TRACKS, ALL), adjusted_cameras(plan.survey)
+    clocks, mountings = load_clocks(plan.store), load_mountings(plan.store)
+    logs = []
+    for record in plan.records:
+        if record.tables.get("images") and record.sensor in cameras:
+            posed = [file.digest for file in trajectory_source(record.run, plan.records).files]
+            seat = mountings_of(record.run, record.sensor, cameras[record.sensor].mounting(), mountings)
+            logs.append([record.key, posed, repr(of_run(clocks, record.run, record.sensor)), repr(seat)])
+        elif record.tables.get(TABLE):
+            logs.append([record.key, record.run, record.sensor])
+    stated = [[name, one.model_dump(mode="json")] for name, one in cameras.items()]
+    return ["" if tracks is None else tracks.digest, plan.ground.max_gap_s, stated, logs]
 
 
 def camera_sigma(camera: Sensor, own: CameraPriors) -> tuple[Float64, Float64]:
@@ -155,11 +155,17 @@ def _named(exposures: Exposures, number: int) -> tuple[str, str, str]:
     return camera.run, camera.sensor, str(exposures.file[number])
 
 
-class _Part:
-    """Measurements of some points, numbered from 0."""
+class _Part(NamedTuple):
+    """Measurements of some points."""
 
-    def __init__(self, picture: Int64, pixel: Float64, sigma_px: Float64, point: Int64) -> None:
-        self.picture, self.pixel, self.sigma_px, self.point = picture, pixel, sigma_px, point
+    picture: Int64
+    """(m,) number of the picture."""
+    pixel: Float64
+    """(m, 2)"""
+    sigma_px: Float64
+    """(m,)"""
+    point: Int64
+    """(m,) number of the point, from 0."""
 
 
 def _joined(tracks: _Part, control: _Part, tied: int) -> _Part:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, Final
@@ -17,7 +17,7 @@ from roadscan.adjust.control.control_test import APART
 from roadscan.adjust.observations import MOUNTED
 from roadscan.adjust.process import MountingPrior
 from roadscan.adjust.settings import AdjustConfig
-from roadscan.adjust.tasks.bundle import asks_pictures, camera_sigma
+from roadscan.adjust.tasks.bundle import adjusted_cameras, camera_sigma
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.unknowns import sharing
 from roadscan.core.rig import Mountings
@@ -119,9 +119,7 @@ def mounted_of(plan: SurveyPlan, sources: Sources, *, foreign: bool) -> Mounted:
         if (sigma > 0.0).any():
             priors.append(MountingPrior(sensor, sigma))
     cameras = [
-        MountingPrior(name, camera_sigma(one, config.cameras)[0])
-        for name, one in sorted(plan.survey.rig.sensors.items())
-        if one.kind == "camera" and one.interior is not None and asks_pictures(plan.survey)
+        MountingPrior(name, camera_sigma(one, config.cameras)[0]) for name, one in adjusted_cameras(plan.survey).items()
     ]
     return Mounted((*priors, *cameras), stated, parallel, frozenset(one.sensor for one in cameras))
 
@@ -253,18 +251,12 @@ class _Told:
         return float(self.right[rows] @ solved[:, 0]), float(np.trace(solved[:, 1:]))
 
 
-def contradicted(found: MountingErrors, cameras: Collection[str] = ()) -> npt.NDArray[np.bool_]:
+def contradicted(found: MountingErrors) -> npt.NDArray[np.bool_]:
     """Returns sensors (s,) whose stated mountings evidence contradicts: the fewest that explain all of it.
-
-    Cameras are among them in any case.
 
     Where two explain it equally well, both are among them. Components that evidence
     does not distinguish, as the height of a head and its range scale, contradict together.
     """
-    filmed = np.array([name in cameras for _, name in found.sensors], bool)
-    if filmed.any():
-        filmed[~filmed] = contradicted(found.of(~filmed))
-        return filmed
     count = len(found.sensors)
     none = np.zeros(count, bool)
     if not (found.prior_sigma > 0.0).any():

@@ -24,7 +24,7 @@ from roadscan.adjust.quality import LeaveOneOut, leave_one_out
 from roadscan.adjust.settings import AdjustConfig, PosePriors
 from roadscan.adjust.solver_settings import AdjustmentSettings, ControlRules
 from roadscan.adjust.targets.shapes import SurveyedLine
-from roadscan.adjust.tasks.bundle import exposure_epochs, picture_spans
+from roadscan.adjust.tasks.bundle import exposure_epochs, exposure_span
 from roadscan.adjust.tasks.control_lines import line_findings
 from roadscan.adjust.tasks.doubts import (
     CONTROL,
@@ -141,7 +141,7 @@ class Solution:
 
 def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[RunPrior, ...]:
     """Returns errors of the recorded poses of each run; of a run without readings there are none."""
-    config, found, filmed = AdjustConfig.of(plan.survey).priors, [], picture_spans(plan)
+    config, found, filmed = AdjustConfig.of(plan.survey).priors, [], exposure_epochs(plan)
     for run in runs:
         own = [(s, files) for s, files in sources if s.run == run]
         trajectory = own[0][0].trajectory if own else None
@@ -150,11 +150,11 @@ def priors_of(plan: SurveyPlan, sources: Sources, runs: Sequence[str]) -> tuple[
         if trajectory is None:
             found.append(RunPrior(run, 0, 0, _NONE))
             continue
-        spans = [span_of(s, files) for s, files in own] + ([filmed[run]] if run in filmed else [])
+        taken = filmed.get(run, np.zeros(0, np.int64))
+        spans = [span_of(s, files) for s, files in own] + ([exposure_span(taken)] if taken.size else [])
         stated = _stated(plan, trajectory) if config.source == "sigma" else None
         first, last = min(a for a, _ in spans), max(b for _, b in spans)
         held = run in AdjustConfig.of(plan.survey).fixed
-        taken = exposure_epochs(plan, run) if run in filmed else np.zeros(0, np.int64)
         found.append(RunPrior(run, first, last, _processes(config, stated), stated, held, taken))
     return tuple(found)
 
@@ -289,25 +289,24 @@ def _adjusted(
         approach = approached(evidence.pictures, (joined, first), evidence.priors, settings, priors)
         joined = Observations.joined([joined, approach.rows.observations])
         cameras = list(evidence.pictures.cameras)
+    filmed = np.array([one.sensor in evidence.mounted.cameras for one in priors], bool)
     for _ in range(_WIDENED):
         found = adjust(joined, evidence.priors, settings, priors, cameras)
         shared = [axis for name in found.verdict.doubted for axis in _AXES[name]]
-        own = [one for one in priors if one.sensor not in evidence.mounted.cameras]
-        if any((one.sigma[shared] > 0.0).any() for one in own):
-            # Where a camera stands beside the others is no error that all sensors have in common.
-            priors = tuple(
-                one if one.sensor in evidence.mounted.cameras else replace(one, sigma=_without(one.sigma, shared))
-                for one in priors
-            )
+        # Where a camera stands beside the others is no error that all sensors have in common.
+        own = zip(priors, filmed.tolist(), strict=True)
+        kept = tuple(one if is_camera else replace(one, sigma=_without(one.sigma, shared)) for one, is_camera in own)
+        if any((one.sigma != other.sigma).any() for one, other in zip(priors, kept, strict=True)):
+            priors = kept
             continue
-        off = disproved(found.mountings) & ~_filmed(evidence, found)[:, None]
+        off = disproved(found.mountings) & ~filmed[:, None]
         if not off.any():
             break
         sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
         priors = tuple(replace(one, sigma=own) for one, own in zip(priors, sigma, strict=True))
     stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, len(MOUNTED))
-    filmed = _filmed(evidence, found)
-    estimated, wrong = found.mountings, contradicted(found.mountings, evidence.mounted.cameras)
+    estimated, wrong = found.mountings, filmed.copy()  # pictures show a mounting whether or not it contradicts
+    wrong[~filmed] = contradicted(found.mountings.of(~filmed))
     named = causes(found.mountings.of(~filmed))
     if priors and not wrong.all():
         priors = tuple(
@@ -321,11 +320,6 @@ def _adjusted(
             sigma=np.where(wrong[:, None], found.mountings.sigma, estimated.sigma),
         )
     return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named, approach
-
-
-def _filmed(evidence: Evidence, found: Adjustment) -> Bool:
-    """Returns a mask (s,) of the mountings of cameras."""
-    return np.array([name in evidence.mounted.cameras for _, name in found.mountings.sensors], bool)
 
 
 def _without(sigma: Float64, axes: Sequence[int]) -> Float64:

@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -112,7 +113,7 @@ def _fitted(rays: tuple[Float64, Float64], relative: Relative, band: float, nois
         matrix = (slope * weight[:, None]).T @ slope + np.diag(prior)
         step = np.linalg.solve(matrix, -(slope * weight[:, None]).T @ residual - prior * total)
         total = total + step
-        turn = _rotation(step[:3]) @ turn
+        turn = Rotation.from_rotvec(step[:3]).as_matrix() @ turn
         base = base + across @ step[3:]
         base = base / np.linalg.norm(base)
     return _epipolar(rays, turn, base)[0]
@@ -136,12 +137,3 @@ def _epipolar(rays: tuple[Float64, Float64], turn: Float64, base: Float64) -> tu
     by_turn = np.cross(in_second, other)
     by_base = np.stack([np.einsum("ni,ni->n", np.cross(across[:, k], one), turned) for k in (0, 1)], axis=-1)
     return residual, np.concatenate([by_turn, by_base], axis=1) / steep[:, None], across
-
-
-def _rotation(vector: Float64) -> Float64:
-    """Returns the rotation (3, 3) of a small rotation vector, exactly (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    half = float(np.sinc(angle / (2.0 * np.pi)))
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * skew + 0.5 * half * half * skew @ skew)

@@ -1,7 +1,7 @@
-"""Recorded streets with pictures and sweeps, as surveys that a user would write.
+"""The recorded street `colour_and_lidar`, with pictures and sweeps, as a survey that a user would write.
 
-`colour_and_lidar` has no poses: its sweeps are registered here (GICP; Segal, Hähnel and Thrun 2009), each to those
-before it, with the vehicle's motion during a turn taken out. `semantic_kitti_00` has poses, and grey pictures.
+It has no poses: its sweeps are registered here (GICP; Segal, Hähnel and Thrun 2009), each to those before it, with
+the vehicle's motion during a turn taken out.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ import numpy as np
 import numpy.typing as npt
 import small_gicp
 from scipy.spatial.transform import Rotation, Slerp
+
+from benchmarks.labelled_street import survey_text
 
 Float64 = npt.NDArray[np.float64]
 
@@ -38,52 +40,11 @@ _RECTIFIED: Final = np.array([
     [-9.869795e-03, 9.999421e-01, -4.278459e-03],
     [7.402527e-03, 4.351614e-03, 9.999631e-01],
 ])  # fmt: skip
-GREY_SIZE_PX: Final = (1241, 376)
-GREY_FOCAL_PX: Final = 718.856
-GREY_PRINCIPAL_PX: Final = (607.1928, 185.2157)
-GREY_FROM_VELODYNE: Final = np.array([
-    [4.276802385584e-04, -9.999672484946e-01, -8.084491683471e-03, -1.198459927713e-02],
-    [-7.210626507497e-03, 8.081198471645e-03, -9.999413164504e-01, -5.403984729748e-02],
-    [9.999738645903e-01, 4.859485810390e-04, -7.206933692422e-03, -2.921968648686e-01],
-])  # fmt: skip
-"""Rotation and translation of `semantic_kitti_00` from the lidar to its camera."""
 _BODY_FROM_VELODYNE: Final = np.diag([1.0, -1.0, -1.0])
 _SENSOR_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _REGISTERED_WITHIN_M: Final = 50.0  # Farther returns do not help (m).
 _ROUNDS: Final = 3  # Rounds in which the motion during a turn is taken out.
 _KEPT: Final = 4  # Sweeps to which the next one is registered.
-
-SURVEY: Final = """
-id = "{name}"
-rig = "rig.toml"
-store = "store"
-[map.local]
-name = "Velodyne axes at sweep 0"
-[tiles]
-cell_m = 0.1
-[adjust]
-on = false
-[[runs]]
-id = "drive"
-[[runs.logs]]
-path = "poses.csv"
-format = "pose_matrices"
-crs = "local"
-clock = {{ system = "unix_utc" }}
-options = {{ axes = "flu" }}
-[[runs.logs]]
-path = "sweeps"
-format = "kitti"
-sensor = "velodyne"
-clock = {{ system = "unix_utc" }}
-options = {{ stamps = "../stamps.csv", stamp_column = "unix_utc_s", {turn} }}
-[[runs.logs]]
-path = "pictures"
-format = "images"
-sensor = "camera"
-clock = {{ system = "unix_utc", unit = "s" }}
-options = {{ stamps = "../pictures.csv" }}
-"""
 
 
 def camera_from_velodyne() -> tuple[Float64, Float64]:
@@ -119,27 +80,7 @@ def colour_and_lidar(recording: Path, folder: Path, sections: str, frames: Seque
     _write_poses(folder / "poses.csv", poses, numbers)
     (folder / "rig.toml").write_text(rig(*camera_from_velodyne(), COLOUR_SIZE_PX, COLOUR_FOCAL_PX, COLOUR_PRINCIPAL_PX))
     turn = f'turn = "azimuth", period_s = {PERIOD_S}'
-    (folder / "SURVEY.toml").write_text(SURVEY.format(name="colour_and_lidar", turn=turn) + sections)
-    return folder / "SURVEY.toml"
-
-
-def semantic_kitti(recording: Path, folder: Path, sections: str) -> Path:
-    """Write the survey of the labelled street with its grey pictures below a folder; returns its survey file."""
-    folder.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(recording / "poses.csv", folder / "poses.csv")
-    shutil.copytree(recording / "image_0", folder / "pictures")
-    (folder / "sweeps").mkdir()
-    with tarfile.open(recording / "sweeps.tar.xz") as archive:
-        archive.extractall(folder / "sweeps", filter="data")
-    rows = [line.split(",")[:2] for line in (recording / "poses.csv").read_text().splitlines()[1:]]
-    held = {int(p.stem) for p in (folder / "sweeps/velodyne_points/data").glob("*.bin")}
-    _write(folder / "stamps.csv", [("frame", "unix_utc_s"), *((n, t) for n, t in rows if int(n) in held)])
-    names = [(f"{int(n):06d}.png", t) for n, t in rows if (folder / "pictures" / f"{int(n):06d}.png").is_file()]
-    _write(folder / "pictures.csv", [("file", "time"), *names])
-    turn, arm = GREY_FROM_VELODYNE[:, :3], GREY_FROM_VELODYNE[:, 3]
-    (folder / "rig.toml").write_text(rig(turn, arm, GREY_SIZE_PX, GREY_FOCAL_PX, GREY_PRINCIPAL_PX))
-    text = SURVEY.format(name="semantic_kitti_00", turn='turn = "compensated"')
-    (folder / "SURVEY.toml").write_text(text + sections)
+    (folder / "SURVEY.toml").write_text(survey_text("colour_and_lidar", 0.1, turn, "pictures") + sections)
     return folder / "SURVEY.toml"
 
 
@@ -147,9 +88,8 @@ def registered(sweeps: Sequence[npt.NDArray[np.float32]], frames: Sequence[int])
     """Poses (n, 4, 4) of sweeps in the frame of the first, at the instants at which the head faces ahead."""
     poses, clouds = [np.eye(4)], list[Float64]()
     step = np.eye(4)
-    step[0, 3] = 0.0
     for number, raw in enumerate(sweeps):
-        near = raw[(np.linalg.norm(raw[:, :3], axis=1) < _REGISTERED_WITHIN_M)]
+        near = _near(raw)
         pose, own_step = (np.eye(4), step) if number == 0 else (poses[-1] @ step, step)
         turns = 1.0 if number == 0 else float(frames[number] - frames[number - 1])
         straight = _straightened(near, own_step, turns)
@@ -194,13 +134,10 @@ def _write_poses(path: Path, poses: Float64, frames: Sequence[int]) -> None:
     place = np.stack([np.interp(inner, at, poses[:, k, 3]) for k in range(3)], axis=-1)
     place[0] -= (poses[1, :3, 3] - poses[0, :3, 3]) / (at[1] - at[0])
     place[-1] += (poses[-1, :3, 3] - poses[-2, :3, 3]) / (at[-1] - at[-2])
-    rows: list[tuple[object, ...]] = [
-        ("frame", "unix_utc_s", *(f"{n}{k}" for n in ("r1", "r2", "r3") for k in (1, 2, 3)))
-    ]
     header = ["frame", "unix_utc_s"]
     for k in (1, 2, 3):
         header += [f"r{k}1", f"r{k}2", f"r{k}3", f"t{k}"]
-    rows = [tuple(header)]
+    rows: list[tuple[object, ...]] = [tuple(header)]
     for turn, r, t in zip(turns, rotation, place, strict=True):
         values = np.column_stack([r, t]).ravel()
         rows.append((int(turn - turns[0]), f"{FIRST_UNIX_S + turn * PERIOD_S:.3f}", *(f"{v:.9f}" for v in values)))

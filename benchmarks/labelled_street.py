@@ -34,14 +34,14 @@ RECORDING: Final = "semantic_kitti_00"
 _SAME_M: Final = 0.003
 """A point of a product is the return that lies so near (m): products round to 1 mm in each direction."""
 
-SURVEY: Final = """
-id = "semantic_kitti_00"
+_SURVEY: Final = """
+id = "{name}"
 rig = "rig.toml"
 store = "store"
 [map.local]
 name = "Velodyne axes at sweep 0"
 [tiles]
-cell_m = 0.2
+cell_m = {cell_m}
 [adjust]
 on = false
 [[runs]]
@@ -50,14 +50,21 @@ id = "drive"
 path = "poses.csv"
 format = "pose_matrices"
 crs = "local"
-clock = { system = "unix_utc" }
-options = { axes = "flu" }
+clock = {{ system = "unix_utc" }}
+options = {{ axes = "flu" }}
 [[runs.logs]]
 path = "sweeps"
 format = "kitti"
 sensor = "velodyne"
-clock = { system = "unix_utc" }
-options = { stamps = "../stamps.csv", stamp_column = "unix_utc_s", turn = "compensated" }
+clock = {{ system = "unix_utc" }}
+options = {{ stamps = "../stamps.csv", stamp_column = "unix_utc_s", {turn} }}
+"""
+_PICTURES: Final = """[[runs.logs]]
+path = "{folder}"
+format = "images"
+sensor = "camera"
+clock = {{ system = "unix_utc", unit = "s" }}
+options = {{ stamps = "../pictures.csv" }}
 """
 _RIG: Final = """
 name = "KITTI car (2011)"
@@ -92,6 +99,18 @@ class LabelledStreet:
         return pd.concat(held, ignore_index=True) if held else pd.DataFrame()
 
 
+def survey_text(
+    name: str = RECORDING, cell_m: float = 0.2, turn: str = 'turn = "compensated"', pictures: str = ""
+) -> str:
+    """Survey file of a KITTI car.
+
+    turn : options that say how a sweep became a picture of one instant.
+    pictures : folder of its pictures; "" without.
+    """
+    text = _SURVEY.format(name=name, cell_m=cell_m, turn=turn)
+    return text + (_PICTURES.format(folder=pictures) if pictures else "")
+
+
 def laid_out(recording: Path, folder: Path, sweeps: Iterable[int]) -> Path:
     """Write the survey of some sweeps of a recording below a folder; returns its survey file."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -103,7 +122,7 @@ def laid_out(recording: Path, folder: Path, sweeps: Iterable[int]) -> Path:
     with (folder / "stamps.csv").open("w", newline="") as file:
         csv.writer(file).writerows([["frame", "unix_utc_s"], *stamps])
     (folder / "rig.toml").write_text(_RIG)
-    (folder / "SURVEY.toml").write_text(f"{SURVEY}[assets]\n")
+    (folder / "SURVEY.toml").write_text(f"{survey_text()}[assets]\n")
     return folder / "SURVEY.toml"
 
 

@@ -80,17 +80,30 @@ def labelled_pictures() -> Iterator[None]:
         yield
 
 
-def scene(length_m: float = 60.0, **changes: Any) -> Scene:
-    """A town street with parked and moving cars, an upright lidar and a camera that looks ahead."""
+def _street(length_m: float, lidar: dict[str, float], camera: dict[str, Any], range_m: float) -> Scene:
+    """A town street with an upright lidar and a camera, without errors of poses; `range_m` is 1 σ of a range."""
+    upright = {"lever_arm_body_m": (0.0, 0.0, -1.9), "roll_deg": 0.2, "pitch_deg": 0.0, "heading_deg": 0.5}
     return Scene.load("urban_street").changed(
         length_m=length_m, passes=[{"lane": 2}],
         **{key: {"on": False} for key in ("profilers", "sick", "imu", "gnss", "encoder")},
-        lidar={"range_max_m": 40.0, "model": "HDL-32E", "divergence_deg": 0.0,
-               "mount": {"lever_arm_body_m": (0.0, 0.0, -1.9), "roll_deg": 0.2, "pitch_deg": 0.0, "heading_deg": 0.5}},
-        camera={"on": True, "every_m": 2.0, "width_px": 960, "height_px": 600, "noise": 0.0,
-                "mount": {"lever_arm_body_m": (0.9, -0.25, -1.6), "pitch_deg": -12.0}},
-        noise={"position_m": 0.0, "attitude_deg": 0.0, "lidar_range_m": 0.0},
-    ).changed(**changes)  # fmt: skip
+        lidar={"model": "HDL-32E", "divergence_deg": 0.0, "mount": upright, **lidar},
+        camera={"on": True, "every_m": 2.0, **camera},
+        noise={"position_m": 0.0, "attitude_deg": 0.0, "lidar_range_m": range_m},
+    )  # fmt: skip
+
+
+def scene(length_m: float = 60.0, **changes: Any) -> Scene:
+    """A town street with parked and moving cars, an upright lidar and a camera that looks ahead."""
+    camera = {"width_px": 960, "height_px": 600, "noise": 0.0,
+              "mount": {"lever_arm_body_m": (0.9, -0.25, -1.6), "pitch_deg": -12.0}}  # fmt: skip
+    return _street(length_m, {"range_max_m": 40.0}, camera, 0.0).changed(**changes)
+
+
+def photographed_street(length_m: float = 24.0, **changes: Any) -> Scene:
+    """A street with painted lines, an upright lidar and a camera that looks down ahead of the vehicle."""
+    camera = {"width_px": 1400, "height_px": 900, "focal_px": 1000.0,
+              "mount": {"lever_arm_body_m": (0.9, -0.25, -1.8), "pitch_deg": -35.0}}  # fmt: skip
+    return _street(length_m, {"range_max_m": 25.0}, camera, 0.01).changed(**changes)
 
 
 def written(folder: Path, sections: str, one: Scene) -> Path:
@@ -169,16 +182,3 @@ def seen_by_truth(
         rows = np.flatnonzero(inside)
         seen[rows] |= wide[np.rint(pixel[1][rows]).astype(int), np.rint(pixel[0][rows]).astype(int)]
     return seen
-
-
-def photographed_street(length_m: float = 24.0, **changes: Any) -> Scene:
-    """A street with painted lines, an upright lidar and a camera that looks down ahead of the vehicle."""
-    return Scene.load("urban_street").changed(
-        length_m=length_m, passes=[{"lane": 2}],
-        **{key: {"on": False} for key in ("profilers", "sick", "imu", "gnss", "encoder")},
-        lidar={"range_max_m": 25.0, "model": "HDL-32E", "divergence_deg": 0.0,
-               "mount": {"lever_arm_body_m": (0.0, 0.0, -1.9), "roll_deg": 0.2, "pitch_deg": 0.0, "heading_deg": 0.5}},
-        camera={"on": True, "every_m": 2.0, "width_px": 1400, "height_px": 900, "focal_px": 1000.0,
-                "mount": {"lever_arm_body_m": (0.9, -0.25, -1.8), "pitch_deg": -35.0}},
-        noise={"position_m": 0.0, "attitude_deg": 0.0, "lidar_range_m": 0.01},
-    ).changed(**changes)  # fmt: skip

@@ -11,7 +11,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.labelled_street import SURVEY, labelled_sweeps, laid_out
+from benchmarks.coloured_streets import rig
+from benchmarks.labelled_street import labelled_sweeps, laid_out, survey_text
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
@@ -23,6 +24,7 @@ from roadscan.survey.run import run_stages
 
 Float64 = npt.NDArray[np.float64]
 
+SIZE_PX: Final = (1241, 376)
 FOCAL_PX: Final = 718.856
 PRINCIPAL_PX: Final = (607.1928, 185.2157)
 CAMERA_FROM_VELODYNE: Final = np.array(
@@ -36,18 +38,6 @@ CAMERA_FROM_VELODYNE: Final = np.array(
 CAMERA_FROM_VELODYNE_M: Final = np.array([-1.198459927713e-02, -5.403984729748e-02, -2.921968648686e-01])
 POLE: Final = 80
 TRUNK: Final = 71
-
-_BODY_FROM_VELODYNE: Final = np.diag([1.0, -1.0, -1.0])
-_SENSOR_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-
-_PICTURES: Final = """
-[[runs.logs]]
-path = "image_0"
-format = "images"
-sensor = "camera"
-clock = { system = "unix_utc", unit = "s" }
-options = { stamps = "../pictures.csv" }
-"""
 
 
 @dataclass(frozen=True)
@@ -99,9 +89,9 @@ def recorded_street(recording: Path, folder: Path) -> RecordedStreet:
     names = [(f"{int(frame):06d}.png", stamp) for frame, stamp in frames]
     with (folder / "pictures.csv").open("w", newline="") as file:
         csv.writer(file).writerows([("file", "time"), *(n for n in names if (recording / "image_0" / n[0]).is_file())])
-    (folder / "rig.toml").write_text(_rig())
+    (folder / "rig.toml").write_text(rig(CAMERA_FROM_VELODYNE, CAMERA_FROM_VELODYNE_M, SIZE_PX, FOCAL_PX, PRINCIPAL_PX))
     privacy = '\n[privacy]\npictures = "off" # published by their makers\n'
-    (folder / "SURVEY.toml").write_text(SURVEY + _PICTURES + privacy)
+    (folder / "SURVEY.toml").write_text(survey_text(pictures="image_0") + privacy)
     survey = Survey.load(folder / "SURVEY.toml")
     session = Session(survey, Store(survey.store_url, survey.config.id), Inline())
     run_stages(session, [stage_named(name) for name in ("ingest", "footprints", "tiles", "products")])
@@ -113,24 +103,3 @@ def recorded_street(recording: Path, folder: Path) -> RecordedStreet:
     return RecordedStreet(
         folder / "site", recording / "image_0", np.concatenate(places), np.concatenate(labels), poses, first
     )
-
-
-def _rig() -> str:
-    turn = _BODY_FROM_VELODYNE @ CAMERA_FROM_VELODYNE.T @ _SENSOR_FROM_CAMERA.T
-    arm_m = _BODY_FROM_VELODYNE @ (-CAMERA_FROM_VELODYNE.T @ CAMERA_FROM_VELODYNE_M)
-    return f"""
-name = "KITTI car (2011)"
-[sensors.velodyne]
-kind = "lidar"
-axes = "flu"
-range_min_m = 2.5
-[sensors.camera]
-kind = "camera"
-lever_arm_body_m = {arm_m.tolist()}
-body_from_sensor = {turn.tolist()}
-[sensors.camera.interior]
-width_px = 1241
-height_px = 376
-focal_px = [{FOCAL_PX}, {FOCAL_PX}]
-principal_px = [{PRINCIPAL_PX[0]}, {PRINCIPAL_PX[1]}]
-"""

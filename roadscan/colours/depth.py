@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.colours.kernels.depths import grow, nearest_in_pixels, slopes
-from roadscan.colours.kernels.looks import FOCAL_X, FOCAL_Y, HEIGHT, LEAST_M, STEPS, UNKNOWN, WIDTH, Camera, project
+from roadscan.colours.kernels.looks import LEAST_M, STEPS, UNKNOWN, Camera, project
 from roadscan.core.extras import cv2
+from roadscan.pictures.kernels.lens import FOCAL_X, FOCAL_Y, HEIGHT, WIDTH
 
 Float32 = npt.NDArray[np.float32]
 Int64 = npt.NDArray[np.int64]

@@ -53,6 +53,11 @@ MOUNTING_COLUMNS: Final = (
     "lever_forward_m", "lever_right_m", "lever_down_m", "roll_rad", "pitch_rad", "heading_rad", "range_scale",
 )  # fmt: skip
 """Columns of the table `mounting_corrections`."""
+MOUNTING_SIGMAS: Final = (
+    "sigma_lever_forward_m", "sigma_lever_right_m", "sigma_lever_down_m",
+    "sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg",
+)  # fmt: skip
+"""Columns of σ of a calibrated mounting in the table `mountings`."""
 
 
 @dataclass(frozen=True)

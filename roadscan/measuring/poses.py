@@ -17,7 +17,7 @@ from roadscan.core.ids import of_run
 from roadscan.core.rig import Sensor
 from roadscan.georeference.picture_axes import camera_from_map, map_from_ned
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
-from roadscan.georeference.sources import load_mountings
+from roadscan.georeference.sources import MOUNTING_SIGMAS, load_mountings
 from roadscan.measuring.orientation import nearest_rotation
 from roadscan.navigation.tasks.pose_sigma import pose_sigma, stated_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_corrections, load_trajectory
@@ -28,11 +28,6 @@ from roadscan.store.small_tables import read_small
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-_SIGMA_COLUMNS: Final = (
-    "sigma_lever_forward_m", "sigma_lever_right_m", "sigma_lever_down_m",
-    "sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg",
-)  # fmt: skip
-"""σ of a calibrated mounting in the table `mountings`."""
 _WORDS: Final = {0: "position", 3: "roll, pitch, heading"}
 """Words for the components of a pose, by the first of each."""
 
@@ -172,7 +167,7 @@ def _mounting_sigma(plan: SurveyPlan, run: str, sensor: str, camera: Sensor, epo
     for row in () if table is None else table.sort_by("valid_from_gps_ns").to_pylist():
         rows.setdefault((row["run"], row["sensor"]), []).append(row)
     for row in of_run(rows, run, sensor) or ():
-        values = np.array([np.nan if row[name] is None else row[name] for name in _SIGMA_COLUMNS])
+        values = np.array([np.nan if row[name] is None else row[name] for name in MOUNTING_SIGMAS])
         values[3:] = np.radians(values[3:])
         sigma[epochs >= row["valid_from_gps_ns"]] = values
     unknown = bool(np.isnan(sigma).any())

@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from roadscan.core.camera import Interior
 from roadscan.core.extras import cv2
-from roadscan.pictures.kernels.picture_colours import AROUND, FOLD, HEIGHT, WIDTH, sample, take_better
+from roadscan.pictures.kernels.lens import AROUND, FOLD, HEIGHT, WIDTH
+from roadscan.pictures.kernels.picture_colours import sample, take_better
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

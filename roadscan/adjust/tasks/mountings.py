@@ -23,7 +23,13 @@ from roadscan.adjust.unknowns import sharing
 from roadscan.core.rig import Mountings
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.georeference.sources import MOUNTING_COLUMNS, MountingChanges, key_of_row, mounting_change_of
+from roadscan.georeference.sources import (
+    MOUNTING_COLUMNS,
+    MOUNTING_SIGMAS,
+    MountingChanges,
+    key_of_row,
+    mounting_change_of,
+)
 from roadscan.poses.mounting_change import MountingChange, Seat
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
@@ -44,10 +50,6 @@ _MOST_WRONG: Final = 3
 """If more sensors are wrong at once, all are estimated instead of searching which."""
 _FREE: Final = 100.0
 """Prior of a free error in the test, in stated σ."""
-_CALIBRATED_SIGMAS: Final = (
-    "sigma_lever_forward_m", "sigma_lever_right_m", "sigma_lever_down_m",
-    "sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg",
-)  # fmt: skip
 
 MOUNTING: Final = Witness(
     "mounting",
@@ -153,7 +155,7 @@ def calibrated_sigma(store: Store) -> dict[str, Float64]:
     table = read_small(store, "mountings")
     found: dict[str, Float64] = {}
     for row in [] if table is None else table.to_pylist():
-        values = [np.nan if row.get(name) is None else float(row[name]) for name in _CALIBRATED_SIGMAS]
+        values = [np.nan if row.get(name) is None else float(row[name]) for name in MOUNTING_SIGMAS]
         sigma = np.array([*values[:3], *np.radians(values[3:]), np.nan])
         found[row["sensor"]] = np.fmax(found.get(row["sensor"], np.full(sigma.size, np.nan)), sigma)
     return found

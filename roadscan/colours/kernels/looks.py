@@ -1,7 +1,6 @@
 """Where points are in a picture, whether it shows them, and their colours there.
 
-A picture is a pinhole with Brown–Conrady distortion (Brown 1971; axes of OpenCV: x right, y down, z ahead), or
-equirectangular. Points are processed one by one, so the result for one does not depend on the others.
+Points are processed one by one, so the result for one does not depend on the others.
 """
 
 from __future__ import annotations
@@ -13,10 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.kernel_options import inlined, kernel
+from roadscan.pictures.kernels.lens import FOCAL_X, FOCAL_Y, HEIGHT, WIDTH, place_of
 
-FOCAL_X, FOCAL_Y, CENTRE_X, CENTRE_Y, K1, K2, P1, P2, K3, FOLD, WIDTH, HEIGHT, AROUND = range(13)
-"""Indices of a lens's parameters, as in `roadscan.pictures.kernels.picture_colours`."""
-LEAST_AHEAD_M = 0.1  # Least depth of a point in front of the camera (m).
 STEPS = 6000.0
 """Steps of a stored distance in which it grows e-fold: 0.02 % each."""
 LEAST_M = 0.1
@@ -35,7 +32,7 @@ class Camera(NamedTuple):
     axes: npt.NDArray[np.float64]
     """(3, 3) camera axes from the map."""
     lens: npt.NDArray[np.float64]
-    """(13,) in the order above."""
+    """(13,) in the order of `roadscan.pictures.kernels.lens`."""
 
 
 class Depths(NamedTuple):
@@ -63,31 +60,6 @@ class Limits(NamedTuple):
     """Points seen within this of the picture were there."""
     weight: float
     """Sharpness of the picture among those of its run, 0 to 1."""
-
-
-@inlined
-def place_of(x, y, z, axes, lens):
-    """Return u, v (pixels) and the square of the distance of a point from the eye; u is NaN where it is not shown."""
-    a = axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z
-    b = axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z
-    ahead = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z
-    square = a * a + b * b + ahead * ahead
-    u, v = np.nan, np.nan
-    if lens[AROUND] > 0.0:
-        if square >= LEAST_AHEAD_M * LEAST_AHEAD_M:
-            u = lens[FOCAL_X] * math.atan2(a, ahead) + lens[CENTRE_X]
-            v = lens[FOCAL_Y] * math.atan2(b, math.hypot(a, ahead)) + lens[CENTRE_Y]
-    elif ahead >= LEAST_AHEAD_M:
-        a /= ahead
-        b /= ahead
-        r2 = a * a + b * b
-        if r2 < lens[FOLD]:
-            radial = 1.0 + r2 * (lens[K1] + r2 * (lens[K2] + r2 * lens[K3]))
-            u = a * radial + 2.0 * lens[P1] * a * b + lens[P2] * (r2 + 2.0 * a * a)
-            v = b * radial + lens[P1] * (r2 + 2.0 * b * b) + 2.0 * lens[P2] * a * b
-            u = lens[FOCAL_X] * u + lens[CENTRE_X]
-            v = lens[FOCAL_Y] * v + lens[CENTRE_Y]
-    return u, v, square
 
 
 @inlined

@@ -1,8 +1,6 @@
 """The picture with the finest resolution at a point, and the point's colour in it.
 
-A picture is a pinhole with Brown–Conrady distortion (Brown 1971; signs and axes of OpenCV: x right, y down, z along
-the optical axis), or equirectangular: longitude to the right and latitude downwards in even steps (Snyder 1987, plate
-carrée). Points are processed one by one, so the result for one does not depend on the others.
+Points are processed one by one, so the result for one does not depend on the others.
 """
 
 from __future__ import annotations
@@ -12,13 +10,10 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import kernel
+from roadscan.pictures.kernels.lens import FOCAL_X, FOCAL_Y, HEIGHT, WIDTH, place_of
 
-FOCAL_X, FOCAL_Y, CENTRE_X, CENTRE_Y, K1, K2, P1, P2, K3, FOLD, WIDTH, HEIGHT, AROUND = range(13)
-"""Indices of a lens's parameters; FOLD: square of the tangent up to which its radius grows; AROUND: 1 for a picture
-of 360°, whose focal length is in pixels a radian."""
 REACH, SINE, BORDER = range(3)
 """Indices of the limits: square of the farthest distance (m²), sine of the least angle, pixels of the border."""
-LEAST_AHEAD_M = 0.1  # Least depth of a point in front of the camera (m).
 
 
 @kernel
@@ -33,7 +28,7 @@ def take_better(point_m, eye_m, turn, up, lens, limits, hidden, number, best, ch
     eye_m : (3,) where the camera was.
     turn : (3, 3) camera axes (x right, y down, z ahead) from world.
     up : (3,) unit vector.
-    lens : (13,) parameters in the order above.
+    lens : (13,) parameters in the order of `roadscan.pictures.kernels.lens`.
     limits : (3,) in the order above.
     hidden : (height, width) bool, pixels that are not used; (0, 0) where there are none.
     number : the picture's number in `chosen`.
@@ -52,27 +47,7 @@ def take_better(point_m, eye_m, turn, up, lens, limits, hidden, number, best, ch
             continue
         if -(x * up[0] + y * up[1] + z * up[2]) < limits[SINE] * math.sqrt(square):
             continue
-        a = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
-        b = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
-        ahead = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
-        if lens[AROUND] > 0.0:
-            if square < LEAST_AHEAD_M * LEAST_AHEAD_M:
-                continue
-            u = math.atan2(a, ahead)
-            v = math.atan2(b, math.hypot(a, ahead))
-        else:
-            if ahead < LEAST_AHEAD_M:
-                continue
-            a /= ahead
-            b /= ahead
-            r2 = a * a + b * b
-            if r2 >= lens[FOLD]:
-                continue
-            radial = 1.0 + r2 * (lens[K1] + r2 * (lens[K2] + r2 * lens[K3]))
-            u = a * radial + 2.0 * lens[P1] * a * b + lens[P2] * (r2 + 2.0 * a * a)
-            v = b * radial + lens[P1] * (r2 + 2.0 * b * b) + 2.0 * lens[P2] * a * b
-        u = lens[FOCAL_X] * u + lens[CENTRE_X]
-        v = lens[FOCAL_Y] * v + lens[CENTRE_Y]
+        u, v, _ = place_of(x, y, z, turn, lens)
         if not (limits[BORDER] <= u <= right and limits[BORDER] <= v <= bottom):
             continue
         if hidden.size > 0 and hidden[int(v + 0.5), int(u + 0.5)]:

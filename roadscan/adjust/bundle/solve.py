@@ -76,7 +76,7 @@ class Approached:
     rows: Rows
     """Of the measurements that enter."""
     weight: Float64
-    """(m,) of each measurement."""
+    """(m,) of each measurement; 0 of one without a row, for instance where no other picture counts for its point."""
     sigma_px: float
     """1 σ of a tie point; NaN where there is none."""
 
@@ -138,7 +138,8 @@ def approached(
         pictures = _with_sigma(pictures, factor)
     tied = pictures.measured.sigma_px[pictures.measured.is_tie]
     sigma = float(np.median(tied)) if tied.size else float("nan")
-    return Approached(pictures, rows, weight, sigma)
+    entered = np.isin(np.arange(weight.size), rows.measurement)
+    return Approached(pictures, rows, np.where(entered, weight, 0.0), sigma)
 
 
 def _judged(pictures: PictureEvidence, rows: Rows, found: Adjustment, others: int) -> tuple[Float64, float]:

@@ -101,7 +101,7 @@ def _drive(seed: int, false: float = 0.0, lens_error: Float64 | None = None) -> 
     sigma = np.zeros(len(CAMERA))
     sigma[:2], sigma[4] = 1.6, 0.002
     numbers = Numbers(*(np.zeros(1, np.int32) for _ in range(3)))
-    evidence = PictureEvidence(measured, numbers, (CameraPrior("left", sigma),), number, enters)
+    evidence = PictureEvidence(measured, numbers, (CameraPrior("left", sigma),), number, enters, 0.0)
     processes = tuple(GaussMarkov(s, TAU_S) for s in (0.1, 0.1, 0.1, *np.radians([0.2] * 3)))
     prior = RunPrior("a", FIRST_NS - NS_PER_S, FIRST_NS + STEP_NS * n + NS_PER_S, processes)  # type: ignore[arg-type]
     return Drive(evidence, prior, body, turned, points[control:])

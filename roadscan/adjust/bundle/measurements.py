@@ -200,6 +200,8 @@ class Rows:
     """(r,) by which a residual is one of pixels."""
     residual_px: Float64
     """(m, 2) observed minus computed, by the state; NaN where the point is not before the camera."""
+    alone_sigma_m: Float64
+    """(r,) 1 σ of each row without the error that it shares with all others of its picture."""
 
 
 def residuals_px(measured: Measurements, where: Seen, place_m: Float64) -> Float64:
@@ -256,7 +258,7 @@ def rows_of(measured: Measurements, where: Seen, numbers: Numbers, place_m: Floa
         (observed[sound], steep[sound], posed[sound], mounted[sound], filmed[sound]),
     )  # fmt: skip
     twice = np.repeat(sound, 2)
-    return Rows(observations, twice, steep[sound].ravel(), residual)
+    return Rows(observations, twice, steep[sound].ravel(), residual, observations.sigma_m)
 
 
 def _observations(

@@ -83,9 +83,8 @@ def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[Cont
     counted = np.where(pictures.enters, weight, 0.0)
     state = state_of(adjusted)
     before, after = (_residuals(pictures, one, counted) for one in (State(), state))
-    left = adjusted.residual_m[own] / rows.observations.sigma_m
-    factor = adjusted.variance_factors[KINDS[int(rows.observations.kind[0])]] if rows.observations.size else 1.0
-    squares = float((adjusted.weight[own] * left**2).sum()) / factor
+    left = adjusted.residual_m[own] / rows.alone_sigma_m
+    squares = float((adjusted.weight[own] * left**2).sum())
     redundancy = float(np.where(adjusted.weight[own] > 0.0, np.nan_to_num(adjusted.redundancy[own]), 0.0).sum())
     degrees = max(redundancy, 1.0)
     low, high = (float(chdtri(degrees, 1.0 - chance)) / degrees for chance in _BOUNDS)

@@ -18,14 +18,21 @@ class CameraPriors(Strict):
     """1 σ of the lever arm on each axis (m)."""
     sigma_boresight_deg: float = Field(default=0.5, ge=0.0, le=10.0)
     """1 σ of the boresight about each axis (degrees)."""
-    sigma_focal: float = Field(default=0.001, ge=0.0, le=0.1)
+    sigma_focal: float = Field(default=0.003, ge=0.0, le=0.1)
     """1 σ of the focal length, as a share of it."""
+    sigma_principal: float = Field(default=0.001, ge=0.0, le=0.1)
+    """1 σ of each coordinate of the principal point, as a share of the focal length. On a straight drive it can hardly
+    be told from the boresight; were it not estimated, its error would be in the boresight, whose σ would not say so."""
     sigma_k1: float = Field(default=0.002, ge=0.0, le=1.0)
-    """1 σ of the radial distortion k1. The principal point and the other parameters of the distortion are estimated
-    only where the rig file states their σ: on a straight drive they cannot be told from the boresight."""
+    """1 σ of the radial distortion k1. The other parameters of the distortion are estimated only where the rig file
+    states their σ."""
     sigma_clock_s: float = Field(default=0.0, ge=0.0, le=1.0)
     """1 σ of what the stamps of the pictures are off (s). 0: the stage `clocks` is to find it."""
     sigma_line_time_us: float = Field(default=0.0, ge=0.0, le=100.0)
     """1 σ of the time between two rows (µs), of cameras whose rig file states such a time."""
+    sigma_shared_px: float = Field(default=0.05, ge=0.0, le=10.0)
+    """1 σ of what all measurements of a picture are off in common (px): what the lens model leaves, and features that
+    look different from nearer. Without it, thousands of tie points would believe their mean to hundredths of a pixel,
+    and bend mountings, lens and control by what they share."""
     sigma_control_px: float = Field(default=0.3, gt=0.0, le=10.0)
     """1 σ of each pixel coordinate of a control point, where the measurement states none (px)."""

@@ -64,6 +64,8 @@ class PictureEvidence:
     """(p,) number of the control point of each point, −1: a tie point."""
     enters: Bool
     """(m,) False of measurements of check points, which no solution uses."""
+    shared_px: float
+    """1 σ of what the measurements of a picture are off in common (px)."""
     notes: tuple[str, ...] = ()
 
 
@@ -139,7 +141,23 @@ def approached(
     tied = pictures.measured.sigma_px[pictures.measured.is_tie]
     sigma = float(np.median(tied)) if tied.size else float("nan")
     entered = np.isin(np.arange(weight.size), rows.measurement)
-    return Approached(pictures, rows, np.where(entered, weight, 0.0), sigma)
+    weight = np.where(entered, weight, 0.0)
+    return Approached(pictures, _sharing(rows, pictures, weight), weight, sigma)
+
+
+def _sharing(rows: Rows, pictures: PictureEvidence, weight: Float64) -> Rows:
+    """Returns rows with larger σ: the mean of a picture's tie points is off at least by what they share.
+
+    Of n measurements with σ each, the mean then has the variance σ² / n + shared². One error more for each picture and
+    axis would say the same, but it would be as many unknowns as a free pose a picture. A control point stands alone.
+    """
+    measured = pictures.measured
+    tied = np.where(measured.is_tie, weight, 0.0)
+    number = np.bincount(measured.picture, tied, minlength=len(measured.exposures))[measured.picture]
+    number = np.where(measured.is_tie, number, 1.0)[rows.measurement]
+    shared_m = np.sqrt(number) * pictures.shared_px / rows.px_per_m
+    observations = replace(rows.observations, sigma_m=np.hypot(rows.alone_sigma_m, shared_m))
+    return replace(rows, observations=observations)
 
 
 def _judged(pictures: PictureEvidence, rows: Rows, found: Adjustment, others: int) -> tuple[Float64, float]:
@@ -231,7 +249,7 @@ def _entering(
     kept = enter[whole.measurement]
     return replace(
         whole, observations=whole.observations.chosen(kept), measurement=whole.measurement[kept],
-        px_per_m=whole.px_per_m[kept],
+        px_per_m=whole.px_per_m[kept], alone_sigma_m=whole.alone_sigma_m[kept],
     )  # fmt: skip
 
 

@@ -95,7 +95,7 @@ def camera_sigma(camera: Sensor, own: CameraPriors) -> tuple[Float64, Float64]:
     if interior is None:
         return mounted, np.zeros(len(CAMERA))
     focal = interior.sigma_focal_px or tuple(own.sigma_focal * f for f in interior.focal_px)
-    principal = interior.sigma_principal_px or (0.0, 0.0)
+    principal = interior.sigma_principal_px or tuple(own.sigma_principal * f for f in interior.focal_px)
     bent = interior.sigma_distortion or (own.sigma_k1, 0.0, 0.0, 0.0, 0.0)
     if interior.model == "equirectangular":
         focal, principal, bent = (0.0, 0.0), (0.0, 0.0), (0.0,) * 5
@@ -147,7 +147,9 @@ def pictures_of(
     )  # fmt: skip
     is_check = np.array([False] * tied + [p.role != "gcp" for p in surveyed], bool)
     named = np.concatenate([np.full(tied, -1), [p.number for p in surveyed]]).astype(np.int64)
-    return PictureEvidence(measured, numbers, cameras, named, ~is_check[measured.point], notes)
+    return PictureEvidence(
+        measured, numbers, cameras, named, ~is_check[measured.point], priors.sigma_shared_px, notes
+    )  # fmt: skip
 
 
 def _named(exposures: Exposures, number: int) -> tuple[str, str, str]:

@@ -21,9 +21,10 @@ from roadscan.core.grid import Bounds
 from roadscan.core.rig import Mountings, Rig, Sensor
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
 from roadscan.georeference.sources import change_of, load_mounting_changes, load_mountings
-from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
+from roadscan.navigation.tasks.taken_pictures import TakenPictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.pictures.camera_changes import changed, clock_ns, load_camera_changes
+from roadscan.pictures.frames.chosen import camera_pictures, folder_of
 from roadscan.pictures.views import Lens, PictureRule, Views
 from roadscan.poses.trajectory import Poses, world_from_ned
 
@@ -136,7 +137,7 @@ def check_pictures(plan: SurveyPlan, rule: PictureRule) -> None:
 def check_folders(plan: SurveyPlan, rule: PictureRule) -> None:
     """Raise where the files of pictures are missing: the tables contain their times only."""
     for _, taken in _camera_logs(plan, rule):
-        folder = plan.survey.resolve(Path(taken.record.path))
+        folder = folder_of(plan, taken)
         if not folder.exists():
             raise ConfigError(
                 f"the pictures of {taken.record.run}/{taken.record.sensor} are not where the survey file says",
@@ -214,15 +215,13 @@ def _camera_logs(plan: SurveyPlan, rule: PictureRule) -> list[tuple[Sensor, Take
     """Returns logs of pictures with their cameras."""
     changes = load_camera_changes(plan.store)
     cameras = [(name, _changed(one, changes.get(name))) for name, one in rule_cameras(plan.survey.rig, rule)]
-    found = [(c, taken) for name, c in cameras for taken in taken_pictures(plan.store, plan.records, name)]
-    usable = [(c, taken) for c, taken in found if taken.files and not _is_video(taken)]
+    found = [(c, taken) for name, c in cameras for taken in camera_pictures(plan, name)]
+    usable = [(c, taken) for c, taken in found if taken.files]
     if not usable:
         names = ", ".join(name for name, _ in cameras)
         raise RunError(
-            f"the pictures of the cameras ({names}) are frames of videos, which are not taken out one by one"
-            if any(taken.files for _, taken in found)
-            else f"the cameras ({names}) have no pictures in the store",
-            expected="a log of pictures (images): a folder of files with their stamps",
+            f"the cameras ({names}) have no pictures in the store",
+            expected="a log of pictures (images): a folder of files with their stamps, or a video",
             change=f"list it in the survey file, or {_WITHOUT}",
         )
     return usable
@@ -233,10 +232,6 @@ def _changed(camera: Sensor, change: Float64 | None) -> Sensor:
     if camera.interior is None:
         return camera
     return camera.model_copy(update={"interior": changed(camera.interior, change)})
-
-
-def _is_video(taken: TakenPictures) -> bool:
-    return taken.record.attributes.get("kind") == "video"
 
 
 def rule_cameras(rig: Rig, rule: PictureRule) -> list[tuple[str, Sensor]]:
@@ -278,7 +273,7 @@ def _lens_key(cameras: Sequence[tuple[str, Sensor]]) -> str:
 def _placed(plan: SurveyPlan, camera: Sensor, taken: TakenPictures, rule: PictureRule) -> _Placed:
     """Returns poses of a log's pictures; those without one, or of another size than the lens is for, are left out."""
     record = taken.record
-    log = PictureLog(record.key, record.run, record.sensor, plan.survey.resolve(Path(record.path)))
+    log = PictureLog(record.key, record.run, record.sensor, folder_of(plan, taken))
     source = trajectory_source(record.run, plan.records)
     mountings = mountings_of(record.run, record.sensor, camera.mounting(), load_mountings(plan.store))
     change = change_of(load_mounting_changes(plan.store), record.run, record.sensor)

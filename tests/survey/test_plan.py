@@ -68,7 +68,7 @@ def test_before_a_run_all_logs_are_due_and_the_rest_waits(simulated: Simulated, 
     assert {"scans", "returns", "trajectory", "control_points", "rejects"} == ingest["writes"].keys()
     assert found["tiles"]["due"] is None and found["tiles"]["waits_for"] == "ingest"
     assert [name for name, one in found.items() if one["state"] == "passed over"] == [
-        "picture_ties", "adjust", "pictures", "surfaces", "condition", "assets", "colours",
+        "video_frames", "picture_ties", "adjust", "pictures", "surfaces", "condition", "assets", "colours",
     ]  # fmt: skip
     assert list(found) == [stage.name for stage in stages()]
     text = printed(place, "plan")

@@ -19,7 +19,13 @@ from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
 from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.bundle import asks_pictures, pictures_key, pictures_of
-from roadscan.adjust.tasks.cameras import camera_findings, picture_findings, picture_lines, picture_rows, publish_cameras
+from roadscan.adjust.tasks.cameras import (
+    camera_findings,
+    picture_findings,
+    picture_lines,
+    picture_rows,
+    publish_cameras,
+)
 from roadscan.adjust.tasks.control_lines import lines_line
 from roadscan.adjust.tasks.control_work import (
     SIGHTINGS,

@@ -38,7 +38,7 @@ PICTURE_FIT: Final = Witness(
 PICTURE_LENS: Final = Witness(
     "picture_lens",
     input="pictures",
-    fault="The lens is another one than the rig file states: another zoom, another camera, pictures that were rectified.",
+    fault="The lens is not the one that the rig file states: another zoom or camera, or pictures that were rectified.",
     asks="tie points and the turns of the poses: focal length and k1 that they have without those that are stated",
     does="it is told; the lens is used as stated, with its σ",
     told=("findings",),
@@ -167,8 +167,9 @@ def _of_lens(free: FreeCameras, k: int) -> list[Finding]:
     if not said:
         return []
     text = (
-        f"tie points, and the turns of the poses, say of the lens: {', '.join(said)}; it is used as stated, and poses take up the "
-        f"difference. Calibrate it (roadscan camera interior), or state how well it is known (adjust.cameras)"
+        f"tie points, and the turns of the poses, say of the lens: {', '.join(said)}; it is used as stated, and poses "
+        "take up the difference. Calibrate it (roadscan camera interior), or state how well it is known "
+        "(adjust.cameras)"
     )
     return [PICTURE_LENS.finds(free.stated[k].sensor, text)]
 
@@ -191,9 +192,7 @@ def _of_clock(found: PictureOutcome, free: FreeCameras, k: int) -> list[Finding]
     return [PICTURE_STAMPS.finds(free.stated[k].sensor, text)]
 
 
-def picture_lines(
-    found: PictureOutcome | None, cameras: CameraErrors | None, free: FreeCameras | None
-) -> list[str]:
+def picture_lines(found: PictureOutcome | None, cameras: CameraErrors | None, free: FreeCameras | None) -> list[str]:
     """Returns what pictures said, in words."""
     if found is None:
         return []

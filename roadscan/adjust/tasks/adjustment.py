@@ -290,7 +290,7 @@ def adjust_survey(session: Session) -> None:
     if config.mode in ("joint", "vertical"):
         doubts += failed_ties(evidence.ties, solution.tie_weight)
     doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings)]
-    doubts += [*picture_findings(solution.pictures), *camera_findings(solution.pictures, solution.free)]
+    doubts += [*picture_findings(solution.pictures), *camera_findings(solution.free)]
     doubts += _of_points(work, evidence.sightings)
     _keep(session, key, held, (lines, doubts), failed=collector.lacks)
 

@@ -12,7 +12,6 @@ from roadscan.adjust.bundle.outcome import ControlOfPictures, PictureOutcome
 from roadscan.adjust.bundle.self_check import FreeCameras
 from roadscan.adjust.tasks.figures import Rows
 from roadscan.core.counted import counted
-from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.pictures.camera_changes import COLUMNS, TABLE
 from roadscan.store.small_tables import read_small, small_path, write_small
@@ -55,9 +54,6 @@ _LEAST_FOCAL: Final = 0.01
 """A focal length is told to be wrong from this share on: 0.2 m across at 20 m."""
 _LEAST_K1: Final = 0.01  # k1 is told to be wrong from here on: half a pixel at 250 px from the middle of a usual lens.
 _LEAST_CLOCK_S: Final = 0.005  # A clock is told to be wrong from here on (s): 10 cm at 70 km/h.
-_NEIGHBOUR: Final = 0.3
-"""Share of the time from picture to picture from which on a clock that is off may be a shift by one picture: of poses
-that are recorded as seldom, the solution about the stated time finds half of it."""
 _WORDS: Final = {
     "focal_x_px": ("focal length", 1.0, "px"), "centre_x_px": ("principal point, right", 1.0, "px"),
     "centre_y_px": ("principal point, down", 1.0, "px"), "k1": ("k1", 1.0, ""), "clock_s": ("clock", 1e3, "ms"),
@@ -146,11 +142,11 @@ def picture_findings(found: PictureOutcome | None) -> list[Finding]:
     return [PICTURE_FIT.finds("pictures", said)]
 
 
-def camera_findings(found: PictureOutcome | None, free: FreeCameras | None) -> list[Finding]:
+def camera_findings(free: FreeCameras | None) -> list[Finding]:
     """Returns findings on lenses and clocks that are not what the rig file and the stamps say."""
-    if found is None or free is None:
+    if free is None:
         return []
-    return [said for k in range(len(free.stated)) for said in (*_of_lens(free, k), *_of_clock(found, free, k))]
+    return [said for k in range(len(free.stated)) for said in (*_of_lens(free, k), *_of_clock(free, k))]
 
 
 def _of_lens(free: FreeCameras, k: int) -> list[Finding]:
@@ -174,20 +170,22 @@ def _of_lens(free: FreeCameras, k: int) -> list[Finding]:
     return [PICTURE_LENS.finds(free.stated[k].sensor, text)]
 
 
-def _of_clock(found: PictureOutcome, free: FreeCameras, k: int) -> list[Finding]:
+def _of_clock(free: FreeCameras, k: int) -> list[Finding]:
     """Returns a finding where the stamps of a camera are not those of the poses."""
-    error, sigma = free.off(k, "clock_s")
-    if abs(error) <= _LEAST_CLOCK_S:
+    (error, sigma), lag = free.off(k, "clock_s"), free.lag[k]
+    if lag:
+        side = "late" if lag > 0 else "early"
+        turns = "the turns from picture to picture are those of the poses"
+        said = f"{turns} if stamps are {side} by {counted(abs(lag), 'picture')}"
+    elif abs(error) > _LEAST_CLOCK_S:
+        said = (
+            f"pictures turn as the poses do if {1e3 * error:+.0f} ms (σ {1e3 * sigma:.0f} ms) are added to their stamps"
+        )
+    else:
         return []
-    own = found.measured.exposures
-    epochs = own.epoch_gps_ns[[own.cameras[c].sensor == free.stated[k].sensor for c in own.camera.tolist()]]
-    steps = np.diff(np.unique(epochs))
-    step_s = float(np.median(steps)) / NS_PER_S if steps.size else float("nan")
-    neighbours = "; they may be those of the pictures beside" if abs(error) > _NEIGHBOUR * step_s else ""
     text = (
-        f"pictures turn as the poses do if {1e3 * error:+.0f} ms (σ {1e3 * sigma:.0f} ms) are added to their stamps, "
-        f"which are {1e3 * step_s:.0f} ms apart{neighbours}; stamps are used as they are, and poses take up the "
-        "difference. Mend them, or let the adjustment estimate the clock (adjust.cameras.sigma_clock_s)"
+        f"{said}; stamps are used as they are, and poses take up the difference. Mend the stamps, or let the "
+        "adjustment estimate a clock that is off by less than a picture (adjust.cameras.sigma_clock_s)"
     )
     return [PICTURE_STAMPS.finds(free.stated[k].sensor, text)]
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import shapely
+from scipy.spatial.transform import Rotation
 
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
 from roadscan.core.crs import MapFrame
@@ -23,7 +24,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory
 from roadscan.georeference.sources import change_of, load_mounting_changes, load_mountings
 from roadscan.navigation.tasks.taken_pictures import TakenPictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
-from roadscan.pictures.camera_changes import changed, clock_ns, load_camera_changes
+from roadscan.pictures.camera_changes import changed, clock_ns, load_camera_changes, row_ns
 from roadscan.pictures.frames.chosen import camera_pictures, folder_of
 from roadscan.pictures.views import Lens, PictureRule, Views
 from roadscan.poses.trajectory import Poses, world_from_ned
@@ -110,7 +111,7 @@ class Pictures:
         """Returns a hash of all that colours from these pictures depend on, except the rule."""
         digest = hashlib.blake2b(self.lens_key.encode(), digest_size=8)
         views = self.views
-        for values in (views.eye_world_m, views.opencv_from_world, views.up_world, views.lens):
+        for values in (views.eye_world_m, views.opencv_from_world, views.up_world, views.lens, views.row_motion):
             digest.update(np.ascontiguousarray(values).tobytes())
         for number, file in enumerate(self.files):
             digest.update(f"{self.worlds[views.world[number]]}\0{self.logs[self.log[number]].key}\0{file}\n".encode())
@@ -180,6 +181,7 @@ def plan_pictures(plan: SurveyPlan, rule: PictureRule) -> Pictures:
         np.concatenate([one.eye_world_m for one in placed]), np.concatenate([one.opencv_from_world for one in placed]),
         np.concatenate([one.up_world for one in placed]), np.array([w for w, _ in counted])[log],
         np.array([k for _, k in counted])[log], tuple(_lens(camera) for _, camera in cameras),
+        np.concatenate([one.row_motion for one in placed]),
     )  # fmt: skip
     return Pictures(
         rule, plan.ground.map, worlds, views.picked(order),
@@ -201,6 +203,7 @@ class _Placed:
     eye_world_m: Float64
     opencv_from_world: Float64
     up_world: Float64
+    row_motion: Float64
     place_m: Float64
     reach_m: Float64
     notes: tuple[str, ...]
@@ -280,16 +283,18 @@ def _placed(plan: SurveyPlan, camera: Sensor, taken: TakenPictures, rule: Pictur
     mountings = mountings if change is None else change.applied(mountings, parallel=False)
     order = np.argsort(taken.epochs_gps_ns, kind="stable")
     fits = order[_fits(camera, taken)[order]]
-    later_ns = clock_ns(load_camera_changes(plan.store).get(record.sensor))
-    poses = list(_poses(plan, source, taken.epochs_gps_ns[fits] + later_ns))
-    found = np.concatenate([p.found for p in poses]) if poses else np.zeros(0, np.bool_)
-    eye, turn = (np.concatenate(a) for a in zip(*(_eyes(p, mountings) for p in poses), strict=True))
-    eye, turn, kept = eye[found], turn[found], fits[found]
+    filmed = load_camera_changes(plan.store).get(record.sensor)
+    epochs = taken.epochs_gps_ns[fits] + clock_ns(filmed)
+    found, eye, turn = _eyes_at(plan, source, epochs, mountings)
+    motion = _row_motion(plan, camera, (source, epochs, mountings), filmed)
+    eye, turn, motion, kept = eye[found], turn[found], motion[found], fits[found]
     place, reach = _reach(plan.ground.map, source.world, eye, rule.reach_m)
     names = tuple(taken.files[i] for i in kept.tolist())
     up = -world_from_ned(source.world, eye)[:, :, 2]
     notes = _notes(log, camera, order.size - fits.size, fits.size - kept.size)
-    return _Placed(log, camera, source.world, taken.epochs_gps_ns[kept], names, eye, turn, up, place, reach, notes)
+    return _Placed(
+        log, camera, source.world, taken.epochs_gps_ns[kept], names, eye, turn, up, motion, place, reach, notes
+    )
 
 
 def _fits(camera: Sensor, taken: TakenPictures) -> npt.NDArray[np.bool_]:
@@ -315,6 +320,39 @@ def _poses(plan: SurveyPlan, source: TrajectorySource, epochs_gps_ns: Int64) -> 
     for part in np.split(epochs_gps_ns, np.flatnonzero(np.diff(pieces)) + 1):
         span = (int(part[0]), int(part[-1]))
         yield load_trajectory(plan.store, source, [span], plan.ground.max_gap_s).poses(part)
+
+
+def _eyes_at(
+    plan: SurveyPlan, source: TrajectorySource, epochs_gps_ns: Int64, mountings: Mountings
+) -> tuple[npt.NDArray[np.bool_], Float64, Float64]:
+    """Returns whether there is a pose at epochs (n,) in order, projection centres (n, 3), and rotations (n, 3, 3)."""
+    poses = list(_poses(plan, source, epochs_gps_ns))
+    found = np.concatenate([p.found for p in poses]) if poses else np.zeros(0, np.bool_)
+    eye, turn = (np.concatenate(a) for a in zip(*(_eyes(p, mountings) for p in poses), strict=True))
+    return found, eye, turn
+
+
+def _row_motion(
+    plan: SurveyPlan, camera: Sensor, exposed: tuple[TrajectorySource, Int64, Mountings], change: Float64 | None
+) -> Float64:
+    """Returns way (m) and turn (rad) of a camera (n, 6) from row to row, along its axes: the mean of a picture; 0 where
+    a pose at its first or last row is missing, and without a rolling shutter.
+
+    exposed : trajectory, epochs (n,) of the middle rows, and mountings.
+    """
+    source, epochs, mountings = exposed
+    motion = np.zeros((epochs.size, 6))
+    if camera.interior is None or not (each_ns := row_ns(camera.interior, change)):
+        return motion
+    rows = max(camera.interior.height_px - 1, 1)
+    half = round(0.5 * rows * each_ns)
+    (first, here, last) = (_eyes_at(plan, source, epochs + k * half, mountings) for k in (-1, 0, 1))
+    known = first[0] & here[0] & last[0]
+    motion[known, :3] = np.einsum("nij,nj->ni", here[2][known], last[1][known] - first[1][known]) / rows
+    # Axes from the world turn against the camera.
+    turned = first[2][known] @ last[2][known].transpose(0, 2, 1)
+    motion[known, 3:] = Rotation.from_matrix(turned).as_rotvec() / rows
+    return motion
 
 
 def _eyes(poses: Poses, mountings: Mountings) -> tuple[Float64, Float64]:

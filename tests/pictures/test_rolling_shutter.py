@@ -21,7 +21,7 @@ from roadscan.pictures.views import PictureRule
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Reporter, Session
 from roadscan.run.stage import stages
-from roadscan.simulate import simulate, truth
+from roadscan.simulate import Scene, simulate, truth
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from tests.simulate.test_simulate_photogrammetry import STREET
@@ -89,7 +89,11 @@ def _true_pixels(survey: Simulated) -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The survey with control measured in its pictures."""
-    folder = simulate(SCENE, tmp_path_factory.mktemp("rolling") / "street").folder
+    return _surveyed(SCENE, tmp_path_factory.mktemp("rolling") / "street")
+
+
+def _surveyed(scene: Scene, where: Path) -> Path:
+    folder = simulate(scene, where).folder
     rows = _true_pixels(Simulated(folder))
     rows[["u_px", "v_px"]] += NOISE_PX * np.random.default_rng(0).normal(size=(len(rows), 2))
     rows.to_csv(folder / "measured.csv", index=False)
@@ -146,4 +150,15 @@ def test_a_row_time_that_is_wrong_is_estimated(street: Path, tmp_path: Path) -> 
     wrong = f"line_time_us = {1.1 * LINE_US}\nsigma_line_time_us = {0.1 * LINE_US}"
     (folder / "RIG.toml").write_text(rig.replace(f"line_time_us = {LINE_US}", wrong))
     left = _left_px(folder)
+    assert np.sqrt(np.mean(left**2)) < 1.0
+
+
+def test_traffic_that_fills_half_of_the_pictures_is_judged(tmp_path: Path) -> None:
+    """A lorry ahead and one beside it, nearly as fast as the survey vehicle: they look as if they stood far away."""
+    lorry = {"length_m": 8.0, "width_m": 2.5, "height_m": 3.2}
+    cars = [
+        {"station_m": 8.0, "offset_m": 1.6, "speed_m_per_s": 27.0, **lorry},
+        {"station_m": 10.0, "offset_m": -1.6, "speed_m_per_s": 29.0, **lorry},
+    ]
+    left = _left_px(_surveyed(SCENE.changed(roadside={"moving_cars": cars}), tmp_path / "traffic"))
     assert np.sqrt(np.mean(left**2)) < 1.0

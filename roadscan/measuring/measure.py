@@ -232,26 +232,30 @@ def meet(
     numbers = [picture_number(poses.pictures, file, plan) for file in files]
     if numbers[0] == numbers[1]:
         raise ConfigError("both pixels are of one picture", expected="two pictures from different places")
-    rays, slopes = [], []
+    rays, slopes, eyes = [], [], []
     for number, pixel in zip(numbers, pixels, strict=True):
         lens = poses.pictures.views.lens_of(number)
         own = _checked(poses, number, [pixel])
         rays.append(rays_of(lens, own)[0])
+        eyes.append(poses.place_m[number] + _way(poses, number, eye_shifts_m(lens, own)[0]))
         slopes.append(_pixel_covariance(ray_slopes(lens, own)[0], sigma_px))
     if not np.isfinite(rays).all():
         raise ConfigError("the lens has no ray at a pixel: its distortion has no inverse", expected="another pixel")
-    return _met(poses, numbers, rays, slopes, pixels[0])
+    return _met(poses, numbers, (eyes, rays), slopes, pixels[0])
 
 
 def _met(
     poses: PicturePoses,
     numbers: Sequence[int],
-    rays: Sequence[Float64],
+    sights: tuple[Sequence[Float64], Sequence[Float64]],
     spreads: Sequence[Float64],
     pixel: Sequence[float],
 ) -> tuple[MeasuredPlace, float]:
-    """Return where two rays meet, with its covariance: errors of poses and mountings are shared as they are."""
-    eyes = [poses.place_m[k] for k in numbers]
+    """Return where two rays meet, with its covariance: errors of poses and mountings are shared as they are.
+
+    sights : where the cameras were on the map, and the rays in their axes.
+    """
+    eyes, rays = sights
     ways = [_way(poses, k, ray) for k, ray in zip(numbers, rays, strict=True)]
     units = [way / np.linalg.norm(way) for way in ways]
     across = [np.eye(3) - np.outer(unit, unit) for unit in units]

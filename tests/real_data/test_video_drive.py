@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from benchmarks import picture_drive
+from roadscan.core.survey import Survey
 from roadscan.formats.cameras import video
+from roadscan.georeference.plan.plan import plan_without_readings
+from roadscan.measuring.listed import listed_pictures
 from tests.real_data.conftest import Place
 
 ERRORS = (0.1, 0.2)
@@ -78,6 +81,9 @@ def test_frames_give_the_poses_that_pictures_give(
     assert np.linalg.norm(found[:, :, 3] - pictures[:, :, 3], axis=1).max() < 0.02
     ways, turns = picture_drive.over_frames(found, pictures)
     assert ways.max() < 0.02 and turns.max() < 0.05
+    survey = Survey.load(file)
+    listed = listed_pictures(plan_without_readings(survey, place.store(file)))
+    assert len(listed.placed[0]) == len(SHOWN) and not listed.unplaced
 
 
 @pytest.mark.witness("damaged_frames")

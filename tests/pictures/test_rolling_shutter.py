@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from roadscan.adjust.tasks.outcome import ADJUSTMENT, SOLUTION
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import plan_without_readings
 from roadscan.pictures.kernels.picture_colours import take_better
@@ -22,6 +23,7 @@ from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Reporter, Session
 from roadscan.run.stage import stages
 from roadscan.simulate import Scene, simulate, truth
+from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from tests.simulate.test_simulate_photogrammetry import STREET
@@ -153,6 +155,21 @@ def test_a_row_time_that_is_wrong_is_estimated(street: Path, tmp_path: Path) -> 
     assert np.sqrt(np.mean(left**2)) < 1.0
 
 
+def test_a_focal_length_that_is_3_percent_wrong_is_told(street: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(street, tmp_path / "lens")
+    rig, stated = (folder / "RIG.toml").read_text(), "focal_px = [490.0, 490.0]"
+    assert stated in rig
+    (folder / "RIG.toml").write_text(rig.replace(stated, f"focal_px = [{1.03 * 490.0}, {1.03 * 490.0}]"))
+    _left_px(folder)
+    record = Manifest(Store(Survey.load(folder / "SURVEY.toml").store_url, "street_with_cameras")).get(
+        ADJUSTMENT, SOLUTION
+    )
+    assert record is not None
+    found = [one["text"] for one in record.figures()["findings"] if one["witness"] == "picture_lens"]
+    assert len(found) == 1 and "focal length -1" in found[0]
+
+
+@pytest.mark.nightly
 def test_traffic_that_fills_half_of_the_pictures_is_judged(tmp_path: Path) -> None:
     """A lorry ahead and one beside it, nearly as fast as the survey vehicle: they look as if they stood far away."""
     lorry = {"length_m": 8.0, "width_m": 2.5, "height_m": 3.2}

@@ -146,7 +146,8 @@ def camera_findings(free: FreeCameras | None) -> list[Finding]:
     """Returns findings on lenses and clocks that are not what the rig file and the stamps say."""
     if free is None:
         return []
-    return [said for k in range(len(free.stated)) for said in (*_of_lens(free, k), *_of_clock(free, k))]
+    # Stamps that are wrong bend what is found of the lens: that is told once they are mended.
+    return [said for k in range(len(free.stated)) for said in _of_clock(free, k) or _of_lens(free, k)]
 
 
 def _of_lens(free: FreeCameras, k: int) -> list[Finding]:

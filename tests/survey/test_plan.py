@@ -165,7 +165,7 @@ def test_the_picture_shows_each_stage_and_what_it_writes(copy: Simulated, tmp_pa
         assert left + float(one.get("width", "0")) <= width and top + float(one.get("height", "0")) <= height
     assert any("cells 15" in word for word in words)
     classes = Counter(one.get("class") for one in root.findall("svg:rect", names))
-    assert classes["over"] == 7 and classes["current"] == len(found) - 7
+    assert classes["over"] == 8 and classes["current"] == len(found) - 8
 
 
 def test_a_picture_of_another_kind_is_refused(copy: Simulated, tmp_path: Path) -> None:

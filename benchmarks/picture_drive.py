@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -102,7 +103,9 @@ def disturbed(poses: Float64, sigma_m: float, sigma_deg: float, seed: int) -> Fl
     return np.concatenate([poses[:, :, :3] @ turn, poses[:, :, 3:] + sigma_m * waves[:, :3, None]], axis=2)
 
 
-def laid_out(recording: Path, folder: Path, errors: tuple[float, float], seed: int, chosen: range = EVERY) -> Path:
+def laid_out(
+    recording: Path, folder: Path, errors: tuple[float, float], seed: int, chosen: Sequence[int] = EVERY
+) -> Path:
     """Write the survey of some pictures of the drive below a folder; returns its survey file.
 
     errors : 1 σ of the disturbed poses (m, degrees).

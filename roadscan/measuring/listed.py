@@ -13,7 +13,8 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import Sensor
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.measuring.poses import PicturePoses, picture_poses
-from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
+from roadscan.navigation.tasks.taken_pictures import TakenPictures
+from roadscan.pictures.frames.chosen import camera_pictures
 from roadscan.pictures.placed import plan_pictures
 from roadscan.pictures.views import PictureRule
 
@@ -53,7 +54,7 @@ def listed_pictures(plan: SurveyPlan) -> ListedPictures:
     unplaced: list[Unplaced] = []
     cameras = {name: one for name, one in sorted(plan.survey.rig.sensors.items()) if one.kind == "camera"}
     for name, camera in cameras.items():
-        taken = [one for one in taken_pictures(plan.store, plan.records, name) if one.files]
+        taken = [one for one in camera_pictures(plan, name) if one.files]
         if not taken:
             continue
         held, refused = set[tuple[str, str, int]](), ""
@@ -91,8 +92,6 @@ def _unplaced(
 
 def _reason(plan: SurveyPlan, camera: Sensor, taken: TakenPictures, number: int, refused: str) -> str:
     record, interior = taken.record, camera.interior
-    if record.attributes.get("kind") == "video":
-        return "a frame of a video, which is not taken out"
     if interior is None:
         return "the camera has no interior orientation in the rig file"
     width, height = taken.size_px[number].tolist()

@@ -22,7 +22,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, poses_plan_of
 from roadscan.measuring.ground import Ground, Plane
 from roadscan.measuring.kernels.march import BELOW, first_hits
 from roadscan.measuring.poses import PicturePoses, picture_poses
-from roadscan.pictures.lens import ray_slopes, rays_of
+from roadscan.pictures.lens import eye_shifts_m, ray_slopes, rays_of
 from roadscan.pictures.placed import Pictures, plan_pictures
 from roadscan.pictures.views import HEIGHT, WIDTH, PictureRule
 from roadscan.run.session import Session, found_once
@@ -163,11 +163,11 @@ def measured_places(
 ) -> list[MeasuredPlace]:
     """Return the places of pixels (m, 2) of a picture with its number, as :func:`measure` does."""
     lens = poses.pictures.views.lens_of(number)
-    ray = rays_of(lens, pixel)
+    ray, shift = rays_of(lens, pixel), eye_shifts_m(lens, pixel)
     slope = ray_slopes(lens, pixel)
     hit_m = ground_hits(poses, ground, number, ray, reach_m)
     found = []
-    for (u, v), one, by_pixel, hit in zip(pixel.tolist(), ray, slope, hit_m.tolist(), strict=True):
+    for (u, v), one, aside, by_pixel, hit in zip(pixel.tolist(), ray, shift, slope, hit_m.tolist(), strict=True):
         if not np.isfinite(one).all():
             found.append(_nowhere(u, v, "the lens has no ray there: its distortion has no inverse"))
             continue
@@ -177,7 +177,7 @@ def measured_places(
         if hit < 0.0:
             found.append(_nowhere(u, v, _why(hit, reach_m)))
             continue
-        meets = _on_plane(poses, ground, number, one, hit)
+        meets = _on_plane(poses, ground, number, (one, aside), hit)
         if meets is None:
             found.append(_nowhere(u, v, "the ray meets ground with too few cells around to fit a plane"))
             continue
@@ -232,26 +232,30 @@ def meet(
     numbers = [picture_number(poses.pictures, file, plan) for file in files]
     if numbers[0] == numbers[1]:
         raise ConfigError("both pixels are of one picture", expected="two pictures from different places")
-    rays, slopes = [], []
+    rays, slopes, eyes = [], [], []
     for number, pixel in zip(numbers, pixels, strict=True):
         lens = poses.pictures.views.lens_of(number)
         own = _checked(poses, number, [pixel])
         rays.append(rays_of(lens, own)[0])
+        eyes.append(poses.place_m[number] + _way(poses, number, eye_shifts_m(lens, own)[0]))
         slopes.append(_pixel_covariance(ray_slopes(lens, own)[0], sigma_px))
     if not np.isfinite(rays).all():
         raise ConfigError("the lens has no ray at a pixel: its distortion has no inverse", expected="another pixel")
-    return _met(poses, numbers, rays, slopes, pixels[0])
+    return _met(poses, numbers, (eyes, rays), slopes, pixels[0])
 
 
 def _met(
     poses: PicturePoses,
     numbers: Sequence[int],
-    rays: Sequence[Float64],
+    sights: tuple[Sequence[Float64], Sequence[Float64]],
     spreads: Sequence[Float64],
     pixel: Sequence[float],
 ) -> tuple[MeasuredPlace, float]:
-    """Return where two rays meet, with its covariance: errors of poses and mountings are shared as they are."""
-    eyes = [poses.place_m[k] for k in numbers]
+    """Return where two rays meet, with its covariance: errors of poses and mountings are shared as they are.
+
+    sights : where the cameras were on the map, and the rays in their axes.
+    """
+    eyes, rays = sights
     ways = [_way(poses, k, ray) for k, ray in zip(numbers, rays, strict=True)]
     units = [way / np.linalg.norm(way) for way in ways]
     across = [np.eye(3) - np.outer(unit, unit) for unit in units]
@@ -314,13 +318,18 @@ def _way(poses: PicturePoses, number: int, ray: Float64) -> Float64:
 
 
 def _on_plane(
-    poses: PicturePoses, ground: Ground, number: int, ray: Float64, hit_m: float
+    poses: PicturePoses, ground: Ground, number: int, sight: tuple[Float64, Float64], hit_m: float
 ) -> tuple[Float64, float, Plane] | None:
-    """Return the place, the distance and the plane of a ray near the place where it met the coarse heights."""
+    """Return the place, the distance and the plane of a ray near the place where it met the coarse heights.
+
+    sight : the ray, and where the camera was when its row was exposed, from where it was at the middle row.
+    """
+    ray, shift_m = sight
     pictures = poses.pictures
     views, frame = pictures.views, pictures.map
     world = pictures.worlds[views.world[number]]
-    way_world, eye_world = ray @ views.opencv_from_world[number], views.eye_world_m[number]
+    way_world = ray @ views.opencv_from_world[number]
+    eye_world = views.eye_world_m[number] + shift_m @ views.opencv_from_world[number]
     way = _way(poses, number, ray)
     along, plane = hit_m, None
     for _ in range(_ROUNDS):

@@ -38,6 +38,12 @@ def changed(interior: Interior, change: Float64 | None) -> Interior:
     return interior.model_copy(update=update)
 
 
+def row_ns(interior: Interior, change: Float64 | None) -> float:
+    """Returns the time (ns) from the exposure of a row to that of the row below; 0 of a global shutter."""
+    found = 0.0 if change is None else float(change[COLUMNS.index("line_time_s")])
+    return 1e3 * interior.line_time_us + found * NS_PER_S
+
+
 def clock_ns(change: Float64 | None) -> int:
     """Returns what is added to the stamps of a camera's pictures (ns)."""
     return 0 if change is None else round(float(change[COLUMNS.index("clock_s")]) * NS_PER_S)

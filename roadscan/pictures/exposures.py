@@ -18,8 +18,9 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import Sensor
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
 from roadscan.georeference.sources import load_mountings
-from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
+from roadscan.navigation.tasks.taken_pictures import TakenPictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
+from roadscan.pictures.frames.chosen import camera_pictures, folder_of
 from roadscan.pictures.views import Lens
 from roadscan.poses.trajectory import world_from_ned
 
@@ -119,11 +120,10 @@ def exposures_of(plan: SurveyPlan) -> tuple[Exposures, tuple[str, ...]]:
     for name, sensor in sorted(plan.survey.rig.sensors.items()):
         if sensor.kind != "camera":
             continue
-        for taken in taken_pictures(plan.store, plan.records, name):
+        for taken in camera_pictures(plan, name):
             where = f"{taken.record.run}/{name}"
-            if sensor.interior is None or taken.record.attributes.get("kind") == "video":
-                why = "no interior orientation in the rig file" if sensor.interior is None else "frames of a video"
-                notes.append(f"{where}: {len(taken.files)} pictures left out: {why}")
+            if sensor.interior is None:
+                notes.append(f"{where}: {len(taken.files)} pictures left out: no interior orientation in the rig file")
                 continue
             own, said = _of_log(plan, (sensor, sensor.interior), taken, len(cameras))
             parts.append(own)
@@ -159,7 +159,7 @@ def _of_log(
     for part, mounting in mountings.pieces(epochs):
         rotation, lever[part] = mounting.arrays()
         axes[part] = rotation @ SENSOR_FROM_OPENCV
-    folder = plan.survey.resolve(Path(record.path))
+    folder = folder_of(plan, taken)
     own_camera = Camera(record.run, record.sensor, record.key, folder, rig, interior, source.world)
     level = np.einsum("nji,njk->nik", world_from_ned(source.world, body[kept]), turned[kept])
     own = Exposures(

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.extras import cv2
+from roadscan.pictures.kernels.lens import ROW_ROUNDS, ROW_SETTLED_PX
 from roadscan.pictures.views import Lens
 
 Float64 = npt.NDArray[np.float64]
@@ -35,11 +36,26 @@ def rays_of(lens: Lens, pixel: Float64) -> Float64:
         level = np.cos(latitude)
         return np.column_stack([np.sin(longitude) * level, np.sin(latitude), np.cos(longitude) * level])
     found = straightened(lens, pixel)
+    turn = lens.row_motion[1]
     ray = np.column_stack([found, np.ones(len(found))])
     wrong = ~(np.linalg.norm(projected(lens, ray) - pixel, axis=1) < _INVERTED_PX)
     wrong |= (found**2).sum(axis=1) >= lens.fold
     ray[wrong] = np.nan
+    if turn.any():
+        ray += _rows(lens, pixel[:, 1])[:, None] * np.cross(turn, ray)
     return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True), np.float64)
+
+
+def eye_shifts_m(lens: Lens, pixel: Float64) -> Float64:
+    """Returns where the camera was (m, 3; m, its axes) when the rows of pixels (m, 2) were exposed, from where it was
+    at the middle row.
+    """
+    return np.asarray(_rows(lens, np.reshape(pixel, (-1, 2))[:, 1])[:, None] * lens.row_motion[0])
+
+
+def _rows(lens: Lens, v_px: Float64) -> Float64:
+    """Returns rows (m,) from the middle one."""
+    return np.asarray(v_px - 0.5 * (lens.size_px[1] - 1))
 
 
 def ray_slopes(lens: Lens, pixel: Float64) -> Float64:
@@ -51,6 +67,18 @@ def ray_slopes(lens: Lens, pixel: Float64) -> Float64:
 def pixels_of(lens: Lens, point: Float64) -> Float64:
     """Returns pixels (m, 2: u, v) of points (m, 3); NaN behind the camera and beyond the lens's fold."""
     point = np.ascontiguousarray(point, np.float64).reshape(-1, 3)
+    pixel = _still_pixels_of(lens, point)
+    shift, turn = lens.row_motion
+    for _ in range(ROW_ROUNDS if shift.any() or turn.any() else 0):
+        rows = _rows(lens, pixel[:, 1])[:, None]
+        before, pixel = pixel, _still_pixels_of(lens, point - rows * (shift + np.cross(turn, point)))
+        if not (np.abs(pixel - before) > ROW_SETTLED_PX).any():
+            break
+    return pixel
+
+
+def _still_pixels_of(lens: Lens, point: Float64) -> Float64:
+    """Returns pixels (m, 2) of points (m, 3) in the axes that the camera has when their rows are exposed."""
     if lens.is_around:
         return lens.parameters[:2] * _angles(point) + lens.parameters[2:4]
     out = np.full((len(point), 2), np.nan)

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import shapely
+from scipy.spatial.transform import Rotation
 
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
 from roadscan.core.crs import MapFrame
@@ -21,9 +22,10 @@ from roadscan.core.grid import Bounds
 from roadscan.core.rig import Mountings, Rig, Sensor
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
 from roadscan.georeference.sources import change_of, load_mounting_changes, load_mountings
-from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
+from roadscan.navigation.tasks.taken_pictures import TakenPictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
-from roadscan.pictures.camera_changes import changed, clock_ns, load_camera_changes
+from roadscan.pictures.camera_changes import changed, clock_ns, load_camera_changes, row_ns
+from roadscan.pictures.frames.chosen import camera_pictures, folder_of
 from roadscan.pictures.views import Lens, PictureRule, Views
 from roadscan.poses.trajectory import Poses, world_from_ned
 
@@ -109,7 +111,7 @@ class Pictures:
         """Returns a hash of all that colours from these pictures depend on, except the rule."""
         digest = hashlib.blake2b(self.lens_key.encode(), digest_size=8)
         views = self.views
-        for values in (views.eye_world_m, views.opencv_from_world, views.up_world, views.lens):
+        for values in (views.eye_world_m, views.opencv_from_world, views.up_world, views.lens, views.row_motion):
             digest.update(np.ascontiguousarray(values).tobytes())
         for number, file in enumerate(self.files):
             digest.update(f"{self.worlds[views.world[number]]}\0{self.logs[self.log[number]].key}\0{file}\n".encode())
@@ -136,7 +138,7 @@ def check_pictures(plan: SurveyPlan, rule: PictureRule) -> None:
 def check_folders(plan: SurveyPlan, rule: PictureRule) -> None:
     """Raise where the files of pictures are missing: the tables contain their times only."""
     for _, taken in _camera_logs(plan, rule):
-        folder = plan.survey.resolve(Path(taken.record.path))
+        folder = folder_of(plan, taken)
         if not folder.exists():
             raise ConfigError(
                 f"the pictures of {taken.record.run}/{taken.record.sensor} are not where the survey file says",
@@ -179,6 +181,7 @@ def plan_pictures(plan: SurveyPlan, rule: PictureRule) -> Pictures:
         np.concatenate([one.eye_world_m for one in placed]), np.concatenate([one.opencv_from_world for one in placed]),
         np.concatenate([one.up_world for one in placed]), np.array([w for w, _ in counted])[log],
         np.array([k for _, k in counted])[log], tuple(_lens(camera) for _, camera in cameras),
+        np.concatenate([one.row_motion for one in placed]),
     )  # fmt: skip
     return Pictures(
         rule, plan.ground.map, worlds, views.picked(order),
@@ -200,6 +203,7 @@ class _Placed:
     eye_world_m: Float64
     opencv_from_world: Float64
     up_world: Float64
+    row_motion: Float64
     place_m: Float64
     reach_m: Float64
     notes: tuple[str, ...]
@@ -214,15 +218,13 @@ def _camera_logs(plan: SurveyPlan, rule: PictureRule) -> list[tuple[Sensor, Take
     """Returns logs of pictures with their cameras."""
     changes = load_camera_changes(plan.store)
     cameras = [(name, _changed(one, changes.get(name))) for name, one in rule_cameras(plan.survey.rig, rule)]
-    found = [(c, taken) for name, c in cameras for taken in taken_pictures(plan.store, plan.records, name)]
-    usable = [(c, taken) for c, taken in found if taken.files and not _is_video(taken)]
+    found = [(c, taken) for name, c in cameras for taken in camera_pictures(plan, name)]
+    usable = [(c, taken) for c, taken in found if taken.files]
     if not usable:
         names = ", ".join(name for name, _ in cameras)
         raise RunError(
-            f"the pictures of the cameras ({names}) are frames of videos, which are not taken out one by one"
-            if any(taken.files for _, taken in found)
-            else f"the cameras ({names}) have no pictures in the store",
-            expected="a log of pictures (images): a folder of files with their stamps",
+            f"the cameras ({names}) have no pictures in the store",
+            expected="a log of pictures (images): a folder of files with their stamps, or a video",
             change=f"list it in the survey file, or {_WITHOUT}",
         )
     return usable
@@ -233,10 +235,6 @@ def _changed(camera: Sensor, change: Float64 | None) -> Sensor:
     if camera.interior is None:
         return camera
     return camera.model_copy(update={"interior": changed(camera.interior, change)})
-
-
-def _is_video(taken: TakenPictures) -> bool:
-    return taken.record.attributes.get("kind") == "video"
 
 
 def rule_cameras(rig: Rig, rule: PictureRule) -> list[tuple[str, Sensor]]:
@@ -278,23 +276,25 @@ def _lens_key(cameras: Sequence[tuple[str, Sensor]]) -> str:
 def _placed(plan: SurveyPlan, camera: Sensor, taken: TakenPictures, rule: PictureRule) -> _Placed:
     """Returns poses of a log's pictures; those without one, or of another size than the lens is for, are left out."""
     record = taken.record
-    log = PictureLog(record.key, record.run, record.sensor, plan.survey.resolve(Path(record.path)))
+    log = PictureLog(record.key, record.run, record.sensor, folder_of(plan, taken))
     source = trajectory_source(record.run, plan.records)
     mountings = mountings_of(record.run, record.sensor, camera.mounting(), load_mountings(plan.store))
     change = change_of(load_mounting_changes(plan.store), record.run, record.sensor)
     mountings = mountings if change is None else change.applied(mountings, parallel=False)
     order = np.argsort(taken.epochs_gps_ns, kind="stable")
     fits = order[_fits(camera, taken)[order]]
-    later_ns = clock_ns(load_camera_changes(plan.store).get(record.sensor))
-    poses = list(_poses(plan, source, taken.epochs_gps_ns[fits] + later_ns))
-    found = np.concatenate([p.found for p in poses]) if poses else np.zeros(0, np.bool_)
-    eye, turn = (np.concatenate(a) for a in zip(*(_eyes(p, mountings) for p in poses), strict=True))
-    eye, turn, kept = eye[found], turn[found], fits[found]
+    filmed = load_camera_changes(plan.store).get(record.sensor)
+    epochs = taken.epochs_gps_ns[fits] + clock_ns(filmed)
+    found, eye, turn = _eyes_at(plan, source, epochs, mountings)
+    motion = _row_motion(plan, camera, (source, epochs, mountings), filmed)
+    eye, turn, motion, kept = eye[found], turn[found], motion[found], fits[found]
     place, reach = _reach(plan.ground.map, source.world, eye, rule.reach_m)
     names = tuple(taken.files[i] for i in kept.tolist())
     up = -world_from_ned(source.world, eye)[:, :, 2]
     notes = _notes(log, camera, order.size - fits.size, fits.size - kept.size)
-    return _Placed(log, camera, source.world, taken.epochs_gps_ns[kept], names, eye, turn, up, place, reach, notes)
+    return _Placed(
+        log, camera, source.world, taken.epochs_gps_ns[kept], names, eye, turn, up, motion, place, reach, notes
+    )
 
 
 def _fits(camera: Sensor, taken: TakenPictures) -> npt.NDArray[np.bool_]:
@@ -320,6 +320,39 @@ def _poses(plan: SurveyPlan, source: TrajectorySource, epochs_gps_ns: Int64) -> 
     for part in np.split(epochs_gps_ns, np.flatnonzero(np.diff(pieces)) + 1):
         span = (int(part[0]), int(part[-1]))
         yield load_trajectory(plan.store, source, [span], plan.ground.max_gap_s).poses(part)
+
+
+def _eyes_at(
+    plan: SurveyPlan, source: TrajectorySource, epochs_gps_ns: Int64, mountings: Mountings
+) -> tuple[npt.NDArray[np.bool_], Float64, Float64]:
+    """Returns whether there is a pose at epochs (n,) in order, projection centres (n, 3), and rotations (n, 3, 3)."""
+    poses = list(_poses(plan, source, epochs_gps_ns))
+    found = np.concatenate([p.found for p in poses]) if poses else np.zeros(0, np.bool_)
+    eye, turn = (np.concatenate(a) for a in zip(*(_eyes(p, mountings) for p in poses), strict=True))
+    return found, eye, turn
+
+
+def _row_motion(
+    plan: SurveyPlan, camera: Sensor, exposed: tuple[TrajectorySource, Int64, Mountings], change: Float64 | None
+) -> Float64:
+    """Returns way (m) and turn (rad) of a camera (n, 6) from row to row, along its axes: the mean of a picture; 0 where
+    a pose at its first or last row is missing, and without a rolling shutter.
+
+    exposed : trajectory, epochs (n,) of the middle rows, and mountings.
+    """
+    source, epochs, mountings = exposed
+    motion = np.zeros((epochs.size, 6))
+    if camera.interior is None or not (each_ns := row_ns(camera.interior, change)):
+        return motion
+    rows = max(camera.interior.height_px - 1, 1)
+    half = round(0.5 * rows * each_ns)
+    (first, here, last) = (_eyes_at(plan, source, epochs + k * half, mountings) for k in (-1, 0, 1))
+    known = first[0] & here[0] & last[0]
+    motion[known, :3] = np.einsum("nij,nj->ni", here[2][known], last[1][known] - first[1][known]) / rows
+    # Axes from the world turn against the camera.
+    turned = first[2][known] @ last[2][known].transpose(0, 2, 1)
+    motion[known, 3:] = Rotation.from_matrix(turned).as_rotvec() / rows
+    return motion
 
 
 def _eyes(poses: Poses, mountings: Mountings) -> tuple[Float64, Float64]:

@@ -60,6 +60,21 @@ class PictureTargetsConfig(PictureTarget, SurveySection):
         return self.names.get(name) or self.codes.get(code or "", self)
 
 
+class VideoFramesConfig(SurveySection):
+    """Key frames of videos, which stand for pictures in all that pictures are used for.
+
+    Cameras need an interior orientation in the rig file.
+    """
+
+    table: ClassVar[str] = "video_frames"
+    meaning: ClassVar[str] = "Which frames of videos stand for pictures. Needs the extra `opencv`."
+
+    on: bool = True
+    """`false`: videos give no pictures."""
+    step_m: float = Field(default=1.0, gt=0.0, le=100.0)
+    """A frame is taken where the vehicle is this far (m) from where the one before was taken."""
+
+
 class PictureTiesConfig(SurveySection):
     """Tie points: what several pictures show is found, matched and handed to the adjustment of the poses.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Final, Self
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.core.camera import Interior
 from roadscan.core.extras import cv2
-from roadscan.pictures.kernels.lens import AROUND, FOLD, HEIGHT, WIDTH
+from roadscan.pictures.kernels.lens import AROUND, FOLD, HEIGHT, ROW_SHIFT, ROW_TURN, WIDTH
 from roadscan.pictures.kernels.picture_colours import sample, take_better
 
 Float64 = npt.NDArray[np.float64]
@@ -51,7 +51,7 @@ class Lens:
     """Interior orientation of a camera, and the parts of its pictures that show the vehicle."""
 
     parameters: Float64
-    """(13,) as the kernel takes them."""
+    """(19,) as the kernel takes them."""
     own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
     """Polygons of pixels (u, v) that show the survey vehicle."""
 
@@ -61,7 +61,19 @@ class Lens:
         k1, k2, p1, p2, k3 = interior.distortion
         size = float(interior.width_px), float(interior.height_px)
         around = float(interior.model == "equirectangular")
-        lens = [*interior.focal_px, *interior.principal_px, k1, k2, p1, p2, k3, _fold(k1, k2, k3), *size, around]
+        lens = [
+            *interior.focal_px,
+            *interior.principal_px,
+            k1,
+            k2,
+            p1,
+            p2,
+            k3,
+            _fold(k1, k2, k3),
+            *size,
+            around,
+            *[0.0] * 6,
+        ]
         return cls(np.array(lens), own_vehicle_px)
 
     @property
@@ -73,6 +85,17 @@ class Lens:
     def fold(self) -> float:
         """Returns the square of the tangent from which on the distortion is ambiguous."""
         return float(self.parameters[FOLD])
+
+    @property
+    def row_motion(self) -> tuple[Float64, Float64]:
+        """Returns way (3,; m) and turn (3,; rad) of the camera from row to row, along its axes, in one picture of a
+        rolling shutter; 0 elsewhere.
+        """
+        return self.parameters[ROW_SHIFT:ROW_TURN], self.parameters[ROW_TURN:]
+
+    def moving(self, row_motion: Float64) -> Lens:
+        """Returns the lens in a picture during which the camera moved by so much (6,) from row to row."""
+        return replace(self, parameters=np.concatenate([self.parameters[:ROW_SHIFT], row_motion]))
 
     @property
     def is_around(self) -> bool:
@@ -112,20 +135,24 @@ class Views:
     lens: Int64
     """(n,) number of the lens."""
     lenses: tuple[Lens, ...]
+    row_motion: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
+    """(n, 6) way (m) and turn (rad) of the camera from row to row, along its axes; (0, 6) where no shutter rolls. Poses
+    are those of the middle row."""
 
     def __len__(self) -> int:
         """Returns the number of pictures."""
         return len(self.lens)
 
     def lens_of(self, number: int) -> Lens:
-        """Returns the lens of a picture."""
-        return self.lenses[int(self.lens[number])]
+        """Returns the lens of a picture, with the motion of the camera during it."""
+        lens = self.lenses[int(self.lens[number])]
+        return lens.moving(self.row_motion[number]) if len(self.row_motion) and self.row_motion[number].any() else lens
 
     def picked(self, index: Int64) -> Views:
         """Returns a subset."""
         return Views(
             self.eye_world_m[index], self.opencv_from_world[index], self.up_world[index], self.world[index],
-            self.lens[index], self.lenses,
+            self.lens[index], self.lenses, self.row_motion[index] if len(self.row_motion) else self.row_motion,
         )  # fmt: skip
 
 

@@ -207,6 +207,7 @@ def _interior(name: str, camera: Camera) -> list[str]:
         f"focal_px = {[lens.focal_px, lens.focal_px]}",
         f"principal_px = {[float(c) for c in lens.principal_px]}",
         f"distortion = {[float(k) for k in lens.distortion]}",
+        *([f"line_time_us = {camera.line_time_us!r}"] if camera.line_time_us else []),
     ]
 
 

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.adjustment import Adjustment, adjust
 from roadscan.adjust.bundle.measurements import Measurements, Numbers, State, met_at, residuals_px, rows_of, seen
-from roadscan.adjust.bundle.solve import PictureEvidence, approached, state_of
+from roadscan.adjust.bundle.self_check import FreeCameras, free_cameras
+from roadscan.adjust.bundle.solve import Approached, PictureEvidence, approached, state_of
 from roadscan.adjust.observations import CAMERA, Observations
 from roadscan.adjust.process import CameraPrior, GaussMarkov, MountingPrior, RunPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
@@ -55,9 +56,9 @@ class Drive:
     control_m: Float64
 
 
-def _path(count: int) -> tuple[Float64, Float64]:
-    """Places (n, 3), east-north-up, and attitudes (n, 3, 3) of the body, frd, on a circle of 120 m."""
-    along = np.arange(count, dtype=np.float64) / 120.0
+def _path(count: int, late_s: float = 0.0) -> tuple[Float64, Float64]:
+    """Places (n, 3), east-north-up, and attitudes (n, 3, 3) of the body, frd, on a circle of 120 m, at 10 m/s."""
+    along = (np.arange(count, dtype=np.float64) + 10.0 * late_s) / 120.0
     place = np.stack([120.0 * np.sin(along), 120.0 * (1.0 - np.cos(along)), 1.6 + 0.02 * np.sin(3 * along)], axis=-1)
     heading = np.pi / 2 - along  # clockwise from north
     roll, pitch = 0.01 * np.sin(7.0 * along), 0.008 * np.cos(5.0 * along)
@@ -65,10 +66,11 @@ def _path(count: int) -> tuple[Float64, Float64]:
     return place, ENU_FROM_NED @ turned
 
 
-def _drive(seed: int, false: float = 0.0, lens_error: Float64 | None = None) -> Drive:
+def _drive(seed: int, false: float = 0.0, lens_error: Float64 | None = None, late_s: float = 0.0) -> Drive:
     rng = np.random.default_rng(seed)
     n = 60
     body, turned = _path(n)
+    stated_body, stated_turned = _path(n, late_s)
     stated_axes = Rotation.from_euler("y", -12, degrees=True).as_matrix() @ OPENCV
     axes = Rotation.from_rotvec(BORESIGHT_RAD).as_matrix() @ stated_axes
     points = np.concatenate([_around(rng, 400), body[5::11] + turned[5::11] @ np.array([6.0, 2.0, 1.6])])
@@ -83,11 +85,11 @@ def _drive(seed: int, false: float = 0.0, lens_error: Float64 | None = None) -> 
     for _ in range(n - 1):
         error.append(keep * error[-1] + np.sqrt(1.0 - keep**2) * rng.normal(size=6))
     shift, turn = 0.1 * np.array(error)[:, :3], np.radians(0.2) * np.array(error)[:, 3:]
-    recorded = turned @ Rotation.from_rotvec(turn).as_matrix()
+    recorded = stated_turned @ Rotation.from_rotvec(turn).as_matrix()
     exposures = Exposures(
         (Camera("a", "left", "key", Path(), RIG, LENS, LOCAL_WORLD),), np.zeros(n, np.int64),
-        FIRST_NS + STEP_NS * np.arange(n), np.array([f"{k}.png" for k in range(n)], dtype=object), body + shift,
-        recorded, np.gradient(body, 0.1, axis=0), np.zeros((n, 3)), ENU_FROM_NED.T @ recorded,
+        FIRST_NS + STEP_NS * np.arange(n), np.array([f"{k}.png" for k in range(n)], dtype=object), stated_body + shift,
+        recorded, np.gradient(stated_body, 0.1, axis=0), _rates(recorded), ENU_FROM_NED.T @ recorded,
         np.tile(LEVER_M, (n, 1)), np.tile(stated_axes, (n, 1, 1)),
     )  # fmt: skip
     surveyed = np.where((np.arange(len(points)) < control)[:, None], np.nan, points)
@@ -105,6 +107,12 @@ def _drive(seed: int, false: float = 0.0, lens_error: Float64 | None = None) -> 
     processes = tuple(GaussMarkov(s, TAU_S) for s in (0.1, 0.1, 0.1, *np.radians([0.2] * 3)))
     prior = RunPrior("a", FIRST_NS - NS_PER_S, FIRST_NS + STEP_NS * n + NS_PER_S, processes)  # type: ignore[arg-type]
     return Drive(evidence, prior, body, turned, points[control:])
+
+
+def _rates(turned: Float64) -> Float64:
+    """Turning rates (n, 3) along the axes of the body (rad/s)."""
+    steps = Rotation.from_matrix(turned[:-1].transpose(0, 2, 1) @ turned[1:]).as_rotvec() / 0.1
+    return np.concatenate([steps, steps[-1:]])
 
 
 def _around(rng: np.random.Generator, count: int) -> Float64:
@@ -132,12 +140,25 @@ def _measured(
     return picture[kept].astype(np.int64), pixel[kept], number[kept].astype(np.int64)
 
 
+MOUNTS = (MountingPrior("left", np.array([*[0.005] * 3, *np.radians([0.5] * 3), 0.0])),)
+
+
 def _solved(drive: Drive) -> tuple[Adjustment, PictureEvidence]:
-    settings = AdjustmentSettings()
-    mounts = (MountingPrior("left", np.array([*[0.005] * 3, *np.radians([0.5] * 3), 0.0])),)
-    found = approached(drive.evidence, (Observations.none(), 0), (drive.prior,), settings, mounts)
+    found = _approached(drive)
     cameras = drive.evidence.cameras
-    return adjust(found.rows.observations, (drive.prior,), settings, mounts, cameras), found.pictures
+    return adjust(found.rows.observations, (drive.prior,), AdjustmentSettings(), MOUNTS, cameras), found.pictures
+
+
+def _approached(drive: Drive) -> Approached:
+    return approached(drive.evidence, (Observations.none(), 0), (drive.prior,), AdjustmentSettings(), MOUNTS)
+
+
+def _free(drive: Drive) -> FreeCameras:
+    approach = _approached(drive)
+    found = adjust(approach.rows.observations, (drive.prior,), AdjustmentSettings(), MOUNTS, drive.evidence.cameras)
+    free = free_cameras(approach, found, AdjustmentSettings(), MOUNTS)
+    assert free is not None
+    return free
 
 
 def _body_after(drive: Drive, state: State) -> tuple[Float64, Float64]:
@@ -216,3 +237,22 @@ def test_the_order_of_measurements_changes_no_bit() -> None:
     other = replace(drive.evidence, measured=drive.evidence.measured.at(order), enters=drive.evidence.enters[order])
     one, two = _solved(drive)[0], _solved(replace(drive, evidence=other))[0]
     np.testing.assert_allclose(one.values[0], two.values[0], atol=1e-9)
+
+
+def test_a_right_camera_is_not_told_to_be_wrong() -> None:
+    for seed in range(3):
+        free = _free(_drive(seed))
+        assert [free.off(0, name)[0] for name in ("focal_x_px", "focal_y_px", "k1", "clock_s")] == [0.0] * 4
+
+
+@pytest.mark.parametrize("share", [0.1, 0.03, -0.03])
+def test_a_focal_length_that_is_wrong_is_found(share: float) -> None:
+    error, sigma = _free(_drive(3, lens_error=np.array([share * 784.0]))).off(0, "focal_x_px")
+    assert abs(error - share * 784.0) < 4.0 * sigma and sigma < 0.01 * 784.0
+
+
+@pytest.mark.parametrize("late_s", [0.1, -0.1])
+def test_stamps_of_the_pictures_beside_are_found(late_s: float) -> None:
+    error, sigma = _free(_drive(3, late_s=late_s)).off(0, "clock_s")
+    # Steps as long as a picture are not linear: the size is right to a third.
+    assert error == pytest.approx(-late_s, rel=0.33) and sigma < 0.01

@@ -10,7 +10,7 @@ from roadscan.colours.kernels.looks import STEPS, UNKNOWN, Camera
 from roadscan.colours.tasks.depths import _kept
 
 FOCAL, WIDTH, HEIGHT = 400.0, 480, 320
-LENS = np.array([FOCAL, FOCAL, 239.5, 159.5, 0, 0, 0, 0, 0, np.inf, WIDTH, HEIGHT, 0.0])
+LENS = np.array([FOCAL, FOCAL, 239.5, 159.5, 0, 0, 0, 0, 0, np.inf, WIDTH, HEIGHT, 0.0, *[0.0] * 6])
 CAMERA = Camera(np.zeros(3), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), LENS)
 """It looks to the north; the map's x is to the right."""
 RULE = DepthRule(moment_ns=60_000_000, grazing_deg=3.0, edge_px=2.0)

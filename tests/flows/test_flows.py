@@ -83,8 +83,8 @@ def test_survey_makes_every_product(survey_file: Path, simulated: SimulatedSurve
     ids = FlowRunFilter(id=FlowRunFilterId(any_=[run.id]))
     tasks = sorted(client.read_task_runs(flow_run_filter=ids), key=lambda t: t.expected_start_time)
     assert [t.name for t in tasks] == [
-        "ingest", "navigate", "footprints", "picture_ties", "adjust", "strips", "tiles", "pictures", "surfaces",
-        "products", "condition", "assets", "colours",
+        "ingest", "navigate", "footprints", "strips", "video_frames", "picture_ties", "adjust", "tiles", "pictures",
+        "surfaces", "products", "condition", "assets", "colours",
     ]  # fmt: skip
 
     clouds = files(survey_file, "tiles/las").values()

@@ -22,7 +22,7 @@ from roadscan.colours.kernels.looks import (
 WIDTH, HEIGHT, FOCAL = 160, 120, 100.0
 DISTORTION = (-0.1, 0.02, 0.001, -0.002, 0.0)
 EYE = np.array([1.0, 2.0, 3.0])
-LENS = np.array([FOCAL, FOCAL, 79.5, 59.5, *DISTORTION, 3.0, WIDTH, HEIGHT, 0.0])
+LENS = np.array([FOCAL, FOCAL, 79.5, 59.5, *DISTORTION, 3.0, WIDTH, HEIGHT, 0.0, *[0.0] * 6])
 AXES = cv2.Rodrigues(np.array([0.1, -0.2, 0.05]))[0]
 CAMERA = Camera(EYE, AXES, LENS)
 

@@ -283,7 +283,7 @@ def test_ground_about_a_hole() -> None:
 def test_the_nearer_picture_shows_a_point_and_its_colour_is_bilinear() -> None:
     point, best = np.array([[0.0, 0.0, 5.0]]), np.full(1, np.inf)
     chosen, pixel = np.full(1, -1, np.int32), np.zeros((1, 2))
-    lens = np.array([100.0, 100, 10, 8, 0, 0, 0, 0, 0, 9, 21, 17, 0])
+    lens = np.array([100.0, 100, 10, 8, 0, 0, 0, 0, 0, 9, 21, 17, 0, *[0.0] * 6])
     limits, up, hidden = np.array([1e4, 0.0, 0.0]), np.array([0.0, 0.0, -1.0]), np.zeros((0, 0), bool)
     for number, eye in ((4, [0.0, 0.0, 0.0]), (5, [0.1, 0.0, 1.0]), (6, [0.0, 0.0, -3.0])):
         take_better(point, np.array(eye), np.eye(3), up, lens, limits, hidden, number, best, chosen, pixel)

@@ -57,6 +57,30 @@ def test_a_second_run_makes_nothing(place: Place, drive: tuple[Path, list[str]])
     assert {one: (one.stat().st_mtime_ns, one.read_bytes()) for one in tables} == before
 
 
+def test_right_lens_and_stamps_are_not_doubted(drive: tuple[Path, list[str]]) -> None:
+    assert not [line for line in drive[1] if "say of the lens" in line or "if stamps are" in line]
+
+
+@pytest.mark.witness("picture_lens")
+def test_a_wrong_lens_is_told(place: Place, recording: Path, tmp_path: Path) -> None:
+    file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, CHOSEN)
+    rig = (tmp_path / "rig.toml").read_text()
+    (tmp_path / "rig.toml").write_text(rig + "distortion = [-0.1, 0.0, 0.0, 0.0, 0.0]\n")
+    assert any("say of the lens: distortion k1 +0.0" in line for line in place.run(file))
+
+
+@pytest.mark.witness("picture_stamps")
+def test_stamps_of_the_pictures_before_are_told(place: Place, recording: Path, tmp_path: Path) -> None:
+    file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(8, 30))
+    stamps = tmp_path / "pictures" / "stamps.csv"
+    head, *rows = stamps.read_text().splitlines()
+    names, times = zip(*(row.split(",") for row in rows), strict=True)
+    moved = [f"{name},{time}" for name, time in zip(names[1:], times[:-1], strict=True)]
+    stamps.write_text("\n".join([head, *moved]) + "\n")
+    (tmp_path / "pictures" / names[0]).unlink()
+    assert any("if stamps are early by 1 picture;" in line for line in place.run(file))
+
+
 @pytest.mark.witness("odd_pictures")
 def test_bad_pictures_are_named_and_the_others_go_on(place: Place, recording: Path, tmp_path: Path) -> None:
     file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(8))

@@ -67,8 +67,8 @@ def test_renewing_forgets_what_follows_and_nothing_before(finished: Simulated, c
 def test_stages_come_after_those_that_they_need() -> None:
     names = [stage.name for stage in stages()]
     assert [n for n in names if n != "levels"] == [
-        "ingest", "navigate", "footprints", "picture_ties", "adjust", "strips", "tiles", "pictures", "surfaces",
-        "products", "condition", "assets", "colours",
+        "ingest", "navigate", "footprints", "strips", "video_frames", "picture_ties", "adjust", "tiles", "pictures",
+        "surfaces", "products", "condition", "assets", "colours",
     ]  # fmt: skip
     for stage in stages():
         assert all(names.index(before) < names.index(stage.name) for before in stage.after)

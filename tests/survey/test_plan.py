@@ -68,7 +68,7 @@ def test_before_a_run_all_logs_are_due_and_the_rest_waits(simulated: Simulated, 
     assert {"scans", "returns", "trajectory", "control_points", "rejects"} == ingest["writes"].keys()
     assert found["tiles"]["due"] is None and found["tiles"]["waits_for"] == "ingest"
     assert [name for name, one in found.items() if one["state"] == "passed over"] == [
-        "picture_ties", "adjust", "pictures", "surfaces", "condition", "assets", "colours",
+        "video_frames", "picture_ties", "adjust", "pictures", "surfaces", "condition", "assets", "colours",
     ]  # fmt: skip
     assert list(found) == [stage.name for stage in stages()]
     text = printed(place, "plan")
@@ -165,7 +165,7 @@ def test_the_picture_shows_each_stage_and_what_it_writes(copy: Simulated, tmp_pa
         assert left + float(one.get("width", "0")) <= width and top + float(one.get("height", "0")) <= height
     assert any("cells 15" in word for word in words)
     classes = Counter(one.get("class") for one in root.findall("svg:rect", names))
-    assert classes["over"] == 7 and classes["current"] == len(found) - 7
+    assert classes["over"] == 8 and classes["current"] == len(found) - 8
 
 
 def test_a_picture_of_another_kind_is_refused(copy: Simulated, tmp_path: Path) -> None:

@@ -136,6 +136,7 @@ def test_second_run_does_nothing(finished: Simulated) -> None:
         "ingest:",
         "navigate:",
         "footprints:",
+        "video_frames:",
         "picture_ties:",
         "adjust:",
         "strips:",

@@ -14,7 +14,6 @@ from roadscan.adjust.adjustment import Adjustment
 from roadscan.adjust.bundle.measurements import Measurements, State, met_at, residuals_px, seen
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, state_of
 from roadscan.adjust.control.control import ControlPoint
-from roadscan.adjust.observations import KINDS
 from roadscan.pictures.ties.tracks import places_of
 from roadscan.poses.trajectory import world_from_ned
 

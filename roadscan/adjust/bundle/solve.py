@@ -81,6 +81,8 @@ class Approached:
     """(m,) of each measurement; 0 of one without a row, for instance where no other picture counts for its point."""
     sigma_px: float
     """1 σ of a tie point; NaN where there is none."""
+    others: tuple[Observations, int]
+    """All other observations, and the place that stands for control point 0."""
 
 
 def state_of(found: Adjustment) -> State:
@@ -123,7 +125,7 @@ def approached(
     for number in range(1, _MOST + 1):
         measured = pictures.measured
         where = seen(measured, state, pictures.numbers)
-        rows = _entering(pictures, where, (met_at(measured, where, weight), first), weight, heavy)
+        rows = entering(pictures, where, (met_at(measured, where, weight), first), weight, heavy)
         if len(before):
             settled = number > _WIDE.size and _change(before, rows.residual_px, weight) < _SETTLED_PX
         if settled or number == _MOST:
@@ -142,7 +144,7 @@ def approached(
     sigma = float(np.median(tied)) if tied.size else float("nan")
     entered = np.isin(np.arange(weight.size), rows.measurement)
     weight = np.where(entered, weight, 0.0)
-    return Approached(pictures, _sharing(rows, pictures, weight), weight, sigma)
+    return Approached(pictures, _sharing(rows, pictures, weight), weight, sigma, others)
 
 
 def _sharing(rows: Rows, pictures: PictureEvidence, weight: Float64) -> Rows:
@@ -226,7 +228,7 @@ def _lengths_px(measured: Measurements, where: Seen, weight: Float64) -> Float64
     return np.where(np.isfinite(away), away, np.inf)
 
 
-def _entering(
+def entering(
     pictures: PictureEvidence, where: Seen, points: tuple[Float64, Int64], weight: Float64, heavy: float
 ) -> Rows:
     """Returns the rows of measurements that count; a weight below 1 is a larger σ of a tie point.

@@ -19,7 +19,13 @@ from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
 from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.bundle import asks_pictures, pictures_key, pictures_of
-from roadscan.adjust.tasks.cameras import picture_findings, picture_lines, picture_rows, publish_cameras
+from roadscan.adjust.tasks.cameras import (
+    camera_findings,
+    picture_findings,
+    picture_lines,
+    picture_rows,
+    publish_cameras,
+)
 from roadscan.adjust.tasks.control_lines import lines_line
 from roadscan.adjust.tasks.control_work import (
     SIGHTINGS,
@@ -280,11 +286,11 @@ def adjust_survey(session: Session) -> None:
     filmed = [] if solution.pictures is None else list(residuals_of(solution.pictures))
     keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), shown, filmed), seen.rows)
     lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
-    lines += picture_lines(solution.pictures, solution.cameras)
+    lines += picture_lines(solution.pictures, solution.cameras, solution.free)
     if config.mode in ("joint", "vertical"):
         doubts += failed_ties(evidence.ties, solution.tie_weight)
     doubts += [*solution.findings, *unsettled, *mounting_findings(solution.mountings)]
-    doubts += picture_findings(solution.pictures)
+    doubts += [*picture_findings(solution.pictures), *camera_findings(solution.free)]
     doubts += _of_points(work, evidence.sightings)
     _keep(session, key, held, (lines, doubts), failed=collector.lacks)
 

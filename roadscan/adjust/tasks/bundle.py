@@ -21,8 +21,8 @@ from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
 from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.clock_tables import load_clocks
-from roadscan.navigation.tasks.taken_pictures import taken_pictures
 from roadscan.pictures.exposures import Exposures, exposures_of
+from roadscan.pictures.frames.chosen import camera_pictures
 from roadscan.pictures.points import TABLE, measured_points
 from roadscan.pictures.settings import PictureTiesConfig
 from roadscan.pictures.ties.work import ALL, TRACKS
@@ -51,7 +51,7 @@ def exposure_epochs(plan: SurveyPlan) -> dict[str, Int64]:
     """Returns the epochs (e,), ascending, of the pictures of each run; none where pictures take no part."""
     found: dict[str, list[Int64]] = {}
     for name in adjusted_cameras(plan.survey):
-        for taken in taken_pictures(plan.store, plan.records, name):
+        for taken in camera_pictures(plan, name):
             found.setdefault(taken.record.run, []).append(taken.epochs_gps_ns)
     epochs = {run: np.unique(np.concatenate(parts)) for run, parts in found.items()}
     return {run: own for run, own in epochs.items() if own.size}

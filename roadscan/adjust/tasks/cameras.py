@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import CameraErrors
 from roadscan.adjust.bundle.outcome import ControlOfPictures, PictureOutcome
+from roadscan.adjust.bundle.self_check import FreeCameras
 from roadscan.adjust.tasks.figures import Rows
 from roadscan.core.counted import counted
 from roadscan.core.witness import Finding, Witness
@@ -33,6 +34,26 @@ PICTURE_FIT: Final = Witness(
     does="it is told; the measurements that disagree do not count",
     told=("findings",),
 )
+PICTURE_LENS: Final = Witness(
+    "picture_lens",
+    input="pictures",
+    fault="The lens is not the one that the rig file states: another zoom or camera, or pictures that were rectified.",
+    asks="tie points and the turns of the poses: focal length and k1 that they have without those that are stated",
+    does="it is told; the lens is used as stated, with its σ",
+    told=("findings",),
+)
+PICTURE_STAMPS: Final = Witness(
+    "picture_stamps",
+    input="pictures",
+    fault="The stamps of the pictures are late or early, or those of the pictures before or after.",
+    asks="tie points and the turns of the poses: the time by which one follows the other",
+    does="it is told; the stamps are used as they are, with their σ",
+    told=("findings",),
+)
+_LEAST_FOCAL: Final = 0.01
+"""A focal length is told to be wrong from this share on: 0.2 m across at 20 m."""
+_LEAST_K1: Final = 0.01  # k1 is told to be wrong from here on: half a pixel at 250 px from the middle of a usual lens.
+_LEAST_CLOCK_S: Final = 0.005  # A clock is told to be wrong from here on (s): 10 cm at 70 km/h.
 _WORDS: Final = {
     "focal_x_px": ("focal length", 1.0, "px"), "centre_x_px": ("principal point, right", 1.0, "px"),
     "centre_y_px": ("principal point, down", 1.0, "px"), "k1": ("k1", 1.0, ""), "clock_s": ("clock", 1e3, "ms"),
@@ -121,7 +142,56 @@ def picture_findings(found: PictureOutcome | None) -> list[Finding]:
     return [PICTURE_FIT.finds("pictures", said)]
 
 
-def picture_lines(found: PictureOutcome | None, cameras: CameraErrors | None) -> list[str]:
+def camera_findings(free: FreeCameras | None) -> list[Finding]:
+    """Returns findings on lenses and clocks that are not what the rig file and the stamps say."""
+    if free is None:
+        return []
+    # Stamps that are wrong bend what is found of the lens: that is told once they are mended.
+    return [said for k in range(len(free.stated)) for said in _of_clock(free, k) or _of_lens(free, k)]
+
+
+def _of_lens(free: FreeCameras, k: int) -> list[Finding]:
+    """Returns a finding where the focal length or k1 of a camera is not the stated one."""
+    focal, said = float(free.focal_px[k]), list[str]()
+    for name, word, least in (
+        ("focal_x_px", "focal length", _LEAST_FOCAL * focal), ("focal_y_px", "focal length", _LEAST_FOCAL * focal),
+        ("k1", "distortion k1", _LEAST_K1),
+    ):  # fmt: skip
+        error, sigma = free.off(k, name)
+        if abs(error) > least and not any(word in one for one in said):
+            unit = " px" if word == "focal length" else ""
+            said.append(f"{word} {error:+.3g}{unit} (σ {sigma:.2g}) from the stated one")
+    if not said:
+        return []
+    text = (
+        f"tie points, and the turns of the poses, say of the lens: {', '.join(said)}; it is used as stated, and poses "
+        "take up the difference. Calibrate it (roadscan camera interior), or state how well it is known "
+        "(adjust.cameras)"
+    )
+    return [PICTURE_LENS.finds(free.stated[k].sensor, text)]
+
+
+def _of_clock(free: FreeCameras, k: int) -> list[Finding]:
+    """Returns a finding where the stamps of a camera are not those of the poses."""
+    (error, sigma), lag = free.off(k, "clock_s"), free.lag[k]
+    if lag:
+        side = "late" if lag > 0 else "early"
+        turns = "the turns from picture to picture are those of the poses"
+        said = f"{turns} if stamps are {side} by {counted(abs(lag), 'picture')}"
+    elif abs(error) > _LEAST_CLOCK_S:
+        said = (
+            f"pictures turn as the poses do if {1e3 * error:+.0f} ms (σ {1e3 * sigma:.0f} ms) are added to their stamps"
+        )
+    else:
+        return []
+    text = (
+        f"{said}; stamps are used as they are, and poses take up the difference. Mend the stamps, or let the "
+        "adjustment estimate a clock that is off by less than a picture (adjust.cameras.sigma_clock_s)"
+    )
+    return [PICTURE_STAMPS.finds(free.stated[k].sensor, text)]
+
+
+def picture_lines(found: PictureOutcome | None, cameras: CameraErrors | None, free: FreeCameras | None) -> list[str]:
     """Returns what pictures said, in words."""
     if found is None:
         return []
@@ -145,10 +215,10 @@ def picture_lines(found: PictureOutcome | None, cameras: CameraErrors | None) ->
                 f"{counted(len(own), word[:-1])} in pictures: RMS in space {1e3 * was:.0f} mm before, "
                 f"{1e3 * now:.1f} mm after"
             )
-    return [*lines, *_camera_lines(cameras), *found.notes]
+    return [*lines, *_camera_lines(cameras, free), *found.notes]
 
 
-def _camera_lines(cameras: CameraErrors | None) -> list[str]:
+def _camera_lines(cameras: CameraErrors | None, free: FreeCameras | None) -> list[str]:
     lines = list[str]()
     if cameras is None:
         return lines
@@ -157,8 +227,8 @@ def _camera_lines(cameras: CameraErrors | None) -> list[str]:
         for name, (word, factor, unit) in _WORDS.items():
             column = COLUMNS.index(name)
             error, sigma, prior = (v[k, column] for v in (cameras.error, cameras.sigma, cameras.prior_sigma))
-            if name == "focal_x_px" and prior > 0.0 and sigma >= _KNOWN * prior:
-                words.append("its focal length is not checked by these pictures")
+            if name == "focal_x_px" and prior > 0.0 and sigma >= _KNOWN * prior and free is not None:
+                words.append(f"a focal length that is off by more than {free.seen_from(k):.1%} would show")
             if prior > 0.0 and sigma < _KNOWN * prior:
                 words.append(f"{word} {factor * error:+.3g} {unit} (σ {factor * sigma:.2g})".replace("  ", " "))
         if words:

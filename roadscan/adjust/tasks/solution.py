@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, CameraErrors, ControlErrors, MountingErrors, adjust
 from roadscan.adjust.bundle.outcome import PictureOutcome, outcome_of
+from roadscan.adjust.bundle.self_check import FreeCameras, free_cameras
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, approached
 from roadscan.adjust.control.control import ControlPoint, SeenBy, Sighting, observations_of
 from roadscan.adjust.control.control_faults import WrongPoint, datum_fault, far_in_height
@@ -133,6 +134,8 @@ class Solution:
     """Errors of lenses and clocks; None where no picture takes part."""
     pictures: PictureOutcome | None = None
     """What is left in pictures."""
+    free: FreeCameras | None = None
+    """What they say of lenses and clocks without what is stated of these."""
 
     def point(self, number: int, run: int) -> PointFigures | None:
         """Returns figures of a point as a run saw it."""
@@ -230,6 +233,11 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     found += offset_findings(adjusted.verdict, adjusted.applied, counting)
     found += shift_findings(adjusted.verdict.shift) + run_findings(evidence.runs, adjusted.run_factors)
     outcome = None if approach is None else outcome_of(approach, adjusted, evidence.points)
+    free = (
+        None
+        if approach is None
+        else free_cameras(approach, adjusted, _settings(config, "joint"), evidence.mounted.priors)
+    )
     joined = evidence.ties.observations.chosen(weight > 0.0)
     found += _not_held(evidence, joined.run, control.chosen(entering), points)
     found += fixed_findings(adjusted.fixed, config.control.false_alarm)
@@ -250,7 +258,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
         corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),
         _left_out(adjusted.control, first, evidence), datum_figures(adjusted.verdict, adjusted.applied),
         adjusted.mountings if adjusted.mountings.sensors else None,
-        adjusted.cameras if approach else None, outcome,
+        adjusted.cameras if approach else None, outcome, free,
     )  # fmt: skip
 
 
@@ -282,8 +290,7 @@ def _adjusted(
     ties = evidence.ties.observations
     first = int(ties.place.max(initial=-1)) + 1
     joined = Observations.joined([ties.chosen(_entering(evidence)), replace(control, place=control.place + first)])
-    rules = {name: getattr(config.control, name) for name in ControlRules.model_fields}
-    settings = AdjustmentSettings(mode=mode, **config.solver.model_dump(), **rules)
+    settings = _settings(config, mode)
     priors, cameras, approach = evidence.mounted.priors, list[CameraPrior](), None
     if evidence.pictures is not None and mode == "joint":
         approach = approached(evidence.pictures, (joined, first), evidence.priors, settings, priors)
@@ -320,6 +327,11 @@ def _adjusted(
             sigma=np.where(wrong[:, None], found.mountings.sigma, estimated.sigma),
         )
     return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named, approach
+
+
+def _settings(config: AdjustConfig, mode: Literal["joint", "each_pass", "vertical"]) -> AdjustmentSettings:
+    rules = {name: getattr(config.control, name) for name in ControlRules.model_fields}
+    return AdjustmentSettings(mode=mode, **config.solver.model_dump(), **rules)
 
 
 def _without(sigma: Float64, axes: Sequence[int]) -> Float64:

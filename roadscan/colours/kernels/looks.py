@@ -32,7 +32,7 @@ class Camera(NamedTuple):
     axes: npt.NDArray[np.float64]
     """(3, 3) camera axes from the map."""
     lens: npt.NDArray[np.float64]
-    """(13,) in the order of `roadscan.pictures.kernels.lens`."""
+    """(19,) in the order of `roadscan.pictures.kernels.lens`."""
 
 
 class Depths(NamedTuple):

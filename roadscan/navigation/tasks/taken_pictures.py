@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import datetime as dt
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.ids import of_run
 from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.store.logs import LogRecord
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
-_COLUMNS = ["epoch_gps_ns", "file", "width_px", "height_px"]
+Int64 = npt.NDArray[np.int64]
+
+_COLUMNS = ["epoch_gps_ns", "file", "frame", "width_px", "height_px"]
 
 
 @dataclass(frozen=True)
@@ -22,16 +28,30 @@ class TakenPictures:
     """The pictures of one log, in the order of the table."""
 
     record: LogRecord
-    epochs_gps_ns: npt.NDArray[np.int64]
+    epochs_gps_ns: Int64
     """(n,) epochs with the camera's clock corrected."""
     files: tuple[str, ...]
-    """(n,) path relative to the log's folder; for frames of a video its name."""
-    size_px: npt.NDArray[np.int64]
+    """(n,) path relative to the log's folder; frame 120 of clip.mp4 is clip-000120.jpg."""
+    size_px: Int64
     """(n, 2) width and height, 0 where unknown."""
+    since_first_ns: Int64
+    """(n,) time since the first frame of a video, by its container; 0 of pictures."""
+
+    @property
+    def is_video(self) -> bool:
+        """Returns True where they are frames of a video."""
+        return self.record.attributes.get("kind") == "video"
+
+    def at(self, rows: Int64) -> Self:
+        """Returns a subset (k,)."""
+        return replace(
+            self, epochs_gps_ns=self.epochs_gps_ns[rows], files=tuple(self.files[k] for k in rows.tolist()),
+            size_px=self.size_px[rows], since_first_ns=self.since_first_ns[rows],
+        )  # fmt: skip
 
 
 def taken_pictures(store: Store, records: Sequence[LogRecord], sensor: str) -> list[TakenPictures]:
-    """Yield pictures of a camera, log by log."""
+    """Yield pictures of a camera, log by log; of a video all frames."""
     clocks = load_clocks(store)
     found = []
     for record in records:
@@ -40,9 +60,13 @@ def taken_pictures(store: Store, records: Sequence[LogRecord], sensor: str) -> l
         clock = of_run(clocks, record.run, sensor)
         for file in record.tables.get("images", ()):
             rows = read_groups(store, file.path, range(len(file.group_rows)), _COLUMNS)
-            epochs = rows.column("epoch_gps_ns").to_numpy()
-            epochs = epochs if clock is None else clock.applied(epochs)
+            logged = rows.column("epoch_gps_ns").to_numpy()
+            epochs = logged if clock is None else clock.applied(logged)
             sizes = [rows.column(c).fill_null(0).to_numpy().astype(np.int64) for c in ("width_px", "height_px")]
-            names = tuple(rows.column("file").to_pylist())
-            found.append(TakenPictures(record, epochs, names, np.stack(sizes, axis=-1)))
+            names, since = tuple(rows.column("file").to_pylist()), np.zeros(logged.size, np.int64)
+            if record.attributes.get("kind") == "video":
+                frames = rows.column("frame").to_pylist()
+                names = tuple(f"{PurePosixPath(n).stem}-{k:06d}.jpg" for n, k in zip(names, frames, strict=True))
+                since = logged - gps_ns_from_utc(dt.datetime.fromisoformat(str(record.attributes["first_utc"])))
+            found.append(TakenPictures(record, epochs, names, np.stack(sizes, axis=-1), since))
     return found

@@ -28,7 +28,7 @@ def take_better(point_m, eye_m, turn, up, lens, limits, hidden, number, best, ch
     eye_m : (3,) where the camera was.
     turn : (3, 3) camera axes (x right, y down, z ahead) from world.
     up : (3,) unit vector.
-    lens : (13,) parameters in the order of `roadscan.pictures.kernels.lens`.
+    lens : (19,) parameters in the order of `roadscan.pictures.kernels.lens`.
     limits : (3,) in the order above.
     hidden : (height, width) bool, pixels that are not used; (0, 0) where there are none.
     number : the picture's number in `chosen`.

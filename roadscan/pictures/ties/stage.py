@@ -64,7 +64,7 @@ class PictureTies(Stage):
 
     name = "picture_ties"
     title = "tie points: what several pictures show, for the adjustment of the poses"
-    after = ("navigate",)
+    after = ("navigate", "video_frames")
     section = "picture_ties"
     units = "pictures"
     reads = ("images", "trajectory", "trajectory_accuracy", "clocks", "mountings")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -17,10 +17,12 @@ from roadscan.core.ids import of_run
 from roadscan.core.rig import Sensor
 from roadscan.georeference.picture_axes import camera_from_map, map_from_ned
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
-from roadscan.georeference.sources import MOUNTING_SIGMAS, load_mountings
+from roadscan.georeference.sources import MOUNTING_COLUMNS, MOUNTING_SIGMAS, key_of_row, load_mountings
 from roadscan.measuring.orientation import nearest_rotation
 from roadscan.navigation.tasks.pose_sigma import pose_sigma, stated_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_corrections, load_trajectory
+from roadscan.pictures.camera_changes import TABLE as CAMERA_CHANGES
+from roadscan.pictures.lens import PARAMETERS
 from roadscan.pictures.placed import Pictures
 from roadscan.poses.trajectory import world_from_ned
 from roadscan.store.small_tables import read_small
@@ -30,6 +32,10 @@ Int64 = npt.NDArray[np.int64]
 
 _WORDS: Final = {0: "position", 3: "roll, pitch, heading"}
 """Words for the components of a pose, by the first of each."""
+_LENS_WORDS: Final = {"focal length": slice(0, 2), "principal point": slice(2, 4), "distortion": slice(4, 9)}
+"""Words for the parameters of a lens, with their place among `PARAMETERS`."""
+_MOUNTED: Final = 12
+"""Errors of a picture's pose and mounting; those of its lens follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +58,8 @@ class PicturePoses:
     move the camera (north, east, down; m) and turn it (about north, east, down; rad)."""
     sigma: Float64
     """(n, 12) 1 σ of those errors (m and rad)."""
+    lens_sigma: Float64
+    """(n, 9) 1 σ of the lens's `PARAMETERS`; NaN where nothing states it."""
     told: tuple[str, ...]
     """(n,) which σ are assumed because nothing states them; "" where all are stated."""
     correlation_s: float
@@ -72,15 +80,26 @@ class PicturePoses:
         scaled = self.influence * self.sigma[:, None, :]
         return scaled @ scaled.transpose(0, 2, 1)
 
-    def correlation(self, first: int, second: int) -> Float64:
-        """Return the correlation (12,) of the errors of two pictures.
+    def sigmas(self, number: int) -> Float64:
+        """Return 1 σ (21,) of the errors of a picture's pose, mounting and lens; 0 for what is not stated of a lens."""
+        return np.concatenate([self.sigma[number], np.nan_to_num(self.lens_sigma[number])])
 
-        Errors of poses fade over time within a run and are independent between runs; a mounting is one error.
+    def assumed(self, number: int) -> str:
+        """Return which σ of a picture's pose, mounting and lens nothing states; "" where all are stated."""
+        missing = [words for words, part in _LENS_WORDS.items() if np.isnan(self.lens_sigma[number, part]).all()]
+        lens = f"lens without σ of {', '.join(missing)}, taken as 0" if missing else ""
+        return "; ".join(filter(None, (self.told[number], lens)))
+
+    def correlation(self, first: int, second: int) -> Float64:
+        """Return the correlation (21,) of the errors of two pictures.
+
+        Errors of poses fade over time within a run and are independent between runs; a mounting is one error, and so
+        is a lens.
         """
         pictures = self.pictures
         one, other = (pictures.logs[pictures.log[k]] for k in (first, second))
         apart_s = abs(int(pictures.epochs_gps_ns[first]) - int(pictures.epochs_gps_ns[second])) / NS_PER_S
-        out = np.zeros(12)
+        out = np.zeros(_MOUNTED + len(PARAMETERS))
         out[:6] = np.exp(-apart_s / self.correlation_s) if one.run == other.run else 0.0
         out[6:] = 1.0 if one.sensor == other.sensor else 0.0
         return out
@@ -101,14 +120,16 @@ def picture_poses(plan: SurveyPlan, pictures: Pictures) -> PicturePoses:
         level[own] = world_from_ned(world, eye).transpose(0, 2, 1) @ turn.transpose(0, 2, 1)
         if world != LOCAL_WORLD:
             geographic[own] = geodetic_from_world(world, eye)
-    influence, sigma = np.zeros((count, 6, 12)), np.zeros((count, 12))
+    influence, sigma = np.zeros((count, 6, _MOUNTED)), np.zeros((count, _MOUNTED))
+    lens_sigma = np.zeros((count, len(PARAMETERS)))
     told = np.full(count, "", object)
     for number in np.unique(pictures.log).tolist():
         own = np.flatnonzero(pictures.log == number)
         influence[own], sigma[own], told[own] = _errors(plan, pictures, number, own, level[own])
+        lens_sigma[own] = _lens_sigma(plan, pictures.logs[number].sensor)
     settings = plan.survey.config.navigation.calibration
     return PicturePoses(
-        pictures, place, geographic, from_map, slope, level, influence, sigma, tuple(told.tolist()),
+        pictures, place, geographic, from_map, slope, level, influence, sigma, lens_sigma, tuple(told.tolist()),
         settings.traverse_time_constant_s,
     )  # fmt: skip
 
@@ -158,7 +179,7 @@ def _pose_sigma(plan: SurveyPlan, source: TrajectorySource, epochs: Int64) -> tu
 
 
 def _mounting_sigma(plan: SurveyPlan, run: str, sensor: str, camera: Sensor, epochs: Int64) -> tuple[Float64, str]:
-    """Return 1 σ (k, 6; m and rad) of a camera's mounting: calibrated, else the rig file's; 0 where none is stated."""
+    """Return 1 σ (k, 6; m and rad) of a camera's mounting: adjusted, else calibrated, else the rig file's, else 0."""
     lever, turn = camera.lever_arm_sigma_m, camera.boresight_sigma_deg
     stated = np.array([*(lever or (np.nan,) * 3), *np.radians(turn or (np.nan,) * 3)])
     sigma = np.tile(stated, (epochs.size, 1))
@@ -170,8 +191,32 @@ def _mounting_sigma(plan: SurveyPlan, run: str, sensor: str, camera: Sensor, epo
         values = np.array([np.nan if row[name] is None else row[name] for name in MOUNTING_SIGMAS])
         values[3:] = np.radians(values[3:])
         sigma[epochs >= row["valid_from_gps_ns"]] = values
+    changes = read_small(plan.store, "mounting_corrections")
+    held = {key_of_row(row): row for row in ([] if changes is None else changes.to_pylist())}
+    sigma = _adjusted(held.get((run, sensor), held.get(("*", sensor))), MOUNTING_COLUMNS[:6], sigma)
     unknown = bool(np.isnan(sigma).any())
     return np.nan_to_num(sigma), "mounting without σ, taken as 0" if unknown else ""
+
+
+def _lens_sigma(plan: SurveyPlan, sensor: str) -> Float64:
+    """Return 1 σ (9,) of a camera's lens, `PARAMETERS`: adjusted, else the rig file's; NaN where nothing states it."""
+    interior = plan.survey.rig.sensors[sensor].interior
+    if interior is None or interior.model == "equirectangular":
+        return np.zeros(len(PARAMETERS))
+    two, five = (np.nan,) * 2, (np.nan,) * 5
+    stated = [*(interior.sigma_focal_px or two), *(interior.sigma_principal_px or two)]
+    stated += interior.sigma_distortion or five
+    table = read_small(plan.store, CAMERA_CHANGES)
+    held = {row["sensor"]: row for row in ([] if table is None else table.to_pylist())}
+    return _adjusted(held.get(sensor), PARAMETERS, np.array(stated))
+
+
+def _adjusted(row: Mapping[str, Any] | None, names: Sequence[str], sigma: Float64) -> Float64:
+    """Return σ (…, k) of named values with those after an adjustment, for the values that it estimated."""
+    if row is None:
+        return sigma
+    after, prior = (np.array([row[f"{w}sigma_{n}"] or 0.0 for n in names], np.float64) for w in ("", "prior_"))
+    return np.where(prior > 0.0, after, sigma)
 
 
 def _cross(vector: Float64) -> Float64:

@@ -6,9 +6,7 @@ out is parsed again and has to mean the old file with just these changes, or not
 
 from __future__ import annotations
 
-import os
 import re
-import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +17,7 @@ from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.rig import Rig
 from roadscan.core.strict import load_toml
 from roadscan.core.toml_text import toml, toml_key
+from roadscan.core.whole_file import replace_file
 
 _KEY: Final = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')"""
 _DOTTED: Final = rf"{_KEY}(?:[ \t]*\.[ \t]*{_KEY})*"
@@ -96,25 +95,8 @@ def update_rig_file(file: Path, sensor: str, values: Mapping[str, Any]) -> Rig:
     text = file.read_bytes().decode("utf-8")
     out = changed_rig_text(text, sensor, values, file=file)
     rig = Rig.parse(tomllib.loads(out), file=file)
-    _replace(file, out.encode("utf-8"))
+    replace_file(file, out.encode("utf-8"))
     return rig
-
-
-def _replace(file: Path, content: bytes) -> None:
-    """Replace the file atomically: readers see the old content or the new."""
-    target = file.resolve()
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.chmod(target.stat().st_mode & 0o7777)
-        temporary.replace(target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise ConfigError(f"the file cannot be written ({error})", file=file) from error
 
 
 def _with_value(text: str, sensor: str, key: str, value: Any, file: str | Path | None) -> str:

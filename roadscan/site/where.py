@@ -45,6 +45,8 @@ class PictureOfPlace:
     sigma_u_px: float
     """1 σ of `u_px`, from those of pose, mounting, lens and the place itself."""
     sigma_v_px: float
+    name: str
+    """RUN/CAMERA/FILE."""
 
 
 def pictures_of_place(
@@ -90,8 +92,9 @@ def pictures_of_place(
         point = pictures.views.opencv_from_world[view] @ (
             worlds[pictures.views.world[view]][0, 0] - pictures.views.eye_world_m[view]
         )
-        spread = np.sqrt(np.diag(pixel_covariance(poses, view, point, covariance))).tolist()
-        found.append(PictureOfPlace(log.run, log.sensor, pictures.path(view), u, v, distance, resolution, *spread))
+        across, down = np.sqrt(np.diag(pixel_covariance(poses, view, point, covariance))).tolist()
+        file, name = pictures.path(view), pictures.name(view)
+        found.append(PictureOfPlace(log.run, log.sensor, file, u, v, distance, resolution, across, down, name))
     return found
 
 

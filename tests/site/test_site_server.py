@@ -13,7 +13,7 @@ import pytest
 
 from roadscan.core.errors import StoreError
 from roadscan.site.live import LiveSite, Served, open_survey
-from roadscan.site.server import SiteServer, range_of
+from roadscan.site.server import Door, SiteServer, range_of
 from tests.surveys import Simulated
 
 CONTENT = bytes(range(256)) * 40
@@ -84,7 +84,7 @@ def editable(held: Held) -> Iterator[SiteServer]:
         held.asked.append(content.decode())
         return {"took": content.decode()}
 
-    with SiteServer(held, take=take) as one:
+    with SiteServer(held, doors={"edits": Door(take, writes=True), "measure": Door(take, writes=False)}) as one:
         thread = threading.Thread(target=one.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         yield one

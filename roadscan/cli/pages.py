@@ -118,24 +118,13 @@ def view(
     """Look at the survey in a browser, while or after a run. The page is for this machine alone; Ctrl-C ends it."""
     import webbrowser
 
-    from roadscan.run.session import Session
-    from roadscan.site.edit_door import EditDoor
+    from roadscan.site.doors import doors_of
     from roadscan.site.live import LiveSite, open_survey
-    from roadscan.site.measuring_door import MeasuringDoor
-    from roadscan.site.parts.edits import POST
-    from roadscan.site.parts.measuring import CONTROL, MEASURE, has_control
-    from roadscan.site.server import Door, SiteServer
+    from roadscan.site.server import SiteServer
     from roadscan.site.web_part import HOW_TO_BUILD, web_folder
 
     site = LiveSite(open_survey(survey_file, over or (), edited=edit))
-    measuring = MeasuringDoor(site, survey_file)
-    doors = {MEASURE: Door(measuring.measure, writes=False)}
-    if edit:
-        if not has_control(site.material):
-            site.material.check_edits()
-        doors[POST] = Door(EditDoor(lambda: Session.open(survey_file)).take, writes=True)
-        doors[CONTROL] = Door(measuring.control, writes=True)
-    with SiteServer(site, port, doors) as server:
+    with SiteServer(site, port, doors_of(site, survey_file, edited=edit)) as server:
         if web_folder() is None:
             typer.echo(f"note: the data are served without the page: {HOW_TO_BUILD}")
         typer.echo(f"page: {server.address} (Ctrl-C ends it)")

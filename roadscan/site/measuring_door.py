@@ -131,10 +131,13 @@ class MeasuringDoor:
         held = measured_points(session.store, others, plan.survey.rig).rows.to_pylist()
         elsewhere = {_measured(one)["picture"]: _measured(one) for one in held if one["point"] == row["name"]}
         names = ("name", "u_px", "v_px", "sigma_u_px", "sigma_v_px", "distance_m", "resolution_m")
-        return [
-            {name: getattr(one, name) for name in names} | {"elsewhere": elsewhere.get(one.name)}
-            for one in seen[:_MOST_PICTURES]
-        ]
+        poses = posed_pictures(session)
+        found = []
+        for one in seen[:_MOST_PICTURES]:
+            assumed = poses.assumed(picture_number(poses.pictures, one.name, plan))
+            told = {name: getattr(one, name) for name in names}
+            found.append(told | {"assumed": assumed, "elsewhere": elsewhere.get(one.name)})
+        return found
 
     def _missing(self) -> list[dict[str, str]]:
         """Return what the survey file lacks for the measurements to count, as it stands now."""

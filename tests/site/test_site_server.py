@@ -112,6 +112,15 @@ def post(
     return answer.status, body
 
 
+def test_what_writes_nothing_needs_no_token_but_the_own_page(editable: SiteServer, held: Held) -> None:
+    own: dict[str, str | None] = {"path": "/measure", "X_Roadscan_Edit": None, "Content_Type": "application/json"}
+    assert post(editable, b"{}", **own)[0] == 200 and held.asked == ["{}"]
+    for header, value in (("Origin", "http://elsewhere.example"), ("Origin", None), ("Host", "elsewhere.example")):
+        assert post(editable, b"{}", **(own | {header: value}))[0] == 403
+    assert post(editable, b"{}", **(own | {"Content_Type": "text/plain"}))[0] == 415
+    assert post(editable, b"{}", path="/nowhere")[0] == 405 and held.asked == ["{}"]
+
+
 def test_edits_of_its_own_page_are_taken(editable: SiteServer, held: Held) -> None:
     assert editable.address.endswith(f"/#edit={editable.token}") and len(editable.token) >= 32
     status, body = post(editable)

@@ -203,7 +203,7 @@ def measured_places(
             found.append(_nowhere(u, v, "the ray meets ground with too few cells around to fit a plane"))
             continue
         place, along, plane = meets
-        moves = _moves(poses, number, one, along, by_pixel @ bent) * poses.sigmas(number)
+        moves = _moves(poses, number, one, along, by_pixel @ bent) @ poses.root[number]
         spread = _pixel_covariance(by_pixel, sigma_px)
         covariance, common = _covariance(poses, number, one, along, plane, moves, spread)
         way = _way(poses, number, one)
@@ -295,18 +295,17 @@ def _met(
     parting = 2.0 * across[1] @ inverse @ across[0]  # the vector from ray to ray is twice the residual of one
     miss = [parting, -parting]
     for k, ray, spread, bend, share, off, t in zip(numbers, rays, spreads, bends, shares, miss, along, strict=True):
-        moves = _moves(poses, k, ray, t, bend)
+        moves = _moves(poses, k, ray, t, bend) @ poses.root[k]
         joint.append((share @ moves, off @ moves))
         across_ray = poses.map_from_ned[k] @ poses.ned_from_camera[k]
         noise = t**2 * across_ray @ spread @ across_ray.T
         covariance += share @ noise @ share.T
         apart += off @ noise @ off.T
-    shared = poses.correlation(*numbers) * poses.sigmas(numbers[0]) * poses.sigmas(numbers[1])
-    own = [np.diag(poses.sigmas(k) ** 2) for k in numbers]
+    alike = np.diag(poses.correlation(*numbers))
     for which, summed in ((0, covariance), (1, apart)):
         one, other = (part[which] for part in joint)
-        summed += one @ own[0] @ one.T + other @ own[1] @ other.T  # noqa: PLW2901 — in place
-        summed += one @ np.diag(shared) @ other.T + other @ np.diag(shared) @ one.T  # noqa: PLW2901 — in place
+        summed += one @ one.T + other @ other.T  # noqa: PLW2901 — in place
+        summed += one @ alike @ other.T + other @ alike @ one.T  # noqa: PLW2901 — in place
     feet = [eye + t * unit for eye, unit, t in zip(eyes, units, along, strict=True)]
     gap = float(np.linalg.norm(feet[0] - feet[1]))
     words = []
@@ -334,7 +333,7 @@ def pixel_covariance(poses: PicturePoses, number: int, point_m: Float64, place_c
     bend = np.zeros((3, by_lens.shape[2]))
     moves = -by_map @ _moves(poses, number, point_m / distance, distance, bend)
     moves[:, -by_lens.shape[2] :] = by_lens[0]
-    moves *= poses.sigmas(number)
+    moves = moves @ poses.root[number]
     return np.asarray(moves @ moves.T + by_map @ place_covariance_m2 @ by_map.T)
 
 

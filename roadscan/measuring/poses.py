@@ -21,6 +21,7 @@ from roadscan.georeference.sources import MOUNTING_COLUMNS, MOUNTING_SIGMAS, key
 from roadscan.measuring.orientation import nearest_rotation
 from roadscan.navigation.tasks.pose_sigma import pose_sigma, stated_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_corrections, load_trajectory
+from roadscan.pictures.camera_changes import JOINT, load_joint_covariances
 from roadscan.pictures.camera_changes import TABLE as CAMERA_CHANGES
 from roadscan.pictures.lens import PARAMETERS
 from roadscan.pictures.placed import Pictures
@@ -34,6 +35,8 @@ _WORDS: Final = {0: "position", 3: "roll, pitch, heading"}
 """Words for the components of a pose, by the first of each."""
 _LENS_WORDS: Final = {"focal length": slice(0, 2), "principal point": slice(2, 4), "distortion": slice(4, 9)}
 """Words for the parameters of a lens, with their place among `PARAMETERS`."""
+_SINGULAR: Final = 1e-9
+"""Eigenvalues of a correlation matrix that are smaller are rounding."""
 _MOUNTED: Final = 12
 """Errors of a picture's pose and mounting; those of its lens follow."""
 
@@ -60,6 +63,9 @@ class PicturePoses:
     """(n, 12) 1 σ of those errors (m and rad)."""
     lens_sigma: Float64
     """(n, 9) 1 σ of the lens's `PARAMETERS`; NaN where nothing states it."""
+    root: Float64
+    """(n, 21, 21) of the covariance of these 21 errors (pose, mounting, lens): root · rootᵀ. The first six columns are
+    what is the pose's own, the others come with mounting and lens."""
     told: tuple[str, ...]
     """(n,) which σ are assumed because nothing states them; "" where all are stated."""
     correlation_s: float
@@ -77,12 +83,8 @@ class PicturePoses:
     @functools.cached_property
     def covariance(self) -> Float64:
         """Covariance (n, 6, 6) of place (north, east, down; m) and small turn (about these axes; rad)."""
-        scaled = self.influence * self.sigma[:, None, :]
+        scaled = self.influence @ self.root[:, :_MOUNTED]
         return scaled @ scaled.transpose(0, 2, 1)
-
-    def sigmas(self, number: int) -> Float64:
-        """Return 1 σ (21,) of the errors of a picture's pose, mounting and lens; 0 for what is not stated of a lens."""
-        return np.concatenate([self.sigma[number], np.nan_to_num(self.lens_sigma[number])])
 
     def assumed(self, number: int) -> str:
         """Return which σ of a picture's pose, mounting and lens nothing states; "" where all are stated."""
@@ -91,7 +93,7 @@ class PicturePoses:
         return "; ".join(filter(None, (self.told[number], lens)))
 
     def correlation(self, first: int, second: int) -> Float64:
-        """Return the correlation (21,) of the errors of two pictures.
+        """Return the correlation (21,) of the errors of two pictures, in the order of the columns of `root`.
 
         Errors of poses fade over time within a run and are independent between runs; a mounting is one error, and so
         is a lens.
@@ -121,15 +123,18 @@ def picture_poses(plan: SurveyPlan, pictures: Pictures) -> PicturePoses:
         if world != LOCAL_WORLD:
             geographic[own] = geodetic_from_world(world, eye)
     influence, sigma = np.zeros((count, 6, _MOUNTED)), np.zeros((count, _MOUNTED))
-    lens_sigma = np.zeros((count, len(PARAMETERS)))
+    lens_sigma, root = np.zeros((count, len(PARAMETERS))), np.zeros((count, JOINT, JOINT))
     told = np.full(count, "", object)
     for number in np.unique(pictures.log).tolist():
         own = np.flatnonzero(pictures.log == number)
         influence[own], sigma[own], told[own] = _errors(plan, pictures, number, own, level[own])
-        lens_sigma[own] = _lens_sigma(plan, pictures.logs[number].sensor)
+        log, epochs = pictures.logs[number], pictures.epochs_gps_ns[own]
+        lens_sigma[own] = _lens_sigma(plan, log.sensor)
+        joint = load_joint_covariances(plan.store, log.run, log.sensor)
+        root[own] = _root(np.hstack([sigma[own], np.nan_to_num(lens_sigma[own])]), joint, epochs)
     settings = plan.survey.config.navigation.calibration
     return PicturePoses(
-        pictures, place, geographic, from_map, slope, level, influence, sigma, lens_sigma, tuple(told.tolist()),
+        pictures, place, geographic, from_map, slope, level, influence, sigma, lens_sigma, root, tuple(told.tolist()),
         settings.traverse_time_constant_s,
     )  # fmt: skip
 
@@ -209,6 +214,40 @@ def _lens_sigma(plan: SurveyPlan, sensor: str) -> Float64:
     table = read_small(plan.store, CAMERA_CHANGES)
     held = {row["sensor"]: row for row in ([] if table is None else table.to_pylist())}
     return _adjusted(held.get(sensor), PARAMETERS, np.array(stated))
+
+
+def _root(sigma: Float64, joint: tuple[Int64, Float64] | None, epochs: Int64) -> Float64:
+    """Return a root (k, 21, 21) of the covariance of errors with σ (k, 21), see `PicturePoses.root`.
+
+    joint : epochs and covariances of an adjustment. What σ have beyond it is independent.
+    """
+    if joint is None:
+        return sigma[:, :, None] * np.eye(JOINT)
+    knots, known = joint
+    at = np.interp(epochs.astype(np.float64), knots.astype(np.float64), np.arange(knots.size, dtype=np.float64))
+    before = np.minimum(at.astype(np.int64), knots.size - 1)
+    after, share = np.minimum(before + 1, knots.size - 1), (at - before)[:, None, None]
+    covariance = (1.0 - share) * known[before] + share * known[after]
+    diagonal = np.arange(JOINT)
+    covariance[:, diagonal, diagonal] = np.maximum(covariance[:, diagonal, diagonal], sigma**2)
+    scale = np.sqrt(covariance[:, diagonal, diagonal])
+    scale[scale == 0.0] = 1.0
+    unit = covariance / (scale[:, :, None] * scale[:, None, :])
+    pose, rest = slice(0, 6), slice(6, JOINT)
+    root = np.zeros_like(unit)
+    root[:, rest, rest], inverse = _symmetric_root(unit[:, rest, rest])
+    root[:, pose, rest] = unit[:, pose, rest] @ inverse
+    own = unit[:, pose, pose] - root[:, pose, rest] @ root[:, pose, rest].transpose(0, 2, 1)
+    root[:, pose, pose] = _symmetric_root(own)[0]
+    return np.asarray(scale[:, :, None] * root)
+
+
+def _symmetric_root(matrix: Float64) -> tuple[Float64, Float64]:
+    """Return roots R (k, m, m) of positive matrices, and R⁻ᵀ; 0 where rounding leaves nothing."""
+    values, vectors = np.linalg.eigh(matrix)
+    roots = np.sqrt(np.maximum(values, 0.0))
+    inverse = np.where(values > _SINGULAR, 1.0 / np.maximum(roots, _SINGULAR), 0.0)
+    return vectors * roots[:, None, :], vectors * inverse[:, None, :]
 
 
 def _adjusted(row: Mapping[str, Any] | None, names: Sequence[str], sigma: Float64) -> Float64:

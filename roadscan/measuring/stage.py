@@ -33,7 +33,7 @@ class PictureLayer(Stage):
     units = "files"
     reads = (
         "images", "trajectory", "trajectory_accuracy", "clocks", "mountings", "corrections", "mounting_corrections",
-        "camera_corrections", "cells", "overviews",
+        "camera_corrections", "camera_covariances", "cells", "overviews",
     )  # fmt: skip
     writes = (PRODUCT,)
 

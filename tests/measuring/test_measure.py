@@ -32,6 +32,7 @@ from tests.surveys import changed
 POSE_SIGMA = np.array([0.03, 0.02, 0.04, 8e-4, 6e-4, 1.5e-3])
 LEVER_SIGMA, TURN_SIGMA_DEG = np.array([0.02, 0.015, 0.01]), (0.05, 0.04, 0.06)
 LENS_SIGMA = np.array([1.5, 1.5, 1.0, 1.2, 0.004, 0.004, 2e-4, 2e-4, 0.002])
+ALL_SIGMA = np.array([*POSE_SIGMA, *LEVER_SIGMA, *np.radians(TURN_SIGMA_DEG), *LENS_SIGMA])
 PLACE_SIGMA = np.array([0.01, 0.01, 0.02])
 
 
@@ -69,13 +70,15 @@ def test_painted_corners_lie_where_they_are(measured_drive: Drive) -> None:
 def disturbed(drive: Drive, rng: np.random.Generator, adjusted: bool) -> Session:
     """The survey with another mounting and lens, and with corrections of its poses that are wrong, each by its σ.
 
-    adjusted : tables of an adjustment make mounting and lens wrong; the rig file states σ that are much larger.
+    adjusted : tables of an adjustment make mounting and lens wrong, at the expense of the poses as in a real one; the
+    rig file states σ that are much larger.
     """
     survey = Survey.load(drive.survey_file)
     camera = survey.rig.sensors["camera"]
     rotation, lever = camera.mounting().arrays()
-    turn = np.radians(TURN_SIGMA_DEG) * rng.standard_normal(3)
-    shift, bend = LEVER_SIGMA * rng.standard_normal(3), LENS_SIGMA * rng.standard_normal(9)
+    alike = joint_correlation() if adjusted else np.eye(21)
+    errors = ALL_SIGMA * rng.multivariate_normal(np.zeros(21), alike, method="cholesky")
+    values, shift, turn, bend = np.split(errors, [6, 9, 12])
     about = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
     u, _, w = np.linalg.svd((np.eye(3) + about) @ rotation)
     interior = camera.interior
@@ -93,6 +96,10 @@ def disturbed(drive: Drive, rng: np.random.Generator, adjusted: bool) -> Session
     store = drive.store()
     if adjusted:
         write_adjusted(store, np.concatenate([shift, turn]), bend)
+        upper = (alike * np.outer(ALL_SIGMA, ALL_SIGMA))[np.triu_indices(21)].tolist()
+        known: dict[str, object] = {"run": "run-1", "sensor": "camera", "covariance": upper}
+        epochs = sorted(p["epoch_gps_ns"] for p in drive.poses.values())[::3]
+        write_small(store, "camera_covariances", [known | {"epoch_gps_ns": epoch} for epoch in epochs])
     else:
         changes |= {
             own + "body_from_sensor": tuple(map(tuple, (u @ w).tolist())),
@@ -101,7 +108,6 @@ def disturbed(drive: Drive, rng: np.random.Generator, adjusted: bool) -> Session
             own + "interior__principal_px": tuple(lens[2:4].tolist()),
             own + "interior__distortion": tuple(lens[4:].tolist()),
         }
-    values = POSE_SIGMA * rng.standard_normal(6)
     rows = []
     for epoch in (min(p["epoch_gps_ns"] for p in drive.poses.values()) - 10**9,
                   max(p["epoch_gps_ns"] for p in drive.poses.values()) + 10**9):  # fmt: skip
@@ -112,6 +118,15 @@ def disturbed(drive: Drive, rng: np.random.Generator, adjusted: bool) -> Session
         rows.append(row)
     write_small(store, "corrections", rows)
     return Session(changed(survey, changes), store)
+
+
+def joint_correlation() -> np.ndarray:
+    """Attitude against boresight and position against lever arm, as pictures tell their sums; focal lengths alike."""
+    found = np.eye(21)
+    for one, other, value in ((0, 7, 0.8), (1, 6, 0.7), (2, 8, -0.95), (3, 9, -0.97), (4, 10, -0.97), (5, 11, -0.98),
+                              (12, 13, 0.9), (14, 16, 0.3)):  # fmt: skip
+        found[one, other] = found[other, one] = value
+    return found
 
 
 def write_adjusted(store: Store, mounting: np.ndarray, lens: np.ndarray) -> None:

@@ -195,7 +195,7 @@ export class ControlPanel {
     const state = this.#state
     if (!state) return
     const count = (point: string): number => state.measured.filter((one) => one.point === point).length
-    fill(this.#choice, ...state.points.map((one) => h('option', { value: one.name, selected: one.name === this.#point }, `${one.name} · ${one.role === 'check' ? 'check point' : 'control'} · ${count(one.name)} measured`)))
+    fill(this.#choice, ...state.points.map((one) => h('option', { value: one.name, selected: one.name === this.#point }, `${one.name} · ${one.role === 'check' ? 'check' : 'control'} · ${count(one.name)} measured`)))
     this.#choice.value = this.#point
     this.#undo.disabled = !this.#done.length && !this.#shown.some((one) => one.unwritten?.failed)
     for (const tile of this.#shown) {
@@ -206,8 +206,7 @@ export class ControlPanel {
     const assumed = [...new Set(this.#shown.map((one) => one.sight.assumed).filter(Boolean))].join('; ')
     fill(
       this.#below,
-      h('p', {}, `Click the point in each picture: it is written at once. Yellow: where it is to be expected, with 3 σ${assumed && ` (${assumed})`}. Wheel and drag look around.`),
-      h('p', { class: 'number' }, all ? `${all} measured in all, in ${state.file}` : `Nothing measured yet; it will be in ${state.file}`),
+      h('p', {}, `Click the point in each picture: it is written at once into ${state.file} (${all} in all). Yellow: where it is to be expected, with 3 σ${assumed && ` (${assumed})`}.`),
       ...(all ? state.missing : []).map(({ where, text }) =>
         h('div', { class: 'control-missing' }, h('p', {}, `Add to the survey file, ${where}:`), h('pre', {}, text), iconButton('copy', 'Copy the lines', () => void copyText(`\n${text}\n`).then(() => this.desk.say('The lines are in the clipboard.')), { class: 'icon-button small' }))),
       all && !state.missing.length ? h('p', {}, 'The survey file takes them: roadscan run adjusts with them.') : null,

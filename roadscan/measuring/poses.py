@@ -219,7 +219,8 @@ def _lens_sigma(plan: SurveyPlan, sensor: str) -> Float64:
 def _root(sigma: Float64, joint: tuple[Int64, Float64] | None, epochs: Int64) -> Float64:
     """Return a root (k, 21, 21) of the covariance of errors with σ (k, 21), see `PicturePoses.root`.
 
-    joint : epochs and covariances of an adjustment. What σ have beyond it is independent.
+    joint : epochs and covariances of an adjustment. What the pose's σ have beyond it, and what it did not estimate,
+    is independent.
     """
     if joint is None:
         return sigma[:, :, None] * np.eye(JOINT)
@@ -229,7 +230,9 @@ def _root(sigma: Float64, joint: tuple[Int64, Float64] | None, epochs: Int64) ->
     after, share = np.minimum(before + 1, knots.size - 1), (at - before)[:, None, None]
     covariance = (1.0 - share) * known[before] + share * known[after]
     diagonal = np.arange(JOINT)
-    covariance[:, diagonal, diagonal] = np.maximum(covariance[:, diagonal, diagonal], sigma**2)
+    own = covariance[:, diagonal, diagonal]
+    known_alone = np.hstack([np.maximum(own[:, :6], sigma[:, :6] ** 2), np.where(own > 0.0, own, sigma**2)[:, 6:]])
+    covariance[:, diagonal, diagonal] = known_alone
     scale = np.sqrt(covariance[:, diagonal, diagonal])
     scale[scale == 0.0] = 1.0
     unit = covariance / (scale[:, :, None] * scale[:, None, :])
@@ -237,8 +240,8 @@ def _root(sigma: Float64, joint: tuple[Int64, Float64] | None, epochs: Int64) ->
     root = np.zeros_like(unit)
     root[:, rest, rest], inverse = _symmetric_root(unit[:, rest, rest])
     root[:, pose, rest] = unit[:, pose, rest] @ inverse
-    own = unit[:, pose, pose] - root[:, pose, rest] @ root[:, pose, rest].transpose(0, 2, 1)
-    root[:, pose, pose] = _symmetric_root(own)[0]
+    left = unit[:, pose, pose] - root[:, pose, rest] @ root[:, pose, rest].transpose(0, 2, 1)
+    root[:, pose, pose] = _symmetric_root(left)[0]
     return np.asarray(scale[:, :, None] * root)
 
 

@@ -6,7 +6,9 @@ out is parsed again and has to mean the old file with just these changes, or not
 
 from __future__ import annotations
 
+import os
 import re
+import secrets
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +19,6 @@ from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.rig import Rig
 from roadscan.core.strict import load_toml
 from roadscan.core.toml_text import toml, toml_key
-from roadscan.core.whole_file import replace_file
 
 _KEY: Final = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')"""
 _DOTTED: Final = rf"{_KEY}(?:[ \t]*\.[ \t]*{_KEY})*"
@@ -97,6 +98,29 @@ def update_rig_file(file: Path, sensor: str, values: Mapping[str, Any]) -> Rig:
     rig = Rig.parse(tomllib.loads(out), file=file)
     replace_file(file, out.encode("utf-8"))
     return rig
+
+
+def replace_file(file: Path, content: bytes) -> None:
+    """Write a file, or replace it, atomically and durably: readers see the old content or the new.
+
+    Raises
+    ------
+    ConfigError
+        where it cannot be written; it then stays as it was.
+    """
+    target = file.resolve()
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    try:
+        with temporary.open("xb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        if target.exists():
+            temporary.chmod(target.stat().st_mode & 0o7777)
+        temporary.replace(target)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise ConfigError(f"the file cannot be written ({error})", file=file) from error
 
 
 def _with_value(text: str, sensor: str, key: str, value: Any, file: str | Path | None) -> str:

@@ -13,7 +13,7 @@ import pyarrow.csv as pa_csv
 
 from roadscan.core.errors import RunError
 from roadscan.core.rig import Rig
-from roadscan.core.whole_file import replace_file
+from roadscan.core.rig_text import replace_file
 from roadscan.formats.vectors.picture_points import BY_HAND, FOUND
 from roadscan.navigation.tasks.taken_pictures import taken_pictures
 from roadscan.store.logs import LogRecord

@@ -163,6 +163,11 @@ def test_control_is_clicked_written_and_adjusted(yard: Yard, open_page: Any) -> 
         assert len(yard.clicked()) == 9
         click(yard, page, "T1", "000001.jpg")
         assert serious(page) == []
+        page.keyboard.press("Escape")
+        go_to(page, "row=control/P3&views=map,pictures")
+        page.locator(".details button", has_text="Measure it in pictures").click()
+        page.wait_for_function("() => document.querySelector('[aria-label=\"Control point\"]').value === 'P3'")
+        tile(page, "000000.jpg").wait_for()
         log, section = page.locator(".control-missing pre").all_inner_texts()
     text = yard.made.survey_file.read_text()
     yard.made.survey_file.write_text(text.replace("[[passes]]", f"{log}\n\n[[passes]]") + f"\n{section}\n")

@@ -118,7 +118,8 @@ export class ControlPanel {
     try {
       const { points, pictures = [] } = await this.#ask({ action: 'show', point })
       if (this.#point !== point) return
-      const [known, all] = [points.find((one) => one.name === point)!, new Map((await this.list.all()).map((one) => [one.name, one]))]
+      const known = points.find((one) => one.name === point)!
+      const all = new Map((await this.list.near(known.easting_m, known.northing_m)).map((one) => [one.name, one]))
       this.desk.place.value = { easting_m: known.easting_m, northing_m: known.northing_m, height_m: known.height_m, from: 'control point' }
       this.desk.goTo({ easting_m: known.easting_m, northing_m: known.northing_m, height_m: known.height_m, across_m: 30 })
       this.#shown = pictures.flatMap((sight) => {

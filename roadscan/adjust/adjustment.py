@@ -11,9 +11,9 @@ runs share, are unknowns beside the poses.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,7 @@ from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, Unknowns, directions_of
 from roadscan.adjust.weights import Groups
+from roadscan.pictures.lens import PARAMETERS
 from roadscan.poses.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]
@@ -40,6 +41,9 @@ _AT_ONCE: Final = 200
 """Control points that are judged with the covariance of all of them: three coordinates each give 600 rows."""
 _NEIGHBOURS: Final = 50
 """With more points, at most this many neighbours are judged together."""
+_LENS: Final = len(PARAMETERS)
+_JOINT_NS: Final = 1_000_000_000
+"""Knots at which the errors of pictures are told jointly are so far apart (ns), or farther: these vary slowly."""
 _SCALED: Final = 3
 """The stated σ of single runs are enlarged at most this many times, until none is too small."""
 SURVEY_FACTOR: Final = "control_survey"
@@ -99,6 +103,17 @@ class MountingErrors:
         )
 
 
+class JointErrors(NamedTuple):
+    """How the errors of a camera's pictures hang together after the adjustment: one is known by another's expense."""
+
+    run: str
+    sensor: str
+    epochs_gps_ns: Int64
+    """(k,) knots of the run, a second or more apart."""
+    covariance: Float64
+    """(k, 21, 21) of the run's pose, `COMPONENTS`, mounting (6) and lens (9); 0 of what is not estimated."""
+
+
 @dataclass(frozen=True)
 class CameraErrors:
     """Errors of the lenses and clocks of k cameras after the adjustment."""
@@ -110,6 +125,8 @@ class CameraErrors:
     """(k, 11) correction that is added; 0 where not estimated."""
     sigma: Float64
     """(k, 11) 1 σ of the corrected value."""
+    joint: tuple[JointErrors, ...] = ()
+    """Of each run and camera whose mounting is estimated."""
 
 
 @dataclass(frozen=True)
@@ -520,7 +537,41 @@ def _of_cameras(unknowns: Unknowns, estimate: Estimate, solution: Float64) -> Ca
     error, variance = np.zeros(prior.shape), np.zeros(prior.shape)
     error[there] = solution[numbers[there]] * prior[there]
     variance[there] = estimate.inverse.at(numbers[there], numbers[there]) * prior[there] ** 2
-    return CameraErrors(tuple(one.sensor for one in unknowns.cameras), prior, error, np.sqrt(variance))
+    joint = tuple(_joint(unknowns, estimate))
+    return CameraErrors(tuple(one.sensor for one in unknowns.cameras), prior, error, np.sqrt(variance), joint)
+
+
+def _joint(unknowns: Unknowns, estimate: Estimate) -> Iterator[JointErrors]:
+    """Yield covariances of poses, mountings and lenses at knots of which the factor of the equations tells them."""
+    keys = [one.key for one in unknowns.mountings]
+    for camera, prior in enumerate(unknowns.cameras):
+        for run, name in enumerate(one.run for one in unknowns.priors):
+            seat = next((keys.index(key) for key in ((name, prior.sensor), ("*", prior.sensor)) if key in keys), None)
+            if seat is None:
+                continue
+            own = np.concatenate([unknowns.of_mountings[seat, :6], unknowns.of_cameras[camera, :_LENS]])
+            own_sigma = np.concatenate([unknowns.mount_sigma[seat, :6], unknowns.camera_sigma[camera, :_LENS]])
+            posed = unknowns.of_run(run)
+            told = np.isfinite(_entries(estimate, posed[:, :, None], own[None, None, :6])).all(axis=(1, 2))
+            at, knots = np.flatnonzero(told), unknowns.knots[run]
+            if not at.size:
+                continue
+            at = at[np.unique((knots[at] - knots[at[0]]) // _JOINT_NS, return_index=True)[1]]
+            numbers = np.hstack([posed[at], np.tile(own, (at.size, 1))])
+            sigma = np.hstack([unknowns.sigmas[run][at], np.tile(own_sigma, (at.size, 1))])
+            blocks = np.nan_to_num(_entries(estimate, numbers[:, :, None], numbers[:, None, :]))
+            blocks *= np.asarray(sigma[:, :, None] * sigma[:, None, :], np.float64)
+            parts = posed.shape[1] // len(COMPONENTS)
+            fold = block_diag(np.tile(np.eye(len(COMPONENTS)), parts), np.eye(own.size))
+            yield JointErrors(name, prior.sensor, knots[at], fold @ blocks @ fold.T)
+
+
+def _entries(estimate: Estimate, first: Int64, second: Int64) -> Float64:
+    """Returns covariances of pairs of unknowns, in their σ; 0 where one is none, NaN where the factor lacks them."""
+    i, j = np.broadcast_arrays(first, second)
+    there, found = (i >= 0) & (j >= 0), np.zeros(i.shape)
+    found[there] = estimate.inverse.at(i[there], j[there])
+    return found
 
 
 def _of_control(unknowns: Unknowns, estimate: Estimate, n: int, factor: float) -> ControlErrors:

@@ -33,7 +33,15 @@ class Adjust(Stage):
         "scans", "returns", "cloud", "trajectory", "trajectory_accuracy", "control_points", "control_lines", "clocks",
         "mountings", "footprints", "picture_tracks", "images",
     )  # fmt: skip
-    writes = ("ties", "control_sightings", *TABLES, "corrections", "mounting_corrections", "camera_corrections")
+    writes = (
+        "ties",
+        "control_sightings",
+        *TABLES,
+        "corrections",
+        "mounting_corrections",
+        "camera_corrections",
+        "camera_covariances",
+    )
 
     def run(self, session: Session) -> None:
         """Adjust where evidence, settings or code differ from those of the last solution."""

@@ -107,23 +107,24 @@ def view(
     ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
     edit: Annotated[
-        bool, typer.Option("--edit", help="Take edits from the page into the inventory, as `inventory pull` does.")
+        bool,
+        typer.Option(
+            "--edit",
+            help="Take edits from the page into the inventory, as `inventory pull` does, and control points that are "
+            "clicked in pictures into a file.",
+        ),
     ] = False,
 ) -> None:
     """Look at the survey in a browser, while or after a run. The page is for this machine alone; Ctrl-C ends it."""
     import webbrowser
 
-    from roadscan.run.session import Session
-    from roadscan.site.edit_door import EditDoor
+    from roadscan.site.doors import doors_of
     from roadscan.site.live import LiveSite, open_survey
     from roadscan.site.server import SiteServer
     from roadscan.site.web_part import HOW_TO_BUILD, web_folder
 
     site = LiveSite(open_survey(survey_file, over or (), edited=edit))
-    if edit:
-        site.material.check_edits()
-    door = EditDoor(lambda: Session.open(survey_file)) if edit else None
-    with SiteServer(site, port, None if door is None else door.take) as server:
+    with SiteServer(site, port, doors_of(site, survey_file, edited=edit)) as server:
         if web_folder() is None:
             typer.echo(f"note: the data are served without the page: {HOW_TO_BUILD}")
         typer.echo(f"page: {server.address} (Ctrl-C ends it)")

@@ -110,11 +110,11 @@ def where(
 
     found = pictures_of_place(Session.open(survey_file), easting_m, northing_m, height_m, reach)
     rows = [
-        (one.run, one.camera, f"{one.u_px:.1f}", f"{one.v_px:.1f}", f"{one.distance_m:.2f}",
-         f"{1e3 * one.resolution_m:.1f}", str(one.file))
+        (one.run, one.camera, f"{one.u_px:.1f}", f"{one.v_px:.1f}", f"{one.sigma_u_px:.1f}", f"{one.sigma_v_px:.1f}",
+         f"{one.distance_m:.2f}", f"{1e3 * one.resolution_m:.1f}", str(one.file))
         for one in found
     ]  # fmt: skip
-    print_table(("run", "camera", "u px", "v px", "distance m", "mm per px", "file"), rows)
+    print_table(("run", "camera", "u px", "v px", "σ u px", "σ v px", "distance m", "mm per px", "file"), rows)
 
 
 def _measure(session: Session, asked: PictureOptions, reach_m: float) -> None:

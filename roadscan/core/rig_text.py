@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
+import secrets
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -96,21 +96,27 @@ def update_rig_file(file: Path, sensor: str, values: Mapping[str, Any]) -> Rig:
     text = file.read_bytes().decode("utf-8")
     out = changed_rig_text(text, sensor, values, file=file)
     rig = Rig.parse(tomllib.loads(out), file=file)
-    _replace(file, out.encode("utf-8"))
+    replace_file(file, out.encode("utf-8"))
     return rig
 
 
-def _replace(file: Path, content: bytes) -> None:
-    """Replace the file atomically: readers see the old content or the new."""
+def replace_file(file: Path, content: bytes) -> None:
+    """Write a file, or replace it, atomically and durably: readers see the old content or the new.
+
+    Raises
+    ------
+    ConfigError
+        where it cannot be written; it then stays as it was.
+    """
     target = file.resolve()
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-    temporary = Path(name)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     try:
-        with os.fdopen(handle, "wb") as stream:
+        with temporary.open("xb") as stream:
             stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
-        temporary.chmod(target.stat().st_mode & 0o7777)
+        if target.exists():
+            temporary.chmod(target.stat().st_mode & 0o7777)
         temporary.replace(target)
     except OSError as error:
         temporary.unlink(missing_ok=True)

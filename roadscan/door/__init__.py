@@ -323,7 +323,8 @@ class OpenSurvey:
 
         Returns
         -------
-        Columns run, camera, file, u_px, v_px (from the centre of the upper left pixel), distance_m, resolution_m.
+        Columns run, camera, file, u_px, v_px (from the centre of the upper left pixel), distance_m, resolution_m,
+        sigma_u_px, sigma_v_px (1 σ of the pixel), name (RUN/CAMERA/FILE).
 
         Raises
         ------

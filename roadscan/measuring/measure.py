@@ -22,7 +22,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, poses_plan_of
 from roadscan.measuring.ground import Ground, Plane
 from roadscan.measuring.kernels.march import BELOW, first_hits
 from roadscan.measuring.poses import PicturePoses, picture_poses
-from roadscan.pictures.lens import eye_shifts_m, ray_slopes, rays_of
+from roadscan.pictures.lens import derivatives, eye_shifts_m, ray_slopes, rays_of
 from roadscan.pictures.placed import Pictures, plan_pictures
 from roadscan.pictures.views import HEIGHT, WIDTH, PictureRule
 from roadscan.run.session import Session, found_once
@@ -43,6 +43,8 @@ _FROM_WHERE: Final = PictureRule((), REACH_M, -90.0, 1)
 """All cameras with an interior orientation."""
 _SMALL_ANGLE_DEG: Final = 5.0
 """Rays that meet at a smaller angle determine the distance badly."""
+_COMMON: Final = 22
+"""Errors that the pixels of a picture share: 12 of its pose and mounting, 9 of its lens, and the tile's height."""
 _APART: Final = 3.0
 """Rays that pass each other by more than so many of their σ do not show one thing."""
 
@@ -61,6 +63,9 @@ class MeasuredPlace:
     """From the camera."""
     incidence_deg: float
     """Angle between the ray and the ground; NaN where no ground took part."""
+    common_m: Float64
+    """(3, 22) by how much each error that all pixels of the picture share (pose, mounting, lens, height of the tile)
+    moves the place where it is as large as its 1 σ; its part of the covariance is `common_m` · `common_m`ᵀ."""
     reason: str = ""
     """Why there is no place; "" where there is one."""
     warning: str = ""
@@ -155,7 +160,23 @@ def measure(
     own = _checked(poses, number, pixel)
     places = measured_places(poses, survey_ground(session), number, own, sigma_px, reach_m)
     log = poses.pictures.logs[poses.pictures.log[number]]
-    return Measured(log.run, log.sensor, poses.pictures.path(number), tuple(places), poses.told[number])
+    return Measured(log.run, log.sensor, poses.pictures.path(number), tuple(places), poses.assumed(number))
+
+
+def length_of(places: Sequence[MeasuredPlace]) -> tuple[float, float]:
+    """Return the length (m) of the line through places measured in one picture, and its 1 σ; 0 of a point.
+
+    Errors that the picture's pixels share move all corners together, and hardly change the length of a short line.
+    """
+    steps = np.diff(np.array([one.place_m for one in places]), axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    ways = steps / np.maximum(lengths, 1e-9)[:, None]
+    pull = np.zeros((len(places), 3))
+    pull[1:] += ways
+    pull[:-1] -= ways
+    common = sum((p @ one.common_m for p, one in zip(pull, places, strict=True)), np.zeros(_COMMON))
+    own = [p @ (one.covariance_m2 - one.common_m @ one.common_m.T) @ p for p, one in zip(pull, places, strict=True)]
+    return float(lengths.sum()), math.sqrt(max(float(common @ common) + math.fsum(own), 0.0))
 
 
 def measured_places(
@@ -164,10 +185,11 @@ def measured_places(
     """Return the places of pixels (m, 2) of a picture with its number, as :func:`measure` does."""
     lens = poses.pictures.views.lens_of(number)
     ray, shift = rays_of(lens, pixel), eye_shifts_m(lens, pixel)
-    slope = ray_slopes(lens, pixel)
+    slope, by_lens = ray_slopes(lens, pixel), derivatives(lens, ray)[2]
     hit_m = ground_hits(poses, ground, number, ray, reach_m)
     found = []
-    for (u, v), one, aside, by_pixel, hit in zip(pixel.tolist(), ray, shift, slope, hit_m.tolist(), strict=True):
+    rows = zip(pixel.tolist(), ray, shift, slope, by_lens, hit_m.tolist(), strict=True)
+    for (u, v), one, aside, by_pixel, bent, hit in rows:
         if not np.isfinite(one).all():
             found.append(_nowhere(u, v, "the lens has no ray there: its distortion has no inverse"))
             continue
@@ -182,11 +204,13 @@ def measured_places(
             found.append(_nowhere(u, v, "the ray meets ground with too few cells around to fit a plane"))
             continue
         place, along, plane = meets
-        covariance = _covariance(poses, number, one, along, plane, _pixel_covariance(by_pixel, sigma_px))
+        moves = _moves(poses, number, one, along, by_pixel @ bent) @ poses.root[number]
+        spread = _pixel_covariance(by_pixel, sigma_px)
+        covariance, common = _covariance(poses, number, one, along, plane, moves, spread)
         way = _way(poses, number, one)
         normal = np.array([*-plane.slope, 1.0]) / math.sqrt(1.0 + float(plane.slope @ plane.slope))
         incidence = math.degrees(math.asin(min(1.0, abs(float(normal @ way) / float(np.linalg.norm(way))))))
-        found.append(MeasuredPlace(u, v, place, covariance, along, incidence))
+        found.append(MeasuredPlace(u, v, place, covariance, along, incidence, common))
     return found
 
 
@@ -232,16 +256,18 @@ def meet(
     numbers = [picture_number(poses.pictures, file, plan) for file in files]
     if numbers[0] == numbers[1]:
         raise ConfigError("both pixels are of one picture", expected="two pictures from different places")
-    rays, slopes, eyes = [], [], []
+    rays, slopes, eyes, bends = [], [], [], []
     for number, pixel in zip(numbers, pixels, strict=True):
         lens = poses.pictures.views.lens_of(number)
         own = _checked(poses, number, [pixel])
         rays.append(rays_of(lens, own)[0])
         eyes.append(poses.place_m[number] + _way(poses, number, eye_shifts_m(lens, own)[0]))
-        slopes.append(_pixel_covariance(ray_slopes(lens, own)[0], sigma_px))
+        by_pixel = ray_slopes(lens, own)[0]
+        slopes.append(_pixel_covariance(by_pixel, sigma_px))
+        bends.append(by_pixel @ derivatives(lens, rays[-1][None])[2][0])
     if not np.isfinite(rays).all():
         raise ConfigError("the lens has no ray at a pixel: its distortion has no inverse", expected="another pixel")
-    return _met(poses, numbers, (eyes, rays), slopes, pixels[0])
+    return _met(poses, numbers, (eyes, rays), slopes, bends, pixels[0])
 
 
 def _met(
@@ -249,6 +275,7 @@ def _met(
     numbers: Sequence[int],
     sights: tuple[Sequence[Float64], Sequence[Float64]],
     spreads: Sequence[Float64],
+    bends: Sequence[Float64],
     pixel: Sequence[float],
 ) -> tuple[MeasuredPlace, float]:
     """Return where two rays meet, with its covariance: errors of poses and mountings are shared as they are.
@@ -272,19 +299,18 @@ def _met(
     shares = [inverse @ one for one in across]
     parting = 2.0 * across[1] @ inverse @ across[0]  # the vector from ray to ray is twice the residual of one
     miss = [parting, -parting]
-    for k, ray, spread, share, off, t in zip(numbers, rays, spreads, shares, miss, along, strict=True):
-        moves = _moves(poses, k, ray, t)
+    for k, ray, spread, bend, share, off, t in zip(numbers, rays, spreads, bends, shares, miss, along, strict=True):
+        moves = _moves(poses, k, ray, t, bend) @ poses.root[k]
         joint.append((share @ moves, off @ moves))
         across_ray = poses.map_from_ned[k] @ poses.ned_from_camera[k]
         noise = t**2 * across_ray @ spread @ across_ray.T
         covariance += share @ noise @ share.T
         apart += off @ noise @ off.T
-    shared = poses.correlation(*numbers) * poses.sigma[numbers[0]] * poses.sigma[numbers[1]]
-    own = [np.diag(poses.sigma[k] ** 2) for k in numbers]
+    alike = np.diag(poses.correlation(*numbers))
     for which, summed in ((0, covariance), (1, apart)):
         one, other = (part[which] for part in joint)
-        summed += one @ own[0] @ one.T + other @ own[1] @ other.T  # noqa: PLW2901 — in place
-        summed += one @ np.diag(shared) @ other.T + other @ np.diag(shared) @ one.T  # noqa: PLW2901 — in place
+        summed += one @ one.T + other @ other.T  # noqa: PLW2901 — in place
+        summed += one @ alike @ other.T + other @ alike @ one.T  # noqa: PLW2901 — in place
     feet = [eye + t * unit for eye, unit, t in zip(eyes, units, along, strict=True)]
     gap = float(np.linalg.norm(feet[0] - feet[1]))
     words = []
@@ -293,8 +319,27 @@ def _met(
     if gap > _APART * math.sqrt(max(float(np.trace(apart)), 1e-12)):
         words.append(f"the rays pass each other by {gap:.3f} m: the pixels may not show the same thing")
     return MeasuredPlace(
-        float(pixel[0]), float(pixel[1]), place, covariance, along[0], math.nan, warning="; ".join(words)
-    ), gap
+        float(pixel[0]), float(pixel[1]), place, covariance, along[0], math.nan, np.zeros((3, _COMMON)),
+        warning="; ".join(words),
+    ), gap  # fmt: skip
+
+
+def pixel_covariance(poses: PicturePoses, number: int, point_m: Float64, place_covariance_m2: Float64) -> Float64:
+    """Return the covariance (2, 2) of the pixel at which a picture shows a place, by σ of pose, mounting and lens.
+
+    Parameters
+    ----------
+    point_m : (3,) the place in the camera's axes.
+    place_covariance_m2 : (3, 3) of the place itself on the map.
+    """
+    distance = float(np.linalg.norm(point_m))
+    _, by_point, by_lens = derivatives(poses.pictures.views.lens_of(number), point_m[None])
+    by_map = by_point[0] @ poses.camera_from_map[number]
+    bend = np.zeros((3, by_lens.shape[2]))
+    moves = -by_map @ _moves(poses, number, point_m / distance, distance, bend)
+    moves[:, -by_lens.shape[2] :] = by_lens[0]
+    moves = moves @ poses.root[number]
+    return np.asarray(moves @ moves.T + by_map @ place_covariance_m2 @ by_map.T)
 
 
 def _checked(poses: PicturePoses, number: int, pixel: Sequence[Sequence[float]] | Float64) -> Float64:
@@ -350,27 +395,33 @@ def _on_plane(
     return frame.map_from_world(world, (eye_world + along * way_world)[None])[0], along, plane
 
 
-def _moves(poses: PicturePoses, number: int, ray: Float64, along_m: float) -> Float64:
-    """Return how the errors (12) of a picture move the point (3: map) at a distance along its ray."""
+def _moves(poses: PicturePoses, number: int, ray: Float64, along_m: float, bend: Float64) -> Float64:
+    """Return how the errors (21) of a picture move the point (3: map) at a distance along its ray.
+
+    bend : (3, 9) by how much the ray turns so that its pixel moves as the lens's parameters move that of a place.
+    """
     ahead = along_m * (poses.ned_from_camera[number] @ ray)
     turned = np.array([[0.0, ahead[2], -ahead[1]], [-ahead[2], 0.0, ahead[0]], [ahead[1], -ahead[0], 0.0]])
     influence = poses.influence[number]
-    return np.asarray(poses.map_from_ned[number] @ (influence[:3] + turned @ influence[3:]))
+    by_lens = -along_m * poses.ned_from_camera[number] @ bend
+    return np.asarray(poses.map_from_ned[number] @ np.hstack([influence[:3] + turned @ influence[3:], by_lens]))
 
 
 def _covariance(
-    poses: PicturePoses, number: int, ray: Float64, along_m: float, plane: Plane, spread: Float64
-) -> Float64:
-    """Return the covariance (3, 3) of the place where a ray meets a plane."""
+    poses: PicturePoses, number: int, ray: Float64, along_m: float, plane: Plane, moves: Float64, spread: Float64
+) -> tuple[Float64, Float64]:
+    """Return the covariance (3, 3) of the place where a ray meets a plane, and its part (3, 22) that pixels share.
+
+    moves : (3, 21) of the point by the picture's errors, each as large as its 1 σ.
+    """
     way = _way(poses, number, ray)
     normal = np.array([*-plane.slope, 1.0])
     slide = np.eye(3) - np.outer(way, normal) / float(normal @ way)
     lift = way / float(normal @ way)
-    moves = slide @ _moves(poses, number, ray, along_m) * poses.sigma[number]
+    common = np.column_stack([slide @ moves, [0.0, 0.0, plane.common_sigma_m]])
     across = slide @ poses.map_from_ned[number] @ poses.ned_from_camera[number]
-    covariance = moves @ moves.T + along_m**2 * across @ spread @ across.T + plane.sigma_m**2 * np.outer(lift, lift)
-    covariance[2, 2] += plane.common_sigma_m**2
-    return np.asarray(covariance)
+    covariance = common @ common.T + along_m**2 * across @ spread @ across.T + plane.sigma_m**2 * np.outer(lift, lift)
+    return np.asarray(covariance), common
 
 
 def _pixel_covariance(by_pixel: Float64, sigma_px: float) -> Float64:
@@ -384,7 +435,8 @@ def _nearest(at: float, size: int) -> int:
 
 
 def _nowhere(u: float, v: float, reason: str) -> MeasuredPlace:
-    return MeasuredPlace(u, v, np.full(3, np.nan), np.full((3, 3), np.nan), math.nan, math.nan, reason)
+    nowhere = np.full((3, 3), np.nan)
+    return MeasuredPlace(u, v, nowhere[0], nowhere, math.nan, math.nan, np.full((3, _COMMON), np.nan), reason)
 
 
 def _why(hit: float, reach_m: float) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -17,10 +17,13 @@ from roadscan.core.ids import of_run
 from roadscan.core.rig import Sensor
 from roadscan.georeference.picture_axes import camera_from_map, map_from_ned
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
-from roadscan.georeference.sources import MOUNTING_SIGMAS, load_mountings
+from roadscan.georeference.sources import MOUNTING_COLUMNS, MOUNTING_SIGMAS, key_of_row, load_mountings
 from roadscan.measuring.orientation import nearest_rotation
 from roadscan.navigation.tasks.pose_sigma import pose_sigma, stated_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_corrections, load_trajectory
+from roadscan.pictures.camera_changes import JOINT, load_joint_covariances
+from roadscan.pictures.camera_changes import TABLE as CAMERA_CHANGES
+from roadscan.pictures.lens import PARAMETERS
 from roadscan.pictures.placed import Pictures
 from roadscan.poses.trajectory import world_from_ned
 from roadscan.store.small_tables import read_small
@@ -30,6 +33,12 @@ Int64 = npt.NDArray[np.int64]
 
 _WORDS: Final = {0: "position", 3: "roll, pitch, heading"}
 """Words for the components of a pose, by the first of each."""
+_LENS_WORDS: Final = {"focal length": slice(0, 2), "principal point": slice(2, 4), "distortion": slice(4, 9)}
+"""Words for the parameters of a lens, with their place among `PARAMETERS`."""
+_SINGULAR: Final = 1e-9
+"""Eigenvalues of a correlation matrix that are smaller are rounding."""
+_MOUNTED: Final = 12
+"""Errors of a picture's pose and mounting; those of its lens follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +61,11 @@ class PicturePoses:
     move the camera (north, east, down; m) and turn it (about north, east, down; rad)."""
     sigma: Float64
     """(n, 12) 1 σ of those errors (m and rad)."""
+    lens_sigma: Float64
+    """(n, 9) 1 σ of the lens's `PARAMETERS`; NaN where nothing states it."""
+    root: Float64
+    """(n, 21, 21) of the covariance of these 21 errors (pose, mounting, lens): root · rootᵀ. The first six columns are
+    what is the pose's own, the others come with mounting and lens."""
     told: tuple[str, ...]
     """(n,) which σ are assumed because nothing states them; "" where all are stated."""
     correlation_s: float
@@ -69,18 +83,25 @@ class PicturePoses:
     @functools.cached_property
     def covariance(self) -> Float64:
         """Covariance (n, 6, 6) of place (north, east, down; m) and small turn (about these axes; rad)."""
-        scaled = self.influence * self.sigma[:, None, :]
+        scaled = self.influence @ self.root[:, :_MOUNTED]
         return scaled @ scaled.transpose(0, 2, 1)
 
-    def correlation(self, first: int, second: int) -> Float64:
-        """Return the correlation (12,) of the errors of two pictures.
+    def assumed(self, number: int) -> str:
+        """Return which σ of a picture's pose, mounting and lens nothing states; "" where all are stated."""
+        missing = [words for words, part in _LENS_WORDS.items() if np.isnan(self.lens_sigma[number, part]).all()]
+        lens = f"lens without σ of {', '.join(missing)}, taken as 0" if missing else ""
+        return "; ".join(filter(None, (self.told[number], lens)))
 
-        Errors of poses fade over time within a run and are independent between runs; a mounting is one error.
+    def correlation(self, first: int, second: int) -> Float64:
+        """Return the correlation (21,) of the errors of two pictures, in the order of the columns of `root`.
+
+        Errors of poses fade over time within a run and are independent between runs; a mounting is one error, and so
+        is a lens.
         """
         pictures = self.pictures
         one, other = (pictures.logs[pictures.log[k]] for k in (first, second))
         apart_s = abs(int(pictures.epochs_gps_ns[first]) - int(pictures.epochs_gps_ns[second])) / NS_PER_S
-        out = np.zeros(12)
+        out = np.zeros(_MOUNTED + len(PARAMETERS))
         out[:6] = np.exp(-apart_s / self.correlation_s) if one.run == other.run else 0.0
         out[6:] = 1.0 if one.sensor == other.sensor else 0.0
         return out
@@ -101,14 +122,19 @@ def picture_poses(plan: SurveyPlan, pictures: Pictures) -> PicturePoses:
         level[own] = world_from_ned(world, eye).transpose(0, 2, 1) @ turn.transpose(0, 2, 1)
         if world != LOCAL_WORLD:
             geographic[own] = geodetic_from_world(world, eye)
-    influence, sigma = np.zeros((count, 6, 12)), np.zeros((count, 12))
+    influence, sigma = np.zeros((count, 6, _MOUNTED)), np.zeros((count, _MOUNTED))
+    lens_sigma, root = np.zeros((count, len(PARAMETERS))), np.zeros((count, JOINT, JOINT))
     told = np.full(count, "", object)
     for number in np.unique(pictures.log).tolist():
         own = np.flatnonzero(pictures.log == number)
         influence[own], sigma[own], told[own] = _errors(plan, pictures, number, own, level[own])
+        log, epochs = pictures.logs[number], pictures.epochs_gps_ns[own]
+        lens_sigma[own] = _lens_sigma(plan, log.sensor)
+        joint = load_joint_covariances(plan.store, log.run, log.sensor)
+        root[own] = _root(np.hstack([sigma[own], np.nan_to_num(lens_sigma[own])]), joint, epochs)
     settings = plan.survey.config.navigation.calibration
     return PicturePoses(
-        pictures, place, geographic, from_map, slope, level, influence, sigma, tuple(told.tolist()),
+        pictures, place, geographic, from_map, slope, level, influence, sigma, lens_sigma, root, tuple(told.tolist()),
         settings.traverse_time_constant_s,
     )  # fmt: skip
 
@@ -158,7 +184,7 @@ def _pose_sigma(plan: SurveyPlan, source: TrajectorySource, epochs: Int64) -> tu
 
 
 def _mounting_sigma(plan: SurveyPlan, run: str, sensor: str, camera: Sensor, epochs: Int64) -> tuple[Float64, str]:
-    """Return 1 σ (k, 6; m and rad) of a camera's mounting: calibrated, else the rig file's; 0 where none is stated."""
+    """Return 1 σ (k, 6; m and rad) of a camera's mounting: adjusted, else calibrated, else the rig file's, else 0."""
     lever, turn = camera.lever_arm_sigma_m, camera.boresight_sigma_deg
     stated = np.array([*(lever or (np.nan,) * 3), *np.radians(turn or (np.nan,) * 3)])
     sigma = np.tile(stated, (epochs.size, 1))
@@ -170,8 +196,69 @@ def _mounting_sigma(plan: SurveyPlan, run: str, sensor: str, camera: Sensor, epo
         values = np.array([np.nan if row[name] is None else row[name] for name in MOUNTING_SIGMAS])
         values[3:] = np.radians(values[3:])
         sigma[epochs >= row["valid_from_gps_ns"]] = values
+    changes = read_small(plan.store, "mounting_corrections")
+    held = {key_of_row(row): row for row in ([] if changes is None else changes.to_pylist())}
+    sigma = _adjusted(held.get((run, sensor), held.get(("*", sensor))), MOUNTING_COLUMNS[:6], sigma)
     unknown = bool(np.isnan(sigma).any())
     return np.nan_to_num(sigma), "mounting without σ, taken as 0" if unknown else ""
+
+
+def _lens_sigma(plan: SurveyPlan, sensor: str) -> Float64:
+    """Return 1 σ (9,) of a camera's lens, `PARAMETERS`: adjusted, else the rig file's; NaN where nothing states it."""
+    interior = plan.survey.rig.sensors[sensor].interior
+    if interior is None or interior.model == "equirectangular":
+        return np.zeros(len(PARAMETERS))
+    two, five = (np.nan,) * 2, (np.nan,) * 5
+    stated = [*(interior.sigma_focal_px or two), *(interior.sigma_principal_px or two)]
+    stated += interior.sigma_distortion or five
+    table = read_small(plan.store, CAMERA_CHANGES)
+    held = {row["sensor"]: row for row in ([] if table is None else table.to_pylist())}
+    return _adjusted(held.get(sensor), PARAMETERS, np.array(stated))
+
+
+def _root(sigma: Float64, joint: tuple[Int64, Float64] | None, epochs: Int64) -> Float64:
+    """Return a root (k, 21, 21) of the covariance of errors with σ (k, 21), see `PicturePoses.root`.
+
+    joint : epochs and covariances of an adjustment. What the pose's σ have beyond it, and what it did not estimate,
+    is independent.
+    """
+    if joint is None:
+        return sigma[:, :, None] * np.eye(JOINT)
+    knots, known = joint
+    at = np.interp(epochs.astype(np.float64), knots.astype(np.float64), np.arange(knots.size, dtype=np.float64))
+    before = np.minimum(at.astype(np.int64), knots.size - 1)
+    after, share = np.minimum(before + 1, knots.size - 1), (at - before)[:, None, None]
+    covariance = (1.0 - share) * known[before] + share * known[after]
+    diagonal = np.arange(JOINT)
+    own = covariance[:, diagonal, diagonal]
+    known_alone = np.hstack([np.maximum(own[:, :6], sigma[:, :6] ** 2), np.where(own > 0.0, own, sigma**2)[:, 6:]])
+    covariance[:, diagonal, diagonal] = known_alone
+    scale = np.sqrt(covariance[:, diagonal, diagonal])
+    scale[scale == 0.0] = 1.0
+    unit = covariance / (scale[:, :, None] * scale[:, None, :])
+    pose, rest = slice(0, 6), slice(6, JOINT)
+    root = np.zeros_like(unit)
+    root[:, rest, rest], inverse = _symmetric_root(unit[:, rest, rest])
+    root[:, pose, rest] = unit[:, pose, rest] @ inverse
+    left = unit[:, pose, pose] - root[:, pose, rest] @ root[:, pose, rest].transpose(0, 2, 1)
+    root[:, pose, pose] = _symmetric_root(left)[0]
+    return np.asarray(scale[:, :, None] * root)
+
+
+def _symmetric_root(matrix: Float64) -> tuple[Float64, Float64]:
+    """Return roots R (k, m, m) of positive matrices, and R⁻ᵀ; 0 where rounding leaves nothing."""
+    values, vectors = np.linalg.eigh(matrix)
+    roots = np.sqrt(np.maximum(values, 0.0))
+    inverse = np.where(values > _SINGULAR, 1.0 / np.maximum(roots, _SINGULAR), 0.0)
+    return vectors * roots[:, None, :], vectors * inverse[:, None, :]
+
+
+def _adjusted(row: Mapping[str, Any] | None, names: Sequence[str], sigma: Float64) -> Float64:
+    """Return σ (…, k) of named values with those after an adjustment, for the values that it estimated."""
+    if row is None:
+        return sigma
+    after, prior = (np.array([row[f"{w}sigma_{n}"] or 0.0 for n in names], np.float64) for w in ("", "prior_"))
+    return np.where(prior > 0.0, after, sigma)
 
 
 def _cross(vector: Float64) -> Float64:

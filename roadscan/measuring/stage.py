@@ -31,7 +31,10 @@ class PictureLayer(Stage):
     after = ("tiles",)
     section = "pictures"
     units = "files"
-    reads = ("images", "trajectory", "trajectory_accuracy", "clocks", "mountings", "corrections", "cells", "overviews")
+    reads = (
+        "images", "trajectory", "trajectory_accuracy", "clocks", "mountings", "corrections", "mounting_corrections",
+        "camera_corrections", "camera_covariances", "cells", "overviews",
+    )  # fmt: skip
     writes = (PRODUCT,)
 
     def is_asked(self, survey: Survey) -> bool:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.core.crs import MapFrame, crs_from_text
 from roadscan.core.errors import ConfigError
-from roadscan.measuring.measure import Measured, MeasuredPlace
+from roadscan.measuring.measure import Measured, MeasuredPlace, length_of
 
 Float64 = npt.NDArray[np.float64]
 
@@ -39,10 +39,17 @@ def place_rows(places: Sequence[MeasuredPlace]) -> list[dict[str, Any]]:
 
 
 def write_geojson_of(path: Path, measured: Measured, frame: MapFrame) -> int:
-    """Write the line through measured places, or the point of one, and return how many places it has.
+    """Write what :func:`geojson_of` returns, and return how many places it has; ConfigError where none has one."""
+    document = geojson_of(measured, frame)
+    path.write_text(json.dumps(document, indent=1, ensure_ascii=False))
+    return len(document["features"][0]["properties"]["vertices"])
+
+
+def geojson_of(measured: Measured, frame: MapFrame) -> dict[str, Any]:
+    """Return the line through measured places as GeoJSON, or the point of one.
 
     Longitude and latitude are in WGS 84 by RFC 7946 where the map has a CRS, else they are the map's own metres;
-    heights stay as the map has them. Properties hold picture, camera, run, and place and 1 σ of each vertex.
+    heights stay as the map has them. Properties hold picture, camera, run, length, and place and 1 σ of each vertex.
 
     Raises
     ------
@@ -56,21 +63,17 @@ def write_geojson_of(path: Path, measured: Measured, frame: MapFrame) -> int:
     places = np.array([one.place_m for one in kept])
     coordinates = np.round(_coordinates(places, frame), _DEGREE_DECIMALS).tolist()
     single = len(kept) == 1
+    length_m, sigma_length_m = length_of(kept)
     geometry = {"type": "Point" if single else "LineString", "coordinates": coordinates[0] if single else coordinates}
     about = {
         "run": measured.run, "camera": measured.camera, "picture": measured.file.name,
         "sigma_assumed": measured.assumed,
-        "left_out": len(measured.places) - len(kept), "length_m": round(_length_m(places), _METRE_DECIMALS),
+        "left_out": len(measured.places) - len(kept), "length_m": round(length_m, _METRE_DECIMALS),
+        "sigma_length_m": round(sigma_length_m, _METRE_DECIMALS),
         "vertices": [{n: _rounded(v) for n, v in row.items() if n != "reason"} for row in place_rows(kept)],
     }  # fmt: skip
     feature = {"type": "Feature", "geometry": geometry, "properties": about}
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}, indent=1, ensure_ascii=False))
-    return len(kept)
-
-
-def _length_m(places: Float64) -> float:
-    """Return the length of a line (m); 0 of a point."""
-    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    return {"type": "FeatureCollection", "features": [feature]}
 
 
 def _coordinates(places: Float64, frame: MapFrame) -> Float64:

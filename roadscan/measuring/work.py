@@ -50,7 +50,7 @@ def row_tasks(session: Session) -> list[PictureRows]:
                 log = poses.pictures.logs[log_number]
                 unit = f"{_PLAIN.sub('-', log.run)}_{_PLAIN.sub('-', log.sensor)}_{log.key[:6]}_{part:03d}.parquet"
                 digests = [(str(t), near.cells[t].digest) for t in sorted(near.cells, key=str)]
-                known = [picked.sigma.tobytes().hex(), picked.told, picked.pictures.epochs_gps_ns.tobytes().hex()]
+                known = [picked.root.tobytes().hex(), picked.told, picked.pictures.epochs_gps_ns.tobytes().hex()]
                 key = key_of(code, unit, picked.pictures.key(), known, digests, reach_m, logs, plan.ground.map)
                 tasks.append(_task(session, unit, key, picked, near, (), logs, reach_m))
     for names, own_unplaced in _by_log(listed.unplaced).items():
@@ -78,8 +78,8 @@ def picked_poses(poses: PicturePoses, index: npt.NDArray[np.int64]) -> PicturePo
     )  # fmt: skip
     return PicturePoses(
         some, poses.place_m[index], poses.geographic[index], poses.camera_from_map[index], poses.map_from_ned[index],
-        poses.ned_from_camera[index], poses.influence[index], poses.sigma[index],
-        tuple(poses.told[k] for k in index.tolist()), poses.correlation_s,
+        poses.ned_from_camera[index], poses.influence[index], poses.sigma[index], poses.lens_sigma[index],
+        poses.root[index], tuple(poses.told[k] for k in index.tolist()), poses.correlation_s,
     )  # fmt: skip
 
 

@@ -15,10 +15,28 @@ from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
 
 TABLE: Final = "camera_corrections"
 COLUMNS: Final = (*PARAMETERS, "clock_s", "line_time_s")
 """Columns of the table, in the order of the values."""
+
+
+JOINT_TABLE: Final = "camera_covariances"
+JOINT: Final = 21
+"""Errors of a picture that are known jointly: 6 of its pose, 6 of the mounting, 9 of the lens (`PARAMETERS`)."""
+
+
+def load_joint_covariances(store: Store, run: str, sensor: str) -> tuple[Int64, Float64] | None:
+    """Returns epochs (k,) and covariances (k, 21, 21) that an adjustment found for a camera in a run; None without."""
+    table = read_small(store, JOINT_TABLE)
+    rows = [] if table is None else [r for r in table.to_pylist() if (r["run"], r["sensor"]) == (run, sensor)]
+    if not rows:
+        return None
+    upper = np.triu_indices(JOINT)
+    found = np.zeros((len(rows), JOINT, JOINT))
+    found[:, upper[0], upper[1]] = found[:, upper[1], upper[0]] = [row["covariance"] for row in rows]
+    return np.array([row["epoch_gps_ns"] for row in rows], np.int64), found
 
 
 def load_camera_changes(store: Store) -> Mapping[str, Float64]:

@@ -13,6 +13,8 @@ import pyarrow.csv as pa_csv
 
 from roadscan.core.errors import RunError
 from roadscan.core.rig import Rig
+from roadscan.core.rig_text import replace_file
+from roadscan.formats.vectors.picture_points import BY_HAND, FOUND
 from roadscan.navigation.tasks.taken_pictures import taken_pictures
 from roadscan.store.logs import LogRecord
 from roadscan.store.readings.row_groups import read_groups
@@ -37,8 +39,8 @@ def measured_points(store: Store, records: Sequence[LogRecord], rig: Rig) -> Mea
     """Return the points that logs state to be measured in pictures.
 
     A row without a run or a sensor has those of its log, or else those of the only picture of that name. A row whose
-    picture is not known, or that several pictures of one name could be meant by, is left out and noted; so is all but
-    the last of several places of one point in one picture.
+    picture is not known, or that several pictures of one name could be meant by, is left out and noted. Of several
+    places of one point in one picture the last that a person measured counts, or else the last; the others are noted.
     """
     known = _pictures(store, records, rig)
     kept: dict[tuple[str, str, str, str], dict[str, Any]] = {}
@@ -55,6 +57,8 @@ def measured_points(store: Store, records: Sequence[LogRecord], rig: Rig) -> Mea
                 place = run, sensor, row["picture"], row["point"]
                 if place in kept:
                     faults[f"{record.path}: {row['point']} stands twice in {run}/{sensor}/{row['picture']}"] += 1
+                    if row["source"] == FOUND and kept[place]["source"] == BY_HAND:
+                        continue
                 kept[place] = row | {"run": run, "sensor": sensor}
     ordered = [kept[place] for place in sorted(kept)]
     notes = tuple(f"{text}: {n:,} measurement{'s' * (n > 1)} left out" for text, n in sorted(faults.items()))
@@ -84,13 +88,15 @@ def control_rows(store: Store, records: Sequence[LogRecord]) -> list[dict[str, A
 
 
 def write_points(rows: pa.Table, file: Path) -> None:
-    """Write measurements as a file that `picture_points_csv` and `roadscan camera resect` read."""
+    """Write measurements as a file that `picture_points_csv` and `roadscan camera resect` read, as a whole or not."""
     listed = rows.to_pylist()
     for row in listed:
         for name in ("u_px", "v_px", "sigma_px"):
             row[name] = None if row[name] is None else round(row[name], _CSV_DIGITS)
+    content = pa.BufferOutputStream()
     table = pa.Table.from_pylist(listed, schema=rows.schema)
-    pa_csv.write_csv(table, file, pa_csv.WriteOptions(quoting_style="needed"))
+    pa_csv.write_csv(table, content, pa_csv.WriteOptions(quoting_style="needed"))
+    replace_file(file, content.getvalue().to_pybytes())
 
 
 def _pictures(store: Store, records: Sequence[LogRecord], rig: Rig) -> dict[str, list[tuple[str, str]]]:

@@ -2,8 +2,8 @@
 
 It listens on a loopback address. It answers GET and HEAD, whole or by one range (RFC 9110, 14), for paths that the site
 names; no path reaches the file system. A request that names another host is refused, so that no page of another origin
-reads the survey by a name that resolves to this machine. Where it is asked to, it takes edits: by POST from its own
-page, with a token that stands in no document.
+reads the survey by a name that resolves to this machine. Where it has doors, it answers POST from its own page: what
+changes nothing as it is, and what writes with a token that stands in no document.
 """
 
 from __future__ import annotations
@@ -12,18 +12,17 @@ import hmac
 import re
 import secrets
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Protocol
+from typing import Any, BinaryIO, Final, NamedTuple, Protocol
 from urllib.parse import unquote, urlsplit
 
 from roadscan import __version__
 from roadscan.core.errors import RoadscanError
 from roadscan.site.document import json_bytes
 from roadscan.site.live import Served
-from roadscan.site.parts.edits import POST
 from roadscan.site.site import REPORT_PAGE
 from roadscan.site.web_part import HOW_TO_BUILD, PAGE
 
@@ -57,7 +56,9 @@ _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 _LONGEST_HEAD: Final = 8192  # longer paths are refused
 TOKEN_HEADER: Final = "X-Roadscan-Edit"
 """Header with the token, which a page of another origin can only send with this server's permission."""
-_MOST_EDITS_BYTES: Final = 16_000_000  # larger documents of edits are refused
+_MOST_POSTED_BYTES: Final = 16_000_000  # larger documents are refused
+_POSTED: Final = ("application/geo+json", "application/json")
+"""Types of documents that are taken: a page of another origin cannot send them without this server's permission."""
 
 
 class Documents(Protocol):
@@ -67,19 +68,24 @@ class Documents(Protocol):
         """Return a document by its path; None where there is none."""
 
 
-class SiteServer(ThreadingHTTPServer):
-    """Serves a site on a loopback port; a context manager, in which `serve_forever` answers until `shutdown`.
+class Door(NamedTuple):
+    """What answers documents that the page posts at a path."""
 
-    With `take`, a function that takes in a document of edits and answers, it takes edits.
-    """
+    answer: Callable[[bytes], Any]
+    writes: bool
+    """Whether it changes files: the token is asked for."""
+
+
+class SiteServer(ThreadingHTTPServer):
+    """Serves a site on a loopback port; a context manager, in which `serve_forever` answers until `shutdown`."""
 
     daemon_threads = True
     allow_reuse_address = False
 
-    def __init__(self, documents: Documents, port: int = 0, take: Callable[[bytes], Any] | None = None) -> None:
-        """Listen on a port; 0 selects a free one."""
-        self.documents, self.take = documents, take
-        self.token = secrets.token_urlsafe(24) if take is not None else ""
+    def __init__(self, documents: Documents, port: int = 0, doors: Mapping[str, Door] | None = None) -> None:
+        """Listen on a port; 0 selects a free one. Doors are named by their paths."""
+        self.documents, self.doors = documents, doors or {}
+        self.token = secrets.token_urlsafe(24) if any(door.writes for door in self.doors.values()) else ""
         super().__init__((LOOPBACK, port), _Handler)
 
     def handle_error(self, request: object, client_address: object) -> None:
@@ -114,17 +120,18 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(with_body=False)
 
     def do_POST(self) -> None:
-        """Apply edits."""
+        """Answer by a door."""
         self.close_connection = True  # an unread body may follow
-        if self.server.take is None or urlsplit(self.path).path != f"/{POST}":
+        door = self.server.doors.get(urlsplit(self.path).path.removeprefix("/"))
+        if door is None:
             self._refuse_method()
             return
-        refused = self._refused()
+        refused = self._refused(door)
         if refused is not None:
             self._text(*refused)
             return
         try:
-            answer = self.server.take(self.rfile.read(int(self.headers["Content-Length"])))
+            answer = door.answer(self.rfile.read(int(self.headers["Content-Length"])))
         except RoadscanError as error:
             self._text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
             return
@@ -132,21 +139,21 @@ class _Handler(BaseHTTPRequestHandler):
         self._head(HTTPStatus.OK, "answer.json", {"Content-Length": str(len(content))})
         self.wfile.write(content)
 
-    def _refused(self) -> tuple[HTTPStatus, str] | None:
-        """Return why edits are refused; None where they come from this server's page."""
+    def _refused(self, door: Door) -> tuple[HTTPStatus, str] | None:
+        """Return why a document is refused; None where it comes from this server's page."""
         host, origin = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
         if host not in [[one] for one in self.server.hosts] or origin != [f"http://{host[0]}"]:
-            return HTTPStatus.FORBIDDEN, "edits are taken from this server's own page alone"
+            return HTTPStatus.FORBIDDEN, "documents are taken from this server's own page alone"
         token = self.headers.get(TOKEN_HEADER, "").encode("utf-8", "replace")
-        if not hmac.compare_digest(token, self.server.token.encode()):
+        if door.writes and not hmac.compare_digest(token, self.server.token.encode()):
             return HTTPStatus.FORBIDDEN, "open the page by the address that roadscan printed: it allows edits"
-        if self.headers.get_content_type() != "application/geo+json":
-            return HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "edits come as application/geo+json"
+        if self.headers.get_content_type() not in _POSTED:
+            return HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"documents come as {' or '.join(_POSTED)}"
         length = self.headers.get("Content-Length", "")
         if not length.isascii() or not length.isdigit():
-            return HTTPStatus.LENGTH_REQUIRED, "edits come with their length"
-        if int(length) > _MOST_EDITS_BYTES:
-            return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"edits hold {_MOST_EDITS_BYTES} bytes at most"
+            return HTTPStatus.LENGTH_REQUIRED, "documents come with their length"
+        if int(length) > _MOST_POSTED_BYTES:
+            return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a document holds {_MOST_POSTED_BYTES} bytes at most"
         return None
 
     def __getattr__(self, name: str) -> object:
@@ -159,7 +166,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refuse_method(self) -> None:
         self.close_connection = True  # an unread body may follow
-        told = "this server is read-only" if self.server.take is None else "only edits are taken, at their address"
+        told = "documents are taken at their addresses alone" if self.server.doors else "this server is read-only"
         self._text(HTTPStatus.METHOD_NOT_ALLOWED, told, {"Allow": "GET, HEAD"})
 
     def _answer(self, *, with_body: bool) -> None:

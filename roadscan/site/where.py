@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.grid import Bounds
 from roadscan.core.ids import TileId
-from roadscan.georeference.plan.plan import plan_of
-from roadscan.pictures.placed import plan_pictures
+from roadscan.georeference.plan.plan import plan_of, poses_plan_of
+from roadscan.measuring.measure import pixel_covariance, posed_pictures
 from roadscan.pictures.views import PictureRule, sights
 from roadscan.run.session import Session
 from roadscan.tiles.tasks.cell_files import read_cells
@@ -23,6 +24,7 @@ REACH_M: Final = 60.0
 _NEAR_M: Final = 1.0
 """Distance within which cells give the height of a place (m)."""
 _BORDER_PX: Final = 1  # least distance of the place from a picture's border
+_WIDEST_SCALE: Final = 2.0  # upper bound on the scale of a map: Web Mercator reaches it at 60° latitude
 _ANY_ANGLE_DEG: Final = -90.0  # accepts any angle between view and surface
 
 
@@ -40,17 +42,24 @@ class PictureOfPlace:
     distance_m: float
     resolution_m: float
     """Size of a pixel at the place (m)."""
+    sigma_u_px: float
+    """1 σ of `u_px`, from those of pose, mounting, lens and the place itself."""
+    sigma_v_px: float
+    name: str
+    """RUN/CAMERA/FILE."""
 
 
 def pictures_of_place(
-    session: Session, easting_m: float, northing_m: float, height_m: float | None = None, reach_m: float = REACH_M
-) -> list[PictureOfPlace]:
+    session: Session, easting_m: float, northing_m: float, height_m: float | None = None, reach_m: float = REACH_M,
+    sigma_m: npt.ArrayLike = (0.0, 0.0, 0.0),
+) -> list[PictureOfPlace]:  # fmt: skip
     """Return the pictures that see a place of the map, the one with the finest resolution first.
 
     Parameters
     ----------
     easting_m, northing_m, height_m : place on the map (m); without a height that of the surveyed ground there.
     reach_m : farthest distance from a camera.
+    sigma_m : 1 σ of easting, northing and height, where the place is known so.
 
     Raises
     ------
@@ -62,18 +71,30 @@ def pictures_of_place(
     if height_m is None:
         height_m = ground_height_m(session, easting_m, northing_m)
     rule = PictureRule((), reach_m, _ANY_ANGLE_DEG, _BORDER_PX)
-    pictures = plan_pictures(plan_of(session), rule).near(Bounds(easting_m, northing_m, easting_m, northing_m))
-    frame, place = plan_of(session).ground.map, np.array([[easting_m, northing_m, height_m]])
-    worlds = [frame.world_from_map(world, place)[None] for world in pictures.worlds]
+    poses = posed_pictures(session)
+    pictures, frame, place = (
+        poses.pictures,
+        poses_plan_of(session).ground.map,
+        np.array([easting_m, northing_m, height_m]),
+    )
+    worlds = [frame.world_from_map(world, place[None])[None] for world in pictures.worlds]
     no_front = [np.full((1, 3), np.nan)] * len(worlds)
-    near = ((number, np.zeros(1, np.int64)) for number in range(len(pictures)))
+    widest = _WIDEST_SCALE * reach_m
+    within = np.flatnonzero(np.hypot(*(poses.place_m[:, :2] - place[:2]).T) <= widest)
+    near = ((number, np.zeros(1, np.int64)) for number in within.tolist())
     seen = sights(worlds, no_front, pictures.views, rule, near)
+    covariance = np.diag(np.square(np.asarray(sigma_m, np.float64)))
     found = []
     for view, (u, v), distance, resolution in zip(
         seen.view.tolist(), seen.pixel.tolist(), seen.distance_m.tolist(), seen.resolution_m.tolist(), strict=True
     ):
         log = pictures.logs[pictures.log[view]]
-        found.append(PictureOfPlace(log.run, log.sensor, pictures.path(view), u, v, distance, resolution))
+        point = pictures.views.opencv_from_world[view] @ (
+            worlds[pictures.views.world[view]][0, 0] - pictures.views.eye_world_m[view]
+        )
+        across, down = np.sqrt(np.diag(pixel_covariance(poses, view, point, covariance))).tolist()
+        file, name = pictures.path(view), pictures.name(view)
+        found.append(PictureOfPlace(log.run, log.sensor, file, u, v, distance, resolution, across, down, name))
     return found
 
 

@@ -28,6 +28,7 @@ REPAIR_HINT: Final = {
     "mountings hold",
     "mounting_corrections": "put it back, or adjust again; if it is removed, mountings hold as they were stated",
     "camera_corrections": "put it back, or adjust again; if it is removed, lenses and clocks hold as they were stated",
+    "camera_covariances": "put it back, or adjust again; if it is removed, σ in pictures count as independent",
     "corrections": "put it back, or compute it again; if it is removed, trajectories hold as they were recorded",
 }
 """How each table is repaired when it is damaged."""

@@ -66,7 +66,9 @@ def _path(count: int, late_s: float = 0.0) -> tuple[Float64, Float64]:
     return place, ENU_FROM_NED @ turned
 
 
-def _drive(seed: int, false: float = 0.0, lens_error: Float64 | None = None, late_s: float = 0.0) -> Drive:
+def _drive(
+    seed: int, false: float = 0.0, lens_error: Float64 | None = None, late_s: float = 0.0, survey_m: float = 0.0
+) -> Drive:
     rng = np.random.default_rng(seed)
     n = 60
     body, turned = _path(n)
@@ -93,6 +95,7 @@ def _drive(seed: int, false: float = 0.0, lens_error: Float64 | None = None, lat
         np.tile(LEVER_M, (n, 1)), np.tile(stated_axes, (n, 1, 1)),
     )  # fmt: skip
     surveyed = np.where((np.arange(len(points)) < control)[:, None], np.nan, points)
+    surveyed += survey_m * np.random.default_rng([seed, 1]).normal(size=points.shape)
     measured = Measurements(
         exposures, picture, pixel, np.where(point < control, 0.5, NOISE_PX), point, surveyed,
         np.where(np.isnan(surveyed[:, :2]), np.nan, 0.005),
@@ -229,6 +232,32 @@ def test_stated_sigma_holds_and_residuals_are_those_of_the_noise() -> None:
         assert np.median(pictures.measured.sigma_px[tie]) == pytest.approx(NOISE_PX, rel=0.1)
     # σ holds a common offset of the control as well, which these draws do not have.
     assert 0.4 < np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 1.5
+
+
+def test_attitude_and_boresight_are_known_together_far_better_than_each() -> None:
+    """The camera's attitude by the joint covariance: errors over σ; and its σ over those of independent errors."""
+    normalised, shares = [], []
+    for seed in range(20, 28):
+        drive = _drive(seed, survey_m=0.005)
+        found, _ = _solved(drive)
+        state = state_of(found)
+        _, turned = _body_after(drive, state)
+        (joint,) = found.cameras.joint
+        assert (joint.run, joint.sensor) == ("a", "left") and (np.diff(joint.epochs_gps_ns) >= NS_PER_S / 2).all()
+        sums = joint.covariance[:, 3:6, 3:6] + joint.covariance[:, 9:12, 9:12]
+        alone = np.einsum("kii->ki", sums).copy()
+        sums += joint.covariance[:, 3:6, 9:12] + joint.covariance[:, 9:12, 3:6]
+        variance = np.einsum("kii->ki", sums)
+        pictures = np.rint((joint.epochs_gps_ns - FIRST_NS) / STEP_NS).astype(int)
+        inside = (pictures >= 0) & (pictures < len(turned))
+        off = Rotation.from_matrix(drive.true_turn.transpose(0, 2, 1) @ turned)[pictures[inside]].as_rotvec()
+        off += state.mountings[0][3:6] - BORESIGHT_RAD
+        normalised.append(off / np.sqrt(variance[inside]))
+        shares.append(np.sqrt(variance / alone))
+        seated = np.einsum("kii->ki", joint.covariance)[0, 6:12] / found.mountings.sigma[0, :6] ** 2
+        assert np.abs(seated[[0, 1, 3, 4, 5]] - 1.0).max() < 1e-9  # the height of a single sensor is the poses' own
+    assert 0.7 < np.sqrt(np.mean(np.concatenate(normalised) ** 2)) < 1.4
+    assert np.median(np.concatenate(shares)) < 0.2
 
 
 def test_the_order_of_measurements_changes_no_bit() -> None:

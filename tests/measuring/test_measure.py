@@ -16,17 +16,24 @@ from roadscan.cli import app
 from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
+from roadscan.georeference.sources import MOUNTING_COLUMNS
 from roadscan.measuring.kernels.march import BELOW, NO_GROUND, first_hits
-from roadscan.measuring.measure import measure, meet
+from roadscan.measuring.measure import length_of, measure, meet
+from roadscan.pictures.camera_changes import COLUMNS
 from roadscan.pictures.lens import pixels_of, rays_of
 from roadscan.pictures.views import Lens
 from roadscan.run.session import Session
+from roadscan.site.where import pictures_of_place
 from roadscan.store.small_tables import write_small
+from roadscan.store.store import Store
 from tests.measuring.drive import MATRIX, Drive
 from tests.surveys import changed
 
 POSE_SIGMA = np.array([0.03, 0.02, 0.04, 8e-4, 6e-4, 1.5e-3])
-LEVER_SIGMA, TURN_SIGMA_DEG = (0.02, 0.015, 0.01), (0.05, 0.04, 0.06)
+LEVER_SIGMA, TURN_SIGMA_DEG = np.array([0.02, 0.015, 0.01]), (0.05, 0.04, 0.06)
+LENS_SIGMA = np.array([1.5, 1.5, 1.0, 1.2, 0.004, 0.004, 2e-4, 2e-4, 0.002])
+ALL_SIGMA = np.array([*POSE_SIGMA, *LEVER_SIGMA, *np.radians(TURN_SIGMA_DEG), *LENS_SIGMA])
+PLACE_SIGMA = np.array([0.01, 0.01, 0.02])
 
 
 def session(drive: Drive) -> Session:
@@ -60,22 +67,47 @@ def test_painted_corners_lie_where_they_are(measured_drive: Drive) -> None:
     assert np.sqrt(np.mean(horizontal**2)) < 0.005 and np.quantile(horizontal, 0.95) < 0.01
 
 
-def disturbed(drive: Drive, rng: np.random.Generator) -> Session:
-    """The survey with another mounting and with corrections of its poses that are wrong, each by its stated σ."""
+def disturbed(drive: Drive, rng: np.random.Generator, adjusted: bool) -> Session:
+    """The survey with another mounting and lens, and with corrections of its poses that are wrong, each by its σ.
+
+    adjusted : tables of an adjustment make mounting and lens wrong, at the expense of the poses as in a real one; the
+    rig file states σ that are much larger.
+    """
     survey = Survey.load(drive.survey_file)
     camera = survey.rig.sensors["camera"]
     rotation, lever = camera.mounting().arrays()
-    turn = np.radians(TURN_SIGMA_DEG) * rng.standard_normal(3)
+    alike = joint_correlation() if adjusted else np.eye(21)
+    errors = ALL_SIGMA * rng.multivariate_normal(np.zeros(21), alike, method="cholesky")
+    values, shift, turn, bend = np.split(errors, [6, 9, 12])
     about = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
     u, _, w = np.linalg.svd((np.eye(3) + about) @ rotation)
+    interior = camera.interior
+    lens = np.array([*interior.focal_px, *interior.principal_px, *interior.distortion]) + bend
+    larger = 5.0 if adjusted else 1.0
+    sigma = larger * LENS_SIGMA
+    own = "rig__sensors__camera__"
     changes = {
-        "rig__sensors__camera__body_from_sensor": tuple(map(tuple, (u @ w).tolist())),
-        "rig__sensors__camera__lever_arm_body_m": tuple((lever + LEVER_SIGMA * rng.standard_normal(3)).tolist()),
-        "rig__sensors__camera__lever_arm_sigma_m": LEVER_SIGMA,
-        "rig__sensors__camera__boresight_sigma_deg": TURN_SIGMA_DEG,
+        own + "lever_arm_sigma_m": tuple((larger * LEVER_SIGMA).tolist()),
+        own + "boresight_sigma_deg": tuple((larger * np.array(TURN_SIGMA_DEG)).tolist()),
+        own + "interior__sigma_focal_px": tuple(sigma[:2].tolist()),
+        own + "interior__sigma_principal_px": tuple(sigma[2:4].tolist()),
+        own + "interior__sigma_distortion": tuple(sigma[4:].tolist()),
     }
     store = drive.store()
-    values = POSE_SIGMA * rng.standard_normal(6)
+    if adjusted:
+        write_adjusted(store, np.concatenate([shift, turn]), bend)
+        upper = (alike * np.outer(ALL_SIGMA, ALL_SIGMA))[np.triu_indices(21)].tolist()
+        known: dict[str, object] = {"run": "run-1", "sensor": "camera", "covariance": upper}
+        epochs = sorted(p["epoch_gps_ns"] for p in drive.poses.values())[::3]
+        write_small(store, "camera_covariances", [known | {"epoch_gps_ns": epoch} for epoch in epochs])
+    else:
+        changes |= {
+            own + "body_from_sensor": tuple(map(tuple, (u @ w).tolist())),
+            own + "lever_arm_body_m": tuple((lever + shift).tolist()),
+            own + "interior__focal_px": tuple(lens[:2].tolist()),
+            own + "interior__principal_px": tuple(lens[2:4].tolist()),
+            own + "interior__distortion": tuple(lens[4:].tolist()),
+        }
     rows = []
     for epoch in (min(p["epoch_gps_ns"] for p in drive.poses.values()) - 10**9,
                   max(p["epoch_gps_ns"] for p in drive.poses.values()) + 10**9):  # fmt: skip
@@ -88,13 +120,44 @@ def disturbed(drive: Drive, rng: np.random.Generator) -> Session:
     return Session(changed(survey, changes), store)
 
 
-def test_stated_sigma_is_right_where_poses_and_mounting_are_disturbed(measured_drive: Drive, tmp_path: Path) -> None:
+def joint_correlation() -> np.ndarray:
+    """Attitude against boresight and position against lever arm, as pictures tell their sums; focal lengths alike."""
+    found = np.eye(21)
+    for one, other, value in ((0, 7, 0.8), (1, 6, 0.7), (2, 8, -0.95), (3, 9, -0.97), (4, 10, -0.97), (5, 11, -0.98),
+                              (12, 13, 0.9), (14, 16, 0.3)):  # fmt: skip
+        found[one, other] = found[other, one] = value
+    return found
+
+
+def write_adjusted(store: Store, mounting: np.ndarray, lens: np.ndarray) -> None:
+    """What an adjustment leaves, with the errors given: the σ after it, and larger ones before."""
+    held = {
+        "mounting_corrections": (MOUNTING_COLUMNS, [*mounting, 0.0], [*LEVER_SIGMA, *np.radians(TURN_SIGMA_DEG), 0.0]),
+        "camera_corrections": (COLUMNS, [*lens, 0.0, 0.0], [*LENS_SIGMA, 0.0, 0.0]),
+    }
+    for table, (names, values, sigma) in held.items():
+        row: dict[str, object] = {"sensor": "camera"} | ({"run": "*"} if table.startswith("mounting") else {})
+        for name, value, after in zip(names, values, sigma, strict=True):
+            row |= {name: float(value), f"sigma_{name}": float(after), f"prior_sigma_{name}": 5.0 * float(after)}
+        write_small(store, table, [row])
+
+
+@pytest.mark.parametrize("adjusted", [False, True], ids=["as the rig file states", "as an adjustment found"])
+def test_stated_sigma_is_right_where_poses_mounting_and_lens_are_disturbed(
+    measured_drive: Drive, tmp_path: Path, adjusted: bool
+) -> None:
     drive = Drive(measured_drive.copy_with_store_to(tmp_path / "survey").survey_file)
-    rng = np.random.default_rng(38)
+    rms, squares, lengths, stereo, pixels = scored(drive, np.random.default_rng(38), 60, adjusted)
+    assert (rms[:2] > 0.8).all() and (rms[:2] < 1.25).all()
+    assert 0.8 < squares < 1.25 and 0.8 < lengths < 1.25 and 0.8 < stereo < 1.25 and 0.8 < pixels < 1.25
+
+
+def scored(drive: Drive, rng: np.random.Generator, draws: int, adjusted: bool) -> tuple[np.ndarray, ...]:
+    """Errors over their σ, RMS: by axis, of both horizontal ones, of lengths, of stereo, of predicted pixels."""
     files, corners = list(drive.poses)[:4], drive.corners()
-    normalised, squares, stereo = [], [], []
-    for _ in range(60):
-        own = disturbed(drive, rng)
+    normalised, squares, lengths, stereo, predicted = [], [], [], [], []
+    for _ in range(draws):
+        own = disturbed(drive, rng, adjusted)
         for file in files[:3:2]:
             pixel = drive.pixels(file, corners)
             distance = np.linalg.norm(drive.seen(file, corners), axis=1)
@@ -107,6 +170,8 @@ def test_stated_sigma_is_right_where_poses_and_mounting_are_disturbed(measured_d
                 error = one.place_m - place
                 normalised.append(error / one.sigma_m)
                 squares.append(error[:2] @ np.linalg.solve(one.covariance_m2[:2, :2], error[:2]) / 2)
+            length, sigma = length_of(found.places)
+            lengths.append((length - np.linalg.norm(np.diff(corners[seen], axis=0), axis=1).sum()) / sigma)
         pair = [drive.pixels(file, corners) for file in files[:2]]
         both = np.flatnonzero(np.isfinite(np.hstack(pair)).all(axis=1))
         one = int(rng.choice(both))
@@ -114,10 +179,14 @@ def test_stated_sigma_is_right_where_poses_and_mounting_are_disturbed(measured_d
         place, _ = meet(own, (files[0], files[1]), pixels)
         error = place.place_m - corners[one]
         stereo.append(error @ np.linalg.solve(place.covariance_m2, error) / 3)
+        surveyed = rng.normal(corners[one], PLACE_SIGMA)
+        for view in pictures_of_place(own, *surveyed, sigma_m=PLACE_SIGMA):
+            if view.file.name in files[:2]:
+                miss = np.array([view.u_px, view.v_px]) - pair[files.index(view.file.name)][one]
+                predicted += (miss / [view.sigma_u_px, view.sigma_v_px]).tolist()
+    assert len(predicted) > draws
     rms = np.sqrt(np.mean(np.array(normalised) ** 2, axis=0))
-    assert (rms[:2] > 0.7).all() and (rms[:2] < 1.3).all()
-    assert 0.7 < np.sqrt(np.mean(squares)) < 1.3
-    assert 0.7 < np.sqrt(np.mean(stereo)) < 1.3
+    return rms, *(np.sqrt(np.mean(a)) for a in (squares, np.square(lengths), stereo, np.square(predicted)))
 
 
 def test_two_pictures_measure_what_stands_above_the_ground(measured_drive: Drive) -> None:

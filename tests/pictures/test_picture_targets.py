@@ -163,8 +163,9 @@ def test_found_targets_are_read_again_and_give_the_mounting(yard: Path, tmp_path
 
 
 def test_what_is_wrong_in_measurements_is_named_and_counted(yard: Path) -> None:
-    lines = ["000000.jpg,P1,1,2,run-1", "000000.jpg,P1,3,4,", "000009.jpg,P1,5,6,", "000000.jpg,P2,5,6,run-7"]
-    (yard.parent / "odd.csv").write_text("\n".join(["picture,point,u_px,v_px,run", *lines, ""]))
+    lines = ["000000.jpg,P1,1,2,run-1,", "000000.jpg,P1,3,4,,", "000009.jpg,P1,5,6,,", "000000.jpg,P2,5,6,run-7,"]
+    lines.append("000000.jpg,P1,7,8,,found")  # what a person measured last counts
+    (yard.parent / "odd.csv").write_text("\n".join(["picture,point,u_px,v_px,run,source", *lines, ""]))
     file = yard.with_name("SURVEY-with-odd-points.toml")
     log = '[[runs.logs]]\npath = "odd.csv"\nformat = "picture_points_csv"\nsensor = "camera"\n\n[[passes]]'
     file.write_text(yard.read_text().replace("[[passes]]", log, 1))
@@ -173,6 +174,7 @@ def test_what_is_wrong_in_measurements_is_named_and_counted(yard: Path) -> None:
     ingest(survey, store)
     table = measured_points(store, read_log_records(store), survey.rig)
     assert [(r["run"], r["sensor"], r["point"]) for r in table.rows.to_pylist()] == [("run-1", "camera", "P1")]
+    assert table.rows["u_px"].to_pylist() == [3.0]
     assert len(table.notes) == 3
     assert any("000009.jpg" in note and "not in the store" in note for note in table.notes)
     assert any("P1 stands twice" in note for note in table.notes)

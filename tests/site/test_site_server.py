@@ -13,7 +13,7 @@ import pytest
 
 from roadscan.core.errors import StoreError
 from roadscan.site.live import LiveSite, Served, open_survey
-from roadscan.site.server import SiteServer, range_of
+from roadscan.site.server import Door, SiteServer, range_of
 from tests.surveys import Simulated
 
 CONTENT = bytes(range(256)) * 40
@@ -84,7 +84,7 @@ def editable(held: Held) -> Iterator[SiteServer]:
         held.asked.append(content.decode())
         return {"took": content.decode()}
 
-    with SiteServer(held, take=take) as one:
+    with SiteServer(held, doors={"edits": Door(take, writes=True), "measure": Door(take, writes=False)}) as one:
         thread = threading.Thread(target=one.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         yield one
@@ -110,6 +110,15 @@ def post(
     body = answer.read()
     connection.close()
     return answer.status, body
+
+
+def test_what_writes_nothing_needs_no_token_but_the_own_page(editable: SiteServer, held: Held) -> None:
+    own: dict[str, str | None] = {"path": "/measure", "X_Roadscan_Edit": None, "Content_Type": "application/json"}
+    assert post(editable, b"{}", **own)[0] == 200 and held.asked == ["{}"]
+    for header, value in (("Origin", "http://elsewhere.example"), ("Origin", None), ("Host", "elsewhere.example")):
+        assert post(editable, b"{}", **(own | {header: value}))[0] == 403
+    assert post(editable, b"{}", **(own | {"Content_Type": "text/plain"}))[0] == 415
+    assert post(editable, b"{}", path="/nowhere")[0] == 405 and held.asked == ["{}"]
 
 
 def test_edits_of_its_own_page_are_taken(editable: SiteServer, held: Held) -> None:

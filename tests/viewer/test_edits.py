@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import pytest
 import shapely
 
-from roadscan.site.server import SiteServer
+from roadscan.site.server import Door, SiteServer
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from tests.viewer.conftest import go_to, serious
 from tests.viewer.inventory_site import CRACK, POLES, EditedSite
@@ -29,7 +29,7 @@ class Opened(NamedTuple):
 def opened(open_page: Any, street: Path, tmp_path: Path) -> Iterator[Opened]:
     """The page by the address that allows edits."""
     site = EditedSite(street, tmp_path)
-    with SiteServer(site, take=site.take) as server:
+    with SiteServer(site, doors={"edits": Door(site.take, writes=True)}) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
         origin = server.address.partition("#")[0]

@@ -5,7 +5,8 @@ import type { Desk, Place, ViewName } from './core/desk'
 import { fill, h, icon, iconButton } from './core/dom'
 import * as format from './core/format'
 import { MapView } from './map/map'
-import { Editing, editToken } from './edits/editing'
+import { editToken } from './core/server'
+import { Editing } from './edits/editing'
 import { helpDialog } from './panels/help'
 import { layersPanel } from './panels/layers'
 import { Measurements } from './panels/measurements'
@@ -48,8 +49,8 @@ export class App {
     this.#available = ['map', ...(survey.clouds ? (['cloud'] as const) : []), ...(survey.pictures ? (['pictures'] as const) : []), ...(survey.strips ? (['strips'] as const) : [])]
     this.map = new MapView(desk)
     this.#measurements = new Measurements(desk)
-    this.parts = new ModelParts(desk, this.map, this.#measurements, () => this.#openDock('section'))
-    const token = survey.edits?.post ? editToken() : null
+    const token = survey.edits?.post || survey.measuring?.control ? editToken() : null
+    this.parts = new ModelParts(desk, this.map, this.#measurements, () => this.#openDock('section'), token)
     this.#editing = survey.edits && (token || !survey.edits.post) ? new Editing(desk, this.map, survey.edits, token) : null
     this.#rows = new RowPanel(desk, {
       openPicture: (url, place) => void this.parts.openPicture(url, place),
@@ -60,6 +61,7 @@ export class App {
         this.#openDock('strips')
         void this.parts.goToStationOf(road ?? '', lane ?? null, station_m ?? 0)
       },
+      measure: this.parts.takesControl ? (point) => void this.parts.measureControl(point) : null,
       edit: this.#editing && ((selected) => this.#editing!.controls(selected)),
       edited: this.#editing && ((selected) => this.#editing!.edited(selected)),
     })

@@ -18,7 +18,8 @@ import type { MapView } from './map/map'
 import type { MapTool, Measured } from './map/measure'
 import { type Measurements, spaceFigures } from './panels/measurements'
 import type { Picture, PictureList } from './pictures/list'
-import type { PictureView } from './pictures/view'
+import type { ControlPanel } from './pictures/control'
+import type { PictureTool, PictureView } from './pictures/view'
 import { SectionPanel } from './strips/section'
 import { Strips } from './strips/strips'
 
@@ -37,6 +38,21 @@ const CLOUD_TOOLS: [CloudTool, Parameters<typeof iconButton>[0], string][] = [
   ['profile', 'profile', 'Profile along a line'],
 ]
 
+const PICTURE_TOOLS: [PictureTool, Parameters<typeof iconButton>[0], string][] = [
+  ['select', 'target', 'Read a place'],
+  ['line', 'ruler', 'Line on the ground'],
+  ['stereo', 'cube', 'Place by two pictures'],
+  ['control', 'point', 'Control points in pictures'],
+]
+
+/** The pictures, and what measures in them where a server answers. */
+interface Pictures {
+  list: PictureList
+  view: PictureView
+  control: ControlPanel | null
+  tools: HTMLElement | null
+}
+
 export class ModelParts {
   readonly section: SectionPanel
   readonly tip = h('span', { class: 'tip' })
@@ -44,7 +60,8 @@ export class ModelParts {
   #cloud: Promise<CloudView> | null = null
   #view: CloudView | null = null
   #strips: Promise<Strips> | null = null
-  #pictures: Promise<{ list: PictureList; view: PictureView }> | null = null
+  #pictures: Promise<Pictures> | null = null
+  #abortPictures: () => boolean = () => false
   #active: ReadonlySet<ViewName> = new Set()
 
   constructor(
@@ -52,6 +69,8 @@ export class ModelParts {
     readonly map: MapView,
     readonly measurements: Measurements,
     readonly openSection: () => void,
+    /** Null where this address allows no edits. */
+    readonly token: string | null = null,
   ) {
     this.section = new SectionPanel(desk)
     this.section.pointed = (place) => this.#view?.setDrawings('section-cursor', [{ kind: 'ring', points: [place] }])
@@ -92,13 +111,14 @@ export class ModelParts {
   /** Give up what is being measured; false where nothing was. */
   abort(): boolean {
     const busy = this.map.tool.value !== 'select' || (this.#view !== null && this.#view.tool.value !== 'select')
+    const drawing = this.#abortPictures()
     this.map.measuring.abort()
     this.map.tool.value = 'select'
     if (this.#view) {
       this.#view.abort()
       this.#view.tool.value = 'select'
     }
-    return busy
+    return busy || drawing
   }
 
   #mapMeasured(measured: Measured, remove: () => void): void {
@@ -180,7 +200,7 @@ export class ModelParts {
   /** Fetch the code of all parts, so that they work when the host is gone. */
   async fetchCode(): Promise<void> {
     const { survey } = this.desk
-    const code = [...(survey.clouds ? [import('./cloud/store'), import('./cloud/view'), import('./cloud/slice')] : []), ...(survey.pictures ? [import('./pictures/list'), import('./pictures/view')] : [])]
+    const code = [...(survey.clouds ? [import('./cloud/store'), import('./cloud/view'), import('./cloud/slice')] : []), ...(survey.pictures ? [import('./pictures/list'), import('./pictures/view')] : []), ...(survey.measuring ? [import('./pictures/measuring'), import('./pictures/control')] : [])]
     await Promise.allSettled(code)
   }
 
@@ -303,14 +323,60 @@ export class ModelParts {
 
   // ---- pictures ----
 
-  #openPicturesOnce(): Promise<{ list: PictureList; view: PictureView }> {
+  #openPicturesOnce(): Promise<Pictures> {
     const { survey, source } = this.desk
     this.#pictures ??= (async () => {
       const [{ PictureList }, { PictureView }, index] = await Promise.all([import('./pictures/list'), import('./pictures/view'), source.json<PictureIndex>(survey.pictures!.url)])
       const list = new PictureList(index, source)
-      return { list, view: new PictureView(this.desk, list, () => this.#openStore()) }
+      const view = new PictureView(this.desk, list, () => this.#openStore())
+      return { list, view, ...(await this.#measuringIn(list, view)) }
     })()
     return this.#pictures
+  }
+
+  get takesControl(): boolean {
+    return Boolean(this.desk.survey.measuring?.control && this.token)
+  }
+
+  /** The tools that the server of `roadscan view` answers; none in a site that was published. */
+  async #measuringIn(list: PictureList, view: PictureView): Promise<Pick<Pictures, 'control' | 'tools'>> {
+    const rules = this.desk.survey.measuring
+    if (!rules) return { control: null, tools: null }
+    const [{ PictureMeasuring }, { ControlPanel }] = await Promise.all([import('./pictures/measuring'), import('./pictures/control')])
+    const measuring = new PictureMeasuring(this.desk, this.map, this.measurements, view, list, rules.measure, (text) => (this.tip.textContent = text))
+    const control = rules.control && this.token ? new ControlPanel(this.desk, list, rules.control, this.token) : null
+    view.clicked = (picture, u, v) => measuring.clicked(picture, [u, v])
+    view.ended = () => void measuring.end()
+    this.#abortPictures = () => {
+      const busy = view.tool.value !== 'select'
+      view.tool.value = 'select'
+      return busy
+    }
+    const tips: Record<PictureTool, string> = {
+      select: '',
+      line: 'Click the corners of the line on the ground; a double click ends it.',
+      stereo: 'Click a thing in this picture, then the same thing in another one.',
+      control: '',
+    }
+    const tools = this.#toolbar('Tools of the pictures', PICTURE_TOOLS.filter(([name]) => name !== 'control' || control), view.tool, (tool) => {
+      this.tip.textContent = tips[tool]
+      if (!control) return
+      if (tool === 'control') void control.open()
+      else control.element.hidden = true
+    })
+    return { control, tools }
+  }
+
+  /** Measure a control point in pictures. */
+  async measureControl(point: string): Promise<void> {
+    this.desk.show('pictures')
+    try {
+      const { view, control } = await this.#openPicturesOnce()
+      view.tool.value = 'control'
+      await control?.open(point)
+    } catch (error) {
+      this.desk.complain(error)
+    }
   }
 
   /** Show on the map where pictures were taken. */
@@ -332,8 +398,8 @@ export class ModelParts {
 
   async openPictures(into: HTMLElement): Promise<void> {
     try {
-      const { view } = await this.#openPicturesOnce()
-      if (view.element.parentElement !== into) fill(into, view.element)
+      const { view, control, tools } = await this.#openPicturesOnce()
+      if (view.element.parentElement !== into) fill(into, view.element, control?.element, tools)
       await view.openFirst()
     } catch (error) {
       this.desk.complain(error)

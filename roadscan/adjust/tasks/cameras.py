@@ -13,12 +13,14 @@ from roadscan.adjust.bundle.self_check import FreeCameras
 from roadscan.adjust.tasks.figures import Rows
 from roadscan.core.counted import counted
 from roadscan.core.witness import Finding, Witness
-from roadscan.pictures.camera_changes import COLUMNS, TABLE
+from roadscan.pictures.camera_changes import COLUMNS, JOINT, JOINT_TABLE, TABLE
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
 
+_UPPER: Final = np.triu_indices(JOINT)
+"""Entries of a joint covariance that the table holds."""
 _SAME: Final = 0.01
 """Values that change by no more than this share of their σ stay, so that what rests on them stays current."""
 _KNOWN: Final = 0.7
@@ -63,7 +65,8 @@ _WORDS: Final = {
 
 
 def publish_cameras(store: Store, found: CameraErrors | None) -> None:
-    """Update the table; a solution that changes nothing leaves it as it is."""
+    """Update the tables; a solution that changes nothing leaves the corrections as they are."""
+    _publish_joint(store, found)
     table = read_small(store, TABLE)
     before = {row["sensor"]: row for row in ([] if table is None else table.to_pylist())}
     after: dict[str, dict[str, Any]] = {}
@@ -78,6 +81,18 @@ def publish_cameras(store: Store, found: CameraErrors | None) -> None:
         write_small(store, TABLE, [after[sensor] for sensor in sorted(after)])
     else:
         store.remove(small_path(TABLE))
+
+
+def _publish_joint(store: Store, found: CameraErrors | None) -> None:
+    rows = [
+        {"run": one.run, "sensor": one.sensor, "epoch_gps_ns": int(epoch), "covariance": values[_UPPER].tolist()}
+        for one in (() if found is None else found.joint)
+        for epoch, values in zip(one.epochs_gps_ns.tolist(), one.covariance, strict=True)
+    ]
+    if rows:
+        write_small(store, JOINT_TABLE, rows)
+    elif store.exists(small_path(JOINT_TABLE)):
+        store.remove(small_path(JOINT_TABLE))
 
 
 def _row(found: CameraErrors, k: int) -> dict[str, Any]:

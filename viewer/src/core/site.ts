@@ -54,6 +54,14 @@ export interface Survey {
   features?: string[]
   catalog?: { collection: string; items: string; points: string | null } | null
   edits?: EditRules | null
+  /** Where the server of `roadscan view` is asked about pictures; null or missing where there is none. */
+  measuring?: MeasuringRules | null
+}
+
+export interface MeasuringRules {
+  measure: string
+  /** Null where no control point can be clicked. */
+  control: string | null
 }
 
 /** Which layers are edited, where edits are sent (null: into a file), and what they are made on. */

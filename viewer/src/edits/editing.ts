@@ -13,6 +13,7 @@ import VectorLayer from 'ol/layer/Vector'
 import VectorSource from 'ol/source/Vector'
 import type { Desk, Selected } from '../core/desk'
 import { fill, h, icon, iconButton } from '../core/dom'
+import { post, Refused } from '../core/server'
 import type { Column, EditForms, EditKind, EditRules, Survey } from '../core/site'
 import type { MapView } from '../map/map'
 import { measuring } from '../map/styles'
@@ -56,22 +57,6 @@ const OUTCOMES: Record<Outcome['outcome'], string> = { accepted: 'accepted', sam
 /** The status that an action gives. */
 const STATUS: Partial<Record<Action, string>> = { confirm: 'confirmed', reject: 'rejected' }
 const STAYS: readonly Outcome['outcome'][] = ['asked', 'refused']
-const TOKEN_HEADER = 'X-Roadscan-Edit'
-const KEPT_TOKEN = 'roadscan-edit'
-
-/** The token of the page's address, which is taken out of it; null where this address allows no edits. */
-export function editToken(): string | null {
-  const parts = location.hash.slice(1).split('&')
-  const given = parts.find((one) => one.startsWith('edit='))?.slice(5) ?? null
-  if (given) history.replaceState(null, '', `#${parts.filter((one) => !one.startsWith('edit=')).join('&')}`)
-  try {
-    if (given) sessionStorage.setItem(KEPT_TOKEN, given)
-    return given ?? sessionStorage.getItem(KEPT_TOKEN)
-  } catch {
-    return given // A browser may keep nothing: the token holds until the page is left.
-  }
-}
-
 export class Editing {
   readonly element = h('section', { class: 'edits', 'aria-live': 'polite' })
   readonly #edits: Edit[] = []
@@ -419,12 +404,10 @@ export class Editing {
     }
     try {
       const sent = [...this.#edits]
-      const headers = { 'Content-Type': 'application/geo+json', [TOKEN_HEADER]: this.token ?? '' }
-      const answer = await fetch(new URL(this.rules.post, document.baseURI), { method: 'POST', headers, body: content })
-      if (!answer.ok) throw new Error(`The edits were not taken: ${await answer.text()}`)
-      await this.#tell(sent, ((await answer.json()) as { edits: Outcome[] }).edits)
+      const { edits } = await post<{ edits: Outcome[] }>(this.rules.post, content, this.token, 'application/geo+json')
+      await this.#tell(sent, edits)
     } catch (error) {
-      this.desk.complain(error)
+      this.desk.complain(error instanceof Refused ? `The edits were not taken: ${error.message}` : error)
     }
   }
 

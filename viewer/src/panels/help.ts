@@ -19,7 +19,7 @@ const MOUSE: [string, string][] = [
   ['Drag', 'Map: move. Cloud: turn about the place below the pointer'],
   ['Right or Shift drag', 'Cloud: move'],
   ['Wheel', 'Nearer or farther at the place below the pointer'],
-  ['Double click', 'End a line that is measured'],
+  ['Double click', 'End a line that is measured, on the map, in the cloud or in a picture (by keys: Enter, with Shift to end)'],
 ]
 
 export function helpDialog(): HTMLDialogElement {

@@ -12,6 +12,10 @@ export interface Figure {
   points: readonly (readonly number[])[]
   remove?: () => void
   show?: () => void
+  /** Offers it as a file. */
+  save?: () => void
+  /** What speaks against it, or was assumed. */
+  notes?: string[]
 }
 
 export class Measurements {
@@ -29,6 +33,7 @@ export class Measurements {
         { class: 'figure-head' },
         h('h4', {}, figure.title),
         figure.show ? iconButton('section', 'Show the section again', figure.show, { class: 'icon-button small' }) : null,
+        figure.save ? iconButton('down', 'Save it as GeoJSON', figure.save, { class: 'icon-button small' }) : null,
         iconButton('copy', 'Copy the figures', () => this.#copy(figure), { class: 'icon-button small' }),
         iconButton('close', 'Remove it', () => {
           figure.remove?.()
@@ -37,6 +42,7 @@ export class Measurements {
         }, { class: 'icon-button small' }),
       ),
       h('dl', { class: 'values' }, ...figure.lines.map(([name, text]) => h('div', {}, h('dt', {}, name), h('dd', { class: 'number' }, text)))),
+      ...(figure.notes ?? []).map((note) => h('p', { class: 'hint' }, note)),
     )
     this.#list.prepend(card)
     this.element.hidden = false

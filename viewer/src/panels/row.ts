@@ -13,6 +13,8 @@ export interface RowActions {
   openTile(tile: string): void
   openRow(layer: string, row: string): void
   openStation(evidence: Evidence): void
+  /** Measure a control point in the pictures that see it. */
+  measure: ((point: string) => void) | null
   edit: ((selected: Selected) => HTMLElement) | null
   /** Values that an edit gives which was kept and not sent yet. */
   edited: ((selected: Selected) => Record<string, unknown>) | null
@@ -55,6 +57,7 @@ export class RowPanel {
         this.#action('target', 'Look there', () => this.#goTo(selected)),
         this.#action('copy', 'Copy the row', () => this.#copy(selected)),
         this.desk.survey.pictures ? this.#action('picture', 'Pictures of it', () => this.#withPlace(selected, (place) => this.actions.openPictures(place))) : null,
+        this.actions.measure && layer.name === 'control' ? this.#action('point', 'Measure it in pictures', () => this.actions.measure!(String(feature.properties['name']))) : null,
       ),
       this.actions.edit?.(selected) ?? null,
       h('dl', { class: 'values' }, ...this.#values(selected)),

@@ -24,6 +24,8 @@ export interface View {
   pixel_m: number
   /** Something nearer stands before it, as far as the cloud tells. */
   hidden: boolean
+  /** What the list says of it in place of distance and pixel. */
+  note?: string
 }
 
 export class PictureList {

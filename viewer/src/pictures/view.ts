@@ -3,12 +3,23 @@
 import type { Desk, Place } from '../core/desk'
 import { fill, h, iconButton } from '../core/dom'
 import * as format from '../core/format'
+import { Signal } from '../core/signal'
 import type { Camera } from '../core/site'
 import { meet, rayNear } from '../cloud/pick'
 import type { CloudStore } from '../cloud/store'
 import { anglesOf, pixelAtAngles, pixelOf, pixelSize, rayOf } from './geometry'
 import type { Picture, PictureList, View } from './list'
 import { Panorama } from './panorama'
+
+export type PictureTool = 'select' | 'line' | 'stereo' | 'control'
+
+/** A line, or dots, over a picture: pixels of the camera. */
+export interface PictureDrawing {
+  points: readonly (readonly [number, number])[]
+  /** With a dot at each point. */
+  dots: boolean
+  label?: string
+}
 
 const OFFERED = 24
 const CHECKED = 8
@@ -31,6 +42,12 @@ function untold(size_m: number, slope: number): number {
 
 export class PictureView {
   readonly element: HTMLElement
+  readonly tool = new Signal<PictureTool>('select')
+  /** Gets the pixels that are clicked while a tool is chosen, and the double click that ends a line. */
+  clicked: (picture: Picture, u: number, v: number) => void = () => {}
+  ended: () => void = () => {}
+  /** By name: what is drawn over a picture. */
+  readonly #drawings = new Map<string, (picture: Picture) => PictureDrawing[]>()
   readonly #frame = h('div', { class: 'picture-frame', tabindex: 0, role: 'application', 'aria-label': 'Picture. Arrow keys move it, plus and minus zoom, a click on a pixel gives its place.' })
   readonly #flat = h('canvas', { class: 'picture-canvas' })
   readonly #ball = h('canvas', { class: 'picture-canvas', hidden: true })
@@ -92,6 +109,7 @@ export class PictureView {
       this.#drag = null
       if (drag && !drag.moved) void this.#click(event.clientX, event.clientY)
     })
+    frame.addEventListener('dblclick', () => this.tool.value !== 'select' && this.ended())
     frame.addEventListener('wheel', (event) => {
       event.preventDefault()
       const box = frame.getBoundingClientRect()
@@ -109,6 +127,7 @@ export class PictureView {
     else if (event.key === '0') this.#fit()
     else if (event.key === 'PageDown') void this.#step(1)
     else if (event.key === 'PageUp') void this.#step(-1)
+    else if (event.key === 'Enter' && event.shiftKey && this.tool.value !== 'select') this.ended()
     else if (event.key === 'Enter') {
       const box = this.#frame.getBoundingClientRect()
       void this.#click(box.left + box.width / 2, box.top + box.height / 2)
@@ -199,6 +218,19 @@ export class PictureView {
     if (first && !this.#turn) await this.open(first)
   }
 
+  /** Draw something over the pictures; null removes it. */
+  setDrawings(name: string, drawings: ((picture: Picture) => PictureDrawing[]) | null): void {
+    if (drawings) this.#drawings.set(name, drawings)
+    else this.#drawings.delete(name)
+    this.#draw()
+  }
+
+  /** Offer pictures in the list below. */
+  offer(views: View[]): void {
+    this.#views = views.slice(0, OFFERED)
+    this.#drawList()
+  }
+
   async #step(by: number): Promise<void> {
     const now = this.#picture
     if (!now) return
@@ -281,8 +313,8 @@ export class PictureView {
             onclick: () => this.open(view.picture).catch((error) => this.desk.complain(error)),
           },
           h('span', {}, view.picture.camera.title),
-          h('span', { class: 'number' }, `${format.fixed(view.distance_m, 1)} m`),
-          h('span', { class: 'number' }, `${format.fixed(view.pixel_m * 1000, 1)} mm/px`),
+          h('span', { class: 'number' }, view.note ?? `${format.fixed(view.distance_m, 1)} m`),
+          view.note ? null : h('span', { class: 'number' }, `${format.fixed(view.pixel_m * 1000, 1)} mm/px`),
           view.hidden ? h('span', {}, 'behind something') : null,
         ),
       ),
@@ -374,6 +406,7 @@ export class PictureView {
     const context = this.#marks.getContext('2d')!
     context.setTransform(ratio, 0, 0, ratio, 0, 0)
     context.clearRect(0, 0, this.#marks.width, this.#marks.height)
+    for (const drawings of this.#drawings.values()) for (const one of drawings(this.#picture!)) this.#drawOver(context, one)
     const pixel = this.#markedPixel()
     const at = pixel && this.#screenOf(...pixel)
     this.#frame.dataset['mark'] = pixel ? pixel.map((one) => one.toFixed(2)).join(' ') : ''
@@ -390,6 +423,32 @@ export class PictureView {
     }
   }
 
+  #drawOver(context: CanvasRenderingContext2D, { points, dots, label }: PictureDrawing): void {
+    const places = points.map(([u, v]) => this.#screenOf(u, v))
+    for (const [width, colour] of [[5, 'rgba(0,0,0,.7)'], [2, '#ffd43b']] as const) {
+      context.beginPath()
+      let before: [number, number] | null = null
+      for (const at of places) {
+        if (at && before) context.lineTo(...at)
+        else if (at) context.moveTo(...at)
+        before = at
+      }
+      ;[context.lineWidth, context.strokeStyle, context.fillStyle] = [width, colour, colour]
+      context.stroke()
+      for (const at of dots ? places : []) {
+        if (!at) continue
+        context.beginPath()
+        context.arc(at[0], at[1], 2 + width / 2, 0, 2 * Math.PI)
+        context.fill()
+      }
+    }
+    const end = places.at(-1)
+    if (!label || !end) return
+    ;[context.font, context.lineWidth, context.strokeStyle] = ['600 13px system-ui, sans-serif', 4, 'rgba(0,0,0,.8)']
+    context.strokeText(label, end[0] + 10, end[1] - 8)
+    context.fillText(label, end[0] + 10, end[1] - 8)
+  }
+
   // ---- from a pixel to the place ----
 
   async #click(clientX: number, clientY: number): Promise<void> {
@@ -398,6 +457,7 @@ export class PictureView {
     const box = this.#frame.getBoundingClientRect()
     if (this.#frame.clientWidth !== this.#fitted[0] || this.#frame.clientHeight !== this.#fitted[1]) this.#fit() // the observer has not told yet
     const [u, v] = this.#pixelAt(clientX - box.left, clientY - box.top)
+    if (this.tool.value !== 'select') return this.clicked(picture, u, v)
     await this.placeOf(picture, u, v, Math.max(CONE, this.#pixelAngle()))
   }
 

@@ -76,7 +76,8 @@ def edges_px(cloud: Session, whole: Session, frames: tuple[int, ...]) -> npt.NDA
         own, weight = np.zeros((len(point), 3), np.float32), np.zeros(len(point), np.float32)
         limits = Limits(30.0, 8.0, 0.0, 0.0, 60_000_000, 1.0)
         taken = int(share.pictures.epochs_gps_ns[number])
-        look(point, gps_ns, none, camera, taken, shown, limits, np.zeros((0, 0), bool), picture, own, weight)
+        look(point, gps_ns, none, camera, taken, shown, limits, np.zeros((0, 0), bool), picture, own, weight,
+             np.empty(len(point), np.bool_))  # fmt: skip
         pixel, away = np.empty((len(point), 2), np.float32), np.empty(len(point), np.float32)
         project(point, camera, 40.0, pixel, away)
         seen = weight > 0.0

@@ -15,6 +15,7 @@ from roadscan.pictures.kernels.lens import FOCAL_X, FOCAL_Y, HEIGHT, WIDTH
 
 Float32 = npt.NDArray[np.float32]
 Int64 = npt.NDArray[np.int64]
+UInt8 = npt.NDArray[np.uint8]
 UInt16 = npt.NDArray[np.uint16]
 
 _MOST_PIXELS: Final = 500_000
@@ -106,7 +107,7 @@ def depth_images(points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: f
     steepest = float(1.0 / np.tan(np.radians(rule.grazing_deg)))
     moment, which = _nearest(pixel, distance, np.flatnonzero(at_once), factor, shape)
     around = _grown(moment, _slopes(moment, which, points, camera, (pixel_rad, steepest)))[0]
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _AROUND + 1, 2 * _AROUND + 1))
+    disc = _disc(_AROUND)
     seen = np.isfinite(around)
     around = cv2.dilate(cv2.erode(np.where(seen, around, _FAR), disc), disc)
     around = np.where(seen & (around < _FAR), around, np.inf).astype(np.float32)
@@ -117,7 +118,8 @@ def depth_images(points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: f
     front, radius = _grown(front, _slopes(front, which, points, camera, (pixel_rad, steepest)))
     known = np.isfinite(front)
     closed = _without_holes(front, pixel_rad)
-    at_edge = _edges(np.where(known, front, closed), radius, rule.edge_px / factor, steepest * pixel_rad)
+    margin = rule.edge_px / factor
+    at_edge, closed = _edges(np.where(known, front, closed), closed, radius, margin, steepest * pixel_rad)
     nearest = np.where(known, at_edge, 0.0)
     farthest = np.where(known, closed * (1.0 + _THICKNESS) + _THICKNESS_M, np.inf)
     moved = np.where(np.isfinite(around), (around - _MOVED_M) / (1.0 + _MOVED), 0.0)
@@ -183,12 +185,15 @@ def _without_holes(front_m: Float32, pixel_rad: float) -> Float32:
     return np.where(out >= _FAR, np.inf, out).astype(np.float32)
 
 
-def _edges(front_m: Float32, radius: Float32, margin: float, steepest: float) -> Float32:
-    """Returns the distance (height, width) below which a point lies at an edge; 0 far from edges.
+def _edges(
+    front_m: Float32, closed_m: Float32, radius: Float32, margin: float, steepest: float
+) -> tuple[Float32, Float32]:
+    """Returns the distance (height, width) below which a point lies at an edge, 0 far from edges, and `closed_m`
+    where what lies behind an edge begins beside it.
 
     An edge is where the distance leaps from a pixel to the next by more than a surface does. Its near side reaches
     beyond the outermost point by the radius of the discs, so points within that and the margin are at the edge, if they
-    lie nearer than half of the leap.
+    lie nearer than half of the leap. Behind it a pixel within the margin shows the near side as well.
     """
     height, width = front_m.shape
     finite = np.where(np.isfinite(front_m), front_m, _FAR)
@@ -198,10 +203,15 @@ def _edges(front_m: Float32, radius: Float32, margin: float, steepest: float) ->
     whole = np.rint(np.repeat(np.repeat(radius, _BLOCK, axis=0), _BLOCK, axis=1)[:height, :width] + margin)
     out = np.zeros((height, width), np.float32)
     for reach in np.unique(whole).astype(int).tolist():
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         own = whole == reach
-        out[own] = cv2.dilate(half, disc)[own]
-    return out
+        out[own] = cv2.dilate(half, _disc(reach))[own]
+    near = cv2.erode(np.where(leaps, finite, _FAR), _disc(round(margin)))
+    return out, np.minimum(closed_m, near)
+
+
+def _disc(radius: int) -> UInt8:
+    size = 2 * radius + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
 
 
 def _stored(distance_m: npt.NDArray[np.floating]) -> UInt16:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.colours.cameras import cameras_of
-from roadscan.colours.kernels.looks import Camera, Depths, Limits, keep_best, look, weighted_medians
+from roadscan.colours.kernels.looks import Camera, Depths, Limits, keep_best, leave_doubtful, look, weighted_medians
 from roadscan.pictures.colours import ColourSource
 from roadscan.pictures.placed import Pictures
 
@@ -43,6 +43,8 @@ class Looks:
     """(n, k, 3) balanced."""
     weight: Float32
     """(n, k), 0: none."""
+    even: npt.NDArray[np.bool_]
+    """(n, k) the picture is even around the place."""
     number: npt.NDArray[np.int32]
     """(n, k) number of the picture."""
 
@@ -51,13 +53,19 @@ class Looks:
         """Returns looks at so many places before any picture was seen."""
         return cls(
             np.zeros((count, most, 3), np.uint8), np.zeros((count, most), np.float32),
-            np.full((count, most), -1, np.int32),
+            np.zeros((count, most), np.bool_), np.full((count, most), -1, np.int32),
         )  # fmt: skip
 
     def medians(self) -> tuple[UInt8, UInt8]:
         """Returns weighted medians (n, 3), 0 without a look, and the number of looks (n,)."""
         colour, count = np.zeros((len(self.weight), 3), np.uint8), np.zeros(len(self.weight), np.uint8)
         weighted_medians(self.colour, self.weight, colour, count)
+        return colour, count
+
+    def sure_medians(self) -> tuple[UInt8, UInt8]:
+        """Returns the same without those that one look alone tells, at an edge of colours in its picture."""
+        colour, count = self.medians()
+        leave_doubtful(self.colour, self.weight, self.even, colour, count)
         return colour, count
 
 
@@ -108,11 +116,15 @@ def paint(palette: Palette, pieces: Sequence[Places], origin_m: Float64, rule: P
         for k in near:
             one, held = pieces[k], found[k]
             colour, weight = np.empty((len(one.point_m), 3), np.float32), np.empty(len(one.point_m), np.float32)
+            even = np.empty(len(one.point_m), np.bool_)
             look(
                 one.point_m, one.epoch_gps_ns, one.normal, camera, int(pictures.epochs_gps_ns[n]), depths, limits,
-                lens.hidden, picture, colour, weight,
+                lens.hidden, picture, colour, weight, even,
             )  # fmt: skip
-            keep_best(colour, weight, palette.gain[n], int(palette.number[n]), held.colour, held.weight, held.number)
+            keep_best(
+                colour, weight, even, palette.gain[n], int(palette.number[n]), held.colour, held.weight, held.even,
+                held.number,
+            )  # fmt: skip
     return found
 
 

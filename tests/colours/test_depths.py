@@ -52,6 +52,14 @@ def test_beside_an_edge_nothing_near_counts() -> None:
     assert edge[160, 318 - 12] == 0.0
 
 
+def test_behind_an_edge_what_the_same_pixel_shows_is_hidden() -> None:
+    """The near wall ends at column 319; the discs of its points reach a gap beyond."""
+    _, hidden, _ = shown((wall(10.0, 2.0, 0.02, 0.02), 0), (wall(20.0, 8.0, 0.02, 0.02), 0))
+    last = int(np.flatnonzero(hidden[160] < 15.0)[-1])
+    assert 321 <= last <= 324  # the wall's end, a disc of one pixel, and the two of `edge_px`
+    assert (hidden[160, last + 1 : last + 40] > 19.9).all()
+
+
 def test_what_was_seen_through_hides_nothing_and_has_moved() -> None:
     """A board 5 m away was seen 2 s later; at the moment of the picture the wall behind was seen all over."""
     behind = wall(20.0, 8.0, 0.05, 0.05)

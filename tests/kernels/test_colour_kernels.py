@@ -8,12 +8,14 @@ import numpy as np
 from roadscan.colours.kernels.blending import blend
 from roadscan.colours.kernels.depths import grow, nearest_in_pixels, slopes
 from roadscan.colours.kernels.looks import (
+    ALIKE,
     STEPS,
     UNKNOWN,
     Camera,
     Depths,
     Limits,
     keep_best,
+    leave_doubtful,
     look,
     project,
     weighted_medians,
@@ -65,10 +67,12 @@ def test_look_takes_what_is_neither_hidden_nor_at_an_edge_nor_gone() -> None:
     pixel, distance = np.empty((400, 2), np.float32), np.empty(400, np.float32)
     project(points, CAMERA, 30.0, pixel, distance)
 
+    even = np.empty(400, np.bool_)
+
     def weights(depths: Depths, own_epoch: int = 0, hidden: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         colour, weight = np.zeros((400, 3), np.float32), np.empty(400, np.float32)
         masked = np.zeros((0, 0), np.bool_) if hidden is None else hidden
-        look(points, epoch, normal, CAMERA, own_epoch, depths, limits, masked, picture, colour, weight)
+        look(points, epoch, normal, CAMERA, own_epoch, depths, limits, masked, picture, colour, weight, even)
         return colour, weight
 
     colour, weight = weights(open_view())
@@ -89,17 +93,27 @@ def test_look_takes_what_is_neither_hidden_nor_at_an_edge_nor_gone() -> None:
     left = np.zeros((HEIGHT, WIDTH), np.bool_)
     left[:, :80] = True
     assert np.array_equal(weights(open_view(), hidden=left)[1] > 0, inside & (np.rint(pixel[:, 0]) >= 80))
+    assert even.all()  # ramps of one value a pixel
+    picture[:, 60:, 2] = ALIKE + 1  # an edge of colours between two columns
+    weights(open_view())
+    column = np.rint(pixel[inside, 0])
+    assert np.array_equal(even[inside], (column < 59) | (column > 60))
 
 
 def test_keep_best_keeps_the_largest_weights() -> None:
     rng = np.random.default_rng(5)
     weights = rng.permutation(12).reshape(12, 1).astype(np.float32)
-    held = np.zeros((1, 4, 3), np.uint8), np.zeros((1, 4), np.float32), np.full((1, 4), -1, np.int32)
+    held = (
+        np.zeros((1, 4, 3), np.uint8), np.zeros((1, 4), np.float32), np.zeros((1, 4), np.bool_),
+        np.full((1, 4), -1, np.int32),
+    )  # fmt: skip
     for number, weight in enumerate(weights):
-        keep_best(np.full((1, 3), 10.0 * number, np.float32), weight, np.array([1.0, 2.0, 9.0]), number, *held)
+        colour, even = np.full((1, 3), 10.0 * number, np.float32), np.array([number % 2 == 0])
+        keep_best(colour, weight, even, np.array([1.0, 2.0, 9.0]), number, *held)
     best = np.argsort(weights[:, 0])[-4:]
-    assert sorted(held[2][0].tolist()) == sorted(best.tolist())
-    for k, number in enumerate(held[2][0]):
+    assert sorted(held[3][0].tolist()) == sorted(best.tolist())
+    for k, number in enumerate(held[3][0]):
+        assert held[2][0, k] == (number % 2 == 0)
         assert held[0][0, k].tolist() == [10 * number, 20 * number, min(255, 90 * number)]
         assert held[1][0, k] == weights[number, 0]
 
@@ -115,6 +129,19 @@ def test_weighted_medians_are_those_of_repeated_values() -> None:
         many = np.sort(np.repeat(colour[i], weight[i].astype(int), axis=0), axis=0)
         expected = many[(len(many) - 1) // 2] if len(many) else np.zeros(3)
         assert np.array_equal(found[i], expected)
+
+
+def test_a_colour_that_one_look_at_an_edge_tells_is_none() -> None:
+    """One look; an uneven one beside others that agree, and that differ; an even one that the median is not of."""
+    colour = np.zeros((5, 3, 3), np.uint8)
+    colour[:, :, 0] = [[90, 0, 0], [90, 0, 0], [90, 95, 10], [90, 150, 210], [90, 150, 210]]
+    weight = np.array([[1, 0, 0], [1, 0, 0], [2, 1, 2], [1, 1, 1], [1, 1, 1]], np.float32)
+    even = np.array([[0, 1, 1], [1, 0, 0], [0, 0, 1], [0, 0, 0], [1, 0, 1]], np.bool_)
+    median, count = np.empty((5, 3), np.uint8), np.empty(5, np.uint8)
+    weighted_medians(colour, weight, median, count)
+    leave_doubtful(colour, weight, even, median, count)
+    assert count.tolist() == [0, 1, 3, 0, 0]
+    assert median[:, 0].tolist() == [0, 90, 90, 0, 0]
 
 
 def test_nearest_in_pixels_is_the_least_of_each() -> None:

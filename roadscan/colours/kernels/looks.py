@@ -22,6 +22,8 @@ UNKNOWN = 65535
 """Stored distance that stands for any distance, however far."""
 NO_NORMAL = 0.5  # Cosine of the incidence where no normal is known.
 LEAST_COSINE = 0.05  # Least cosine of the incidence in weights.
+ALIKE = 24
+"""Largest difference of a channel (8 bits) between looks at the same thing, and between pixels of an even surface."""
 
 
 class Camera(NamedTuple):
@@ -100,8 +102,8 @@ def project(point_m, camera, reach_m, pixel, distance_m):
 
 
 @kernel
-def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden, picture, colour, weight):
-    """Compute the colours that a picture gives to points, and their weights.
+def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden, picture, colour, weight, even):
+    """Compute the colours that a picture gives to points, their weights, and whether it is even there.
 
     Weights are the cosine of the incidence over the square of the size of a pixel at the point, times a ramp beside the
     border and the picture's sharpness.
@@ -117,12 +119,15 @@ def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden
     picture : (height, width, 3) uint8.
     colour : (n, 3) float32, written where the weight is not 0.
     weight : (n,) float32, written, 0 where the picture does not show a point.
+    even : (n,) bool, written: the pixel and its neighbours are alike, so that the colour is right though the point lies
+        a pixel beside.
     """
     lens = camera.lens
     right, bottom = lens[WIDTH] - 1.0 - limits.border_px, lens[HEIGHT] - 1.0 - limits.border_px
     focal_square = lens[FOCAL_X] * lens[FOCAL_Y]
     for i in range(point_m.shape[0]):
         weight[i] = 0.0
+        even[i] = True
         x = point_m[i, 0] - camera.eye_m[0]
         y = point_m[i, 1] - camera.eye_m[1]
         z = point_m[i, 2] - camera.eye_m[2]
@@ -159,18 +164,24 @@ def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden
             above = (1.0 - s) * picture[y0, x0, c] + s * picture[y0, x0 + 1, c]
             under = (1.0 - s) * picture[y0 + 1, x0, c] + s * picture[y0 + 1, x0 + 1, c]
             colour[i, c] = (1.0 - t) * above + t * under
+            low, high = 255, 0
+            for row in range(int(v + 0.5) - 1, int(v + 0.5) + 2):
+                for column in range(int(u + 0.5) - 1, int(u + 0.5) + 2):
+                    low, high = min(low, int(picture[row, column, c])), max(high, int(picture[row, column, c]))
+            even[i] = even[i] and high - low <= ALIKE
 
 
 @kernel
-def keep_best(colour, weight, gain, number, held_colour, held_weight, held_number):
+def keep_best(colour, weight, even, gain, number, held_colour, held_weight, held_even, held_number):
     """Put the colours of a picture among the best of each point: those with the largest weights, of equals the first.
 
     Parameters
     ----------
-    colour : (n, 3) float32; weight : (n,) float32, 0: none.
+    colour : (n, 3) float32; weight : (n,) float32, 0: none; even : (n,) bool.
     gain : (3,) factors of the picture's channels.
     number : the picture's number.
-    held_colour : (n, k, 3) uint8; held_weight : (n, k) float32, 0: none; held_number : (n, k) int32. Read and written.
+    held_colour : (n, k, 3) uint8; held_weight : (n, k) float32, 0: none; held_even : (n, k) bool; held_number : (n, k)
+        int32. Read and written.
     """
     most = held_weight.shape[1]
     for i in range(weight.shape[0]):
@@ -183,6 +194,7 @@ def keep_best(colour, weight, gain, number, held_colour, held_weight, held_numbe
         if weight[i] <= held_weight[i, least]:
             continue
         held_weight[i, least] = weight[i]
+        held_even[i, least] = even[i]
         held_number[i, least] = number
         for c in range(3):
             held_colour[i, least, c] = np.uint8(min(255.0, colour[i, c] * gain[c] + 0.5))
@@ -222,3 +234,31 @@ def weighted_medians(held_colour, held_weight, colour, count):
                 if below >= 0.5 * total * (1.0 - 1e-6):
                     best = value
             colour[i, c] = best
+
+
+@kernel
+def leave_doubtful(held_colour, held_weight, held_even, colour, count):
+    """Take the colour from points at which pictures are uneven and no two of them agree with the median.
+
+    There a pixel shows two surfaces, or the one beside the point's.
+
+    Parameters
+    ----------
+    held_colour : (n, k, 3) uint8; held_weight : (n, k) float32, 0: none; held_even : (n, k) bool.
+    colour : (n, 3) uint8, medians; count : (n,) uint8, of looks. Read and written, 0 where there is none.
+    """
+    for i in range(held_weight.shape[0]):
+        agree, sure = 0, False
+        for k in range(held_weight.shape[1]):
+            if held_weight[i, k] <= 0.0:
+                continue
+            off = 0
+            for c in range(3):
+                off = max(off, abs(int(held_colour[i, k, c]) - int(colour[i, c])))
+            if off <= ALIKE:
+                agree += 1
+                sure = sure or held_even[i, k]
+        if not sure and agree < 2:
+            count[i] = 0
+            for c in range(3):
+                colour[i, c] = 0

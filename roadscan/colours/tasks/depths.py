@@ -218,7 +218,7 @@ def _sample(
     unknown = np.full((len(point_m), 3), np.nan, np.float32)
     look(
         point_m, epochs, unknown, camera, int(task.pictures.epochs_gps_ns[number]), Shown(images).depths, limits,
-        lens.hidden, picture, colour, weight,
+        lens.hidden, picture, colour, weight, np.empty(len(point_m), np.bool_),
     )  # fmt: skip
     return sample_of(cell, colour, weight)
 

@@ -149,7 +149,7 @@ def _written(
 ) -> Iterator[OutputRecord]:
     looks = paint(task.share.palette(task.readings.store), [p for _, p in held], _ORIGIN_M, task.rule)
     for (points, _), own in zip(held, looks, strict=True):
-        colour, count = own.medians()
+        colour, count = own.sure_medians()
         seen = int(np.count_nonzero(count))
         context = replace(task.readings.context, date=utc_from_gps_ns(int(points.epoch_gps_ns.min())).date())
         figures: dict[str, Any] = {"points": len(points), "coloured": seen}

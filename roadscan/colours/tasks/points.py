@@ -101,7 +101,8 @@ def plan_points(plan: ColourPlan, shares: Shares) -> PointsPlan:
 def paint_rule(config: ColoursConfig) -> PaintRule:
     """Returns which looks at points count."""
     return PaintRule(
-        config.reach_m, config.border_px, config.grazing_deg, round(config.moment_s * NS_PER_S), _LOOKS
+        config.reach_m, config.border_px, config.grazing_deg, round(config.moment_s * NS_PER_S),
+        round(config.seconds * NS_PER_S), _LOOKS,
     )  # fmt: skip
 
 

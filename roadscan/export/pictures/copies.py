@@ -56,7 +56,7 @@ def export_pictures(
     settings: CopySettings,
     report: Callable[[int, int], None] = lambda _a, _b: None,
 ) -> Exported:
-    """Write copies of pictures under their `exported_names`, with ``pictures.csv`` (poses) and ``cameras.json`` (lenses).
+    """Write copies of pictures by their `exported_names`, and ``pictures.csv`` (poses) and ``cameras.json`` (lenses).
 
     JPEG files that are neither undistorted nor blurred keep their picture's bytes; all others are encoded anew.
 

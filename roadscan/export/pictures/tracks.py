@@ -73,7 +73,8 @@ def tie_points(
     found = places_of(point, views.eye_world_m[picture], _rays(views, picture, pixel), weight)
     own_of = {own_names[k]: k for k in chosen}
     own = np.array([own_of.get(one, -1) for one in names], np.int64)[picture]
-    sound = np.isfinite(found.place_m).all(axis=1)[point] & (own >= 0)
+    met = np.asarray(np.isfinite(found.place_m).all(axis=1))
+    sound = met[point] & (own >= 0)
     sound &= (np.bincount(point[sound], minlength=len(found.place_m)) > 1)[point]
     order = np.flatnonzero(sound)[np.lexsort((own[sound], point[sound]))]
     held, point = np.unique(point[order], return_inverse=True)

@@ -108,11 +108,11 @@ def drawn_street(number: int) -> Scene:
     """A town street whose cars, trees and posts stand and drive where chance puts them, and its scanner and camera."""
     rng = np.random.default_rng(number)
     mounts = ((0.9, -0.25, -1.6, -12.0, 0.0), (1.4, 0.45, -2.1, -20.0, 18.0), (0.6, -0.5, -1.9, -8.0, -30.0))
-    forward, right, down, pitch, heading = mounts[(number - DRAWS[0]) % 3]
-    camera = {"width_px": 960, "height_px": 600, "noise": 0.0, "focal_px": (820.0, 640.0, 700.0)[(number - DRAWS[0]) % 3],
+    forward, right, down, pitch, heading = mounts[number - DRAWS[0]]
+    camera = {"width_px": 960, "height_px": 600, "noise": 0.0, "focal_px": (820.0, 640.0, 700.0)[number - DRAWS[0]],
               "mount": {"lever_arm_body_m": (forward, right, down), "pitch_deg": pitch, "heading_deg": heading},
     }  # fmt: skip
-    lidar = {"model": ("HDL-32E", "OS1-128", "XT32")[(number - DRAWS[0]) % 3], "range_max_m": 40.0}
+    lidar = {"model": ("HDL-32E", "OS1-128", "XT32")[number - DRAWS[0]], "range_max_m": 40.0}
 
     def row(kind: dict[str, Any], count: int, offset_m: float) -> list[dict[str, Any]]:
         stations = np.cumsum(rng.uniform(5.5, 14.0, count)) - 10.0

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from roadscan.colours.cameras import cameras_of, eyes_m
 from roadscan.colours.depth import DepthImages, DepthRule, Seen, depth_images, seen_through
-from roadscan.colours.gains import PictureSample, cells_of, is_compared, sample_of
+from roadscan.colours.gains import BRIGHT, DARK, PictureSample, cells_of, is_compared, sample_of
 from roadscan.colours.kernels.looks import Camera, Depths, Limits, look
 from roadscan.colours.normals import normals_of
 from roadscan.colours.tasks.plan import DEPTHS, Batch, ColourPlan, reach_beyond_m
@@ -46,6 +46,9 @@ _TABLE: Final = pa.schema(
 _SAMPLED: Final = ["camera", "file", "epoch_gps_ns", "sharpness", "reason", "cell", "colour"]
 _MOST_POINTS: Final = 6_000_000
 """Points around the pictures of a batch, about: of more, which fast lidars see, a share is used. It bounds memory."""
+_SHOWN: Final = (
+    0.02  # A picture shows something where at least this share of its pixels is neither dark nor overexposed.
+)
 _SAMPLE_REACH: Final = 0.6
 """Pictures are compared on places within this share of the reach."""
 
@@ -99,11 +102,12 @@ def write_depths(task: DepthTask) -> OutputRecord:
         images = depth_images(seen.part(near), camera, own, task.beyond_m, task.rule, moved[near])
         picture = source.picture(task.pictures, number)
         sharpness, sample = 0.0, PictureSample(np.zeros(0, np.int64), np.zeros((0, 3), np.float32))
-        if picture is not None:
+        reason = source.reason(task.pictures, number) if picture is None else blank(picture)
+        if picture is not None and not reason:
             chosen = np.arange(near.start, near.stop)[compared[near]]
             sharpness = sharpness_of(picture)
             sample = _sample(task, number, camera, images, picture, (point_m[chosen], epochs[chosen], cell[chosen]))
-        rows.append(_row(task.pictures, number, images, sharpness, source.reason(task.pictures, number), sample))
+        rows.append(_row(task.pictures, number, images, sharpness, reason, sample))
     with task.store.scratch() as folder:
         path = folder / "depths.parquet"
         pq.write_table(pa.Table.from_pylist(rows, schema=_TABLE), path, compression="zstd", use_dictionary=False,
@@ -123,6 +127,15 @@ def _moved(task: DepthTask, seen: Seen, cameras: Sequence[Camera], spans: Sequen
         for vote, mask in zip(votes, seen_through(seen.part(near), camera, own, task.beyond_m, task.rule), strict=True):
             vote[near] += mask
     return np.asarray(votes[0] > votes[1])
+
+
+def blank(picture: UInt8) -> str:
+    """Returns the words for a picture that shows nothing, black or overexposed; "" of others."""
+    brightest = picture.max(axis=2)
+    lit, dull = np.mean(brightest >= DARK), np.mean(picture.min(axis=2) <= BRIGHT)
+    if min(lit, dull) >= _SHOWN:
+        return ""
+    return "it is black" if lit < _SHOWN else "it is overexposed"
 
 
 def sharpness_of(picture: UInt8) -> float:

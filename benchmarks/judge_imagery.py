@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Final
 
 import cv2
-import laspy
 import numpy as np
 import numpy.typing as npt
 import rasterio
@@ -21,6 +20,10 @@ _SOUGHT_M: Final = 0.10  # Shifts are sought within this (m).
 _WINDOW_M: Final = 0.30  # Half of the window around a corner (m).
 _TOLD: Final = 0.05  # Least fall of the correlation over 8 cm in a direction in which a shift is told.
 _LEAST_CORRELATION: Final = 0.6  # Windows that correlate less show something else.
+_SOUGHT_RECORDED_M: Final = 0.3  # Shifts of a recording are sought within this (m).
+_BIN_M: Final = 0.04  # Width of the bins of returns (m): the spot of a beam at 8 m.
+_BLUR_M: Final = 0.02  # 1 σ of the spot of a beam (m).
+_LEAST_RETURNS: Final = 6  # Fewest returns of a bin whose median counts.
 
 
 def grey_of(path: Path) -> tuple[Float32, rasterio.Affine]:
@@ -100,75 +103,62 @@ def corner_shifts_m(orthophoto: Path, known: Truth) -> Float64:
     return np.array(found).reshape(-1, 2)
 
 
-def intensity_shifts_m(orthophoto: Path, points: list[Path], *, half_m: float = 0.8, step_m: float = 0.01) -> Float64:
-    """How far (n, 2: east, north; m) paint in an orthophoto lies from where lidar returns are bright.
+def paint_shift_m(photo: Path, returns: Float64, box: tuple[float, float, float, float], axis: int) -> Float64:
+    """How far (m) paint in an orthophoto lies along an axis (0: east, 1: north) from where returns show it.
 
-    Windows of `half_m` to each side lie around bright returns of the road; each shift maximises the correlation of the
-    returns' intensities with the orthophoto's grey values, blurred as a beam blurs them.
+    Single returns scatter more than paint and asphalt differ. So the grey values and the logarithms of the calibrated
+    intensities of a box are stacked to one profile along the axis each, and these are shifted until they agree best.
+    Returns the shift of all returns, their correlation there, and 1 σ of the shift from that of eight parts in time;
+    NaN where the profiles do not agree.
+
+    Parameters
+    ----------
+    returns : (n, 4) easting, northing, calibrated intensity, time (s).
+    box : west, south, east, north; paint crosses it at a right angle to the axis.
     """
-    grey, place = grey_of(orthophoto)
-    known = ~np.isnan(grey)
-    weight = gaussian_filter(known.astype(np.float32), 0.03 / place.a)
-    blurred = gaussian_filter(np.where(known, grey, 0.0), 0.03 / place.a) / np.maximum(weight, 1e-3)
-    parts = [laspy.read(p) for p in points]
-    xy = np.concatenate([np.column_stack([p.x, p.y]) for p in parts])
-    light = np.concatenate([np.asarray(p.intensity, np.float64) for p in parts])
-    coloured = np.concatenate([np.asarray(p["pictures"]) for p in parts]) > 0
-    column, row = pixels_of(place, *xy.T)
-    inside = coloured & (column > 1) & (row > 1) & (column < grey.shape[1] - 1) & (row < grey.shape[0] - 1)
-    inside[inside] &= known[row[inside].astype(int), column[inside].astype(int)]
-    xy, light = xy[inside], light[inside]
-    found = []
-    for middle in _bright_places(xy, light, half_m):
-        near = (np.abs(xy - middle) < half_m).all(axis=1)
-        shift = _best_shift(xy[near], light[near], blurred, place, step_m)
-        if shift is not None:
-            found.append(shift)
-    return np.array(found).reshape(-1, 2)
+    grey, place = grey_of(photo)
+    column, row = pixels_of(place, [box[0], box[2]], [box[3], box[1]])
+    shown = grey[round(row[0]) : round(row[1]), round(column[0]) : round(column[1])]
+    shown = shown if axis == 0 else shown[::-1].T
+    known = np.isfinite(shown).mean(axis=0) >= 0.5
+    profile = np.full(shown.shape[1], np.nan)
+    profile[known] = np.nanmean(shown[:, known], axis=0)
+    at = box[axis] + place.a * (np.arange(profile.size) + 0.5)
+    profile = gaussian_filter(profile, _BLUR_M / place.a)
+    inside = (returns[:, :2] >= box[:2]).all(axis=1) & (returns[:, :2] < box[2:]).all(axis=1)
+    own = returns[inside]
+    parts = np.array_split(own[np.argsort(own[:, 3], kind="stable")], 8)
+    whole, *each = (_best_shift(one[:, axis], one[:, 2], at, profile) for one in (own, *parts))
+    if whole[1] < _LEAST_CORRELATION:
+        return np.array([np.nan, whole[1], np.nan])
+    return np.array([*whole, np.nanstd([one[0] for one in each], ddof=1) / np.sqrt(len(each))])
 
 
-def _bright_places(xy: Float64, light: Float64, half_m: float) -> list[Float64]:
-    """Middles of windows, half a window apart, in which some returns are far brighter than the rest."""
-    places = []
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    for north in np.arange(low[1], high[1], half_m):
-        for east in np.arange(low[0], high[0], half_m):
-            own = light[(np.abs(xy - (east, north)) < half_m).all(axis=1)]
-            if own.size < 100:
-                continue
-            usual = np.median(own)
-            bright = own > usual + max(4.0 * 1.4826 * np.median(np.abs(own - usual)), 0.5 * usual)
-            if bright.sum() >= 12 and bright.mean() <= 0.4:
-                places.append(np.array([east, north]))
-    return places
+def _best_shift(place_m: Float64, light: Float64, at_m: Float64, profile: Float64) -> tuple[float, float]:
+    """Shift (m) of a profile against the medians of returns by bins, and the correlation there."""
+    step = round(_BIN_M / (at_m[1] - at_m[0]))
+    edges = at_m[0] + _BIN_M * np.arange(int((at_m[-1] - at_m[0]) / _BIN_M) + 1)
+    which = np.digitize(place_m, edges) - 1
+    told = [k for k in range(len(edges) - 1) if np.count_nonzero(which == k) >= _LEAST_RETURNS]
+    middle = np.array([edges[k] + 0.5 * _BIN_M for k in told])
+    bright = np.array([np.median(np.log(np.maximum(light[which == k], 1.0))) for k in told])
+    shifts = np.arange(-_SOUGHT_RECORDED_M, _SOUGHT_RECORDED_M + 0.005, 0.01)
+    scores = np.full(shifts.size, -1.0)
+    smooth = np.convolve(profile, np.full(step, 1.0 / step), "same")
+    for k, shift in enumerate(shifts):
+        values = np.interp(middle + shift, at_m, smooth, np.nan, np.nan)
+        both = np.isfinite(values)
+        if both.sum() >= 0.6 * len(told) and both.sum() > 8:
+            scores[k] = np.corrcoef(_level(values[both], middle[both]), _level(bright[both], middle[both]))[0, 1]
+    best = int(np.argmax(scores))
+    if not 0 < best < shifts.size - 1:
+        return np.nan, -1.0
+    return float(shifts[best] + 0.01 * _peak(scores[best - 1 : best + 2])), float(scores[best])
 
 
-def _best_shift(
-    xy: Float64, light: Float64, grey: Float32, place: rasterio.Affine, step_m: float
-) -> tuple[float, float] | None:
-    """Shift (east, north; m) of the picture against the returns; NaN along a line, which does not tell it.
-
-    None where nothing agrees.
-    """
-    steps = np.arange(-2.0 * _SOUGHT_M, 2.0 * _SOUGHT_M + step_m / 2, step_m)
-    light = np.minimum(light, np.percentile(light, 97))
-    scores = np.empty((steps.size, steps.size))
-    for i, north in enumerate(steps):
-        for j, east in enumerate(steps):
-            column, row = pixels_of(place, xy[:, 0] + east, xy[:, 1] + north)
-            values = map_coordinates(grey, [row - 0.5, column - 0.5], order=1, mode="nearest")
-            scores[i, j] = np.corrcoef(values, light)[0, 1]
-    i, j = np.unravel_index(np.argmax(scores), scores.shape)
-    if scores[i, j] < _LEAST_CORRELATION or not (0 < i < steps.size - 1 and 0 < j < steps.size - 1):
-        return None
-    away = round(0.08 / step_m)
-    east_told = scores[i, j] - max(scores[i, max(j - away, 0)], scores[i, min(j + away, steps.size - 1)])
-    north_told = scores[i, j] - max(scores[max(i - away, 0), j], scores[min(i + away, steps.size - 1), j])
-    x, y = _peak(scores[i, j - 1 : j + 2]), _peak(scores[i - 1 : i + 2, j])
-    return (
-        float(steps[j] + x * step_m) if east_told >= _TOLD else np.nan,
-        float(steps[i] + y * step_m) if north_told >= _TOLD else np.nan,
-    )
+def _level(values: Float64, at: Float64) -> Float64:
+    """Values less the straight line through them: light falls with range, and asphalt is worn in tracks."""
+    return np.asarray(values - np.polyval(np.polyfit(at, values, 1), at))
 
 
 _TILE_PX: Final = 32  # Edge of the windows of a picture (pixels) in which colours of a cloud are sought.

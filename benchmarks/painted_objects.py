@@ -99,6 +99,45 @@ def scene(length_m: float = 60.0, **changes: Any) -> Scene:
     return _street(length_m, {"range_max_m": 40.0}, camera, 0.0).changed(**changes)
 
 
+DRAWS: Final = (11, 12, 13)
+"""Streets that are scored and nothing else: another layout each; the second and the third have another scanner and
+another camera, mounted otherwise."""
+
+
+def drawn_street(number: int) -> Scene:
+    """A town street whose cars, trees and posts stand and drive where chance puts them, and its scanner and camera."""
+    rng = np.random.default_rng(number)
+    mounts = ((0.9, -0.25, -1.6, -12.0, 0.0), (1.4, 0.45, -2.1, -20.0, 18.0), (0.6, -0.5, -1.9, -8.0, -30.0))
+    forward, right, down, pitch, heading = mounts[number - DRAWS[0]]
+    camera = {"width_px": 960, "height_px": 600, "noise": 0.0, "focal_px": (820.0, 640.0, 700.0)[number - DRAWS[0]],
+              "mount": {"lever_arm_body_m": (forward, right, down), "pitch_deg": pitch, "heading_deg": heading},
+    }  # fmt: skip
+    lidar = {"model": ("HDL-32E", "OS1-128", "XT32")[number - DRAWS[0]], "range_max_m": 40.0}
+
+    def row(kind: dict[str, Any], count: int, offset_m: float) -> list[dict[str, Any]]:
+        stations = np.cumsum(rng.uniform(5.5, 14.0, count)) - 10.0
+        return [{**kind, "station_m": float(s), "offset_m": offset_m + rng.uniform(-0.15, 0.15)} for s in stations]
+
+    cars = row({}, 5, 4.2) + row({"heading_deg": 180.0, "shade": 110.0}, 6, -4.2)
+    for one in cars:
+        one |= {"length_m": rng.uniform(3.8, 5.4), "height_m": rng.uniform(1.4, 2.4), "width_m": rng.uniform(1.7, 2.0)}
+    trees = [
+        {**one, "height_m": rng.uniform(5.0, 9.0), "crown_m": rng.uniform(2.5, 4.5), "trunk_m": 0.25}
+        for one in row({}, 4, 7.2) + row({}, 4, -7.4)
+    ]
+    driving = [
+        {"station_m": rng.uniform(14.0, 30.0), "offset_m": 1.6, "speed_m_per_s": rng.uniform(7.0, 10.0)},
+        {"station_m": rng.uniform(40.0, 80.0), "offset_m": -1.6, "speed_m_per_s": -rng.uniform(5.0, 9.0)},
+    ]
+    beside = {
+        "parked_cars": cars, "trees": trees, "moving_cars": driving,
+        "poles": row({"height_m": 0.9, "diameter_m": 0.12}, 6, 5.6), "lamp_posts": row({"height_m": 6.0}, 3, -5.8),
+        "facades": [{"offset_m": side * rng.uniform(9.0, 11.0), "start_m": -40.0, "end_m": rng.uniform(70.0, 110.0),
+                     "height_m": rng.uniform(7.0, 14.0)} for side in (-1.0, 1.0)],
+    }  # fmt: skip
+    return _street(50.0, lidar, camera, 0.0).changed(seed=number, roadside=beside)
+
+
 def photographed_street(length_m: float = 24.0, **changes: Any) -> Scene:
     """A street with painted lines, an upright lidar and a camera that looks down ahead of the vehicle."""
     camera = {"width_px": 1400, "height_px": 900, "focal_px": 1000.0,

@@ -9,12 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.colours.kernels.depths import grow, nearest_in_pixels, slopes
-from roadscan.colours.kernels.looks import LEAST_M, STEPS, UNKNOWN, Camera, project
+from roadscan.colours.kernels.looks import LEAST_M, MOVED, MOVED_M, STEPS, UNKNOWN, VOTED, VOTED_M, Camera, project
 from roadscan.core.extras import cv2
 from roadscan.pictures.kernels.lens import FOCAL_X, FOCAL_Y, HEIGHT, WIDTH
 
 Float32 = npt.NDArray[np.float32]
 Int64 = npt.NDArray[np.int64]
+UInt8 = npt.NDArray[np.uint8]
 UInt16 = npt.NDArray[np.uint16]
 
 _MOST_PIXELS: Final = 500_000
@@ -29,13 +30,11 @@ _THICKNESS_M: Final = 0.15
 """A point may lie so far behind the nearest one and still be seen (m): noise of ranges and poses, rough surfaces."""
 _THICKNESS: Final = 0.01
 """The same as a share of its distance."""
-_MOVED_M: Final = 0.5
-"""What was seen so far behind a place (m) was seen through it."""
-_MOVED: Final = 0.05
-"""The same as a share of its distance."""
 _AROUND: Final = 12
 """Something was seen through a place where an opening of more than twice so many pixels was at the moment: leaves,
 wires and the like are seen through, and stay."""
+_OUTLINE: Final = 16
+"""What moves is shown by the lines of one turn alone, and may reach so far beyond (pixels): twice the widest gap."""
 _UNKNOWN_SLOPE: Final = 2.7
 """Slope (m a m across the ray) of a surface whose normal is not known: it is seen at 20 degrees."""
 _HALF_OF_FAR: Final = 1.5
@@ -91,12 +90,78 @@ def depth_factor(lens: npt.NDArray[np.float64]) -> int:
     return max(1, int(np.ceil(np.sqrt(lens[WIDTH] * lens[HEIGHT] / _MOST_PIXELS))))
 
 
-def depth_images(points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: float, rule: DepthRule) -> DepthImages:
+@dataclass(frozen=True, eq=False)
+class _Moment:
+    """What was seen at the moment of a picture."""
+
+    factor: int
+    pixel: Float32
+    """(n, 2) of all points, also those of other times, NaN where one is not shown."""
+    distance_m: Float32
+    """(n,) likewise."""
+    at_once: npt.NDArray[np.bool_]
+    """(n,) seen at the moment."""
+    nearest_m: Float32
+    """(rows, columns) of those."""
+    which: npt.NDArray[np.int32]
+    """(rows, columns) number of the nearest."""
+    around_m: Float32
+    """(rows, columns) its gaps closed, openings of leaves and wires as well."""
+    turned: tuple[float, float]
+    """Angle of a pixel of the image (rad), steepest slope."""
+
+
+def depth_images(
+    points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: float, rule: DepthRule,
+    moved: npt.NDArray[np.bool_] | None = None,
+) -> DepthImages:  # fmt: skip
     """Returns what a picture shows, from the points around it.
 
     Points of the moment come first. Points of other times count unless something was seen through their place at the
     moment: such were things that moved. Nearest points of each pixel grow to discs that close the gaps (`grow`).
+
+    moved : (n,) points that were seen through at other moments as well: they count at their own alone.
     """
+    m = _moment(points, camera, own_epoch_gps_ns, reach_m, rule)
+    moment, around, factor = m.nearest_m, m.around_m, m.factor
+    counted = ~m.at_once if moved is None else ~m.at_once & ~moved
+    other, others = _nearest(m.pixel, m.distance_m, np.flatnonzero(counted), factor, moment.shape)
+    other[np.isfinite(around) & (around > other * (1.0 + MOVED) + MOVED_M)] = np.inf
+    closer = other < moment
+    front, which = np.where(closer, other, moment), np.where(closer, others, m.which)
+    front, radius = _grown(front, _slopes(front, which, points, camera, m.turned))
+    pixel_rad, steepest = m.turned
+    known = np.isfinite(front)
+    closed = _without_holes(front, pixel_rad)
+    margin = rule.edge_px / factor
+    at_edge, closed = _edges(np.where(known, front, closed), closed, radius, margin, steepest * pixel_rad)
+    if moved is not None and moved.any():
+        moving, _ = _nearest(m.pixel, m.distance_m, np.flatnonzero(m.at_once & moved), factor, moment.shape)
+        closed = np.minimum(closed, cv2.erode(np.where(np.isfinite(moving), moving, _FAR), _disc(_OUTLINE)))
+        known |= closed < _FAR
+    nearest = np.where(known, at_edge, 0.0)
+    farthest = np.where(known, closed * (1.0 + _THICKNESS) + _THICKNESS_M, np.inf)
+    gone = np.where(np.isfinite(around), (around - MOVED_M) / (1.0 + MOVED), 0.0)
+    return DepthImages(_stored(nearest), _stored(farthest), _stored(gone), factor)
+
+
+def seen_through(
+    points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: float, rule: DepthRule
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Returns which points (n,) of other times were seen through at the moment of a picture, and which were there."""
+    m = _moment(points, camera, own_epoch_gps_ns, reach_m, rule)
+    rows = np.flatnonzero(~m.at_once & ~np.isnan(m.distance_m))
+    place = ((m.pixel[rows] + 0.5) / m.factor).astype(np.int64)
+    height, width = m.around_m.shape
+    around = m.around_m[np.minimum(place[:, 1], height - 1), np.minimum(place[:, 0], width - 1)]
+    distance = m.distance_m[rows]
+    through, there = np.zeros(len(points.point_m), np.bool_), np.zeros(len(points.point_m), np.bool_)
+    through[rows] = np.isfinite(around) & (around > distance * (1.0 + VOTED) + VOTED_M)
+    there[rows] = np.isfinite(around) & (np.abs(around - distance) <= distance * _THICKNESS + _THICKNESS_M)
+    return through, there
+
+
+def _moment(points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: float, rule: DepthRule) -> _Moment:
     factor = depth_factor(camera.lens)
     shape = (-(-int(camera.lens[HEIGHT]) // factor), -(-int(camera.lens[WIDTH]) // factor))
     pixel, distance = np.empty((len(points.point_m), 2), np.float32), np.empty(len(points.point_m), np.float32)
@@ -106,22 +171,11 @@ def depth_images(points: Seen, camera: Camera, own_epoch_gps_ns: int, reach_m: f
     steepest = float(1.0 / np.tan(np.radians(rule.grazing_deg)))
     moment, which = _nearest(pixel, distance, np.flatnonzero(at_once), factor, shape)
     around = _grown(moment, _slopes(moment, which, points, camera, (pixel_rad, steepest)))[0]
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _AROUND + 1, 2 * _AROUND + 1))
+    disc = _disc(_AROUND)
     seen = np.isfinite(around)
     around = cv2.dilate(cv2.erode(np.where(seen, around, _FAR), disc), disc)
     around = np.where(seen & (around < _FAR), around, np.inf).astype(np.float32)
-    other, others = _nearest(pixel, distance, np.flatnonzero(~at_once), factor, shape)
-    other[np.isfinite(around) & (around > other * (1.0 + _MOVED) + _MOVED_M)] = np.inf
-    closer = other < moment
-    front, which = np.where(closer, other, moment), np.where(closer, others, which)
-    front, radius = _grown(front, _slopes(front, which, points, camera, (pixel_rad, steepest)))
-    known = np.isfinite(front)
-    closed = _without_holes(front, pixel_rad)
-    at_edge = _edges(np.where(known, front, closed), radius, rule.edge_px / factor, steepest * pixel_rad)
-    nearest = np.where(known, at_edge, 0.0)
-    farthest = np.where(known, closed * (1.0 + _THICKNESS) + _THICKNESS_M, np.inf)
-    moved = np.where(np.isfinite(around), (around - _MOVED_M) / (1.0 + _MOVED), 0.0)
-    return DepthImages(_stored(nearest), _stored(farthest), _stored(moved), factor)
+    return _Moment(factor, pixel, distance, at_once, moment, which, around, (pixel_rad, steepest))
 
 
 def _nearest(
@@ -183,12 +237,15 @@ def _without_holes(front_m: Float32, pixel_rad: float) -> Float32:
     return np.where(out >= _FAR, np.inf, out).astype(np.float32)
 
 
-def _edges(front_m: Float32, radius: Float32, margin: float, steepest: float) -> Float32:
-    """Returns the distance (height, width) below which a point lies at an edge; 0 far from edges.
+def _edges(
+    front_m: Float32, closed_m: Float32, radius: Float32, margin: float, steepest: float
+) -> tuple[Float32, Float32]:
+    """Returns the distance (height, width) below which a point lies at an edge, 0 far from edges, and `closed_m`
+    where what lies behind an edge begins beside it.
 
     An edge is where the distance leaps from a pixel to the next by more than a surface does. Its near side reaches
     beyond the outermost point by the radius of the discs, so points within that and the margin are at the edge, if they
-    lie nearer than half of the leap.
+    lie nearer than half of the leap. Behind it a pixel within the margin shows the near side as well.
     """
     height, width = front_m.shape
     finite = np.where(np.isfinite(front_m), front_m, _FAR)
@@ -198,10 +255,15 @@ def _edges(front_m: Float32, radius: Float32, margin: float, steepest: float) ->
     whole = np.rint(np.repeat(np.repeat(radius, _BLOCK, axis=0), _BLOCK, axis=1)[:height, :width] + margin)
     out = np.zeros((height, width), np.float32)
     for reach in np.unique(whole).astype(int).tolist():
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         own = whole == reach
-        out[own] = cv2.dilate(half, disc)[own]
-    return out
+        out[own] = cv2.dilate(half, _disc(reach))[own]
+    near = cv2.erode(np.where(leaps, finite, _FAR), _disc(round(margin)))
+    return out, np.minimum(closed_m, near)
+
+
+def _disc(radius: int) -> UInt8:
+    size = 2 * radius + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
 
 
 def _stored(distance_m: npt.NDArray[np.floating]) -> UInt16:

@@ -18,7 +18,7 @@ CELL_M: Final = 0.5
 """Edge of the cubes (m) in which pictures are compared; they are anchored at the map's origin and at height 0."""
 _ONE_IN: Final = 4  # One cube in so many, by its number, is compared.
 _LEAST_POINTS: Final = 3  # Fewest points of a picture in a cube.
-_DARK, _BRIGHT = 12.0, 243.0
+DARK, BRIGHT = 12.0, 243.0
 """Values outside of these are not compared: what is black or overexposed does not follow the exposure."""
 _LEAST_SHARED: Final = 8  # Fewest cubes that two pictures share, to be compared.
 _NEIGHBOURS: Final = 12
@@ -57,7 +57,7 @@ def is_compared(cell: Int64) -> npt.NDArray[np.bool_]:
 
 def sample_of(cell: Int64, colour: Float32, weight: Float32) -> PictureSample:
     """Returns mean colours by cube of points (n,) that a picture sees (weight above 0)."""
-    seen = np.flatnonzero((weight > 0.0) & (colour.min(axis=1) >= _DARK) & (colour.max(axis=1) <= _BRIGHT))
+    seen = np.flatnonzero((weight > 0.0) & (colour.min(axis=1) >= DARK) & (colour.max(axis=1) <= BRIGHT))
     held, which, count = np.unique(cell[seen], return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(which, colour[seen, c], held.size) for c in range(3)], axis=-1) / np.maximum(
         count, 1

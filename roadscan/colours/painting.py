@@ -10,7 +10,16 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.colours.cameras import cameras_of
-from roadscan.colours.kernels.looks import Camera, Depths, Limits, keep_best, look, weighted_medians
+from roadscan.colours.kernels.looks import (
+    Camera,
+    Depths,
+    Limits,
+    keep_best,
+    leave_doubtful,
+    leave_moved,
+    look,
+    weighted_medians,
+)
 from roadscan.pictures.colours import ColourSource
 from roadscan.pictures.placed import Pictures
 
@@ -43,21 +52,34 @@ class Looks:
     """(n, k, 3) balanced."""
     weight: Float32
     """(n, k), 0: none."""
+    state: UInt8
+    """(n, k) as kernels have it."""
     number: npt.NDArray[np.int32]
     """(n, k) number of the picture."""
+    votes: UInt8
+    """(n, 2) how many pictures saw through the place, and how many of another time show it."""
 
     @classmethod
     def none(cls, count: int, most: int) -> Self:
         """Returns looks at so many places before any picture was seen."""
         return cls(
             np.zeros((count, most, 3), np.uint8), np.zeros((count, most), np.float32),
-            np.full((count, most), -1, np.int32),
+            np.zeros((count, most), np.uint8), np.full((count, most), -1, np.int32), np.zeros((count, 2), np.uint8),
         )  # fmt: skip
 
     def medians(self) -> tuple[UInt8, UInt8]:
         """Returns weighted medians (n, 3), 0 without a look, and the number of looks (n,)."""
         colour, count = np.zeros((len(self.weight), 3), np.uint8), np.zeros(len(self.weight), np.uint8)
         weighted_medians(self.colour, self.weight, colour, count)
+        return colour, count
+
+    def sure_medians(self) -> tuple[UInt8, UInt8]:
+        """Returns the same without looks at what had moved, and without colours that one look alone tells, at an edge
+        of colours in its picture. It is called once.
+        """
+        leave_moved(self.weight, self.state, self.votes)
+        colour, count = self.medians()
+        leave_doubtful(self.colour, self.weight, self.state, colour, count)
         return colour, count
 
 
@@ -70,6 +92,8 @@ class PaintRule:
     least_angle_deg: float
     """Least angle between a ray and a surface whose normal is known."""
     moment_ns: int
+    window_ns: int
+    """Pictures so near in time to a place tell whether what was seen there moved."""
     most: int
     """Looks that are kept of a place."""
 
@@ -104,15 +128,20 @@ def paint(palette: Palette, pieces: Sequence[Places], origin_m: Float64, rule: P
         limits = Limits(
             rule.reach_m, float(rule.border_px), _RAMP * min(picture.shape[:2]),
             float(np.sin(np.radians(rule.least_angle_deg))), rule.moment_ns, float(palette.weight[n]),
+            rule.window_ns,
         )  # fmt: skip
         for k in near:
             one, held = pieces[k], found[k]
             colour, weight = np.empty((len(one.point_m), 3), np.float32), np.empty(len(one.point_m), np.float32)
+            state = np.empty(len(one.point_m), np.uint8)
             look(
                 one.point_m, one.epoch_gps_ns, one.normal, camera, int(pictures.epochs_gps_ns[n]), depths, limits,
-                lens.hidden, picture, colour, weight,
+                lens.hidden, picture, colour, weight, state,
             )  # fmt: skip
-            keep_best(colour, weight, palette.gain[n], int(palette.number[n]), held.colour, held.weight, held.number)
+            keep_best(
+                colour, weight, state, palette.gain[n], int(palette.number[n]), held.colour, held.weight, held.state,
+                held.number, held.votes,
+            )  # fmt: skip
     return found
 
 

@@ -86,7 +86,7 @@ class Colours(Stage):
         bad = [] if work.plan is None else work.unreadable
         more = f"; and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
         if bad:
-            session.note(f"colours: {len(bad):,} pictures cannot be read: {'; '.join(bad[:_NAMED])}{more}")
+            session.note(f"colours: {len(bad):,} pictures give no colour: {'; '.join(bad[:_NAMED])}{more}")
 
     def check(self, survey: Survey) -> list[RoadscanError]:
         """Check that there is a camera whose pictures can give colours."""

@@ -128,6 +128,10 @@ class Sensor(Strict):
     """Errors of an IMU: a grade ("navigation", "tactical", "industrial", "mems"), or a table from its data sheet."""
     interior: Interior | None = None
     """Interior orientation of a camera, as `roadscan camera` finds it."""
+    above_road_m: float | None = Field(default=None, gt=0.0, le=20.0)
+    """Height of a camera's projection centre above the road, as measured on the standing vehicle (m). Where no ground
+    is surveyed below the camera, footprints of its pictures lie on a level plane so far below it; left out, they have
+    none."""
     own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
     """Polygons in a camera's pictures that show its own vehicle, each a list of corners (u, v), in pixels from the
     centre of the upper left one: no colour is taken from there."""

@@ -34,22 +34,33 @@ class Footprint(NamedTuple):
     """Polygon on the map with heights, counter-clockwise; None where the picture shows no ground."""
     on_ground: float
     """Share of its border's rays that meet surveyed ground; NaN without a polygon."""
+    without: str = ""
+    """Why there is no polygon."""
 
 
-_NONE: Final = Footprint(None, math.nan)
+_NONE: Final = Footprint(None, math.nan, "the picture shows no ground")
+_NO_ROAD: Final = Footprint(
+    None, math.nan, "no ground is surveyed below the camera, and the rig file states no above_road_m of it"
+)
+_BELOW: Final = Footprint(None, math.nan, "the camera lies below the surveyed ground")
 
 
-def footprint(poses: PicturePoses, ground: Ground, number: int, reach_m: float) -> Footprint:
+def footprint(
+    poses: PicturePoses, ground: Ground, number: int, reach_m: float, above_road_m: float | None = None
+) -> Footprint:
     """Return what a picture shows of the ground within a reach of the camera, on the map.
 
     Rays that meet no surveyed ground are held against a level plane at the height of the road below the camera; those
-    that rise or go farther end at the reach.
+    that rise or go farther end at the reach. Where no ground is surveyed there, that plane lies `above_road_m` below.
     """
     place = poses.place_m[number]
     heights = (ground.height_m(float(place[0]), float(place[1]), radius) for radius in _BELOW_M)
-    road_m = next((h for h in heights if math.isfinite(h)), math.nan)
-    if not math.isfinite(road_m) or road_m >= place[2]:
-        return _NONE
+    known_m = next((h for h in heights if math.isfinite(h)), None)
+    if known_m is None and above_road_m is None:
+        return _NO_ROAD
+    road_m = float(place[2]) - (above_road_m or 0.0) if known_m is None else known_m
+    if road_m >= place[2]:
+        return _BELOW
     lens = poses.pictures.views.lens_of(number)
     if lens.is_around:
         turn = np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)

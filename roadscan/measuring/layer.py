@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime as dt
+import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -55,6 +57,8 @@ class PictureRows:
     logs: tuple[str, ...]
     """Paths of the logs that the poses name by number."""
     reach_m: float
+    above_road_m: float | None
+    """Height of the camera above the road, as the rig file states it."""
 
 
 def write_rows(task: PictureRows) -> OutputRecord:
@@ -62,7 +66,12 @@ def write_rows(task: PictureRows) -> OutputRecord:
     rows, places, prints = picture_rows(task)
     schema = table_schema(PRODUCT)
     table = pa.Table.from_pylist(rows, schema=schema.arrow())
-    figures = f'{{"pictures": {len(rows)}, "without_pose": {len(task.unplaced)}}}'
+    without = Counter(row["without_footprint"] for row in rows if row.get("without_footprint"))
+    told = {
+        "pictures": len(rows),
+        "without_pose": len(task.unplaced),
+        "without_footprint": dict(sorted(without.items())),
+    }
     with task.store.scratch() as folder:
         path = folder / task.unit
         write_geo_table(
@@ -70,7 +79,7 @@ def write_rows(task: PictureRows) -> OutputRecord:
             more={"footprint": (prints, ["Polygon Z"])},
         )  # fmt: skip
         target = f"{schema.location}/{task.unit}"
-        return publish_file(task.store, path, target, PRODUCT, task.unit, task.key, figures)
+        return publish_file(task.store, path, target, PRODUCT, task.unit, task.key, json.dumps(told))
 
 
 def picture_rows(task: PictureRows) -> tuple[list[dict[str, Any]], npt.NDArray[Any], npt.NDArray[Any]]:
@@ -80,9 +89,11 @@ def picture_rows(task: PictureRows) -> tuple[list[dict[str, Any]], npt.NDArray[A
     if task.poses is not None and task.ground is not None:
         angles = _angles(task.poses)
         for number in range(len(task.poses)):
-            seen = footprint(task.poses, task.ground, number, task.reach_m)
+            seen = footprint(task.poses, task.ground, number, task.reach_m, task.above_road_m)
             row = _row(task, task.poses, number) | {name: values[number] for name, values in angles.items()}
-            if seen.polygon_m is not None:
+            if seen.polygon_m is None:
+                row["without_footprint"] = seen.without
+            else:
                 row |= {"footprint_m2": seen.polygon_m.area, "footprint_on_ground": seen.on_ground}
             rows.append({name: _plain(value) for name, value in row.items()})
             shapes.append((shapely.Point(task.poses.place_m[number]), seen.polygon_m))

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.grid import Bounds
-from roadscan.georeference.plan.plan import SurveyPlan, poses_plan_of
+from roadscan.georeference.plan.plan import SurveyPlan, pictures_plan_of
 from roadscan.measuring.ground import Ground, Plane
 from roadscan.measuring.kernels.march import BELOW, first_hits
 from roadscan.measuring.poses import PicturePoses, picture_poses
@@ -100,14 +100,14 @@ def posed_pictures(session: Session) -> PicturePoses:
     RunError
         where the survey has no pictures, or none has a pose.
     """
-    plan = poses_plan_of(session)
+    plan = pictures_plan_of(session)
     return picture_poses(plan, plan_pictures(plan, _FROM_WHERE))
 
 
 @found_once
 def survey_ground(session: Session) -> Ground:
     """Return the surveyed ground."""
-    return Ground.of(session.store, poses_plan_of(session).ground.grid, session.manifest)
+    return Ground.of(session.store, pictures_plan_of(session).ground.grid, session.manifest)
 
 
 def picture_number(pictures: Pictures, file: str | Path, plan: SurveyPlan) -> int:
@@ -156,7 +156,7 @@ def measure(
         where the picture is not known, or a pixel lies outside it.
     """
     poses = posed_pictures(session)
-    number = picture_number(poses.pictures, file, poses_plan_of(session))
+    number = picture_number(poses.pictures, file, pictures_plan_of(session))
     own = _checked(poses, number, pixel)
     places = measured_places(poses, survey_ground(session), number, own, sigma_px, reach_m)
     log = poses.pictures.logs[poses.pictures.log[number]]
@@ -252,7 +252,7 @@ def meet(
     ConfigError
         where a picture is not known, both are the same, a pixel has no ray, or the rays do not meet before the cameras.
     """
-    poses, plan = posed_pictures(session), poses_plan_of(session)
+    poses, plan = posed_pictures(session), pictures_plan_of(session)
     numbers = [picture_number(poses.pictures, file, plan) for file in files]
     if numbers[0] == numbers[1]:
         raise ConfigError("both pixels are of one picture", expected="two pictures from different places")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Sequence
 from typing import Final
@@ -60,6 +61,11 @@ class PictureLayer(Stage):
         session.failed(self.name, [(task.unit, reason) for task, reason in failed])
         for reason, count in sorted(Counter(one.reason for one in all_pictures(session).unplaced).items()):
             session.note(f"pictures: {count:,} without a pose: {reason}")
+        without = Counter[str]()
+        for record in manifest.of(PRODUCT).values():
+            without.update(json.loads(record.detail or "{}").get("without_footprint", {}))
+        for reason, count in sorted(without.items()):
+            session.note(f"pictures: {count:,} without a footprint: {reason}")
         key = self._package_key(manifest, tasks)
         if not failed and not manifest.is_current(PRODUCT, GEOPACKAGE, key):
             held = manifest.of(PRODUCT)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.grid import Bounds
-from roadscan.georeference.plan.plan import SurveyPlan, plan_of
+from roadscan.georeference.plan.plan import SurveyPlan, pictures_plan_of
 from roadscan.measuring.ground import Ground
 from roadscan.measuring.layer import PictureRows
 from roadscan.measuring.listed import ListedPictures, Unplaced, listed_pictures
@@ -31,17 +31,18 @@ _PLAIN: Final = re.compile(r"[^A-Za-z0-9_-]+")
 @found_once
 def all_pictures(session: Session) -> ListedPictures:
     """Return all pictures of a survey's cameras."""
-    return listed_pictures(plan_of(session))
+    return listed_pictures(pictures_plan_of(session))
 
 
 def row_tasks(session: Session) -> list[PictureRows]:
     """Return the files that there should be, in order of their names."""
-    plan, listed, ground = plan_of(session), all_pictures(session), survey_ground(session)
+    plan, listed, ground = pictures_plan_of(session), all_pictures(session), survey_ground(session)
     reach_m = PicturesConfig.of(session.survey).footprint_reach_m
-    code = code_digest("roadscan.measuring.layer:write_rows")
+    code, context = code_digest("roadscan.measuring.layer:write_rows"), product_context(plan)
     tasks: list[PictureRows] = []
     for poses in listed.placed:
         logs = tuple(_path_of(plan, log.key) for log in poses.pictures.logs)
+        above_m = plan.survey.rig.sensors[poses.pictures.logs[0].sensor].above_road_m
         for log_number in range(len(logs)):
             own = np.flatnonzero(poses.pictures.log == log_number)
             for part, start in enumerate(range(0, own.size, _IN_A_FILE)):
@@ -51,21 +52,14 @@ def row_tasks(session: Session) -> list[PictureRows]:
                 unit = f"{_PLAIN.sub('-', log.run)}_{_PLAIN.sub('-', log.sensor)}_{log.key[:6]}_{part:03d}.parquet"
                 digests = [(str(t), near.cells[t].digest) for t in sorted(near.cells, key=str)]
                 known = [picked.root.tobytes().hex(), picked.told, picked.pictures.epochs_gps_ns.tobytes().hex()]
-                key = key_of(code, unit, picked.pictures.key(), known, digests, reach_m, logs, plan.ground.map)
-                tasks.append(_task(session, unit, key, picked, near, (), logs, reach_m))
+                key = key_of(code, unit, picked.pictures.key(), known, digests, reach_m, logs, plan.ground.map,
+                             above_m)  # fmt: skip
+                tasks.append(PictureRows(session.store, context, unit, key, picked, near, (), logs, reach_m, above_m))
     for names, own_unplaced in _by_log(listed.unplaced).items():
         unit = f"{_PLAIN.sub('-', '_'.join(names))}_without_pose.parquet"
         key = key_of(code, unit, [repr(one) for one in own_unplaced], plan.ground.map)
-        tasks.append(_task(session, unit, key, None, None, own_unplaced, (), reach_m))
+        tasks.append(PictureRows(session.store, context, unit, key, None, None, own_unplaced, (), reach_m, None))
     return sorted(tasks, key=lambda task: task.unit)
-
-
-def _task(
-    session: Session, unit: str, key: str, poses: PicturePoses | None, ground: Ground | None,
-    unplaced: tuple[Unplaced, ...], logs: tuple[str, ...], reach_m: float,
-) -> PictureRows:  # fmt: skip
-    context = product_context(plan_of(session))
-    return PictureRows(session.store, context, unit, key, poses, ground, unplaced, logs, reach_m)
 
 
 def picked_poses(poses: PicturePoses, index: npt.NDArray[np.int64]) -> PicturePoses:

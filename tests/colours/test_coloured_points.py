@@ -6,6 +6,7 @@ import csv
 import json
 from pathlib import Path
 
+import cv2
 import laspy
 import numpy as np
 import pytest
@@ -127,7 +128,7 @@ def test_blocks_and_workers_change_no_byte(street: Street, coloured: Session) ->
     assert street.products(street.run(single, TwoThreads())) == first
 
 
-def test_a_second_run_does_nothing_and_a_lost_picture_costs_itself(street: Street, coloured: Session) -> None:
+def test_a_second_run_does_nothing_and_blank_pictures_cost_themselves(street: Street, coloured: Session) -> None:
     again = street.run(street.survey)
     state = COLOURS[0].state(again)
     assert (state.stale, state.current > 0) == (0, True)
@@ -136,11 +137,16 @@ def test_a_second_run_does_nothing_and_a_lost_picture_costs_itself(street: Stree
     content = bytearray(third.read_bytes())
     content[len(content) // 2] ^= 8  # whole to look at, and cannot be decoded
     third.write_bytes(content)
+    second, fourth = (sorted(camera.glob("*.jpg"))[k] for k in (1, 3))
+    for file, value in ((second, 0), (fourth, 255)):
+        cv2.imwrite(str(file), np.full((200, 320, 3), value, np.uint8))
     run = street.run(street.survey, stages=(*STAGES, *COLOURS))
     assert not run.failures
-    told = [n for n in run.reporter.lines if "cannot be read" in n]  # type: ignore[attr-defined]
+    told = [n for n in run.reporter.lines if "give no colour" in n]  # type: ignore[attr-defined]
     assert len(told) == 1
-    assert f"1 pictures cannot be read: run-1/camera/{third.name}" in told[0]
+    assert "3 pictures give no colour: " in told[0] and f"run-1/camera/{third.name}: " in told[0]
+    assert f"run-1/camera/{second.name}: it is black" in told[0]
+    assert f"run-1/camera/{fourth.name}: it is overexposed" in told[0]
     found = judged(street.folder, Path(run.store.path("products/coloured_points")))
     assert 0 < found.wrong.sum() <= 0.01 * found.coloured.sum()
 

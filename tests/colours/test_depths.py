@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.colours.depth import DepthRule, Seen, depth_images
+from roadscan.colours.depth import DepthRule, Seen, depth_images, seen_through
 from roadscan.colours.gains import PictureSample, gains_of
 from roadscan.colours.kernels.looks import STEPS, UNKNOWN, Camera
 from roadscan.colours.tasks.depths import _kept
@@ -50,6 +50,34 @@ def test_beside_an_edge_nothing_near_counts() -> None:
     assert (edge[150:170, 225:255] == 0.0).all()  # in its middle
     assert 10.0 < edge[160, 318] < 20.0  # the last points of the near wall lie at column 319
     assert edge[160, 318 - 12] == 0.0
+
+
+def test_behind_an_edge_what_the_same_pixel_shows_is_hidden() -> None:
+    """The near wall ends at column 319; the discs of its points reach a gap beyond."""
+    _, hidden, _ = shown((wall(10.0, 2.0, 0.02, 0.02), 0), (wall(20.0, 8.0, 0.02, 0.02), 0))
+    last = int(np.flatnonzero(hidden[160] < 15.0)[-1])
+    assert 321 <= last <= 324  # the wall's end, a disc of one pixel, and the two of `edge_px`
+    assert (hidden[160, last + 1 : last + 40] > 19.9).all()
+
+
+def test_what_another_picture_saw_through_hides_nothing() -> None:
+    """The moment saw nothing around a board that was there later: others tell; one of the moment hides more around."""
+    board = wall(5.0, 1.0, 0.02, 0.02).astype(np.float32)
+    behind = wall(20.0, 8.0, 0.05, 0.05).astype(np.float32)
+    count = len(board) + len(behind)
+    normal = np.tile(np.array([0, -1, 0], np.float32), (count, 1))
+    points, moved = Seen(np.concatenate([board, behind]), normal, np.full(count, LATER)), np.arange(count) < len(board)
+
+    def farthest(seen: Seen, gone: np.ndarray | None) -> np.ndarray:
+        return 0.1 * np.exp(depth_images(seen, CAMERA, 0, 60.0, RULE, gone).farthest[160] / STEPS)
+
+    assert farthest(points, None)[240] < 6.0
+    assert farthest(points, moved)[240] > 19.9
+    now = Seen(points.point_m, points.normal, np.where(moved, 0, LATER))
+    wide = np.flatnonzero(farthest(now, moved) < 6.0).size - np.flatnonzero(farthest(now, None) < 6.0).size
+    assert 20 <= wide <= 32  # 16 pixels to each side, in place of a disc and the margin
+    through, there = seen_through(Seen(points.point_m, points.normal, np.where(moved, LATER, 0)), CAMERA, 0, 60.0, RULE)
+    assert through[: len(board)].all() and not there[: len(board)].any()
 
 
 def test_what_was_seen_through_hides_nothing_and_has_moved() -> None:

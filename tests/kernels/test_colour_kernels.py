@@ -8,12 +8,22 @@ import numpy as np
 from roadscan.colours.kernels.blending import blend
 from roadscan.colours.kernels.depths import grow, nearest_in_pixels, slopes
 from roadscan.colours.kernels.looks import (
+    ALIKE,
+    EVEN,
+    GONE,
+    MOVED,
+    MOVED_M,
+    OTHER,
     STEPS,
     UNKNOWN,
+    VOTED,
+    VOTED_M,
     Camera,
     Depths,
     Limits,
     keep_best,
+    leave_doubtful,
+    leave_moved,
     look,
     project,
     weighted_medians,
@@ -61,14 +71,16 @@ def test_look_takes_what_is_neither_hidden_nor_at_an_edge_nor_gone() -> None:
     picture[..., 0], picture[..., 1] = np.arange(WIDTH), np.arange(HEIGHT)[:, None]
     normal = np.full((400, 3), np.nan, np.float32)
     epoch = np.zeros(400, np.int64)
-    limits = Limits(30.0, 4.0, 0.0, 0.0, 10, 1.0)
+    limits = Limits(30.0, 4.0, 0.0, 0.0, 10, 1.0, window_ns=11)
     pixel, distance = np.empty((400, 2), np.float32), np.empty(400, np.float32)
     project(points, CAMERA, 30.0, pixel, distance)
+
+    state = np.empty(400, np.uint8)
 
     def weights(depths: Depths, own_epoch: int = 0, hidden: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         colour, weight = np.zeros((400, 3), np.float32), np.empty(400, np.float32)
         masked = np.zeros((0, 0), np.bool_) if hidden is None else hidden
-        look(points, epoch, normal, CAMERA, own_epoch, depths, limits, masked, picture, colour, weight)
+        look(points, epoch, normal, CAMERA, own_epoch, depths, limits, masked, picture, colour, weight, state)
         return colour, weight
 
     colour, weight = weights(open_view())
@@ -85,21 +97,39 @@ def test_look_takes_what_is_neither_hidden_nor_at_an_edge_nor_gone() -> None:
     assert np.array_equal(weights(edge)[1] > 0, inside & (distance >= 10.0 - 2e-3))
     gone = open_view(middle)
     assert np.array_equal(weights(gone, own_epoch=11)[1] > 0, inside & (distance >= 10.0 - 2e-3))
+    behind = 10.0 * (1.0 + MOVED) + MOVED_M  # so far away something was seen then
+    through = inside & (distance * (1.0 + VOTED) + VOTED_M < behind)
+    assert np.abs((state & GONE > 0) ^ through).sum() <= 1  # stored distances have steps
+    assert np.array_equal(state & OTHER > 0, inside & (distance >= 10.0 - 2e-3))
+    assert not (weights(gone, own_epoch=12) and state & GONE).any()  # too long before it
     assert np.array_equal(weights(gone, own_epoch=10)[1] > 0, inside)  # seen at the moment itself
     left = np.zeros((HEIGHT, WIDTH), np.bool_)
     left[:, :80] = True
     assert np.array_equal(weights(open_view(), hidden=left)[1] > 0, inside & (np.rint(pixel[:, 0]) >= 80))
+    weights(open_view())
+    assert (state[inside] == EVEN).all()  # ramps of one value a pixel
+    picture[:, 60:, 2] = ALIKE + 1  # an edge of colours between two columns
+    weights(open_view())
+    column = np.rint(pixel[inside, 0])
+    assert np.array_equal(state[inside] == EVEN, (column < 59) | (column > 60))
 
 
 def test_keep_best_keeps_the_largest_weights() -> None:
     rng = np.random.default_rng(5)
     weights = rng.permutation(12).reshape(12, 1).astype(np.float32)
-    held = np.zeros((1, 4, 3), np.uint8), np.zeros((1, 4), np.float32), np.full((1, 4), -1, np.int32)
+    held = (
+        np.zeros((1, 4, 3), np.uint8), np.zeros((1, 4), np.float32), np.zeros((1, 4), np.uint8),
+        np.full((1, 4), -1, np.int32), np.zeros((1, 2), np.uint8),
+    )  # fmt: skip
     for number, weight in enumerate(weights):
-        keep_best(np.full((1, 3), 10.0 * number, np.float32), weight, np.array([1.0, 2.0, 9.0]), number, *held)
+        colour, state = np.full((1, 3), 10.0 * number, np.float32), np.array([OTHER * (number % 2)], np.uint8)
+        keep_best(colour, weight, state, np.array([1.0, 2.0, 9.0]), number, *held)
     best = np.argsort(weights[:, 0])[-4:]
-    assert sorted(held[2][0].tolist()) == sorted(best.tolist())
-    for k, number in enumerate(held[2][0]):
+    keep_best(colour, np.zeros(1, np.float32), np.array([GONE], np.uint8), np.ones(3), 12, *held)
+    assert held[4].tolist() == [[1, int((weights[1::2] > 0).sum())]]
+    assert sorted(held[3][0].tolist()) == sorted(best.tolist())
+    for k, number in enumerate(held[3][0]):
+        assert held[2][0, k] == OTHER * (number % 2)
         assert held[0][0, k].tolist() == [10 * number, 20 * number, min(255, 90 * number)]
         assert held[1][0, k] == weights[number, 0]
 
@@ -115,6 +145,26 @@ def test_weighted_medians_are_those_of_repeated_values() -> None:
         many = np.sort(np.repeat(colour[i], weight[i].astype(int), axis=0), axis=0)
         expected = many[(len(many) - 1) // 2] if len(many) else np.zeros(3)
         assert np.array_equal(found[i], expected)
+
+
+def test_a_colour_that_one_look_at_an_edge_tells_is_none() -> None:
+    """One look; an uneven one beside others that agree, and that differ; an even one that the median is not of."""
+    colour = np.zeros((5, 3, 3), np.uint8)
+    colour[:, :, 0] = [[90, 0, 0], [90, 0, 0], [90, 95, 10], [90, 150, 210], [90, 150, 210]]
+    weight = np.array([[1, 0, 0], [1, 0, 0], [2, 1, 2], [1, 1, 1], [1, 1, 1]], np.float32)
+    even = np.array([[0, 1, 1], [1, 0, 0], [0, 0, 1], [0, 0, 0], [1, 0, 1]], np.uint8)
+    median, count = np.empty((5, 3), np.uint8), np.empty(5, np.uint8)
+    weighted_medians(colour, weight, median, count)
+    leave_doubtful(colour, weight, even, median, count)
+    assert count.tolist() == [0, 1, 3, 0, 0]
+    assert median[:, 0].tolist() == [0, 90, 90, 0, 0]
+
+
+def test_what_moved_has_the_looks_of_its_moment() -> None:
+    weight = np.ones((3, 3), np.float32)
+    state = np.array([[OTHER, EVEN, OTHER | EVEN]] * 3, np.uint8)
+    leave_moved(weight, state, np.array([[2, 1], [1, 1], [0, 3]], np.uint8))
+    assert weight.tolist() == [[0, 1, 0], [1, 1, 1], [1, 1, 1]]
 
 
 def test_nearest_in_pixels_is_the_least_of_each() -> None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from roadscan.colours.kernels.looks import ALIKE
 from roadscan.compute.kernel_options import kernel
 
-AGREES = 24
-"""Largest difference of a channel (8 bits) between looks at the same thing: more is something that moved, or glare."""
 VOTES = 3  # Fewest looks whose median tells what is there.
 SHARE = 2.0
 """Power of the weights of looks that are blended: the best view stands out, and seams stay soft."""
@@ -39,7 +38,7 @@ def blend(held_colour, held_weight, held_number, median, count, colour, number):
                 off = 0.0
                 for c in range(3):
                     off = max(off, abs(float(held_colour[i, k, c]) - float(median[i, c])))
-                if off > AGREES:
+                if off > ALIKE:
                     continue
             if best < 0 or held_weight[i, k] > held_weight[i, best]:
                 best = k
@@ -60,7 +59,7 @@ def blend(held_colour, held_weight, held_number, median, count, colour, number):
             off = 0.0
             for c in range(3):
                 off = max(off, abs(float(held_colour[i, k, c]) - float(held_colour[i, best, c])))
-            if off > AGREES:
+            if off > ALIKE:
                 continue
             share = (held_weight[i, k] / held_weight[i, best]) ** SHARE
             total += share

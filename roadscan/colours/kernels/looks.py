@@ -22,6 +22,15 @@ UNKNOWN = 65535
 """Stored distance that stands for any distance, however far."""
 NO_NORMAL = 0.5  # Cosine of the incidence where no normal is known.
 LEAST_COSINE = 0.05  # Least cosine of the incidence in weights.
+ALIKE = 24
+"""Largest difference of a channel (8 bits) between looks at the same thing, and between pixels of an even surface."""
+EVEN, OTHER, GONE = 1, 2, 4
+"""Bits of the state of a look: the pixel and its neighbours are alike, so that the colour is right though the point
+lies a pixel beside; the point was seen at another time than the picture; and what lies behind it was seen then."""
+MOVED_M, MOVED = 0.5, 0.05
+"""What was seen so far behind a place (m, and a share of its distance more) was seen through it, by one picture."""
+VOTED_M, VOTED = 0.25, 0.02
+"""The same where several pictures vote: the underside of a car is 0.6 m before the road behind it, 6 m away."""
 
 
 class Camera(NamedTuple):
@@ -60,6 +69,8 @@ class Limits(NamedTuple):
     """Points seen within this of the picture were there."""
     weight: float
     """Sharpness of the picture among those of its run, 0 to 1."""
+    window_ns: int = 0
+    """Pictures so near in time to a point tell whether it moved."""
 
 
 @inlined
@@ -100,8 +111,8 @@ def project(point_m, camera, reach_m, pixel, distance_m):
 
 
 @kernel
-def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden, picture, colour, weight):
-    """Compute the colours that a picture gives to points, and their weights.
+def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden, picture, colour, weight, state):
+    """Compute the colours that a picture gives to points, their weights, and the state of these looks.
 
     Weights are the cosine of the incidence over the square of the size of a pixel at the point, times a ramp beside the
     border and the picture's sharpness.
@@ -117,12 +128,14 @@ def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden
     picture : (height, width, 3) uint8.
     colour : (n, 3) float32, written where the weight is not 0.
     weight : (n,) float32, written, 0 where the picture does not show a point.
+    state : (n,) uint8, written: `EVEN`, `OTHER`, `GONE`; at most `GONE` where the weight is 0.
     """
     lens = camera.lens
     right, bottom = lens[WIDTH] - 1.0 - limits.border_px, lens[HEIGHT] - 1.0 - limits.border_px
     focal_square = lens[FOCAL_X] * lens[FOCAL_Y]
     for i in range(point_m.shape[0]):
         weight[i] = 0.0
+        state[i] = 0
         x = point_m[i, 0] - camera.eye_m[0]
         y = point_m[i, 1] - camera.eye_m[1]
         z = point_m[i, 2] - camera.eye_m[2]
@@ -137,12 +150,17 @@ def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden
         row, column = int((v + 0.5) / depths.factor), int((u + 0.5) / depths.factor)
         row, column = min(row, depths.nearest.shape[0] - 1), min(column, depths.nearest.shape[1] - 1)
         code = stored(distance)
+        apart_ns = abs(epoch_ns[i] - own_epoch_ns) if epoch_ns.size > 0 else 0
+        is_other = apart_ns > limits.moment_ns
+        if is_other and depths.moved[row, column] > 0:
+            behind = LEAST_M * math.exp(depths.moved[row, column] / STEPS) * (1.0 + MOVED) + MOVED_M
+            if apart_ns <= limits.window_ns and distance * (1.0 + VOTED) + VOTED_M < behind:
+                state[i] = GONE
+            if code < depths.moved[row, column]:
+                continue
         if code < depths.nearest[row, column]:
             continue
         if code > depths.farthest[row, column] and depths.farthest[row, column] < UNKNOWN:
-            continue
-        is_other = epoch_ns.size > 0 and abs(epoch_ns[i] - own_epoch_ns) > limits.moment_ns
-        if is_other and code < depths.moved[row, column]:
             continue
         cosine = NO_NORMAL
         if not math.isnan(normal[i, 0]):
@@ -155,27 +173,40 @@ def look(point_m, epoch_ns, normal, camera, own_epoch_ns, depths, limits, hidden
         weight[i] = cosine * ramp * limits.weight * focal_square / square
         x0, y0 = int(u), int(v)
         s, t = u - x0, v - y0
+        even = True
         for c in range(3):
             above = (1.0 - s) * picture[y0, x0, c] + s * picture[y0, x0 + 1, c]
             under = (1.0 - s) * picture[y0 + 1, x0, c] + s * picture[y0 + 1, x0 + 1, c]
             colour[i, c] = (1.0 - t) * above + t * under
+            low, high = 255, 0
+            for row in range(int(v + 0.5) - 1, int(v + 0.5) + 2):
+                for column in range(int(u + 0.5) - 1, int(u + 0.5) + 2):
+                    low, high = min(low, int(picture[row, column, c])), max(high, int(picture[row, column, c]))
+            even = even and high - low <= ALIKE
+        state[i] |= (EVEN if even else 0) | (OTHER if is_other else 0)
 
 
 @kernel
-def keep_best(colour, weight, gain, number, held_colour, held_weight, held_number):
+def keep_best(colour, weight, state, gain, number, held_colour, held_weight, held_state, held_number, votes):
     """Put the colours of a picture among the best of each point: those with the largest weights, of equals the first.
 
     Parameters
     ----------
-    colour : (n, 3) float32; weight : (n,) float32, 0: none.
+    colour : (n, 3) float32; weight : (n,) float32, 0: none; state : (n,) uint8.
     gain : (3,) factors of the picture's channels.
     number : the picture's number.
-    held_colour : (n, k, 3) uint8; held_weight : (n, k) float32, 0: none; held_number : (n, k) int32. Read and written.
+    held_colour : (n, k, 3) uint8; held_weight : (n, k) float32, 0: none; held_state : (n, k) uint8; held_number :
+        (n, k) int32. Read and written.
+    votes : (n, 2) uint8, read and written: pictures that saw through the point, and those of other times that show it.
     """
     most = held_weight.shape[1]
     for i in range(weight.shape[0]):
+        if state[i] & GONE:
+            votes[i, 0] = min(votes[i, 0] + 1, 255)
         if weight[i] <= 0.0:
             continue
+        if state[i] & OTHER and not state[i] & GONE:
+            votes[i, 1] = min(votes[i, 1] + 1, 255)
         least = 0
         for k in range(1, most):
             if held_weight[i, k] < held_weight[i, least]:
@@ -183,6 +214,7 @@ def keep_best(colour, weight, gain, number, held_colour, held_weight, held_numbe
         if weight[i] <= held_weight[i, least]:
             continue
         held_weight[i, least] = weight[i]
+        held_state[i, least] = state[i]
         held_number[i, least] = number
         for c in range(3):
             held_colour[i, least, c] = np.uint8(min(255.0, colour[i, c] * gain[c] + 0.5))
@@ -222,3 +254,48 @@ def weighted_medians(held_colour, held_weight, colour, count):
                 if below >= 0.5 * total * (1.0 - 1e-6):
                     best = value
             colour[i, c] = best
+
+
+@kernel
+def leave_doubtful(held_colour, held_weight, held_state, colour, count):
+    """Take the colour from points at which pictures are uneven and no two of them agree with the median.
+
+    There a pixel shows two surfaces, or the one beside the point's.
+
+    Parameters
+    ----------
+    held_colour : (n, k, 3) uint8; held_weight : (n, k) float32, 0: none; held_state : (n, k) uint8.
+    colour : (n, 3) uint8, medians; count : (n,) uint8, of looks. Read and written, 0 where there is none.
+    """
+    for i in range(held_weight.shape[0]):
+        agree, sure = 0, False
+        for k in range(held_weight.shape[1]):
+            if held_weight[i, k] <= 0.0:
+                continue
+            off = 0
+            for c in range(3):
+                off = max(off, abs(int(held_colour[i, k, c]) - int(colour[i, c])))
+            if off <= ALIKE:
+                agree += 1
+                sure = sure or held_state[i, k] & EVEN != 0
+        if not sure and agree < 2:
+            count[i] = 0
+            for c in range(3):
+                colour[i, c] = 0
+
+
+@kernel
+def leave_moved(held_weight, held_state, votes):
+    """Leave out the looks of other times at what moved: more pictures saw through it than show it.
+
+    Parameters
+    ----------
+    held_weight : (n, k) float32, read and written, 0: none.
+    held_state : (n, k) uint8.
+    votes : (n, 2) uint8, as `keep_best` writes them.
+    """
+    for i in range(held_weight.shape[0]):
+        if votes[i, 0] > votes[i, 1]:
+            for k in range(held_weight.shape[1]):
+                if held_state[i, k] & OTHER:
+                    held_weight[i, k] = 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.colours.cameras import cameras_of, eyes_m
-from roadscan.colours.depth import DepthImages, DepthRule, Seen, depth_images
-from roadscan.colours.gains import PictureSample, cells_of, is_compared, sample_of
+from roadscan.colours.depth import DepthImages, DepthRule, Seen, depth_images, seen_through
+from roadscan.colours.gains import BRIGHT, DARK, PictureSample, cells_of, is_compared, sample_of
 from roadscan.colours.kernels.looks import Camera, Depths, Limits, look
 from roadscan.colours.normals import normals_of
 from roadscan.colours.tasks.plan import DEPTHS, Batch, ColourPlan, reach_beyond_m
@@ -46,6 +46,9 @@ _TABLE: Final = pa.schema(
 _SAMPLED: Final = ["camera", "file", "epoch_gps_ns", "sharpness", "reason", "cell", "colour"]
 _MOST_POINTS: Final = 6_000_000
 """Points around the pictures of a batch, about: of more, which fast lidars see, a share is used. It bounds memory."""
+_SHOWN: Final = (
+    0.02  # A picture shows something where at least this share of its pixels is neither dark nor overexposed.
+)
 _SAMPLE_REACH: Final = 0.6
 """Pictures are compared on places within this share of the reach."""
 
@@ -88,22 +91,51 @@ def write_depths(task: DepthTask) -> OutputRecord:
     compared = is_compared(cell)
     source, rows = ColourSource(task.pictures), []
     window = round(task.seconds * NS_PER_S)
-    for number, camera in enumerate(cameras_of(task.pictures, origin)):
+    cameras = cameras_of(task.pictures, origin)
+    spans = [
+        slice(*np.searchsorted(epochs, [own - window, own + window + 1]).tolist())
+        for own in task.pictures.epochs_gps_ns.tolist()
+    ]
+    moved = _moved(task, seen, cameras, spans)
+    for number, (camera, near) in enumerate(zip(cameras, spans, strict=True)):
         own = int(task.pictures.epochs_gps_ns[number])
-        near = slice(*np.searchsorted(epochs, [own - window, own + window + 1]).tolist())
-        images = depth_images(seen.part(near), camera, own, task.beyond_m, task.rule)
+        images = depth_images(seen.part(near), camera, own, task.beyond_m, task.rule, moved[near])
         picture = source.picture(task.pictures, number)
         sharpness, sample = 0.0, PictureSample(np.zeros(0, np.int64), np.zeros((0, 3), np.float32))
-        if picture is not None:
+        reason = source.reason(task.pictures, number) if picture is None else blank(picture)
+        if picture is not None and not reason:
             chosen = np.arange(near.start, near.stop)[compared[near]]
             sharpness = sharpness_of(picture)
             sample = _sample(task, number, camera, images, picture, (point_m[chosen], epochs[chosen], cell[chosen]))
-        rows.append(_row(task.pictures, number, images, sharpness, source.reason(task.pictures, number), sample))
+        rows.append(_row(task.pictures, number, images, sharpness, reason, sample))
     with task.store.scratch() as folder:
         path = folder / "depths.parquet"
         pq.write_table(pa.Table.from_pylist(rows, schema=_TABLE), path, compression="zstd", use_dictionary=False,
                        row_group_size=1, write_statistics=False, write_page_checksum=True, version="2.6")  # fmt: skip
         return publish_file(task.store, path, f"tables/{DEPTHS}/{task.unit}.parquet", DEPTHS, task.unit, task.key)
+
+
+def _moved(task: DepthTask, seen: Seen, cameras: Sequence[Camera], spans: Sequence[slice]) -> npt.NDArray[np.bool_]:
+    """Returns which points (n,) moved: more pictures of the batch saw through them than saw them there later or before.
+
+    What drives ahead leaves a trail of points along the lane; far ahead the lines of a scan are too wide apart to see
+    through it, and a picture that was nearer tells.
+    """
+    votes = np.zeros((2, len(seen.point_m)), np.uint16)
+    for number, (camera, near) in enumerate(zip(cameras, spans, strict=True)):
+        own = int(task.pictures.epochs_gps_ns[number])
+        for vote, mask in zip(votes, seen_through(seen.part(near), camera, own, task.beyond_m, task.rule), strict=True):
+            vote[near] += mask
+    return np.asarray(votes[0] > votes[1])
+
+
+def blank(picture: UInt8) -> str:
+    """Returns the words for a picture that shows nothing, black or overexposed; "" of others."""
+    brightest = picture.max(axis=2)
+    lit, dull = np.mean(brightest >= DARK), np.mean(picture.min(axis=2) <= BRIGHT)
+    if min(lit, dull) >= _SHOWN:
+        return ""
+    return "it is black" if lit < _SHOWN else "it is overexposed"
 
 
 def sharpness_of(picture: UInt8) -> float:
@@ -218,7 +250,7 @@ def _sample(
     unknown = np.full((len(point_m), 3), np.nan, np.float32)
     look(
         point_m, epochs, unknown, camera, int(task.pictures.epochs_gps_ns[number]), Shown(images).depths, limits,
-        lens.hidden, picture, colour, weight,
+        lens.hidden, picture, colour, weight, np.empty(len(point_m), np.uint8),
     )  # fmt: skip
     return sample_of(cell, colour, weight)
 

@@ -59,14 +59,16 @@ def write_gains(store: Store, table: GainsTable) -> OutputRecord:
     samples = [one for batch in held for one in batch.samples]
     gains, compared = gains_of(samples) if table.balance else (np.ones((len(samples), 3)), np.zeros(len(samples), int))
     sharpness = np.array([value for batch in held for value in batch.sharpness])
+    reasons = [value for batch in held for value in batch.reasons]
     schema = table_schema(GAINS)
     rows = pa.table(
         {
             "run": [table.run] * len(samples), "camera": [v for b in held for v in b.cameras],
             "file": [v for b in held for v in b.files], "epoch_gps_ns": [v for b in held for v in b.epochs_gps_ns],
             **{f"gain_{name}": np.round(gains[:, k], _DIGITS) for k, name in enumerate(("red", "green", "blue"))},
-            "compared": compared, "sharpness": sharpness, "weight": np.round(weights_of(sharpness), _DIGITS),
-            "reason": [v or None for b in held for v in b.reasons],
+            "compared": compared, "sharpness": sharpness,
+            "weight": np.where([bool(v) for v in reasons], 0.0, np.round(weights_of(sharpness), _DIGITS)),
+            "reason": [v or None for v in reasons],
         },
         schema=schema.arrow(),
     )  # fmt: skip
@@ -92,16 +94,18 @@ class PictureGains:
     weight: Float64
     """(n,) of sharpness."""
     reason: tuple[str, ...]
-    """(n,) why a picture cannot be read; empty where it can."""
+    """(n,) why a picture gives no colour; empty where it does."""
 
 
 def read_gains(plan: ColourPlan, manifest: Manifest, tables: Sequence[GainsTable]) -> PictureGains:
     """Returns the gains of all pictures of the survey."""
     count = len(plan.pictures)
     gain, weight, reason = np.ones((count, 3)), np.ones(count), [""] * count
-    rows: Mapping[tuple[str, str, str], int] = {
-        (plan.pictures.logs[log].run, plan.pictures.logs[log].sensor, file): number
-        for number, (log, file) in enumerate(zip(plan.pictures.log.tolist(), plan.pictures.files, strict=True))
+    pictures = plan.pictures
+    named = zip(pictures.log.tolist(), pictures.files, pictures.epochs_gps_ns.tolist(), strict=True)
+    rows: Mapping[tuple[str, str, str, int], int] = {  # two logs may have files of one name
+        (pictures.logs[log].run, pictures.logs[log].sensor, file, epoch): number
+        for number, (log, file, epoch) in enumerate(named)
     }
     for table in tables:
         record = manifest.get(GAINS, table.run)
@@ -109,7 +113,7 @@ def read_gains(plan: ColourPlan, manifest: Manifest, tables: Sequence[GainsTable
             continue
         held = plan.survey.store.parse_table(read_recorded(plan.survey.store, record), record.path)
         for row in held.to_pylist():
-            number = rows.get((row["run"], row["camera"], row["file"]), -1)
+            number = rows.get((row["run"], row["camera"], row["file"], row["epoch_gps_ns"]), -1)
             if number < 0:
                 continue  # a table of other pictures: it is due
             gain[number] = row["gain_red"], row["gain_green"], row["gain_blue"]

@@ -85,7 +85,7 @@ class PhotoPlan:
         config = self.plan.config
         photo = _photo(self.plan)
         rule = PaintRule(
-            photo.reach_m, config.border_px, photo.least_angle_deg, round(config.moment_s * NS_PER_S), _LOOKS
+            photo.reach_m, config.border_px, photo.least_angle_deg, round(config.moment_s * NS_PER_S), 0, _LOOKS
         )
         around = tuple(self.cells[t] for t in _around(self.plan, tile) if t in self.cells)
         first = min(one.figures()["first_epoch_gps_ns"] for one in around)

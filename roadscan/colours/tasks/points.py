@@ -101,7 +101,8 @@ def plan_points(plan: ColourPlan, shares: Shares) -> PointsPlan:
 def paint_rule(config: ColoursConfig) -> PaintRule:
     """Returns which looks at points count."""
     return PaintRule(
-        config.reach_m, config.border_px, config.grazing_deg, round(config.moment_s * NS_PER_S), _LOOKS
+        config.reach_m, config.border_px, config.grazing_deg, round(config.moment_s * NS_PER_S),
+        round(config.seconds * NS_PER_S), _LOOKS,
     )  # fmt: skip
 
 
@@ -149,7 +150,7 @@ def _written(
 ) -> Iterator[OutputRecord]:
     looks = paint(task.share.palette(task.readings.store), [p for _, p in held], _ORIGIN_M, task.rule)
     for (points, _), own in zip(held, looks, strict=True):
-        colour, count = own.medians()
+        colour, count = own.sure_medians()
         seen = int(np.count_nonzero(count))
         context = replace(task.readings.context, date=utc_from_gps_ns(int(points.epoch_gps_ns.min())).date())
         figures: dict[str, Any] = {"points": len(points), "coloured": seen}

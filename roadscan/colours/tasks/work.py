@@ -44,7 +44,7 @@ class ColourWork:
 
     @property
     def unreadable(self) -> list[str]:
-        """Returns the pictures that cannot be read, with the reason."""
+        """Returns the pictures that give no colour, with the reason."""
         if self.plan is None or self.gains is None:
             return []
         names = (self.plan.pictures.name(n) for n in range(len(self.plan.pictures)))

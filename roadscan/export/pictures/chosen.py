@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Final
@@ -20,6 +21,9 @@ from roadscan.run.session import Session
 
 Float64 = npt.NDArray[np.float64]
 
+JPEG: Final = (".jpg", ".jpeg")
+"""Suffixes of pictures whose bytes are copied."""
+_KEY_DIGITS: Final = 6  # Digits of a log's key that tell it from others in names.
 _WHOLE_M: Final = 1.0
 """The local frame's origin lies at whole multiples of this on the map."""
 
@@ -110,6 +114,28 @@ def wgs84(world: str, world_m: Float64) -> Float64:
     return np.stack(to_degrees.transform(*to_wgs84.transform(*world_m.T)), axis=-1)
 
 
-def relative_name(poses: PicturePoses, number: int) -> str:
-    """Return the name of a picture in an export: RUN/CAMERA/FILE."""
-    return PurePosixPath(poses.pictures.name(number)).as_posix()
+def exported_names(poses: PicturePoses) -> tuple[str, ...]:
+    """Return the names of pictures in an export, RUN/CAMERA/FILE; copies are JPEG files, so the file ends as these do.
+
+    Where pictures of two logs of one camera would have one name, each has RUN/CAMERA/LOG/FILE, LOG being its log's
+    folder with the first digits of its key; pictures of one log that still would have one name also have their epochs.
+    """
+    pictures = poses.pictures
+    names, by_log, by_epoch = [], [], []
+    for log, file, epoch in zip(pictures.log.tolist(), pictures.files, pictures.epochs_gps_ns.tolist(), strict=True):
+        own = pictures.logs[log]
+        folder = f"{own.folder.name}-{own.key[:_KEY_DIGITS]}"
+        names.append(_inside(f"{own.run}/{own.sensor}/{file}"))
+        by_log.append(_inside(f"{own.run}/{own.sensor}/{folder}/{file}"))
+        name = by_log[-1]
+        by_epoch.append(name.with_name(f"{name.stem}_{name.suffix[1:]}_{epoch}{name.suffix}"))
+    for other in (by_log, by_epoch):
+        copies = [str(name.with_suffix(".jpg")).casefold() for name in names]  # as programs that fold case see them
+        held = Counter(copies)
+        names = [o if held[copy] > 1 else n for n, o, copy in zip(names, other, copies, strict=True)]
+    return tuple(str(name if name.suffix.lower() in JPEG else name.with_suffix(".jpg")) for name in names)
+
+
+def _inside(name: str) -> PurePosixPath:
+    """Return a relative path that leads to nothing beside the export."""
+    return PurePosixPath(*(part for part in PurePosixPath(name).parts if part != ".."))

@@ -18,7 +18,7 @@ from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.extras import cv2, need
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.export.export import Exported, published
-from roadscan.export.pictures.chosen import Choice, chosen_pictures, relative_name, wgs84
+from roadscan.export.pictures.chosen import JPEG, Choice, chosen_pictures, exported_names, wgs84
 from roadscan.measuring.orientation import yaw_pitch_roll_deg
 from roadscan.measuring.poses import PicturePoses
 from roadscan.pictures.lens import matrix_of
@@ -35,7 +35,6 @@ _SENSOR_MM: Final = 36.0
 FocalPlaneXResolution says how many of them a millimetre has."""
 _FILM_MM: Final = math.hypot(36.0, 24.0)  # Diagonal of FocalLengthIn35mmFilm (CIPA DCG-001).
 _QUALITY: Final = 95  # Quality of pictures that are encoded anew.
-_JPEG: Final = (".jpg", ".jpeg")
 _NADIR_DEG: Final = 90.0
 """Pix4D's pitch is 0 where the camera looks down, DJI's 0 where it looks to the horizon (degrees)."""
 _MM_UNIT: Final = 4  # Code of millimetres in FocalPlaneResolutionUnit.
@@ -57,7 +56,7 @@ def export_pictures(
     settings: CopySettings,
     report: Callable[[int, int], None] = lambda _a, _b: None,
 ) -> Exported:
-    """Write copies of pictures as RUN/CAMERA/FILE with ``pictures.csv`` (poses) and ``cameras.json`` (lenses).
+    """Write copies of pictures by their `exported_names`, and ``pictures.csv`` (poses) and ``cameras.json`` (lenses).
 
     JPEG files that are neither undistorted nor blurred keep their picture's bytes; all others are encoded anew.
 
@@ -69,15 +68,15 @@ def export_pictures(
     if settings.undistorted or settings.blurred:
         need("cv2", "copies of pictures")
     poses = chosen_pictures(session, choice)
-    hider = hider_of(session) if settings.blurred else None
+    hider, names = hider_of(session) if settings.blurred else None, exported_names(poses)
     notes, rows, files = [], [], []
     with published(out) as folder:
         for k in range(len(poses)):
             report(k, len(poses))
             try:
-                name = _copy(poses, k, folder, settings, hider)
+                name = _copy(poses, k, folder / names[k], settings, hider).relative_to(folder).as_posix()
             except (OSError, ValueError) as error:
-                notes.append(f"left out: {relative_name(poses, k)}: {error}")
+                notes.append(f"left out: {names[k]}: {error}")
                 continue
             files.append(name)
             rows.append(_row(poses, k, name))
@@ -93,22 +92,22 @@ def export_pictures(
     return Exported((*(out / name for name in files), out / "pictures.csv", out / "cameras.json"), tuple(notes))
 
 
-def _copy(poses: PicturePoses, number: int, folder: Path, settings: CopySettings, hider: Hider | None) -> str:
-    """Write a copy; return its name."""
+def _copy(poses: PicturePoses, number: int, out: Path, settings: CopySettings, hider: Hider | None) -> Path:
+    """Write a copy; return its file."""
     source, lens = poses.pictures.path(number), poses.pictures.views.lens_of(number)
     undistorts = settings.undistorted and not lens.is_around
-    content, name = source.read_bytes(), relative_name(poses, number)
-    if undistorts or hider is not None or source.suffix.lower() not in _JPEG:
+    content = source.read_bytes()
+    if undistorts or hider is not None or source.suffix.lower() not in JPEG:
         picture = decoded(content)
         if hider is not None:
             picture, _ = hider.hide(poses.pictures, number, picture)
         content = encoded(undistorted(picture, lens) if undistorts else picture, _QUALITY)
-        name = str(Path(name).with_suffix(".jpg"))
+        out = out.with_suffix(".jpg")
     if settings.exif:
         content = with_tags(content, *tags_of(poses, number, _pinhole(lens) if undistorts else lens))
-    (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    (folder / name).write_bytes(content)
-    return name
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_bytes(content)
+    return out
 
 
 def undistorted(picture: UInt8, lens: Lens) -> UInt8:

@@ -8,7 +8,8 @@ left one, OpenSfM's from the picture's middle in units of its longer side.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,9 +25,10 @@ from roadscan.export.pictures.chosen import (
     Choice,
     LocalFrame,
     chosen_pictures,
+    exported_names,
     local_frame,
-    relative_name,
 )
+from roadscan.export.pictures.tracks import TiePoints, tie_points
 from roadscan.georeference.picture_axes import map_from_ned
 from roadscan.measuring.poses import PicturePoses
 from roadscan.pictures.views import Lens
@@ -37,6 +39,8 @@ Float64 = npt.NDArray[np.float64]
 OFFSET_FILE: Final = "offset.json"
 """Where the local frame lies."""
 _GREY: Final = 128  # Colour of points that have none.
+_TRACKS_HEADER: Final = "OPENSFM_TRACKS_VERSION_v2"  # First line of OpenSfM's file of tracks.
+_NO_CODE: Final = -1  # OpenSfM's segment and instance of a feature of which none is known.
 
 
 def export_colmap(session: Session, out: Path, choice: Choice, points: Path | None = None) -> Exported:
@@ -44,7 +48,8 @@ def export_colmap(session: Session, out: Path, choice: Choice, points: Path | No
 
     Parameters
     ----------
-    points : CSV with columns easting_m, northing_m, height_m (metres of the survey's map); no points without it.
+    points : CSV with columns easting_m, northing_m, height_m (metres of the survey's map). They have no tracks; they
+        come before the tie points that the adjustment kept.
 
     Raises
     ------
@@ -55,29 +60,38 @@ def export_colmap(session: Session, out: Path, choice: Choice, points: Path | No
     flat = [k for k in range(len(poses)) if not poses.pictures.views.lens_of(k).is_around]
     if not flat:
         raise ConfigError("all pictures are of 360°, for which COLMAP has no camera", expected="perspective pictures")
-    frame, lenses = local_frame(poses), _lenses(poses, flat)
+    frame, lenses, names = local_frame(poses), _lenses(poses, flat), exported_names(poses)
+    ties, notes = tie_points(session, poses, frame, flat)
     cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", f"# Number of cameras: {len(lenses)}"]
     cameras += [_colmap_camera(number, lens) for number, (lens, _) in lenses.items()]
-    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", f"# Number of images: {len(flat)}"]
+    places = _points(poses, frame, points)
+    seen, tracks = _colmap_tracks(ties, flat, len(places) + 1)
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)",
+              f"# Number of images: {len(flat)}"]  # fmt: skip
     for number, k in enumerate(flat, start=1):
         turn, shift = _camera_from_local(poses, frame, k)
         values = " ".join(repr(float(v)) for v in (*quaternion_from_rotation(turn), *shift))
-        images += [f"{number} {values} {int(poses.pictures.views.lens[k]) + 1} {relative_name(poses, k)}", ""]
-    places = _points(poses, frame, points)
-    listed = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", f"# Number of points: {len(places)}"]
+        images += [f"{number} {values} {int(poses.pictures.views.lens[k]) + 1} {names[k]}", " ".join(seen[k])]
+    whole = np.concatenate([places, ties.place_m])
+    errors = np.concatenate([np.zeros(len(places)), ties.error_px])
+    listed = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+              f"# Number of points: {len(whole)}"]  # fmt: skip
     listed += [
-        f"{number} {' '.join(repr(float(v)) for v in place)} {_GREY} {_GREY} {_GREY} 0"
-        for number, place in enumerate(places, start=1)
+        " ".join([f"{n} {' '.join(repr(v) for v in place)} {_GREY} {_GREY} {_GREY} {error:g}", *tracks.get(n, ())])
+        for n, (place, error) in enumerate(zip(whole.tolist(), errors.tolist(), strict=True), start=1)
     ]
     texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": listed}
     written = {name: "\n".join(lines) + "\n" for name, lines in texts.items()}
     written[OFFSET_FILE] = _json(_offset(poses, frame))
-    notes = [] if len(flat) == len(poses) else [f"{len(poses) - len(flat):,} pictures of 360° are left out"]
+    if len(flat) < len(poses):
+        notes.append(f"{len(poses) - len(flat):,} pictures of 360° are left out")
     return _written(out, written, [*notes, *_where_pictures_are(poses)])
 
 
 def export_opensfm(session: Session, out: Path, choice: Choice, points: Path | None = None) -> Exported:
     """Write ``reconstruction.json``, ``camera_models.json`` and ``reference_lla.json`` of OpenSfM.
+
+    Where the survey has tie points, ``tracks.csv`` as well.
 
     Parameters
     ----------
@@ -94,7 +108,7 @@ def export_opensfm(session: Session, out: Path, choice: Choice, points: Path | N
     if origin is None:
         raise ConfigError("the survey's poses are in a local frame", expected="poses with a place on the Earth",
                           change="use `roadscan export colmap`, which needs none")  # fmt: skip
-    lenses = _lenses(poses, range(len(poses)))
+    lenses, names = _lenses(poses, range(len(poses))), exported_names(poses)
     cameras = {f"roadscan {title}": _opensfm_camera(lens) for lens, title in lenses.values()}
     reference = {"longitude": float(origin[0]), "latitude": float(origin[1]), "altitude": float(origin[2])}
     shots = {}
@@ -102,22 +116,53 @@ def export_opensfm(session: Session, out: Path, choice: Choice, points: Path | N
         turn, shift = _camera_from_local(poses, frame, k)
         moment = utc_from_gps_ns(int(poses.pictures.epochs_gps_ns[k]))
         spread = float(np.sqrt(np.trace(poses.covariance[k, :3, :3]) / 3.0))
-        shots[relative_name(poses, k)] = {
+        shots[names[k]] = {
             "rotation": Rotation.from_matrix(turn).as_rotvec().tolist(), "translation": shift.tolist(),
             "camera": f"roadscan {lenses[int(poses.pictures.views.lens[k]) + 1][1]}", "orientation": 1,
             "capture_time": moment.timestamp(), "gps_dop": spread,
             "gps_position": _eye(poses, frame, k).tolist(),
         }  # fmt: skip
+    ties, notes = tie_points(session, poses, frame, range(len(poses)))
+    given = _points(poses, frame, points)
     places = {
-        str(number): {"coordinates": place.tolist(), "color": [_GREY] * 3}
-        for number, place in enumerate(_points(poses, frame, points))
+        str(number): {"coordinates": place, "color": [_GREY] * 3}
+        for number, place in enumerate(np.concatenate([given, ties.place_m]).tolist())
     }
     whole = [{"cameras": cameras, "shots": shots, "points": places, "reference_lla": reference}]
     written = {
         "reconstruction.json": _json(whole), "camera_models.json": _json(cameras),
         "reference_lla.json": _json(reference), OFFSET_FILE: _json(_offset(poses, frame)),
     }  # fmt: skip
-    return _written(out, written, _where_pictures_are(poses))
+    if ties.point.size:
+        written["tracks.csv"] = "\n".join([_TRACKS_HEADER, *_opensfm_tracks(poses, ties, names, len(given))]) + "\n"
+    return _written(out, written, [*notes, *_where_pictures_are(poses)])
+
+
+def _colmap_tracks(
+    ties: TiePoints, pictures: Sequence[int], first: int
+) -> tuple[Mapping[int, list[str]], Mapping[int, list[str]]]:
+    """Return the measurements by picture, and the tracks by point, as COLMAP's lines have them.
+
+    first : number of the first tie point among all points.
+    """
+    image = {k: number for number, k in enumerate(pictures, start=1)}
+    seen, tracks = defaultdict[int, list[str]](list), defaultdict[int, list[str]](list)
+    for point, k, (u, v) in zip(ties.point.tolist(), ties.picture.tolist(), ties.pixel.tolist(), strict=True):
+        tracks[first + point].append(f"{image[k]} {len(seen[k])}")
+        seen[k].append(f"{u + 0.5!r} {v + 0.5!r} {first + point}")
+    return seen, tracks
+
+
+def _opensfm_tracks(poses: PicturePoses, ties: TiePoints, names: Sequence[str], first: int) -> Iterator[str]:
+    """Yield the rows of `tracks.csv`: picture, point, feature, place in it and scale, colour, and two codes of none."""
+    size = np.array([poses.pictures.views.lens_of(k).size_px for k in range(len(poses))], np.float64)[ties.picture]
+    place = (ties.pixel + 0.5 - size / 2.0) / size.max(axis=1, keepdims=True)
+    order = np.lexsort((ties.point, ties.picture))
+    for feature in order.tolist():
+        x, y = place[feature].tolist()
+        name, scale = names[ties.picture[feature]], 1.0 / size[feature].max()
+        values = name, first + int(ties.point[feature]), feature, repr(x), repr(y), repr(float(scale))
+        yield "\t".join(map(str, (*values, *(_GREY,) * 3, *(_NO_CODE,) * 2)))
 
 
 def _written(out: Path, contents: dict[str, str], notes: Sequence[str]) -> Exported:

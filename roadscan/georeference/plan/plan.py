@@ -70,8 +70,9 @@ class SurveyPlan:
 
     @property
     def date(self) -> dt.date:
-        """UTC date of the first reading."""
-        return utc_from_gps_ns(min(p.start_gps_ns for p in self.passes)).date()
+        """UTC date of the first reading; of a survey without any, of its first picture."""
+        pictures = (f.span[0] for r in self.records for f in r.tables.get("images", ()) if f.span is not None)
+        return utc_from_gps_ns(min((p.start_gps_ns for p in self.passes), default=min(pictures, default=0))).date()
 
     def pass_key(self, run: str) -> list[object]:
         """Key by which a run's tiles become stale when its passes change: ids, and the spans in the survey file."""
@@ -344,5 +345,16 @@ def poses_plan_of(session: Session) -> SurveyPlan:
     except NothingToPlaceError:
         # Where pictures improved the poses before, what they made is withdrawn.
         if not session.survey.has("picture_ties") and not session.manifest.of("adjustment"):
+            raise
+        return plan_without_readings(session.survey, session.store)
+
+
+@found_once
+def pictures_plan_of(session: Session) -> SurveyPlan:
+    """Return the plan of the session's survey; it may have no readings where the survey has pictures."""
+    try:
+        return plan_of(session)
+    except NothingToPlaceError:
+        if not any(record.tables.get("images") for record in records_of(session)):
             raise
         return plan_without_readings(session.survey, session.store)

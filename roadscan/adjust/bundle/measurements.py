@@ -178,14 +178,13 @@ def seen(measured: Measurements, state: State, numbers: Numbers) -> Seen:
 
 def met_at(measured: Measurements, where: Seen, weight: Float64) -> Float64:
     """Returns places (p, 3), world frame: of tie points where their rays meet, of control points as surveyed."""
-    rows = measured.is_tie & (weight > 0.0)
-    place = measured.surveyed_world_m.copy()
+    ray, place = where.rays_world(measured.pixel), measured.surveyed_world_m.copy()
+    # A lens that is far from the true one has no ray in the corners of the picture.
+    rows = measured.is_tie & (weight > 0.0) & np.isfinite(ray).all(axis=1)
     point, number = np.unique(measured.point[rows], return_inverse=True)
     if point.size:
         scaled = weight[rows] / measured.sigma_px[rows] ** 2
-        place[point] = places_of(
-            number, where.eye_world_m[rows], where.rays_world(measured.pixel)[rows], scaled
-        ).place_m
+        place[point] = places_of(number, where.eye_world_m[rows], ray[rows], scaled).place_m
     return place
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.adjustment import Adjustment, CameraErrors, adjust
 from roadscan.adjust.bundle.measurements import Measurements, State, met_at, seen
-from roadscan.adjust.bundle.solve import Approached, PictureEvidence, entering, places, state_of
+from roadscan.adjust.bundle.solve import Approached, PictureEvidence, entering, places, sharing, state_of
 from roadscan.adjust.observations import CAMERA, COMPONENTS, KINDS, Observations
 from roadscan.adjust.process import CameraPrior, MountingPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
@@ -110,6 +110,7 @@ def free_cameras(
         state = _on_stamps(state_of(found))
         where = seen(pictures.measured, state, pictures.numbers)
         rows = entering(pictures, where, (met_at(pictures.measured, where, weight), numbers), weight, heavy)
+        rows = sharing(rows, pictures, weight)
         found = adjust(Observations.joined([others, rows.observations]), priors, quiet, mountings, cameras)
     lags = [_lag(approach.pictures, state_of(adjusted), number) for number in range(len(stated))]
     return FreeCameras(stated, focal, found.cameras, tuple(lags))

@@ -30,7 +30,7 @@ class CameraPriors(Strict):
     """1 σ of what the stamps of the pictures are off (s). 0: the stage `clocks` is to find it."""
     sigma_line_time_us: float = Field(default=0.0, ge=0.0, le=100.0)
     """1 σ of the time between two rows (µs), of cameras whose rig file states such a time."""
-    sigma_shared_px: float = Field(default=0.05, ge=0.0, le=10.0)
+    sigma_shared_px: float = Field(default=0.01, ge=0.0, le=10.0)
     """1 σ of what all measurements of a picture are off in common (px): what the lens model leaves, and features that
     look different from nearer. Without it, thousands of tie points would believe their mean to hundredths of a pixel,
     and bend mountings, lens and control by what they share."""

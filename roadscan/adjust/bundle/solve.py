@@ -144,10 +144,10 @@ def approached(
     sigma = float(np.median(tied)) if tied.size else float("nan")
     entered = np.isin(np.arange(weight.size), rows.measurement)
     weight = np.where(entered, weight, 0.0)
-    return Approached(pictures, _sharing(rows, pictures, weight), weight, sigma, others)
+    return Approached(pictures, sharing(rows, pictures, weight), weight, sigma, others)
 
 
-def _sharing(rows: Rows, pictures: PictureEvidence, weight: Float64) -> Rows:
+def sharing(rows: Rows, pictures: PictureEvidence, weight: Float64) -> Rows:
     """Returns rows with larger σ: the mean of a picture's tie points is off at least by what they share.
 
     Of n measurements with σ each, the mean then has the variance σ² / n + shared². One error more for each picture and

@@ -53,8 +53,6 @@ _SURE: Final = 0.99
 _RIGID: Final = 1e14
 """Weight, in units of the prior's, of an unknown that is held at 0: others move it by less than a double shows in a
 millimetre."""
-_OF_PICTURES: Final = ("picture_tie", "picture_control")
-"""Kinds whose σ are not estimated here: they hold an error that all measurements of a picture share."""
 _MEDIAN: Final = 0.6745
 """Median of the absolute value of a standard normal number."""
 
@@ -290,7 +288,7 @@ class Rounds:
         statistic, found = np.abs(estimate.without.statistic), np.zeros(len(KINDS) + 1)
         for kind in range(len(KINDS)):
             here = statistic[self.problem.kind == kind]
-            if here.size >= _ENOUGH and KINDS[kind] not in _OF_PICTURES:
+            if here.size >= _ENOUGH:
                 ratio = (float(np.median(here)) / _MEDIAN) ** 2
                 found[kind] = ratio if ratio > _UNDERSTATED else 0.0
         return found
@@ -310,8 +308,6 @@ class Rounds:
         share = self.problem.variance * self._kinds[self.problem.kind] / own
         squares, redundancy = weight * residual**2 / own, np.where(weight > 0.0, without.redundancy, 0.0)
         for kind in range(len(KINDS)):
-            if KINDS[kind] in _OF_PICTURES:
-                continue
             here = self.problem.kind == kind
             told, own_part = redundancy[here].sum(), (share * redundancy)[here].sum()
             ratio = (share * squares)[here].sum() / max(own_part, 1e-300)

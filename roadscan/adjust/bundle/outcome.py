@@ -14,6 +14,7 @@ from roadscan.adjust.adjustment import Adjustment
 from roadscan.adjust.bundle.measurements import Measurements, State, met_at, residuals_px, seen
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, state_of
 from roadscan.adjust.control.control import ControlPoint
+from roadscan.adjust.observations import KINDS
 from roadscan.pictures.ties.tracks import places_of
 from roadscan.poses.trajectory import world_from_ned
 
@@ -83,7 +84,8 @@ def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[Cont
     state = state_of(adjusted)
     before, after = (_residuals(pictures, one, counted) for one in (State(), state))
     left = adjusted.residual_m[own] / rows.alone_sigma_m
-    squares = float((adjusted.weight[own] * left**2).sum())
+    factor = adjusted.variance_factors[KINDS[int(rows.observations.kind[0])]] if rows.observations.size else 1.0
+    squares = float((adjusted.weight[own] * left**2).sum()) / factor
     redundancy = float(np.where(adjusted.weight[own] > 0.0, np.nan_to_num(adjusted.redundancy[own]), 0.0).sum())
     degrees = max(redundancy, 1.0)
     low, high = (float(chdtri(degrees, 1.0 - chance)) / degrees for chance in _BOUNDS)

@@ -136,3 +136,10 @@ def test_exchanged_heights_are_told_by_what_the_exchange_would_leave() -> None:
     other = WrongPoint("B", 0.299, nan, 0.002, 50.3)
     third = WrongPoint("C", 0.050, nan, 0.002, 50.3)
     assert swapped([one, other, third]) == [("A", "B")]
+
+
+def test_a_wrong_point_whose_difference_is_not_known_is_told() -> None:
+    nan = float("nan")
+    told = WrongPoint("P2", nan, nan, nan, 500.0, 4.1, 3.8, ("P3",)).told()
+    assert told.startswith("its survey lies elsewhere from what all other evidence says (4.1 σ")
+    assert told.endswith("none of their surveys counts")

@@ -47,6 +47,8 @@ class WrongPoint:
         if np.isfinite(self.horizontal_m):
             parts.append(f"its surveyed place lies {self.horizontal_m * 1e3:.1f} mm")
             what.append("place")
+        if not what:  # all others together contradict it, but none of them alone says by how much
+            parts, what = ["its survey lies elsewhere"], ["survey"]
         text = f"{' and '.join(parts)} from what all other evidence says"
         if np.isfinite(self.sigmas):
             text += f" ({self.sigmas:.1f} σ, where {self.limit:.1f} σ are the limit)"

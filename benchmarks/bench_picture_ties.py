@@ -47,7 +47,9 @@ def figures(folder: Path) -> Iterator[Figure]:
 
 
 def of_scene(scene: str, folder: Path, bar_m: float) -> Iterator[Figure]:
-    """Check points, whose rays meet away from their survey, before and after; χ² of the tie points."""
+    """Check points, whose rays meet away from their survey, before and after, with targets that were searched for once,
+    and again by the poses that the first run corrected.
+    """
     if not (folder / "SURVEY.toml").is_file():
         _roadscan("simulate", scene, "--out", str(folder))
     file = folder / "SURVEY.toml"
@@ -55,13 +57,25 @@ def of_scene(scene: str, folder: Path, bar_m: float) -> Iterator[Figure]:
         _roadscan("ingest", str(file))
         _roadscan("camera", "targets", str(file), "--out", str(folder / "measured.csv"))
         file.write_text(file.read_text().replace("[[passes]]", MEASURED, 1))
-    picture_drive.run(file)
+    for search in ("once", "twice"):
+        if search == "twice":
+            _roadscan("camera", "targets", str(file), "--out", str(folder / "measured.csv"))
+        picture_drive.run(file)
+        yield from _check_points(folder, f"{scene}, targets searched for {search}", bar_m)
+
+
+def _check_points(folder: Path, of: str, bar_m: float) -> Iterator[Figure]:
+    """Figures of the check points that two pictures or more show."""
     rows = pq.read_table(next(folder.glob("store/*/tables/picture_control/*.parquet"))).to_pandas()
-    check = rows[rows.role == "check"]
+    every = rows[rows.role == "check"]
+    check = every[every.pictures > 1]
+    yield Figure(f"{of}: check points that two pictures or more show", float(len(check)), "", float(len(every)), "all")
+    if check.empty:
+        return
     for word in ("before", "after"):
         away = np.linalg.norm(check[[f"{word}_{axis}_m" for axis in ("north", "east", "down")]].to_numpy(), axis=1)
-        yield Figure(f"{scene}: check points in space, {word}, RMS", 1e3 * _rms(away), "mm", 1e3 * bar_m, "the bar")
-        yield Figure(f"{scene}: the same, largest", 1e3 * float(away.max()), "mm")
+        yield Figure(f"{of}: check points in space, {word}, RMS", 1e3 * _rms(away), "mm", 1e3 * bar_m, "the bar")
+        yield Figure(f"{of}: the same, largest", 1e3 * float(away.max()), "mm")
 
 
 def _roadscan(*words: str) -> None:

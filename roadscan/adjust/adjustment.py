@@ -491,10 +491,7 @@ def _of_knots(
 
 def _blocks(estimate: Estimate, first: tuple[Int64, Float64], second: tuple[Int64, Float64]) -> Float64:
     """Returns covariances (k, 6, 6) of the sum of two tables of unknowns, each with its scale."""
-    i, j = np.broadcast_arrays(first[0][:, :, None], second[0][:, None, :])
-    there = (i >= 0) & (j >= 0)
-    blocks = np.zeros(i.shape)
-    blocks[there] = estimate.inverse.at(i[there], j[there])
+    blocks = _entries(estimate, first[0][:, :, None], second[0][:, None, :])
     blocks *= first[1][:, :, None] * second[1][:, None, :]
     rows, columns, size = first[0].shape[1], second[0].shape[1], len(COMPONENTS)
     folded = blocks.reshape(-1, rows // size, size, columns // size, size)
@@ -517,10 +514,7 @@ def _of_observations(
 def _of_mountings(unknowns: Unknowns, estimate: Estimate, solution: Float64) -> MountingErrors:
     prior, numbers = unknowns.mount_sigma, unknowns.of_mountings
     there = numbers >= 0
-    i, j = np.broadcast_arrays(numbers.reshape(-1, 1), numbers.reshape(1, -1))
-    both, covariance = (i >= 0) & (j >= 0), np.zeros(i.shape)
-    covariance[both] = estimate.inverse.at(i[both], j[both])
-    covariance *= np.outer(prior, prior)
+    covariance = _entries(estimate, numbers.reshape(-1, 1), numbers.reshape(1, -1)) * np.outer(prior, prior)
     error = np.zeros(prior.shape)
     error[there] = solution[numbers[there]] * prior[there]
     variance = np.zeros(prior.shape)

@@ -34,14 +34,9 @@ class Adjust(Stage):
         "mountings", "footprints", "picture_tracks", "images",
     )  # fmt: skip
     writes = (
-        "ties",
-        "control_sightings",
-        *TABLES,
-        "corrections",
-        "mounting_corrections",
-        "camera_corrections",
+        "ties", "control_sightings", *TABLES, "corrections", "mounting_corrections", "camera_corrections",
         "camera_covariances",
-    )
+    )  # fmt: skip
 
     def run(self, session: Session) -> None:
         """Adjust where evidence, settings or code differ from those of the last solution."""

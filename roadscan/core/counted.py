@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 _SIZES: Final = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
@@ -11,6 +12,12 @@ _SIZES: Final = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 def counted(number: int, one: str) -> str:
     """Return a number of things in words, such as ``1 file`` and ``1,000 files``."""
     return f"{number:,} {one}{'' if number == 1 else 's'}"
+
+
+def listed(words: Sequence[str], most: int, between: str = ", ") -> str:
+    """Return some of many words, and the number of the others: ``A, B and 3 more``."""
+    more = f" and {len(words) - most:,} more" if len(words) > most else ""
+    return between.join(words[:most]) + more
 
 
 def size_in_words(size: int) -> str:

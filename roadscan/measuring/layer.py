@@ -67,11 +67,7 @@ def write_rows(task: PictureRows) -> OutputRecord:
     schema = table_schema(PRODUCT)
     table = pa.Table.from_pylist(rows, schema=schema.arrow())
     without = Counter(row["without_footprint"] for row in rows if row.get("without_footprint"))
-    told = {
-        "pictures": len(rows),
-        "without_pose": len(task.unplaced),
-        "without_footprint": dict(sorted(without.items())),
-    }
+    told = {"pictures": len(rows), "without_pose": len(task.unplaced), "without_footprint": without}
     with task.store.scratch() as folder:
         path = folder / task.unit
         write_geo_table(
@@ -79,7 +75,7 @@ def write_rows(task: PictureRows) -> OutputRecord:
             more={"footprint": (prints, ["Polygon Z"])},
         )  # fmt: skip
         target = f"{schema.location}/{task.unit}"
-        return publish_file(task.store, path, target, PRODUCT, task.unit, task.key, json.dumps(told))
+        return publish_file(task.store, path, target, PRODUCT, task.unit, task.key, json.dumps(told, sort_keys=True))
 
 
 def picture_rows(task: PictureRows) -> tuple[list[dict[str, Any]], npt.NDArray[Any], npt.NDArray[Any]]:

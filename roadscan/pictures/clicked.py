@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -17,11 +15,7 @@ from roadscan.core.errors import ConfigError
 from roadscan.formats.vectors.picture_points import BY_HAND
 from roadscan.pictures.points import TABLE, write_points
 from roadscan.store.schema import table_schema
-
-try:
-    import fcntl
-except ImportError:  # systems without such locks: threads of one process still wait for one another
-    fcntl = None  # type: ignore[assignment]
+from roadscan.store.store import alone_in
 
 FILE: Final = "control_in_pictures.csv"
 """Name of the file beside the survey file."""
@@ -73,7 +67,7 @@ class ClickedPoints:
         ConfigError
             where another one stands there, since somebody else measured it meanwhile; the file stays as it is.
         """
-        with self._alone, _locked(self.file.parent):
+        with self._alone, alone_in(self.file.parent):
             rows = self.rows()
             held = next((row for row in rows if _place(row) == place), None)
             there = None if held is None else (held["u_px"], held["v_px"])
@@ -107,14 +101,3 @@ def _same(one: Sequence[float] | None, other: Sequence[float] | None) -> bool:
     if one is None or other is None:
         return one is other
     return max(abs(a - b) for a, b in zip(one, other, strict=True)) < _SAME_PX
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold a folder against other programs that lock it alike; the system lets go of it when this one ends."""
-    with contextlib.ExitStack() as stack:
-        if fcntl is not None:
-            opened = os.open(folder, os.O_RDONLY)
-            stack.callback(os.close, opened)
-            fcntl.flock(opened, fcntl.LOCK_EX)
-        yield

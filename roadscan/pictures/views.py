@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.core.camera import Interior
 from roadscan.core.extras import cv2
-from roadscan.pictures.kernels.lens import AROUND, FOLD, HEIGHT, ROW_SHIFT, ROW_TURN, WIDTH
+from roadscan.pictures.kernels.lens import AROUND, FOLD, HEIGHT, PARAMETERS, ROW_SHIFT, ROW_TURN, WIDTH
 from roadscan.pictures.kernels.picture_colours import sample, take_better
 
 Float64 = npt.NDArray[np.float64]
@@ -24,6 +24,7 @@ __all__ = ["AROUND", "HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown
            "best_views", "sampled", "sights"]  # fmt: skip
 
 NO_VIEW: Final = -1  # Number that stands for no picture.
+_STILL: Final = (0.0,) * (PARAMETERS - ROW_SHIFT)  # A camera that does not move from row to row.
 _LEAST_TURNED: Final = float(np.sin(np.radians(10.0)))
 """Least cosine between the ray and the direction in which a front faces."""
 
@@ -58,23 +59,11 @@ class Lens:
     @classmethod
     def of(cls, interior: Interior, own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()) -> Self:
         """Returns the lens from the rig's values."""
-        k1, k2, p1, p2, k3 = interior.distortion
+        k1, k2, _, _, k3 = interior.distortion
         size = float(interior.width_px), float(interior.height_px)
         around = float(interior.model == "equirectangular")
-        lens = [
-            *interior.focal_px,
-            *interior.principal_px,
-            k1,
-            k2,
-            p1,
-            p2,
-            k3,
-            _fold(k1, k2, k3),
-            *size,
-            around,
-            *[0.0] * 6,
-        ]
-        return cls(np.array(lens), own_vehicle_px)
+        lens = [*interior.focal_px, *interior.principal_px, *interior.distortion, _fold(k1, k2, k3), *size, around]
+        return cls(np.array([*lens, *_STILL]), own_vehicle_px)
 
     @property
     def size_px(self) -> tuple[int, int]:

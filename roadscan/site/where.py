@@ -72,11 +72,8 @@ def pictures_of_place(
         height_m = ground_height_m(session, easting_m, northing_m)
     rule = PictureRule((), reach_m, _ANY_ANGLE_DEG, _BORDER_PX)
     poses = posed_pictures(session)
-    pictures, frame, place = (
-        poses.pictures,
-        poses_plan_of(session).ground.map,
-        np.array([easting_m, northing_m, height_m]),
-    )
+    pictures, frame = poses.pictures, poses_plan_of(session).ground.map
+    place = np.array([easting_m, northing_m, height_m])
     worlds = [frame.world_from_map(world, place[None])[None] for world in pictures.worlds]
     no_front = [np.full((1, 3), np.nan)] * len(worlds)
     widest = _WIDEST_SCALE * reach_m

@@ -263,7 +263,7 @@ class Store:
 
     def _take(self, file: Path) -> None:
         me = f"{socket.gethostname()} {os.getpid()}"
-        with _alone_in(file.parent):
+        with alone_in(file.parent):
             for _ in range(2):
                 try:
                     with file.open("x") as stream:
@@ -412,7 +412,7 @@ def _in_words(file: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
+def alone_in(folder: Path) -> Iterator[None]:
     """Lock out other processes of this machine: of several that find the lock of a dead run, one takes it."""
     with contextlib.ExitStack() as stack:
         if fcntl is not None:

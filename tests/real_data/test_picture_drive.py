@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -72,12 +73,8 @@ def test_a_wrong_lens_is_told(place: Place, recording: Path, tmp_path: Path) -> 
 @pytest.mark.witness("picture_stamps")
 def test_stamps_of_the_pictures_before_are_told(place: Place, recording: Path, tmp_path: Path) -> None:
     file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(8, 30))
-    stamps = tmp_path / "pictures" / "stamps.csv"
-    head, *rows = stamps.read_text().splitlines()
-    names, times = zip(*(row.split(",") for row in rows), strict=True)
-    moved = [f"{name},{time}" for name, time in zip(names[1:], times[:-1], strict=True)]
-    stamps.write_text("\n".join([head, *moved]) + "\n")
-    (tmp_path / "pictures" / names[0]).unlink()
+    first = _stamped_anew(tmp_path, lambda names: names[1:])[0]
+    (tmp_path / "pictures" / first).unlink()
     assert any("if stamps are early by 1 picture;" in line for line in place.run(file))
 
 
@@ -106,9 +103,15 @@ def test_a_camera_that_looks_the_other_way_is_told(place: Place, recording: Path
 @pytest.mark.witness("picture_fit")
 def test_stamps_of_other_pictures_are_told(place: Place, recording: Path, tmp_path: Path) -> None:
     file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(14, 22))
-    stamps = tmp_path / "pictures" / "stamps.csv"
-    head, *rows = stamps.read_text().splitlines()
-    names, times = zip(*(row.split(",") for row in rows), strict=True)
-    rows = [f"{name},{time}" for name, time in zip(reversed(names), times, strict=True)]
-    stamps.write_text("\n".join([head, *rows]) + "\n")
+    _stamped_anew(tmp_path, lambda names: names[::-1])
     assert any("of the measurements of tie points agree" in line for line in place.run(file))
+
+
+def _stamped_anew(folder: Path, order: Callable[[list[str]], list[str]]) -> list[str]:
+    """Give the pictures' stamps, from the first on, to pictures in another order; returns the names as they were."""
+    stamps = folder / "pictures" / "stamps.csv"
+    head, *rows = stamps.read_text().splitlines()
+    names, times = (list(column) for column in zip(*(row.split(",") for row in rows), strict=True))
+    moved = [f"{name},{time}" for name, time in zip(order(names), times, strict=False)]
+    stamps.write_text("\n".join([head, *moved]) + "\n")
+    return names

@@ -11,10 +11,11 @@ import numpy.typing as npt
 
 from roadscan.adjust.control.control import Sighting
 from roadscan.compute.robust import scatter_about
+from roadscan.core.counted import listed
 
 Float64 = npt.NDArray[np.float64]
 
-_NAMED: Final = 8
+NAMED: Final = 8
 """At most this many points are named; of the rest the number is reported."""
 _SIGMAS: Final = 4.0  # Heights agree after an exchange within this many σ.
 
@@ -53,7 +54,7 @@ class WrongPoint:
         if np.isfinite(self.sigmas):
             text += f" ({self.sigmas:.1f} σ, where {self.limit:.1f} σ are the limit)"
         if self.alternatives:
-            names = listed(self.alternatives)
+            names = listed(self.alternatives, NAMED)
             return f"{text}; it or {names} is wrong, and nothing tells which of them: none of their {what[0]}s counts"
         return f"{text}; its {' and its '.join(what)} does not count"
 
@@ -104,9 +105,3 @@ def swapped(wrong: Sequence[WrongPoint]) -> list[tuple[str, str]]:
             if np.isfinite(left).all() and (np.abs(left) < limit).all():
                 found.append((one.name, other.name))
     return found
-
-
-def listed(words: Sequence[str]) -> str:
-    """Returns some of many items, and the number of the others."""
-    more = f" and {len(words) - _NAMED} more" if len(words) > _NAMED else ""
-    return ", ".join(words[:_NAMED]) + more

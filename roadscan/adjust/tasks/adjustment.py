@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.bundle.picture import residuals_of
 from roadscan.adjust.control.control import ControlPoint, Sighting
-from roadscan.adjust.control.control_faults import listed
+from roadscan.adjust.control.control_faults import NAMED
 from roadscan.adjust.picture import AdjustmentPicture, Residuals
 from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import RunPrior
@@ -68,6 +68,7 @@ from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
 from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
 from roadscan.adjust.tie_settings import PlaceSettings
 from roadscan.core.counted import counted as count_of
+from roadscan.core.counted import listed
 from roadscan.core.extras import can_draw
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, poses_plan_of
@@ -403,7 +404,7 @@ def _of_points(work: Work, sightings: Sequence[Sighting]) -> list[Finding]:
         found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(points)))
     elif beside := _beside(work, sightings):
         text = (
-            f"{len(beside)} of {len(points)} control points lie where no pass saw the road: {listed(beside)}; "
+            f"{len(beside)} of {len(points)} control points lie where no pass saw the road: {listed(beside, NAMED)}; "
             "they are of another stretch, or in another CRS"
         )
         found.append(CONTROL_PLACE.finds(CONTROL, text, left_out=len(beside)))

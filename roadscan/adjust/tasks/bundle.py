@@ -15,6 +15,7 @@ from roadscan.adjust.control.control import ControlPoint
 from roadscan.adjust.observations import CAMERA
 from roadscan.adjust.process import CameraPrior
 from roadscan.adjust.settings import AdjustConfig
+from roadscan.core.counted import listed
 from roadscan.core.ids import of_run
 from roadscan.core.rig import Sensor
 from roadscan.core.survey import Survey
@@ -213,8 +214,8 @@ def _control(
             values.append((row["u_px"], row["v_px"], row["sigma_px"] or priors.sigma_control_px))
     number, own = np.unique(np.array(point, np.int64), return_inverse=True)
     notes = [*found.notes]
-    notes += [f"no control point is called {', '.join(sorted(unknown)[:_NAMED])}: not used"] if unknown else []
-    notes += [f"no pose for {', '.join(sorted(unplaced)[:_NAMED])}: points in it are not used"] if unplaced else []
+    notes += [f"no control point is called {listed(sorted(unknown), _NAMED)}: not used"] if unknown else []
+    notes += [f"no pose for {listed(sorted(unplaced), _NAMED)}: points in it are not used"] if unplaced else []
     measured = np.array(values, np.float64).reshape(-1, 3)
     part = _Part(np.array(picture, np.int64), measured[:, :2], measured[:, 2], own.astype(np.int64))
     return part, number.astype(np.int64), notes

@@ -11,9 +11,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from roadscan.adjust.control.control import Sighting
-from roadscan.adjust.control.control_faults import WrongPoint, listed, swapped
+from roadscan.adjust.control.control_faults import NAMED, WrongPoint, swapped
 from roadscan.adjust.control.control_test import COMPONENTS, HEIGHT, PLACE, AppliedOffset, ControlVerdict, PlaneShift
 from roadscan.adjust.process import RunPrior
+from roadscan.core.counted import listed
 from roadscan.core.witness import Finding, Witness
 
 Float64 = npt.NDArray[np.float64]
@@ -280,9 +281,9 @@ def not_held(runs: Sequence[str], moving: Sequence[int], links: Int64, held: set
     for k in moving:
         if int(group[k]) not in good:
             others = [runs[j] for j in moving if j != k and group[j] == group[k]]
-            tied = (
-                f"it is tied to {listed(others)} alone, which no control holds either" if others else "no tie holds it"
-            )
+            tied = "no tie holds it"
+            if others:
+                tied = f"it is tied to {listed(others, NAMED)} alone, which no control holds either"
             told = "no control point that counts lies on its way, and " if held else ""
             found.append(
                 RUN_NOT_HELD.finds(
@@ -342,5 +343,5 @@ def target_findings(sightings: Sequence[Sighting]) -> list[Finding]:
         if own:
             told = [f"{one.point.name} in {one.sensor}: {one.why_not}" for one in own]
             unused = len(own) if status == "doubled" else 0
-            found.append(CONTROL_TARGET.finds(CONTROL, f"{len(own)} {words}: {listed(told)}", left_out=unused))
+            found.append(CONTROL_TARGET.finds(CONTROL, f"{len(own)} {words}: {listed(told, NAMED)}", left_out=unused))
     return found

@@ -232,12 +232,10 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     counting = len(_counting_points(adjusted.control))
     found += offset_findings(adjusted.verdict, adjusted.applied, counting)
     found += shift_findings(adjusted.verdict.shift) + run_findings(evidence.runs, adjusted.run_factors)
-    outcome = None if approach is None else outcome_of(approach, adjusted, evidence.points)
-    free = (
-        None
-        if approach is None
-        else free_cameras(approach, adjusted, _settings(config, "joint"), evidence.mounted.priors)
-    )
+    outcome, free = None, None
+    if approach is not None:
+        outcome = outcome_of(approach, adjusted, evidence.points)
+        free = free_cameras(approach, adjusted, _settings(config, "joint"), evidence.mounted.priors)
     joined = evidence.ties.observations.chosen(weight > 0.0)
     found += _not_held(evidence, joined.run, control.chosen(entering), points)
     found += fixed_findings(adjusted.fixed, config.control.false_alarm)

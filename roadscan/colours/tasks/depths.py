@@ -46,9 +46,8 @@ _TABLE: Final = pa.schema(
 _SAMPLED: Final = ["camera", "file", "epoch_gps_ns", "sharpness", "reason", "cell", "colour"]
 _MOST_POINTS: Final = 6_000_000
 """Points around the pictures of a batch, about: of more, which fast lidars see, a share is used. It bounds memory."""
-_SHOWN: Final = (
-    0.02  # A picture shows something where at least this share of its pixels is neither dark nor overexposed.
-)
+_SHOWN: Final = 0.02
+"""A picture shows something where at least this share of its pixels is neither dark nor overexposed."""
 _SAMPLE_REACH: Final = 0.6
 """Pictures are compared on places within this share of the reach."""
 

@@ -28,6 +28,7 @@ from roadscan.condition.profiles.iri import iri_of, mean_roughness_index, rollin
 from roadscan.condition.profiles.quarter_car import RULES, SEVERE_M
 from roadscan.condition.profiles.ride import Ride, ride
 from roadscan.condition.profiles.segments import Segments
+from roadscan.core.counted import listed
 from roadscan.core.witness import Witness
 
 SEVERE_STEP: Final = Witness(
@@ -134,8 +135,7 @@ def _steps(on: Ride, path: WheelPath, noted: str) -> str:
         if word in noted:
             own = places[(places >= path.ends.from_m[0]) & (places <= path.ends.to_m[0])]
             at = list(dict.fromkeys(f"{one:.1f}" for one in np.interp(own, way, station).tolist()))
-            more = f" and {len(at) - _NAMED} more" if len(at) > _NAMED else ""
-            found.append(f"at station {', '.join(at[:_NAMED])}{more} the road steps by {done}")
+            found.append(f"at station {listed(at, _NAMED)} the road steps by {done}")
     return "; ".join(found)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from roadscan.core.counted import listed
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import is_installed
 from roadscan.core.gpstime import NS_PER_S
@@ -90,9 +91,8 @@ class VideoFrames(Stage):
         bad = sorted(record.unit for record in manifest.of(FRAMES).values() if not record.path)
         if not bad:
             return ()
-        named = ", ".join(Path(unit).name for unit in bad[:_NAMED])
-        more = f" and {len(bad) - _NAMED:,} more" if len(bad) > _NAMED else ""
-        text = f"{len(bad):,} key frames of videos cannot be decoded: {named}{more}"
+        named = listed([Path(unit).name for unit in bad], _NAMED)
+        text = f"{len(bad):,} key frames of videos cannot be decoded: {named}"
         return (DAMAGED_FRAMES.finds("pictures", text, left_out=len(bad)),)
 
     def folders(self) -> Sequence[str]:

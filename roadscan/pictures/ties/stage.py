@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from typing import Final
 
+from roadscan.core.counted import listed
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.extras import need
 from roadscan.core.survey import Survey
@@ -142,9 +143,8 @@ def _of_odd(odd: list[tuple[str, str]]) -> list[Finding]:
     """Returns a finding on pictures that give no tie points."""
     if not odd:
         return []
-    named = "; ".join(f"{name}: {why}" for name, why in odd[:_NAMED])
-    more = f" and {len(odd) - _NAMED:,} more" if len(odd) > _NAMED else ""
-    said = f"{len(odd):,} pictures give no tie point: {named}{more}"
+    named = listed([f"{name}: {why}" for name, why in odd], _NAMED, "; ")
+    said = f"{len(odd):,} pictures give no tie point: {named}"
     return [ODD_PICTURES.finds("pictures", said, left_out=len(odd))]
 
 

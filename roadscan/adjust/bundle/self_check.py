@@ -34,8 +34,7 @@ _FREE_K1: Final = 0.2
 _FREE_CLOCK_S: Final = 0.5
 """1 σ (s) of a clock of which nothing is known: some pictures."""
 _BEYOND: Final = 4.0
-"""An error of so many σ is told. Of six draws of `drive_left`, whose lens and stamps are right and whose poses were
-disturbed, focal lengths and clocks had up to 2.3; k1 had up to 6.9, so that a least error stands beside this bound."""
+"""An error of so many σ is told: focal lengths and clocks of six draws of `drive_left` had up to 2.3, k1 up to 6.9."""
 _BEYOND_STATED: Final = 3.0  # It is also so many σ of what is stated, which the adjustment would find by itself.
 _ROUNDS: Final = 4
 """Solutions, each about the one before: a focal length that is 10 % off is found to 0.1 % in three."""

@@ -54,9 +54,7 @@ PICTURE_STAMPS: Final = Witness(
 )
 _LEAST_FOCAL: Final = 0.01
 """A focal length is told to be wrong from this share on: 0.2 m across at 20 m."""
-_LEAST_K1: Final = 0.02
-"""k1 is told to be wrong from here on: of the right lens of `drive_left` up to 0.014 was found, with a σ of 0.002 that
-does not hold."""
+_LEAST_K1: Final = 0.02  # k1 is told to be wrong from here on: the right one of `drive_left` was found up to 0.014 off.
 _LEAST_CLOCK_S: Final = 0.005  # A clock is told to be wrong from here on (s): 10 cm at 70 km/h.
 _WORDS: Final = {
     "focal_x_px": ("focal length", 1.0, "px"), "centre_x_px": ("principal point, right", 1.0, "px"),

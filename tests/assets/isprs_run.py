@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.assets import classes
 
-_CORNER_M = (500_017.0, 5_400_011.0, 200.0)
+CORNER_M = (500_017.0, 5_400_011.0, 200.0)
 _FIRST_S, _STEP_S = 200_000_000.0, 0.001
 _SURVEY = """
 id = "sample"
@@ -33,7 +33,8 @@ make = []
 [[runs]]
 id = "flight"
 logs = [{ path = "sample.las", format = "las", crs = "EPSG:32632" }]
-
+"""
+_NO_KINDS = """
 [assets]
 kinds = []
 """
@@ -41,17 +42,22 @@ kinds = []
 
 def classified(points: npt.NDArray[np.float64], folder: Path, settings: str = "") -> npt.NDArray[np.uint8]:
     """Class (n,) of each point of a cloud (n, 3), from the classified points of a run; stamps tell which is which."""
-    las = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
-    las.header.scales, las.header.offsets = [0.001] * 3, list(_CORNER_M)
-    las.header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
-    las.x, las.y, las.z = (points + _CORNER_M).T
-    las.gps_time = _FIRST_S + _STEP_S * np.arange(len(points))
-    las.return_number[:] = las.number_of_returns[:] = 1
-    las.write(folder / "sample.las")
-    (folder / "SURVEY.toml").write_text(_SURVEY + settings)
-    subprocess.run([sys.executable, "-m", "roadscan", "run", "SURVEY.toml"], cwd=folder, check=True)
+    run_cloud(points, folder, _NO_KINDS + settings)
     found = np.full(len(points), classes.UNCLASSIFIED, np.uint8)
     for file in folder.rglob("classified_points/*.laz"):
         read = laspy.read(file)
         found[np.rint((read.gps_time - _FIRST_S) / _STEP_S).astype(np.int64)] = np.asarray(read.classification)
     return found
+
+
+def run_cloud(points: npt.NDArray[np.float64], folder: Path, settings: str) -> None:
+    """Write a cloud (n, 3) as a LAS file without a trajectory, its corner at `CORNER_M`, and run its survey."""
+    las = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+    las.header.scales, las.header.offsets = [0.001] * 3, list(CORNER_M)
+    las.header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    las.x, las.y, las.z = (points + CORNER_M).T
+    las.gps_time = _FIRST_S + _STEP_S * np.arange(len(points))
+    las.return_number[:] = las.number_of_returns[:] = 1
+    las.write(folder / "sample.las")
+    (folder / "SURVEY.toml").write_text(_SURVEY + settings)
+    subprocess.run([sys.executable, "-m", "roadscan", "run", "SURVEY.toml"], cwd=folder, check=True)

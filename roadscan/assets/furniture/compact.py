@@ -101,7 +101,8 @@ def _forms(scene: Scene, rows: Int64) -> Float64:
     """
     r = scene.returns
     xyh = np.column_stack([r.x_m[rows], r.y_m[rows], r.height_m[rows]])
-    cell = np.floor((xyh - xyh.min(axis=0)) / _VOXEL_M).astype(np.int64)
+    cell = np.floor(xyh / _VOXEL_M).astype(np.int64)
+    cell -= cell.min(axis=0)
     span = cell.max(axis=0) + 1
     _, own = np.unique((cell[:, 2] * span[1] + cell[:, 1]) * span[0] + cell[:, 0], return_inverse=True)
     number = np.bincount(own)

@@ -13,7 +13,7 @@ _INNER = 0.04
 """Share of the offsets across the sight lines that is left out at each end."""
 _LEAST_OF_SECTOR = 15
 """Least number of returns seen from one direction for a width."""
-_LEAST_RADIUS_M, _MOST_RADIUS_M = 0.01, 0.6  # Bounds of a radius (m).
+LEAST_RADIUS_M, MOST_RADIUS_M = 0.01, 0.6  # Bounds of a radius (m).
 _STIFF = 0.002
 """Weight of an upright axis, per return."""
 
@@ -69,7 +69,7 @@ def radius_across(across, kept, sector):
         if reached >= 0.5 * total:
             middle = widths[order[k]]
             break
-    return min(max(0.5 * middle / (1.0 - 2.0 * _INNER), _LEAST_RADIUS_M), _MOST_RADIUS_M)
+    return min(max(0.5 * middle / (1.0 - 2.0 * _INNER), LEAST_RADIUS_M), MOST_RADIUS_M)
 
 
 @kernel

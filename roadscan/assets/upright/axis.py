@@ -9,12 +9,18 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.kernels.cylinders import fit_cylinder
+from roadscan.assets.kernels.cylinders import LEAST_RADIUS_M, MOST_RADIUS_M, fit_cylinder
 
 Float64 = npt.NDArray[np.float64]
 
 SECTOR_DEG: Final = 8.0
 """Sight lines within a sector (degrees) count as of one direction."""
+_LEAST_SEEN: Final = 8
+"""Fewer returns whose sensor's place is known show no width."""
+_NOISE_M: Final = 0.02
+"""Returns farther from the circle than this (m), the noise of many scanners, weigh less."""
+_STIFF_M: Final = 0.05
+"""A slope of 1 counts as so great a distance (m) of every return: what shows no lean stands upright."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +53,15 @@ def fit_axis(xyh: Float64, sensor_xy: Float64, *, lean: bool = True) -> Axis:
     Sight lines meet a cylinder evenly across its width, so the spread of the returns across their sight lines shows the
     radius, and the middle of that spread the axis across them; along them the axis lies where the returns are one
     radius away from it (Gauss–Newton, Huber weights). A circle fit alone shows neither for shafts as thin as the range
-    noise.
+    noise; it is what remains where it is not known from where they were seen, as in clouds without a trajectory.
 
+    sensor_xy : NaN where it is not known.
     lean : the axis may lean; otherwise it is upright.
     """
+    seen = np.isfinite(sensor_xy[:, 0])
+    if np.count_nonzero(seen) < _LEAST_SEEN:
+        return _round_axis(xyh, lean)
+    xyh, sensor_xy = xyh[seen], sensor_xy[seen]
     middle = float(np.median(xyh[:, 2]))
     sight = sensor_xy - xyh[:, :2]
     sight /= np.maximum(np.hypot(sight[:, 0], sight[:, 1]), 1e-9)[:, None]
@@ -61,3 +72,26 @@ def fit_axis(xyh: Float64, sensor_xy: Float64, *, lean: bool = True) -> Axis:
     residual, _ = fit_cylinder(table, sector[order], lean, state, np.empty((len(table), 4)))
     x, y, slope_x, slope_y, radius = map(float, state)
     return Axis(x, y, middle, slope_x, slope_y, radius, float(residual))
+
+
+def _round_axis(xyh: Float64, lean: bool) -> Axis:
+    """Returns the cylinder that returns (n, 3) lie on: distances from it count by a soft L1 norm."""
+    from scipy.optimize import least_squares
+
+    middle = float(np.median(xyh[:, 2]))
+    centre = np.median(xyh[:, :2], axis=0)
+    past = xyh - [*centre, middle]
+
+    def misses(state: Float64) -> Float64:
+        x, y, slope_x, slope_y, radius = state
+        away = np.hypot(past[:, 0] - x - slope_x * past[:, 2], past[:, 1] - y - slope_y * past[:, 2])
+        return np.asarray(np.append(away - radius, math.sqrt(len(past)) * _STIFF_M * np.array([slope_x, slope_y])))
+
+    most = np.array([1.0, 1.0, *[1.0 if lean else 1e-9] * 2, MOST_RADIUS_M])
+    least = np.append(-most[:4], LEAST_RADIUS_M)
+    spread = math.sqrt(past[:, :2].var(axis=0).sum())
+    begin = [0.0, 0.0, 0.0, 0.0, min(max(spread, 2.0 * LEAST_RADIUS_M), 0.9 * MOST_RADIUS_M)]
+    fit = least_squares(misses, begin, loss="soft_l1", f_scale=_NOISE_M, bounds=(least, most))
+    x, y, slope_x, slope_y, radius = map(float, fit.x)
+    return Axis(float(centre[0]) + x, float(centre[1]) + y, middle, slope_x, slope_y, radius,
+                float(np.sqrt(np.mean(np.square(misses(fit.x)[:-2])))))  # fmt: skip

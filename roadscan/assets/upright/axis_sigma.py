@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.shafts import Shaft
+from roadscan.assets.upright.axis import fit_axis
+from roadscan.assets.upright.shafts import LEANING_M, Shaft
 from roadscan.assets.upright.slices import SLICE_M
 
 Float64 = npt.NDArray[np.float64]
@@ -25,6 +26,11 @@ counts as: one sweep alone cannot show its own error."""
 _ROUND: Final = 0.1
 """1 σ of a trunk's or post's radius over directions, as a share of it: stems are out of round, and bark
 and twigs add to them."""
+_PARTS: Final = 6
+"""Parts of a shaft, one above the other, that are left out in turn where nothing else tells its σ."""
+_UNSEEN: Final = 0.25
+"""1 σ of a radius by its circle alone, as a share of it: on the labelled street, diameters from a cloud without a
+trajectory differ so much (RMS) from those with it."""
 _LEAST_M: Final = 0.003
 """Least σ (m): coordinates are millimetres, ranges are stated in steps of 2 mm or more."""
 _LEAST_OF_SLICE: Final = 3
@@ -44,7 +50,8 @@ def sigma_of(scene: Scene, shaft: Shaft) -> Sigma:
 
     Variances add up of: the mean of the sweeps, from their scatter; the mean of the slices, as bark, branches and the
     noise of ranges move them, carried down to the foot with the error of the lean; and along the sight lines that of
-    the radius, by which the axis lies behind the surface that was seen.
+    the radius, by which the axis lies behind the surface that was seen. Where it is not known from where it was seen,
+    the fits without one part in six each tell both (jackknife: Tukey 1958).
     """
     returns, axis = scene.returns, shaft.axis
     height = returns.height_m[shaft.rows]
@@ -53,6 +60,8 @@ def sigma_of(scene: Scene, shaft: Shaft) -> Sigma:
     rows = shaft.rows[np.hypot(*past) < axis.radius_m + _SKIN_M]
     if rows.size < _LEAST_OF_SLICE:
         return Sigma(_POSE_M + axis.radius_m, max(axis.radius_m, _LEAST_M))
+    if not np.isfinite(returns.sensor_x_m[rows]).all():
+        return _of_parts(np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]]), shaft)
     height = returns.height_m[rows]
     x, y = axis.at(height)
     past = np.stack([returns.x_m[rows] - x, returns.y_m[rows] - y])
@@ -68,6 +77,18 @@ def sigma_of(scene: Scene, shaft: Shaft) -> Sigma:
     behind = float(np.hypot(*sight.mean(axis=1)))  # 1: seen from one side, 0: from all
     place = pose**2 / sweeps + mean**2 + foot**2 + 0.5 * (behind * radius) ** 2
     return Sigma(max(math.sqrt(place), _LEAST_M), max(radius, _LEAST_M))
+
+
+def _of_parts(xyh: Float64, shaft: Shaft) -> Sigma:
+    """Returns the standard deviations of a shaft from fits to all parts of its returns (n, 3) but one each."""
+    xyh = xyh[np.argsort(xyh[:, 2], kind="stable")]
+    part = np.arange(len(xyh)) * _PARTS // len(xyh)
+    fits = [fit_axis(held, np.full((len(held), 2), np.nan), lean=float(np.ptp(held[:, 2])) > LEANING_M)
+            for k in range(_PARTS) if len(held := xyh[part != k]) > _LEAST_OF_SLICE]  # fmt: skip
+    of_each = np.array([[*map(float, fit.at(shaft.ground_m)), fit.radius_m] for fit in fits])
+    spread = np.sqrt((len(fits) - 1) * of_each.var(axis=0))
+    radius = math.hypot(spread[2], _UNSEEN * shaft.axis.radius_m)
+    return Sigma(max(math.hypot(spread[0], spread[1], radius, _POSE_M) / math.sqrt(2.0), _LEAST_M), radius)
 
 
 def _of_sweeps(off: Float64, sweep: Int64) -> tuple[int, float]:

@@ -30,6 +30,7 @@ _LEAST_RETURNS: Final = 8  # Least number of returns of a shaft.
 _HIGHEST_FOOT_M: Final = 2.0
 """Greatest height of a hidden foot (m): parked cars and hedges hide no more."""
 _FOOT_SLICES: Final = round((_HIGHEST_FOOT_M - LOWEST_M) / SLICE_M) + 1  # Slices in which the foot of a shaft may lie.
+LEANING_M: Final = 0.8  # Returns over less of the height (m) than this show no lean.
 _MOST_FITTED: Final = 3000  # Returns used for the axis, at most.
 _RING_M: Final = 0.6  # Outer radius of the ring that must be free (m).
 _AROUND_TILE_M: Final = 6.0
@@ -170,7 +171,7 @@ def _measured(scene: Scene, slices: Slices, members: Int64, rows: Int64, alone: 
     seen_from = np.column_stack([returns.sensor_x_m[rows], returns.sensor_y_m[rows]])
     core = np.flatnonzero(_narrow(xyh))
     core = core[:: -(-core.size // _MOST_FITTED)]
-    axis = fit_axis(xyh[core], seen_from[core], lean=float(np.ptp(xyh[core, 2])) > 0.8)
+    axis = fit_axis(xyh[core], seen_from[core], lean=float(np.ptp(xyh[core, 2])) > LEANING_M)
     ground = float(scene.ground.height_at(*axis.at(axis.height_m - 1.0)))
     if not np.isfinite(ground):
         return None

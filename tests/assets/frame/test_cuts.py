@@ -23,7 +23,7 @@ WHOLE_M = 200.0
 """Four squares of this edge hold the street, each with all that it reads."""
 CLASSES_DIFFER = 5e-4
 """Share of the returns whose class a cut may change: surfaces and tracks of any length end where a scene does."""
-POINTS = ("poles", "trees", "signals", "lighting", "delineators", "road_signs")
+POINTS = ("poles", "trees", "signals", "lighting", "delineators", "road_signs", "street_furniture")
 AREAS = ("landscape_areas", "lane_lines", "road_markings")
 
 

@@ -46,8 +46,6 @@ _FREE: Final = 100.0
 """Factor of the poses' variances in the test whether they were too small."""
 _SOME: Final = 1.0
 """Least redundancy for which the σ of poses that turned out too small is estimated, however roughly."""
-_ALSO: Final = 0.1
-"""A component whose factor is below this share of the largest one keeps its stated σ: it follows other components."""
 _SURE: Final = 0.99
 """Share of right solutions whose corrections are no larger."""
 _RIGID: Final = 1e14
@@ -133,13 +131,29 @@ class Rounds:
         self._keep_stated(self._process_ratios(freed.solution, freed.inverse)[1] < _SOME)
         self._enough, self._estimating = _SOME, True
         estimate = self._rounds(freed.rounds)
-        self._keep_stated(self._processes < max(_UNDERSTATED, _ALSO * float(self._processes.max())))
+        self._keep_stated(self._processes < _UNDERSTATED)
+        self._keep_followers()
         return self._rounds(estimate.rounds)
 
     def _keep_stated(self, components: Bool) -> None:
         """Fix the σ of some components of the poses at the stated one."""
         self._fixed = self._fixed | components
         self._processes[self._fixed] = 1.0
+
+    def _keep_followers(self) -> None:
+        """Fix the components whose corrections the stated σ explains, by the quantile of χ², when all others have their
+        factors: they only followed those.
+        """
+        for component in np.argsort(self._processes, kind="stable").tolist():
+            if self._fixed[component]:
+                continue
+            factor, self._processes[component] = self._processes[component], 1.0
+            ratio, told = self._process_ratios(self._solved()[0], self._equations.inverse())
+            redundancy = max(float(told[component]), _SOME)
+            if ratio[component] * redundancy > chdtri(redundancy, 1.0 - _SURE):
+                self._processes[component] = factor
+            else:
+                self._fixed[component] = True
 
     def with_surveys(self, weight: Float64, observed: Float64, factor: float, done: int) -> Estimate:
         """Returns rounds from there on, with surveys that count by a weight of 1 or 0 each.

@@ -485,6 +485,20 @@ def test_wrong_statistics_are_found_by_variance_components() -> None:
     assert factors["shift_tie"] == pytest.approx(1.0, rel=0.1)
 
 
+def test_a_component_stated_too_small_counts_beside_one_stated_far_smaller() -> None:
+    """σ of heights stated fifteen times too small, and of places to the east three times: a factor of 225, and of 9."""
+    road = Road(2500.0, 3, 5.0, 50.0, lane_m=3.5)
+    observations, _, _ = drawn(road, 15)
+    processes = list(road.processes)
+    for component, times in ((0, 3.0), (2, 15.0)):
+        processes[component] = GaussMarkov(processes[component].sigma / times, processes[component].tau_s)
+    given = [replace(p, processes=tuple(processes)) for p in road.priors()]
+    factors = adjust(observations, given, AdjustmentSettings()).variance_factors
+    assert factors[COMPONENTS[0]] == pytest.approx(9.0, rel=0.5)
+    assert factors[COMPONENTS[2]] == pytest.approx(225.0, rel=0.5)
+    assert factors[COMPONENTS[1]] == 1.0
+
+
 def test_no_observation_gives_the_prior() -> None:
     found = adjust(Observations.none(), priors(), AdjustmentSettings(knot_spacing_s=1.0))
     assert (all_values(found) == 0.0).all()

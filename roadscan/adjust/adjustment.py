@@ -214,7 +214,7 @@ class Adjustment:
         parts = prior.parts_at(knots)
         count = parts.shape[1] // len(COMPONENTS)
         ends, taus = (parts[before], parts[before + 1]), np.tile(prior.taus_s, count)
-        lines = line_variance(share[:, None], step[:, None] / 1e9, taus, ends)
+        lines = line_variance(share[:, None], step[:, None] / 1e9, taus, ends, np.arange(taus.size) >= len(COMPONENTS))
         lines = lines.reshape(-1, count, len(COMPONENTS)).sum(axis=1) * factors
         return np.asarray(np.sqrt(variance + (partials**2 * lines).sum(axis=1)))
 

@@ -2,10 +2,16 @@
 
 An error is b(t) u(t) + e(t) v(t). Here u is a first-order Gauss–Markov process of unit variance, with the covariance
 e^(−|Δt|/τ) (Gelb 1974, 3.8), and b(t) is the σ that the logs state of each pose. In an outage, where σ is much larger
-than usual, b stays at a bound and e(t) = √(σ² − b²): v is another such process, independent in each outage, because
-the error in an outage is independent of those before and after it. At knots u is the sequence u(k+1) = φ u(k) + w,
-φ = e^(−h/τ), var w = 1 − φ², without any approximation. Between knots the adjustment is linear; the variance of
-the process about the line has a closed form (`line_variance`).
+than usual, b stays at the usual one and e(t) = √(σ² − b²): the rest is another process, independent in each outage,
+because the error in an outage is independent of those before and after it. It drifts: what is added while e grows does
+not follow from what was there, nor does what is left when e has shrunk tell what there was. So its covariance is
+min(e, e')² e^(−|Δt|/τ), that of a random walk (Gelb 1974, 3.8) while e grows. Were it e e' e^(−|Δt|/τ), the first
+centimetres of a drift of metres would be known to a hundredth of what they grow to, and with it the poses beside the
+outage.
+
+At knots u is the sequence u(k+1) = φ u(k) + w, φ = e^(−h/τ), var w = 1 − φ², without any approximation; of an outage φ
+is smaller by the ratio of e at both knots. Between knots the adjustment is linear; the variance of the process about
+the line has a closed form (`line_variance`).
 """
 
 from __future__ import annotations
@@ -67,6 +73,19 @@ class StatedSigma:
         since, known = ((e - self.epochs_gps_ns[0]).astype(np.float64) for e in (epochs_gps_ns, self.epochs_gps_ns))
         return np.stack([np.interp(since, known, column) for column in self.sigma.T], axis=-1)
 
+    def beside_outages(self, usual: Float64, epochs_gps_ns: Int64) -> Float64:
+        """Returns the part (n, 6) of σ that an outage leaves as it is; `usual` (6,) while one lasts, else σ.
+
+        An outage lasts as long as σ is above the usual one. Were only what is far above it left to the drift, the error
+        beside the outage would seem to grow in proportion where it begins, and its size would follow from how it grows.
+        """
+        held = self.sigma.copy()
+        for column, most in zip(held.T, usual.tolist(), strict=True):
+            for first, end in runs_of(column > most).tolist():
+                if column[first:end].max() > _OUTAGE * most:
+                    column[first:end] = most
+        return StatedSigma(self.epochs_gps_ns, held).at(epochs_gps_ns)
+
 
 @dataclass(frozen=True)
 class RunPrior:
@@ -115,7 +134,7 @@ class RunPrior:
     def parts_at(self, epochs_gps_ns: Int64) -> Float64:
         """Parts b and e of that σ at epochs (n,): (n, 6), or (n, 12) with e where there is an outage among them."""
         sigma = self.sigma_at(epochs_gps_ns)
-        usual = np.minimum(sigma, _OUTAGE * self.sigmas)
+        usual = sigma if self.stated is None else np.fmin(sigma, self.stated.beside_outages(self.sigmas, epochs_gps_ns))
         extra = np.sqrt(np.maximum(sigma**2 - usual**2, 0.0))
         return np.concatenate([usual, extra], axis=1) if extra.any() else usual
 
@@ -221,12 +240,16 @@ def _more_knots(prior: RunPrior, even: Int64) -> Int64:
     return np.asarray(np.floor(wanted * fits), np.int64)
 
 
-def precision_of(epochs_gps_ns: Int64, tau_s: float) -> tuple[Float64, Float64]:
-    """Returns the inverse covariance of a process of σ = 1 at knots: its diagonal (k,) and the one beside it (k − 1,).
+def precision_of(epochs_gps_ns: Int64, tau_s: float, drift: Float64 | None = None) -> tuple[Float64, Float64]:
+    """Returns the inverse covariance of a process, in its σ, at knots: its diagonal (k,) and that beside it (k − 1,).
 
     Rue & Held (2005, 1.1): a Markov process has a tridiagonal one.
+
+    drift : (k,) σ of the error in an outage.
     """
     step = np.diff(epochs_gps_ns) / NS_PER_S / tau_s
+    if drift is not None:
+        step = step + np.abs(np.diff(np.log(drift)))
     keep, gain = np.exp(-step), -1.0 / np.expm1(-2.0 * step)
     diagonal = np.ones(epochs_gps_ns.size)
     diagonal[1:] = gain
@@ -244,6 +267,7 @@ def line_variance(
     step_s: Float64,
     tau_s: float | Float64,
     sigma: tuple[float | Float64, float | Float64] = (1.0, 1.0),
+    drifts: bool | npt.NDArray[np.bool_] = False,
 ) -> Float64:
     """Returns the variance of a process about the straight line between two knots.
 
@@ -252,14 +276,20 @@ def line_variance(
     share : where between the knots, 0 to 1.
     step_s : from knot to knot (s).
     tau_s : correlation time (s).
-    sigma : of the process at the first and at the second knot, between which it is linear. All broadcast.
+    sigma : of the process at the first and at the second knot, between which it is linear.
+    drifts : whether it is that of an outage. All broadcast.
 
     Notes
     -----
     Var[x(t) − (1 − λ) x(0) − λ x(h)] of the covariance σ(t) σ(t') e^(−|Δt|/τ); for h ≪ τ and an even σ it is
-    2 σ² λ (1 − λ) h / τ.
+    2 σ² λ (1 − λ) h / τ. In an outage the covariance is min(σ(t), σ(t'))² e^(−|Δt|/τ).
     """
     left, right = (1.0 - share) * sigma[0], share * sigma[1]
+    middle, least = left + right, np.minimum(sigma[0], sigma[1])
     # Written with e^x − 1: the terms of order one cancel.
     whole, to_left, to_right = (np.expm1(-d / tau_s) for d in (step_s, share * step_s, (1.0 - share) * step_s))
-    return np.maximum(2.0 * (left * right * whole - (left + right) * (left * to_left + right * to_right)), 0.0)
+    even = left * right * whole - middle * (left * to_left + right * to_right)
+    drift = share * (1.0 - share) * (least**2 * whole + np.abs(np.subtract(*sigma)) * middle)
+    drift -= (1.0 - share) * np.minimum(sigma[0], middle) ** 2 * to_left
+    drift -= share * np.minimum(sigma[1], middle) ** 2 * to_right
+    return np.maximum(2.0 * np.where(drifts, drift, even), 0.0)

@@ -34,6 +34,7 @@ Int64 = npt.NDArray[np.int64]
 _SIZE = len(COMPONENTS)
 _MOUNT_SIZE = len(MOUNTED)
 _TIE_POINT = KINDS.index("picture_tie")
+_IN_PICTURES = (_TIE_POINT, KINDS.index("picture_control"))
 _DOWN = 2  # Index of the component down.
 _ALONG = 0.5
 """Least component of a direction along an axis for it to determine that coordinate; each has one or two such axes."""
@@ -75,7 +76,10 @@ class ControlPoints:
         sigma = np.zeros((len(points), 3))
         free = np.zeros(len(points), bool)
         free[index[observations.kind == _TIE_POINT]] = True
-        along = (np.abs(directions_of(observations)[seen]) >= _ALONG) | free[index[seen]][:, None]
+        # Rays of pictures run in all directions: what they say across an axis rests on the place along it.
+        pictured = np.zeros(len(points), bool)
+        pictured[index[np.isin(observations.kind, _IN_PICTURES) & seen]] = True
+        along = (np.abs(directions_of(observations)[seen]) >= _ALONG) | pictured[index[seen]][:, None]
         for axis in range(3):
             which = along[:, axis]
             np.maximum.at(sigma[:, axis], index[seen][which], observations.survey_sigma_m[seen][which])
@@ -236,7 +240,9 @@ class Unknowns:
                 for side, (knot, weight) in enumerate(((before, 1.0 - share), (after, share))):
                     at = slice((2 * end + side) * width, (2 * end + side) * width + own)
                     unknown[here, at], derivative[here, at] = numbers[knot], partial * sigma[knot] * weight[:, None]
-                lines = line_variance(share[:, None], step_s[:, None], taus, (sigma[before], sigma[after]))
+                lines = line_variance(
+                    share[:, None], step_s[:, None], taus, (sigma[before], sigma[after]), np.arange(own) >= _SIZE
+                )
                 variance[here] += (partial**2 * lines).reshape(-1, parts, _SIZE).sum(axis=1)
         seen = point >= 0
         unknown[seen, -3:] = self.of_control[point[seen]]
@@ -279,7 +285,8 @@ class Unknowns:
             for part, numbers in enumerate(self.of_run(run).T):
                 component = part % _SIZE
                 for one in stretches(numbers >= 0):
-                    diagonal, beside = precision_of(self.knots[run][one], prior.processes[component].tau_s)
+                    drift = self.sigmas[run][one, part] if part >= _SIZE else None
+                    diagonal, beside = precision_of(self.knots[run][one], prior.processes[component].tau_s, drift)
                     own = numbers[one]
                     row, column = np.concatenate([own, own[:-1]]), np.concatenate([own, own[1:]])
                     value = np.concatenate([diagonal, beside])

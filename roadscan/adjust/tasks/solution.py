@@ -66,6 +66,9 @@ Bool = npt.NDArray[np.bool_]
 
 _WIDENED: Final = 3
 """Adjustments, at most, until no mounting is off by more than its σ allows."""
+_SOUND: Final = 0.1
+"""Share of a run with GNSS, at least: a drive with less of it, or none, is all alike."""
+_IN_OUTAGE: Final = 3.0  # Factor of σ above that of the best part of a run from which on there is no GNSS.
 _NONE: Final = (GaussMarkov(0.0, 1.0),) * 6  # processes of a run without readings
 
 
@@ -182,11 +185,18 @@ def _processes(
         ]
     )
     assumed[3:] = np.radians(assumed[3:])
-    usual = np.full(assumed.size, np.nan) if stated is None else np.median(stated.sigma, axis=0)
+    usual = np.full(assumed.size, np.nan) if stated is None else _usual(stated.sigma)
     sigma = np.where(np.isfinite(usual), usual, assumed)
     times = (config.position_time_s,) * 3 + (config.attitude_time_s,) * 3
     n, e, d, r, p, h = (GaussMarkov(float(s), t) for s, t in zip(sigma, times, strict=True))
     return n, e, d, r, p, h
+
+
+def _usual(sigma: Float64) -> Float64:
+    """Returns the median (6,) of stated σ (k, 6); of a run that is an outage for the most part, that of the rest."""
+    every, limit = np.median(sigma, axis=0), _IN_OUTAGE * np.quantile(sigma, _SOUND, axis=0)
+    sound = [np.median(own[own <= most]) if most > 0.0 else np.nan for own, most in zip(sigma.T, limit, strict=True)]
+    return np.where(every > limit, sound, every)
 
 
 def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:

@@ -12,18 +12,20 @@ from roadscan.core.extras import need
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import poses_plan_of
+from roadscan.pictures.ties.refining import REFINED, refine_picture, refine_tasks, tracks_key, write_tracks
 from roadscan.pictures.ties.work import (
     ALL,
+    CHAINS,
     FEATURES,
     MATCHES,
     TRACKS,
     TieWork,
+    chains_key,
     find_features,
     match_picture,
     match_tasks,
     plan_ties,
-    tracks_key,
-    write_tracks,
+    write_chains,
 )
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.session import Session
@@ -60,6 +62,10 @@ WRONG_WAY: Final = Witness(
 )
 
 
+_TABLES: Final = (FEATURES, MATCHES, CHAINS, REFINED, TRACKS)
+"""What the stage writes, each from the one before."""
+
+
 class PictureTies(Stage):
     """The stage of tie points: a file of features and one of matches a picture, and the tracks of the survey."""
 
@@ -69,13 +75,13 @@ class PictureTies(Stage):
     section = "picture_ties"
     units = "pictures"
     reads = ("images", "trajectory", "trajectory_accuracy", "clocks", "mountings")
-    writes = (FEATURES, MATCHES, TRACKS)
+    writes = _TABLES
 
     def run(self, session: Session) -> None:
         """Find features and matches that are missing or stale, and join them to tracks."""
         manifest = session.manifest
         if not self.is_asked(session.survey):
-            manifest.remove([r for name in (FEATURES, MATCHES, TRACKS) for r in manifest.of(name).values()])
+            manifest.remove([r for name in _TABLES for r in manifest.of(name).values()])
             return
         work = plan_ties(poses_plan_of(session))
         for note in work.notes:
@@ -94,11 +100,24 @@ class PictureTies(Stage):
         session.failed(self.name, [(t.unit, reason) for t, reason in unmatched])
         manifest.remove(manifest.beside([FEATURES], set(work.units)))
         manifest.remove(manifest.beside([MATCHES], {t.unit for t in tasks}))
-        key = tracks_key(work, tasks, manifest)
-        if not manifest.is_current(TRACKS, ALL, key):
-            manifest.add([write_tracks(work, tasks, manifest, session.store)])
+        if not manifest.is_current(CHAINS, ALL, chains_key(work, tasks, manifest)):
+            manifest.add([write_chains(work, tasks, manifest, session.store)])
+        self._refine(session, work)
         for line in _lines(work, manifest):
             session.reporter.line(f"{self.name}: {line}")
+
+    def _refine(self, session: Session, work: TieWork) -> None:
+        """Match the patches of chains, and write the tracks."""
+        manifest = session.manifest
+        tasks = refine_tasks(work, manifest, session.store)
+        left = [t for t in tasks if not manifest.is_current(REFINED, t.unit, t.key)]
+        failed = run_bundles(
+            refine_picture, left, lambda _: 1, _PICTURES, manifest, session.compute, session.bar("tie points refined")
+        )
+        session.failed(self.name, [(str(task.path), reason) for task, reason in failed])
+        manifest.remove(manifest.beside([REFINED], {t.unit for t in tasks}))
+        if not manifest.is_current(TRACKS, ALL, tracks_key(tasks, manifest)):
+            manifest.add([write_tracks(work, tasks, manifest, session.store)])
 
     def check(self, survey: Survey) -> list[RoadscanError]:
         """Check that the rig has a camera whose directions are known."""
@@ -125,7 +144,12 @@ class PictureTies(Stage):
         state = StageState.of(manifest, [(FEATURES, t.unit, t.key) for t in work.features])
         tasks = match_tasks(work, manifest)
         state.join(StageState.of(manifest, [(MATCHES, t.unit, t.key) for t in tasks]))
-        state.join(StageState.of(manifest, [(TRACKS, ALL, tracks_key(work, tasks, manifest))]))
+        chains = chains_key(work, tasks, manifest)
+        state.join(StageState.of(manifest, [(CHAINS, ALL, chains)]))
+        # Chains that are due name pictures that may be gone.
+        tied = refine_tasks(work, manifest, session.store) if manifest.is_current(CHAINS, ALL, chains) else []
+        state.join(StageState.of(manifest, [(REFINED, t.unit, t.key) for t in tied]))
+        state.join(StageState.of(manifest, [(TRACKS, ALL, tracks_key(tied, manifest))]))
         return state
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
@@ -136,7 +160,7 @@ class PictureTies(Stage):
 
     def folders(self) -> Sequence[str]:
         """Returns the folders of features, matches and tracks."""
-        return [str(table_schema(name).location) for name in (FEATURES, MATCHES, TRACKS)]
+        return [str(table_schema(name).location) for name in _TABLES]
 
 
 def _of_odd(odd: list[tuple[str, str]]) -> list[Finding]:
@@ -167,5 +191,6 @@ def _lines(work: TieWork, manifest: Manifest) -> list[str]:
     own = json.loads(record.detail)
     return [
         f"{len(work.units):,} pictures, {len(work.pairs):,} pairs compared: {own['found']:,} tie points, of which "
-        f"{own['tracks']:,} are kept (long ones first, spread over the pictures)"
+        f"{own['tracks']:,} are kept (long ones first, spread over the pictures); least-squares matching finds "
+        f"{own['matched']:,} of {own['compared']:,} of their places"
     ]

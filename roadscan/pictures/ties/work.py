@@ -39,9 +39,10 @@ UInt8 = npt.NDArray[np.uint8]
 
 FEATURES: Final = "picture_features"
 MATCHES: Final = "picture_matches"
+CHAINS: Final = "picture_chains"
 TRACKS: Final = "picture_tracks"
 ALL: Final = "all"
-"""Unit of the tracks in the manifest."""
+"""Unit of chains and tracks in the manifest."""
 
 _LEAST_TURN_DEG: Final = 0.03
 """1 σ of the turn between two neighbouring pictures, at least (degrees): that of a good attitude over a second."""
@@ -159,10 +160,10 @@ def find_features(task: FeatureTask) -> OutputRecord:
         ],
         schema=schema.arrow(),
     )  # fmt: skip
-    return _written(task.store, FEATURES, task.unit, task.key, rows, json.dumps(detail))
+    return written(task.store, FEATURES, task.unit, task.key, rows, json.dumps(detail))
 
 
-def _written(store: Store, product: str, unit: str, key: str, rows: pa.Table, detail: str) -> OutputRecord:
+def written(store: Store, product: str, unit: str, key: str, rows: pa.Table, detail: str) -> OutputRecord:
     """Write the rows of a unit; returns its record."""
     schema = table_schema(product)
     content = parquet_bytes(rows, schema)
@@ -233,7 +234,7 @@ def match_picture(task: MatchTask) -> OutputRecord:
         [pa.array(names, pa.string()), pa.array(joined[:, 0], pa.int32()), pa.array(joined[:, 1], pa.int32())],
         schema=table_schema(MATCHES).arrow(),
     )
-    return _written(task.store, MATCHES, task.unit, task.key, table, json.dumps({"matches": len(joined)}))
+    return written(task.store, MATCHES, task.unit, task.key, table, json.dumps({"matches": len(joined)}))
 
 
 def _load(store: Store, record: OutputRecord) -> Features:
@@ -263,15 +264,15 @@ def odd_pictures(work: TieWork, manifest: Manifest) -> list[tuple[int, str]]:
     return found
 
 
-def tracks_key(work: TieWork, tasks: Sequence[MatchTask], manifest: Manifest) -> str:
-    """Returns the key of the tracks."""
+def chains_key(work: TieWork, tasks: Sequence[MatchTask], manifest: Manifest) -> str:
+    """Returns the key of the chains."""
     made = [(record.digest if (record := manifest.get(MATCHES, task.unit)) is not None else "") for task in tasks]
     settings = work.settings.model_dump(mode="json")
-    return key_of(code_digest(f"{__name__}:write_tracks"), settings, [task.key for task in tasks], made)
+    return key_of(code_digest(f"{__name__}:write_chains"), settings, [task.key for task in tasks], made)
 
 
-def write_tracks(work: TieWork, tasks: Sequence[MatchTask], manifest: Manifest, store: Store) -> OutputRecord:
-    """Join all matches to tracks, and write those that are kept."""
+def write_chains(work: TieWork, tasks: Sequence[MatchTask], manifest: Manifest, store: Store) -> OutputRecord:
+    """Join all matches to chains, and write those that are kept."""
     number = {unit: k for k, unit in enumerate(work.units)}
     counts = np.zeros(len(work.units), np.int64)
     for k, unit in enumerate(work.units):
@@ -292,10 +293,10 @@ def write_tracks(work: TieWork, tasks: Sequence[MatchTask], manifest: Manifest, 
     features, track = tracks_of(np.concatenate(first), np.concatenate(second), picture)
     pixel, size = _pixels(work, manifest, store, (features, picture[features], starts))
     kept, figures = _kept(work, track, picture[features], pixel)
-    rows = _rows(work, track[kept], picture[features][kept], (pixel[kept], size[kept]))
+    rows = rows_of(work, track[kept], picture[features][kept], (pixel[kept], size[kept]))
     odd = [[work.exposures.name(number), why] for number, why in odd_pictures(work, manifest)]
     detail = json.dumps({**figures, "odd": odd})
-    return _written(store, TRACKS, ALL, tracks_key(work, tasks, manifest), rows, detail)
+    return written(store, CHAINS, ALL, chains_key(work, tasks, manifest), rows, detail)
 
 
 def _pixels(
@@ -349,8 +350,8 @@ def _kept(work: TieWork, track: Int64, picture: Int64, pixel: Float64) -> tuple[
     return kept, figures
 
 
-def _rows(work: TieWork, track: Int64, picture: Int64, of_feature: tuple[Float64, Float64]) -> pa.Table:
-    """Returns rows of the table of tracks, by track and picture; tracks are numbered from 0."""
+def rows_of(work: TieWork, track: Int64, picture: Int64, of_feature: tuple[Float64, Float64]) -> pa.Table:
+    """Returns rows of the tables of chains and tracks, by track and picture; tracks are numbered from 0."""
     order = np.lexsort((picture, track))
     exposures, rows = work.exposures, picture[order]
     cameras = [exposures.cameras[k] for k in exposures.camera[rows].tolist()]
@@ -365,3 +366,31 @@ def _rows(work: TieWork, track: Int64, picture: Int64, of_feature: tuple[Float64
         ],
         schema=table_schema(TRACKS).arrow(),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Chains:
+    """What several pictures show, m measurements, as the features lie."""
+
+    track: Int64
+    """(m,) number of the tie point, ascending from 0."""
+    picture: Int64
+    """(m,) number of the picture."""
+    pixel: Float64
+    """(m, 2)"""
+    size_px: Float64
+    """(m,) diameter of the feature."""
+
+
+def chains_of(work: TieWork, manifest: Manifest, store: Store) -> Chains:
+    """Returns the chains of a survey, as they were written last."""
+    record = manifest.get(CHAINS, ALL)
+    if record is None or not record.path:
+        return Chains(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
+    rows = store.parse_table(read_recorded(store, record), record.path)
+    logs = [work.exposures.cameras[k].log for k in work.exposures.camera.tolist()]
+    number = {one: k for k, one in enumerate(zip(logs, work.exposures.file.tolist(), strict=True))}
+    names = zip(*(rows.column(c).to_pylist() for c in ("log", "file")), strict=True)
+    pixel = np.stack([rows.column(name).to_numpy() for name in ("u_px", "v_px")], axis=-1)
+    picture = np.array([number[one] for one in names], np.int64)
+    return Chains(rows.column("track").to_numpy(), picture, pixel.astype(np.float64), rows.column("size_px").to_numpy())

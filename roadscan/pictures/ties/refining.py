@@ -1,0 +1,150 @@
+"""Places of tie points to a tenth of a pixel: each is matched from one of its pictures to all others.
+
+A feature lies where its own picture is most contrasted. The nearer the camera, the farther that moves on the thing that
+it shows, a hundredth of a pixel a picture and always the same way, so that long drives bend. The grey values of a
+patch, matched with its affine form, show the same point of the thing in all pictures.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from roadscan.core.extras import cv2
+from roadscan.pictures.files import read_picture
+from roadscan.pictures.kernels.patch_matching import match_patches
+from roadscan.pictures.lens import rays_of
+from roadscan.pictures.ties.tracks import places_of
+from roadscan.pictures.ties.work import ALL, CHAINS, FEATURES, TRACKS, TieWork, chains_of, rows_of, written
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import key_of
+from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
+
+Float64 = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+Int64 = npt.NDArray[np.int64]
+
+REFINED: Final = "picture_refined"
+_BLUR_PX: Final = 0.8  # Smoothing of the pictures (1 σ, px): interpolation between sharp pixels draws places to them.
+_FIXED: Final = 128.0
+"""Steps of a grey value: smoothing in whole numbers gives the same on all processors."""
+
+
+@dataclass(frozen=True)
+class RefineTask:
+    """The tie points of one picture, and where others show them."""
+
+    store: Store
+    path: Path
+    size_px: tuple[int, int]
+    others: tuple[tuple[Path, tuple[int, int]], ...]
+    """File and size of the other pictures."""
+    row: Int64
+    """(n,) of each measurement in another picture among all chains."""
+    other: Int64
+    """(n,) its picture, of `others`, ascending."""
+    place: Float64
+    """(n, 2) the feature in this picture …"""
+    guess: Float64
+    """(n, 2) … and in the other one."""
+    scale: Float64
+    """(n,) by how much larger the other one shows it."""
+    unit: str
+    key: str
+
+
+def refine_tasks(work: TieWork, manifest: Manifest, store: Store) -> list[RefineTask]:
+    """Returns a task for each picture from which chains are matched: of each, that of the middle distance."""
+    chains = chains_of(work, manifest, store)
+    if not chains.track.size:
+        return []
+    depth = _depths_m(work, chains.track, chains.picture, chains.pixel)
+    order = np.lexsort((depth, chains.track))
+    starts = np.searchsorted(chains.track[order], np.arange(int(chains.track.max()) + 2))
+    middle = order[(starts[:-1] + starts[1:]) // 2]
+    base = middle[chains.track]
+    own = np.flatnonzero(base != np.arange(base.size))
+    own = own[np.lexsort((own, chains.picture[own], chains.picture[base[own]]))]
+    code = code_digest(f"{__name__}:refine_picture")
+    cuts = np.flatnonzero(np.diff(chains.picture[base[own]])) + 1
+    tasks = []
+    for rows in np.split(own, cuts) if own.size else []:
+        number = int(chains.picture[base[rows[0]]])
+        others, other = np.unique(chains.picture[rows], return_inverse=True)
+        place, guess, scale = chains.pixel[base[rows]], chains.pixel[rows], depth[base[rows]] / depth[rows]
+        contents = [manifest.get(FEATURES, work.units[k]) for k in (number, *others.tolist())]
+        digests = ["" if one is None else one.digest for one in contents]
+        key = key_of(code, digests, [v.round(4).tobytes().hex() for v in (place, guess, scale)], other.tolist())
+        files = tuple((work.exposures.path(k), work.camera(k).lens.size_px) for k in others.tolist())
+        tasks.append(
+            RefineTask(
+                store, work.exposures.path(number), work.camera(number).lens.size_px, files, rows,
+                other.astype(np.int64), place, guess, scale, work.units[number], key,
+            )
+        )  # fmt: skip
+    return tasks
+
+
+def _depths_m(work: TieWork, track: Int64, picture: Int64, pixel: Float64) -> Float64:
+    """Returns how far before its camera each measurement (m,) lies by the recorded poses, at least 0.1 m."""
+    sight, own = np.empty((track.size, 3)), work.exposures.at(picture)
+    for k, camera in enumerate(work.exposures.cameras):
+        sight[own.camera == k] = rays_of(camera.lens, pixel[own.camera == k])
+    ray = np.einsum("nij,nj->ni", own.world_from_opencv, sight)
+    met = places_of(track, own.eye_world_m, ray)
+    return np.maximum(met.distance_m, 0.1)
+
+
+def refine_picture(task: RefineTask) -> OutputRecord:
+    """Match the tie points of a picture in all others, and write where they lie there (runs on a worker)."""
+    first, found = _smoothed(task.path, task.size_px), np.full((task.row.size, 2), np.nan)
+    starts = np.searchsorted(task.other, np.arange(len(task.others) + 1))
+    for (path, size_px), begin, end in zip(task.others, starts[:-1], starts[1:], strict=True):
+        own = slice(int(begin), int(end))
+        second = _smoothed(path, size_px)
+        match_patches(first, second, task.place[own], task.guess[own], task.scale[own], found[own])
+    rows = pa.Table.from_arrays([pa.array(v, pa.float32()) for v in found.T], schema=table_schema(REFINED).arrow())
+    known = int(np.isfinite(found[:, 0]).sum())
+    return written(task.store, REFINED, task.unit, task.key, rows, json.dumps({"matched": known, "of": len(found)}))
+
+
+def _smoothed(path: Path, size_px: tuple[int, int]) -> Float32:
+    """Returns grey values (height, width) of a picture, smoothed."""
+    whole = read_picture(path, size_px, grey=True).astype(np.uint16) * np.uint16(_FIXED)
+    return np.asarray(cv2.GaussianBlur(whole, (0, 0), _BLUR_PX), np.float32) / np.float32(_FIXED)
+
+
+def tracks_key(tasks: Sequence[RefineTask], manifest: Manifest) -> str:
+    """Returns the key of the tracks."""
+    chains = manifest.get(CHAINS, ALL)
+    made = [(record.digest if (record := manifest.get(REFINED, task.unit)) is not None else "") for task in tasks]
+    return key_of(code_digest(f"{__name__}:write_tracks"), "" if chains is None else chains.digest, made)
+
+
+def write_tracks(work: TieWork, tasks: Sequence[RefineTask], manifest: Manifest, store: Store) -> OutputRecord:
+    """Write the tie points as they were refined; what no patch shows is left out, and a point that is left alone."""
+    chains = chains_of(work, manifest, store)
+    pixel = chains.pixel.copy()
+    others = np.zeros(chains.track.size, bool)
+    for task in tasks:
+        record = manifest.get(REFINED, task.unit)
+        others[task.row], pixel[task.row] = True, np.nan
+        if record is not None and record.path:
+            rows = store.parse_table(read_recorded(store, record), record.path)
+            pixel[task.row] = np.column_stack([rows.column(name).to_numpy() for name in ("u_px", "v_px")])
+    found = np.isfinite(pixel[:, 0])
+    kept = found & (np.bincount(chains.track[found], minlength=int(chains.track.max(initial=-1)) + 1) > 1)[chains.track]
+    rows = rows_of(work, chains.track[kept], chains.picture[kept], (pixel[kept], chains.size_px[kept]))
+    known = manifest.get(CHAINS, ALL)
+    detail = {} if known is None else json.loads(known.detail)
+    detail |= {"compared": int(others.sum()), "matched": int((others & found).sum())}
+    return written(store, TRACKS, ALL, tracks_key(tasks, manifest), rows, json.dumps(detail))

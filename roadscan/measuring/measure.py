@@ -418,7 +418,12 @@ def _covariance(
     normal = np.array([*-plane.slope, 1.0])
     slide = np.eye(3) - np.outer(way, normal) / float(normal @ way)
     lift = way / float(normal @ way)
-    common = np.column_stack([slide @ moves, [0.0, 0.0, plane.common_sigma_m]])
+    # The ground was measured from the same poses: what is wrong with their height lifts camera and ground alike.
+    lifts = normal @ poses.map_from_ned[number] @ poses.influence[number, :3, :3] @ poses.root[number, :3]
+    of_pose, of_ground = float(lifts @ lifts), plane.common_sigma_m**2
+    shared = min(of_ground / of_pose, 1.0) if of_pose > 0.0 else 0.0
+    alone = math.sqrt(max(of_ground - shared**2 * of_pose, 0.0))
+    common = np.column_stack([slide @ moves + shared * np.outer(lift, lifts), alone * lift])
     across = slide @ poses.map_from_ned[number] @ poses.ned_from_camera[number]
     covariance = common @ common.T + along_m**2 * across @ spread @ across.T + plane.sigma_m**2 * np.outer(lift, lift)
     return np.asarray(covariance), common

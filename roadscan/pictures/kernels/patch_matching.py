@@ -41,11 +41,11 @@ def _holds(picture, u, v):
 
 
 @kernel
-def match_patches(first, second, places, guesses, scale, found):
+def match_patches(first, second, places, guesses, forms, found):
     """Fill `found` (n, 2) with the places in a second picture that show what the first one shows; NaN where none does.
 
     first, second : (rows, columns) float32 grey values, 0 to 255, smoothed. places : (n, 2) column, row in the first;
-    guesses : (n, 2) in the second; scale : (n,) by how much larger the second shows it.
+    guesses : (n, 2) in the second; forms : (n, 2, 2) by how much column and row move there as they move in the first.
     """
     grey = np.empty((2 * HALF_PX + 1, 2 * HALF_PX + 1))
     state, normal, right = np.empty(_UNKNOWNS), np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
@@ -56,7 +56,8 @@ def match_patches(first, second, places, guesses, scale, found):
             continue
         state[:] = 0.0
         state[0], state[1] = guesses[n, 0], guesses[n, 1]
-        state[2], state[5], state[6] = scale[n], scale[n], 1.0
+        state[2], state[3], state[4], state[5] = forms[n, 0, 0], forms[n, 0, 1], forms[n, 1, 0], forms[n, 1, 1]
+        state[6] = 1.0
         left = np.inf
         for turn in range(_ROUNDS):
             left = _equations(second, grey, variance, state, turn == 0, normal, right)

@@ -20,9 +20,9 @@ import pyarrow as pa
 from roadscan.core.extras import cv2
 from roadscan.pictures.files import read_picture
 from roadscan.pictures.kernels.patch_matching import match_patches
-from roadscan.pictures.lens import rays_of
+from roadscan.pictures.lens import derivatives, rays_of
 from roadscan.pictures.ties.tracks import places_of
-from roadscan.pictures.ties.work import ALL, CHAINS, FEATURES, TRACKS, TieWork, chains_of, rows_of, written
+from roadscan.pictures.ties.work import ALL, CHAINS, FEATURES, TRACKS, Chains, TieWork, chains_of, rows_of, written
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
@@ -56,8 +56,8 @@ class RefineTask:
     """(n, 2) the feature in this picture …"""
     guess: Float64
     """(n, 2) … and in the other one."""
-    scale: Float64
-    """(n,) by how much larger the other one shows it."""
+    form: Float64
+    """(n, 2, 2) by how much column and row move there as they move in this picture, of a thing that faces it."""
     unit: str
     key: str
 
@@ -67,7 +67,8 @@ def refine_tasks(work: TieWork, manifest: Manifest, store: Store) -> list[Refine
     chains = chains_of(work, manifest, store)
     if not chains.track.size:
         return []
-    depth = _depths_m(work, chains.track, chains.picture, chains.pixel)
+    seen = _seen_from(work, chains)
+    depth = np.linalg.norm(seen, axis=1)
     order = np.lexsort((depth, chains.track))
     starts = np.searchsorted(chains.track[order], np.arange(int(chains.track.max()) + 2))
     middle = order[(starts[:-1] + starts[1:]) // 2]
@@ -80,28 +81,53 @@ def refine_tasks(work: TieWork, manifest: Manifest, store: Store) -> list[Refine
     for rows in np.split(own, cuts) if own.size else []:
         number = int(chains.picture[base[rows[0]]])
         others, other = np.unique(chains.picture[rows], return_inverse=True)
-        place, guess, scale = chains.pixel[base[rows]], chains.pixel[rows], depth[base[rows]] / depth[rows]
+        place, guess, form = chains.pixel[base[rows]], chains.pixel[rows], _forms(work, chains, seen, base[rows], rows)
         contents = [manifest.get(FEATURES, work.units[k]) for k in (number, *others.tolist())]
         digests = ["" if one is None else one.digest for one in contents]
-        key = key_of(code, digests, [v.round(4).tobytes().hex() for v in (place, guess, scale)], other.tolist())
+        key = key_of(code, digests, [v.round(4).tobytes().hex() for v in (place, guess, form)], other.tolist())
         files = tuple((work.exposures.path(k), work.camera(k).lens.size_px) for k in others.tolist())
         tasks.append(
             RefineTask(
                 store, work.exposures.path(number), work.camera(number).lens.size_px, files, rows,
-                other.astype(np.int64), place, guess, scale, work.units[number], key,
+                other.astype(np.int64), place, guess, form, work.units[number], key,
             )
         )  # fmt: skip
     return tasks
 
 
-def _depths_m(work: TieWork, track: Int64, picture: Int64, pixel: Float64) -> Float64:
-    """Returns how far before its camera each measurement (m,) lies by the recorded poses, at least 0.1 m."""
-    sight, own = np.empty((track.size, 3)), work.exposures.at(picture)
+def _seen_from(work: TieWork, chains: Chains) -> Float64:
+    """Returns where each measurement's point lies (m, 3) in the axes of its camera, by the recorded poses."""
+    sight, own = np.empty((chains.track.size, 3)), work.exposures.at(chains.picture)
     for k, camera in enumerate(work.exposures.cameras):
-        sight[own.camera == k] = rays_of(camera.lens, pixel[own.camera == k])
+        sight[own.camera == k] = rays_of(camera.lens, chains.pixel[own.camera == k])
     ray = np.einsum("nij,nj->ni", own.world_from_opencv, sight)
-    met = places_of(track, own.eye_world_m, ray)
-    return np.maximum(met.distance_m, 0.1)
+    place = places_of(chains.track, own.eye_world_m, ray).place_m[chains.track]
+    return np.asarray(np.einsum("nji,nj->ni", own.world_from_opencv, place - own.eye_world_m))
+
+
+def _forms(work: TieWork, chains: Chains, seen_m: Float64, first: Int64, second: Int64) -> Float64:
+    """Returns by how much pixels (n, 2, 2) move in a second picture as they move in the first, of things that face it.
+
+    first, second : (n,) measurements of the same points, of which `seen_m` (m, 3) says where cameras see them.
+    """
+    ways = [work.exposures.at(chains.picture[rows]).world_from_opencv for rows in (first, second)]
+    turned = np.einsum("nji,njk->nik", ways[1], ways[0])
+    # Two vectors across the ray: columns of the reflection that takes the optical axis to it (Householder).
+    ray = seen_m[first] / np.linalg.norm(seen_m[first], axis=1)[:, None]
+    mirror = ray + np.where(ray[:, 2:] < 0.0, -1.0, 1.0) * np.array([0.0, 0.0, 1.0])
+    shrunk = 2.0 / np.einsum("ni,ni->n", mirror, mirror)
+    across = (np.eye(3) - shrunk[:, None, None] * mirror[:, :, None] * mirror[:, None, :])[:, :, :2]
+    moved = [np.empty((first.size, 2, 2)), np.empty((first.size, 2, 2))]
+    for rows, vectors, out in zip((first, second), (across, turned @ across), moved, strict=True):
+        number = work.exposures.camera[chains.picture[rows]]
+        for k, camera in enumerate(work.exposures.cameras):
+            here = number == k
+            out[here] = derivatives(camera.lens, seen_m[rows[here]])[1] @ vectors[here]
+    size = np.linalg.det(moved[0])
+    known = np.flatnonzero(np.isfinite(moved[1]).all(axis=(1, 2)) & np.isfinite(size) & (size != 0.0))
+    form = np.tile(np.eye(2), (first.size, 1, 1))
+    form[known] = moved[1][known] @ np.linalg.inv(moved[0][known])
+    return form
 
 
 def refine_picture(task: RefineTask) -> OutputRecord:
@@ -111,7 +137,7 @@ def refine_picture(task: RefineTask) -> OutputRecord:
     for (path, size_px), begin, end in zip(task.others, starts[:-1], starts[1:], strict=True):
         own = slice(int(begin), int(end))
         second = _smoothed(path, size_px)
-        match_patches(first, second, task.place[own], task.guess[own], task.scale[own], found[own])
+        match_patches(first, second, task.place[own], task.guess[own], task.form[own], found[own])
     rows = pa.Table.from_arrays([pa.array(v, pa.float32()) for v in found.T], schema=table_schema(REFINED).arrow())
     known = int(np.isfinite(found[:, 0]).sum())
     return written(task.store, REFINED, task.unit, task.key, rows, json.dumps({"matched": known, "of": len(found)}))

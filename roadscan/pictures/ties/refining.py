@@ -35,6 +35,8 @@ Int64 = npt.NDArray[np.int64]
 
 REFINED: Final = "picture_refined"
 _BLUR_PX: Final = 0.8  # Smoothing of the pictures (1 σ, px): interpolation between sharp pixels draws places to them.
+_MEET_RAD: Final = 0.02
+"""Rays that pass their point by more (rad) are of poses that do not tell how patches are turned: features stay."""
 _FIXED: Final = 128.0
 """Steps of a grey value: smoothing in whole numbers gives the same on all processors."""
 
@@ -67,13 +69,14 @@ def refine_tasks(work: TieWork, manifest: Manifest, store: Store) -> list[Refine
     chains = chains_of(work, manifest, store)
     if not chains.track.size:
         return []
-    seen = _seen_from(work, chains)
+    seen, off_rad = _seen_from(work, chains)
     depth = np.linalg.norm(seen, axis=1)
     order = np.lexsort((depth, chains.track))
     starts = np.searchsorted(chains.track[order], np.arange(int(chains.track.max()) + 2))
     middle = order[(starts[:-1] + starts[1:]) // 2]
     base = middle[chains.track]
-    own = np.flatnonzero(base != np.arange(base.size))
+    near = off_rad < _MEET_RAD
+    own = np.flatnonzero((base != np.arange(base.size)) & near & near[base])
     own = own[np.lexsort((own, chains.picture[own], chains.picture[base[own]]))]
     code = code_digest(f"{__name__}:refine_picture")
     cuts = np.flatnonzero(np.diff(chains.picture[base[own]])) + 1
@@ -95,14 +98,17 @@ def refine_tasks(work: TieWork, manifest: Manifest, store: Store) -> list[Refine
     return tasks
 
 
-def _seen_from(work: TieWork, chains: Chains) -> Float64:
-    """Returns where each measurement's point lies (m, 3) in the axes of its camera, by the recorded poses."""
+def _seen_from(work: TieWork, chains: Chains) -> tuple[Float64, Float64]:
+    """Returns where each measurement's point lies (m, 3) in the axes of its camera, by the recorded poses, and by how
+    much its ray passes that (m,; rad).
+    """
     sight, own = np.empty((chains.track.size, 3)), work.exposures.at(chains.picture)
     for k, camera in enumerate(work.exposures.cameras):
         sight[own.camera == k] = rays_of(camera.lens, chains.pixel[own.camera == k])
     ray = np.einsum("nij,nj->ni", own.world_from_opencv, sight)
-    place = places_of(chains.track, own.eye_world_m, ray).place_m[chains.track]
-    return np.asarray(np.einsum("nji,nj->ni", own.world_from_opencv, place - own.eye_world_m))
+    met = places_of(chains.track, own.eye_world_m, ray)
+    away = met.place_m[chains.track] - own.eye_world_m
+    return np.asarray(np.einsum("nji,nj->ni", own.world_from_opencv, away)), met.residual_rad
 
 
 def _forms(work: TieWork, chains: Chains, seen_m: Float64, first: Int64, second: Int64) -> Float64:
@@ -157,7 +163,9 @@ def tracks_key(tasks: Sequence[RefineTask], manifest: Manifest) -> str:
 
 
 def write_tracks(work: TieWork, tasks: Sequence[RefineTask], manifest: Manifest, store: Store) -> OutputRecord:
-    """Write the tie points as they were refined; what no patch shows is left out, and a point that is left alone."""
+    """Write the tie points as they were refined, without the pictures that do not show the patch of their first one; a
+    point that no other picture confirms stays as its features lie.
+    """
     chains = chains_of(work, manifest, store)
     pixel = chains.pixel.copy()
     others = np.zeros(chains.track.size, bool)
@@ -167,8 +175,9 @@ def write_tracks(work: TieWork, tasks: Sequence[RefineTask], manifest: Manifest,
         if record is not None and record.path:
             rows = store.parse_table(read_recorded(store, record), record.path)
             pixel[task.row] = np.column_stack([rows.column(name).to_numpy() for name in ("u_px", "v_px")])
-    found = np.isfinite(pixel[:, 0])
-    kept = found & (np.bincount(chains.track[found], minlength=int(chains.track.max(initial=-1)) + 1) > 1)[chains.track]
+    found, count = np.isfinite(pixel[:, 0]), int(chains.track.max(initial=-1)) + 1
+    alone = (np.bincount(chains.track[found], minlength=count) < 2)[chains.track]
+    pixel[alone], kept = chains.pixel[alone], found | alone
     rows = rows_of(work, chains.track[kept], chains.picture[kept], (pixel[kept], chains.size_px[kept]))
     known = manifest.get(CHAINS, ALL)
     detail = {} if known is None else json.loads(known.detail)

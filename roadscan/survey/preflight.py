@@ -551,6 +551,11 @@ class Preflight:
 
 def preflight(survey: Survey, store: Store, last_stage: str = "", selection: Selection | None = None) -> Preflight:
     """Run all checks that stages up to `last_stage` need (all, where none is named), for some tiles or for all."""
+    with store.looked():
+        return _preflight(survey, store, last_stage, selection)
+
+
+def _preflight(survey: Survey, store: Store, last_stage: str, selection: Selection | None) -> Preflight:
     if selection is not None and not store.exists("manifest/outputs"):
         raise ConfigError("tiles are chosen, and none is computed yet", change="run `roadscan run` first")
     asked = Asked(survey, store)

@@ -17,6 +17,7 @@ from roadscan.run.selection import SelectionError
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, findings_of, stages
 from roadscan.store.logs import read_log_records
+from roadscan.store.look import look_again
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
 from roadscan.store.repair_records import repair_records
 from roadscan.store.verified import note_written, recorded_files
@@ -49,6 +50,7 @@ def run_stages(session: Session, chosen: Sequence[Stage] | None = None) -> None:
 def run_stage(session: Session, stage: Stage) -> None:
     """Run one stage. If an earlier stage had failures, append this error to them instead of raising it."""
     session.stage = stage.name
+    look_again()
     if session.goes_on is None:
         repair_records(session.store, session.note)
         session.goes_on = begin_changes(session.store)

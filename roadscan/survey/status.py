@@ -93,6 +93,11 @@ class Status:
 
 def survey_status(session: Session) -> Status:
     """Return the state of a survey from its manifest; no readings are read."""
+    with session.store.looked():
+        return _survey_status(session)
+
+
+def _survey_status(session: Session) -> Status:
     store, damaged = session.store, session.hear_of_damage()
     found = preflight(session.survey, store)
     causes = [*map(str, found.causes), *found.failing]

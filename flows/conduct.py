@@ -53,6 +53,7 @@ def conduct(
         survey = Survey.load(survey_file)
         store = Store(survey.store_url, survey.config.id)
         reporter = FlowReporter()
+        store.check_free()
         preflight(survey, store, selection=selection).begin(reporter.line)
         with store.lock(), compute_on(workers, scheduler) as compute:
             run = Session(survey, store, compute, selection, reporter)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from urllib.request import Request, urlopen
 
 KEYS = {"AWS_ACCESS_KEY_ID": "roads", "AWS_SECRET_ACCESS_KEY": "roads", "AWS_DEFAULT_REGION": "us-east-1"}
 
@@ -58,6 +59,7 @@ def served() -> Iterator[ObjectStore]:
     conf = dict(fsspec.config.conf)
     os.environ.update(store.environment)
     fsspec.config.conf["s3"] = {"endpoint_url": store.endpoint}
+    urlopen(Request(f"{store.endpoint}/moto-api/reset", method="POST")).close()  # of a server before this one
     fs = fsspec.filesystem("s3", skip_instance_cache=True)
     fs.mkdir("roads")
     try:

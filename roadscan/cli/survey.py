@@ -77,7 +77,9 @@ def run_and_sum_up(
     """The same, with a summary of the survey printed at the end, also of a run of which some units failed."""
     from roadscan.core.errors import RunError
 
-    with opened_store(survey_file).looked():
+    store = opened_store(survey_file)
+    store.check_free()
+    with store.looked():
         try:
             run = run_survey(survey_file, stages, where, selection)
         except RunError:

@@ -111,6 +111,11 @@ class Lease:
         self._renewed_s = 0.0
         self._lost = ""
 
+    def check_free(self) -> None:
+        """Raise StoreError where another process holds the lease now."""
+        if (held := self._place.read()) is not None:
+            _check_over(held, self._place)
+
     def take(self) -> None:
         """Take the lease, and renew it from now on.
 

@@ -78,7 +78,7 @@ def own_tag() -> str:
 def tag_lives(name: str) -> bool | None:
     """Return whether the process lives that a file's name begins with; None where that cannot be seen from here.
 
-    A name that begins with a number alone is one of an older version, on one machine. A name of no process has a dead maker.
+    A name that begins with a number alone is one of an older version, on one machine. Other names have no maker.
     """
     parts = name.split("-")
     if parts[0].isdigit() and len(parts) == 2:

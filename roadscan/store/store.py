@@ -300,13 +300,10 @@ class Store:
         StoreError
             where another run has the store; and at a later change, where this one has lost it.
         """
-        file = self.path(_LOCK)
+        file, lease = self.path(_LOCK), self._new_lease()
         with _in_words(file):
-            place: ObjectPlace | FolderPlace = ObjectPlace(self.fs, file)
             if self.is_folder:
                 _make_folder(Path(file).parent, lasting=True)
-                place = FolderPlace(Path(file), self._new_temporary, alone_in)
-        lease = Lease(place)
         with _in_words(file), contextlib.nullcontext() if self.is_folder else self._reached():
             lease.take()
         try:
@@ -318,6 +315,17 @@ class Store:
         finally:
             self._lease = None
             lease.give_back()
+
+    def check_free(self) -> None:
+        """Raise StoreError where another run has the store now: before long work, since :meth:`lock` asks again."""
+        with contextlib.nullcontext() if self.is_folder else self._reached():
+            self._new_lease().check_free()
+
+    def _new_lease(self) -> Lease:
+        file = self.path(_LOCK)
+        return Lease(
+            FolderPlace(Path(file), self._new_temporary, alone_in) if self.is_folder else ObjectPlace(self.fs, file)
+        )
 
     @contextlib.contextmanager
     def looked(self) -> Iterator[None]:

@@ -62,7 +62,10 @@ def test_a_second_run_is_refused_in_words_and_at_once(url: str) -> None:
         began = time.perf_counter()
         with pytest.raises(StoreError, match=rf"process {os.getpid()} on .* is working on this store"), again.lock():
             pass
+        with pytest.raises(StoreError, match="is working on this store"):
+            again.check_free()
         assert time.perf_counter() - began < 2.0
+    store.check_free()
     with store.lock():
         pass
 

@@ -35,6 +35,7 @@ from roadscan.store.lease import FolderPlace, Lease, ObjectPlace
 from roadscan.store.look import Look, at_once, look_of, looking
 from roadscan.store.process import own_tag, tag_lives
 from roadscan.store.seal import check_seal, without_seal
+from roadscan.store.written_by import VERSION_FILE, refuse_newer, version_of
 
 try:
     import fcntl
@@ -311,10 +312,25 @@ class Store:
             if self.is_folder:
                 self._clear_staging()
             with self.looked():
+                self.check_version()
                 yield
         finally:
             self._lease = None
             lease.give_back()
+
+    def last_version(self) -> str:
+        """Return the version of roadscan that wrote last, empty where that is not known."""
+        if not self.exists(VERSION_FILE):
+            return ""
+        try:
+            return version_of(self.read_bytes(VERSION_FILE))
+        except ValueError:
+            return ""
+
+    def check_version(self) -> None:
+        """Raise StoreError where a newer version of roadscan than this one wrote to the store."""
+        if version := self.last_version():
+            refuse_newer(version, self.root)
 
     def check_free(self) -> None:
         """Raise StoreError where another run has the store now: before long work, since :meth:`lock` asks again."""

@@ -476,7 +476,8 @@ def check_passes(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_store(asked: Asked) -> Iterator[RoadscanError]:
-    """Check that the store can be written, and contains only a survey's files."""
+    """Check that the store can be written, that no newer version wrote it, and that it has only a survey's files."""
+    yield from _faults(asked.store.check_version)
     if not asked.store.is_folder:
         yield from _faults(lambda: asked.store.exists("manifest"))
         return

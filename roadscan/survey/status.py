@@ -28,6 +28,7 @@ from roadscan.store.salvage import Lost, read_lost
 from roadscan.store.sql_files import Stamp, stamp_of
 from roadscan.store.store import Store
 from roadscan.store.verified import held_faults, note_verified
+from roadscan.store.written_by import VERSION_FILE
 from roadscan.survey.preflight import preflight
 from roadscan.tiles.product import products
 from roadscan.tiles.tasks.tile_plan import TILE
@@ -185,7 +186,13 @@ def find_damage(store: Store, report: Callable[[int, int], None] = lambda _a, _b
     manifest = Manifest(store, damaged)
     logs = read_log_records(store, damaged=damaged)
     found = Damage(
-        [*map(str, damaged), *damaged_sources(store), *_copy_faults(store, [r.key for r in logs]), *held_faults(store)]
+        [
+            *map(str, damaged),
+            *damaged_sources(store),
+            *_version_faults(store),
+            *_copy_faults(store, [r.key for r in logs]),
+            *held_faults(store),
+        ]
     )
     data = [f for r in logs for own in r.tables.values() for f in own]
     outputs = [r for r in manifest.all() if r.path]
@@ -213,6 +220,13 @@ def find_damage(store: Store, report: Callable[[int, int], None] = lambda _a, _b
     manifest.doubt(odd)
     note_verified(store, whole, anew=True)
     return found
+
+
+def _version_faults(store: Store) -> list[str]:
+    """Return the fault of the file that names the version which wrote last, if it has one."""
+    if store.exists(VERSION_FILE) and not store.last_version():
+        return [f"{VERSION_FILE}: it is damaged; the next run writes it anew"]
+    return []
 
 
 def _copy_faults(store: Store, keys: Sequence[str]) -> list[str]:

@@ -122,6 +122,14 @@ class Store:
         start = len(self.fs._strip_protocol(self.root)) + 1
         return sorted(f[start:] for f in found if f.endswith(suffix))
 
+    def changed_s(self, relative: str) -> float:
+        """Return when a file was written (Unix s), by the store's clock."""
+        return float(self.fs.modified(self.path(relative)).timestamp())
+
+    def now_s(self) -> float:
+        """Return what the store's clock says (Unix s): that of the file server, or of the object store."""
+        return self._lease_place().now_s()
+
     def read_bytes(self, relative: str) -> bytes:
         """Return the content of a small file."""
         look = self._look()
@@ -338,10 +346,11 @@ class Store:
             self._new_lease().check_free()
 
     def _new_lease(self) -> Lease:
+        return Lease(self._lease_place())
+
+    def _lease_place(self) -> FolderPlace | ObjectPlace:
         file = self.path(_LOCK)
-        return Lease(
-            FolderPlace(Path(file), self._new_temporary, alone_in) if self.is_folder else ObjectPlace(self.fs, file)
-        )
+        return FolderPlace(Path(file), self._new_temporary, alone_in) if self.is_folder else ObjectPlace(self.fs, file)
 
     @contextlib.contextmanager
     def looked(self) -> Iterator[None]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import datetime as dt
 import functools
 import os
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 
+from roadscan.core.counted import size_in_words
 from roadscan.core.crs import (
     LOCAL_WORLD,
     MapFrame,
@@ -599,12 +601,32 @@ def _notes(asked: Asked) -> Iterator[str]:
             f"[segmentation] applies to {', '.join(sorted(segmented))}; all readings of {', '.join(rest)} count, "
             "whether they hit the road or not"
         )
+    yield from _room(asked)
     for log, place, beyond_deg in asked.places:
         if _NEAR_DEG < beyond_deg <= FARTHEST_DEG:
             yield (
                 f"{log.path}: its positions begin near {_place_words(place)}, {beyond_deg:.1f}° outside the area of "
                 f"{_map_words(asked)}: distances on the map differ from those on the ground"
             )
+
+
+def _room(asked: Asked) -> Iterator[str]:
+    """Yield a note where the store's disk has less room than the logs have that are still to be ingested.
+
+    Rows take a third to three times the space of their log: a run may end well with less room, and badly with more.
+    """
+    if not asked.store.is_folder:
+        return
+    root = Path(asked.store.root)
+    held = {(record.run, record.path) for record in read_log_records(asked.store, damaged=[])}
+    due = [log.path for log in asked.logs if (log.run, str(log.config.path)) not in held]
+    needed = sum(path.stat().st_size for path in due if path.is_file())
+    free = shutil.disk_usage(next(folder for folder in (root, *root.parents) if folder.exists())).free
+    if free < needed:
+        yield (
+            f"the logs that are not ingested yet have {size_in_words(needed)}, and {size_in_words(free)} are free on the "
+            "store's disk: the run may stop for want of room; what is finished then stays"
+        )
 
 
 def _tables_of_sensors(asked: Asked) -> dict[str, set[str]]:

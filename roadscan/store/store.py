@@ -66,7 +66,7 @@ class Store:
     def __init__(self, url: str, survey_id: str) -> None:
         self.url = url
         self.survey_id = survey_id
-        self.fs, base = _opened(url)
+        self.fs, base = opened_url(url)
         self.root = f"{base.rstrip('/')}/survey={survey_id}"
         self.is_folder = "file" in self.fs.protocol or "local" in self.fs.protocol
         self._lease: Lease | None = None
@@ -446,7 +446,7 @@ def _sync_file(path: Path) -> None:
         os.fsync(stream.fileno())
 
 
-def _opened(url: str) -> tuple[Any, str]:
+def opened_url(url: str) -> tuple[Any, str]:
     """Return file system and path of a store; a folder's name may contain the URL separator ``::`` of fsspec.
 
     Lists of what an object store holds are not kept: workers write to it at the same time.

@@ -624,8 +624,8 @@ def _room(asked: Asked) -> Iterator[str]:
     free = shutil.disk_usage(next(folder for folder in (root, *root.parents) if folder.exists())).free
     if free < needed:
         yield (
-            f"the logs that are not ingested yet have {size_in_words(needed)}, and {size_in_words(free)} are free on the "
-            "store's disk: the run may stop for want of room; what is finished then stays"
+            f"the logs that are not ingested yet have {size_in_words(needed)}, and {size_in_words(free)} are free on "
+            "the store's disk: the run may stop for want of room; what is finished then stays"
         )
 
 

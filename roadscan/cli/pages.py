@@ -82,6 +82,8 @@ def publish(
         reporter.close()
         for path, reason in made.failures:
             typer.echo(f"failed: {path}: {reason}")
+        for path in made.damaged:
+            typer.echo(f"damaged: {path} was not as it had been published, and was made again")
         if web_folder() is None:
             typer.echo(f"note: the folder holds the data without the page: {HOW_TO_BUILD}")
         typer.echo(f"site: {out} ({counted(made.files, 'file')}, {made.made:,} new, {made.bytes / 1e6:,.1f} MB)")

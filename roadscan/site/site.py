@@ -21,6 +21,7 @@ from roadscan.site.document import Ask, Document, json_document
 from roadscan.site.material import SHEET_M, Box, Material
 from roadscan.site.part import site_parts
 from roadscan.site.parts.catalog import to_longitude_latitude
+from roadscan.site.parts.vectors import site_layers
 from roadscan.site.report_copy import REPORT, linked_report
 from roadscan.site.web_part import web_documents
 from roadscan.store.checked_json import checked_json, parse_checked
@@ -89,6 +90,8 @@ class Published:
     bytes: int
     failures: tuple[tuple[str, str], ...]
     """Documents that could not be made, with reasons."""
+    left_out: tuple[str, ...] = ()
+    """Layers that are missing, with reasons."""
     damaged: tuple[str, ...] = ()
     """Files of the folder that were missing or were not as they had been written; they are made again."""
 
@@ -120,7 +123,8 @@ def publish(material: Material, out: Path, report: Callable[[int, int], None] = 
         _exchange(scratch, out)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    return Published(out, len(writer.keys), writer.made, writer.bytes, tuple(writer.failures), tuple(damaged))
+    left_out = site_layers(material)[1]
+    return Published(out, len(writer.keys), writer.made, writer.bytes, tuple(writer.failures), left_out, tuple(damaged))
 
 
 def known_files(out: Path) -> tuple[dict[str, _Known], list[str]]:

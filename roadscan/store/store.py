@@ -31,6 +31,7 @@ import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, FullDiskError, RoadscanError, StoreError
 from roadscan.core.extras import need
+from roadscan.store.damage import UNREADABLE
 from roadscan.store.lease import FolderPlace, Lease, ObjectPlace
 from roadscan.store.look import Look, at_once, look_of, looking
 from roadscan.store.process import own_tag, tag_lives
@@ -167,7 +168,7 @@ class Store:
             check_seal(content)
             file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
             return without_seal(file.read(None if columns is None else list(columns), use_threads=False))
-        except (pa.ArrowException, OSError, ValueError) as error:
+        except UNREADABLE as error:
             raise DamagedError(f"the file is damaged: {error}", change=change, file=self.path(relative)) from error
 
     def write_bytes(self, relative: str, content: bytes, *, lasting: bool = True) -> None:

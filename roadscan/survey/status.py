@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import RoadscanError, StoreError
@@ -21,6 +20,7 @@ from roadscan.ingest.sources import damaged_sources
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.session import Session
 from roadscan.run.stage import StageState, findings_of, stages
+from roadscan.store.damage import UNREADABLE
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
 from roadscan.store.repair_records import fault_of
@@ -250,6 +250,6 @@ def _check_output(store: Store, folder: Path, record: OutputRecord) -> str | Non
             products()[record.product].check(local)
         elif record.path.endswith(".parquet"):
             pq.ParquetFile(local).read(use_threads=False)
-    except (RoadscanError, OSError, pa.ArrowInvalid) as error:
+    except (RoadscanError, *UNREADABLE) as error:
         return f"{record.path}: {error}"
     return None

@@ -7,6 +7,7 @@ itself is at fault, since another check reports that. Of a log its header is rea
 
 from __future__ import annotations
 
+import contextlib
 import datetime as dt
 import functools
 import os
@@ -648,9 +649,13 @@ def _room(asked: Asked) -> Iterator[str]:
     root = Path(asked.store.root)
     held = {(record.run, record.path) for record in read_log_records(asked.store, damaged=[])}
     due = [log.path for log in asked.logs if (log.run, str(log.config.path)) not in held]
-    needed = sum(path.stat().st_size for path in due if path.is_file())
-    free = shutil.disk_usage(next(folder for folder in (root, *root.parents) if folder.exists())).free
-    if free < needed:
+    needed = 0
+    for path in due:
+        with contextlib.suppress(OSError):  # a log that cannot be opened is told by itself
+            needed += path.stat().st_size
+    disk = shutil.disk_usage(next(folder for folder in (root, *root.parents) if folder.exists()))
+    free = disk.free
+    if disk.total and free < needed:
         yield (
             f"the logs that are not ingested yet have {size_in_words(needed)}, and {size_in_words(free)} are free on "
             "the store's disk: the run may stop for want of room; what is finished then stays"

@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from roadscan.core.errors import StoreError
-from roadscan.store.look import at_once
-from roadscan.store.process import Process, process_lives
+from roadscan.store.holding.look import at_once
+from roadscan.store.holding.process import Process, process_lives
 
 LEASE_S: Final = 40.0
 """A lease (s) that was not renewed for this long is over: a run on another machine can go on within a minute."""

@@ -20,6 +20,7 @@ from roadscan.georeference.sources import MapSettings, RawSlice, ReadingSource, 
 from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.store.codecs.parquet.page_file import opened_parquet
 from roadscan.store.damage import ROWS_CHANGE, damage_named
+from roadscan.store.readings.packed_returns import box_of, is_packed
 from roadscan.store.readings.profiles import ProfileReader
 from roadscan.store.store import Store
 
@@ -128,15 +129,20 @@ def _read_spans(
 def _of_returns(reach: Reach, one: RawSlice, file: pq.ParquetFile) -> Touched:
     metadata = file.metadata
     index = {metadata.schema.column(i).name: i for i in range(metadata.num_columns)}
+    packed = is_packed(metadata.schema.names)
+    epoch = "epoch_gps_ns" if packed else "pose_epoch_gps_ns"
     boxes = np.empty((len(one.groups), 3, 2))
     spans = np.empty((len(one.groups), 2), np.int64)
     readings = np.empty(len(one.groups), np.int64)
     for number, group in enumerate(one.groups):
         part = metadata.row_group(group)
         readings[number] = part.num_rows
-        for axis, name in enumerate("xyz"):
-            boxes[number, axis] = _limits(part, index[f"{name}_sensor_m"]) or (-np.inf, np.inf)
-        spans[number] = _limits(part, index["pose_epoch_gps_ns"]) or _span(file, group, "pose_epoch_gps_ns")
+        if packed:
+            boxes[number] = box_of(metadata.metadata, group) or (-np.inf, np.inf)
+        else:
+            for axis, name in enumerate("xyz"):
+                boxes[number, axis] = _limits(part, index[f"{name}_sensor_m"]) or (-np.inf, np.inf)
+        spans[number] = _limits(part, index[epoch]) or _span(file, group, epoch)
     boxes[np.isnan(boxes).any(axis=2)] = (-np.inf, np.inf)
     return reach.returns(_on_time(one, spans.ravel()).reshape(-1, 2), boxes, readings)
 

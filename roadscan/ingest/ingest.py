@@ -298,7 +298,7 @@ def _take(writer: LogWriter, item: Item, checks: Sequence[LogCheck]) -> None:
     if isinstance(item, Reject):
         writer.reject(item.file, item.record, item.offset, item.records, item.reason)
         return
-    refused = writer.add(item.table, item.batch, [one for check in checks for one in check.refused(item)])
+    refused = writer.add(*item.stored, [one for check in checks for one in check.refused(item)])
     for check in checks:
         check.take(item, [rows for rows, _ in refused])
     for rows, reason in refused:

@@ -74,12 +74,18 @@ class LogRecord:
 
     def folder(self, table: str) -> str:
         """Return the folder of the log's rows in a table, relative to the survey's root."""
-        return log_folder(table, self.run, self.sensor, self.key)
+        files = self.tables.get(table, ())
+        return log_folder(table_of(files[0].path) if files else table, self.run, self.sensor, self.key)
 
 
 def log_folder(table: str, run: str, sensor: str, key: str) -> str:
     """Return the folder of one log's rows in a table."""
     return f"tables/{table}/run={run}/sensor={sensor}/log={key}"
+
+
+def table_of(path: str) -> str:
+    """Return the table whose form the rows of a log's file have."""
+    return path.split("/")[1]
 
 
 def log_of(path: str) -> str:

@@ -17,7 +17,7 @@ from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.damage import UNREADABLE
 from roadscan.store.logs import DataFile, data_file
-from roadscan.store.schema import table_schema
+from roadscan.store.readings.packed_returns import stored_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import describe, write_parquet
 
@@ -80,8 +80,11 @@ def salvaged(
     sound = [group for group in groups if group is not None]
     if not sound:
         return None, file.rows, file.group_spans
-    rows = pa.concat_tables(sound).replace_schema_metadata(None)  # the footer has a separate checksum
-    write_parquet(to, rows, table_schema(table))
+    rows = pa.concat_tables(sound)
+    schema = stored_schema(table, rows.schema.names)
+    if not schema.holds:
+        rows = rows.replace_schema_metadata(None)  # the footer has a separate checksum
+    write_parquet(to, rows, schema)
     kept = describe(to, file.path)
     spans = tuple(file.group_spans[number] for number in gone) if file.group_spans else ()
     return kept, sum(file.group_rows[number] for number in gone), spans
@@ -106,7 +109,7 @@ def _sound_group(opened: pq.ParquetFile, number: int, table: str, file: DataFile
         rows.validate(full=True)
     except UNREADABLE:
         return None
-    known = {column.name for column in table_schema(table).columns}
+    known = {column.name for column in stored_schema(table, rows.schema.names).columns}
     if not known <= set(rows.schema.names) or rows.num_rows != file.group_rows[number]:
         return None
     if file.group_spans:

@@ -81,6 +81,8 @@ class TableSchema:
     """Length of a partition of GPS time (s); None for tables that are not partitioned."""
     compression: str = "zstd"
     """Parquet codec of all columns."""
+    holds: str = ""
+    """Table whose rows its files hold in another form; empty for its own."""
     location: str | None = None
     """Folder of its Parquet files, relative to the survey's root; None for rows of logs, whose records name them."""
 
@@ -119,6 +121,8 @@ class TableSchema:
                 f"column '{unknown[0]}' does not belong to table '{self.name}'{nearest(unknown[0], target.names)}",
                 expected=", ".join(target.names),
             )
+        if self.holds:  # what turns its rows into those of the other table comes with the batch
+            target = target.with_metadata(batch.schema.metadata)
         arrays: list[pa.Array] = []
         for field in target:
             if field.name not in batch.schema.names:
@@ -229,5 +233,6 @@ def table_schema(name: str) -> TableSchema:
         row_group_rows=raw["row_group_rows"],
         partition_s=raw.get("partition_s"),
         compression=raw.get("compression", "zstd"),
+        holds=raw.get("holds", ""),
         location=raw.get("location"),
     )

@@ -23,6 +23,7 @@ from roadscan.store.derived import with_derived
 from roadscan.store.digest import file_digest
 from roadscan.store.logs import DataFile, log_folder
 from roadscan.store.merge import merged
+from roadscan.store.readings.packed_returns import PACKED, as_returns, stored_columns, write_packed_returns
 from roadscan.store.row_order import sorted_batch, sorted_rows
 from roadscan.store.schema import TableSchema, table_schema
 from roadscan.store.store import Store
@@ -85,7 +86,7 @@ class LogWriter:
             held.bytes += part.nbytes
             held.row_bytes = max(held.row_bytes, part.nbytes / part.num_rows)
             self._held += part.nbytes
-        self.rows[table] += rows.num_rows
+        self.rows[schema.holds or table] += rows.num_rows
         while self._held > BUDGET_BYTES:
             self._flush(max(self._bins, key=lambda k: self._bins[k].bytes))
         return faults
@@ -106,9 +107,14 @@ class LogWriter:
 
     def tables(self, table: str, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
         """Yield the rows of a finished table, file by file, in order of time."""
-        for key in sorted(key for key in self._bins if key[0] == table):
+        for key in self._keys_of(table):
             for path, _, _ in self._bins[key].parts:
-                yield pq.read_table(path, columns=None if columns is None else list(columns), partitioning=None)
+                own = stored_columns(columns, [c.name for c in table_schema(key[0]).columns])
+                yield as_returns(pq.read_table(path, columns=own, partitioning=None), columns)
+
+    def _keys_of(self, table: str) -> list[tuple[str, int]]:
+        """Return the keys of the bins with rows of a table, in any form, in order of time."""
+        return sorted(key for key in self._bins if table in (key[0], table_schema(key[0]).holds))
 
     def leave_out(
         self,
@@ -123,17 +129,17 @@ class LogWriter:
         is_out : returns which rows of a file (n,), in order of time, are taken out.
         may_be_out : returns, by the epochs of a file, whether any of its rows can be.
         """
-        schema, left_out = table_schema(table), 0
-        for key in sorted(key for key in self._bins if key[0] == table):
+        left_out = 0
+        for key in self._keys_of(table):
             parts, self._bins[key].parts = self._bins[key].parts, []
             for path, first, last in parts:
                 epochs = pq.read_table(path, columns=["epoch_gps_ns"], partitioning=None).column(0).to_numpy()
                 rows = pq.read_table(path, partitioning=None) if may_be_out(epochs) else None
-                out = np.zeros(epochs.size, dtype=bool) if rows is None else is_out(rows)
+                out = np.zeros(epochs.size, dtype=bool) if rows is None else is_out(as_returns(rows))
                 if rows is not None and out.any():
                     path.unlink()
                     if not out.all():
-                        write_parquet(path, rows.filter(pa.array(~out)), schema)
+                        write_parquet(path, rows.filter(pa.array(~out)), table_schema(key[0]))
                 if not out.all():
                     self._bins[key].parts.append((path, first, last))
                 left_out += int(out.sum())
@@ -143,7 +149,7 @@ class LogWriter:
     def publish(self, store: Store, run: str, sensor: str, key: str) -> dict[str, tuple[DataFile, ...]]:
         """Move the finished tables into the store, each atomically."""
         out = self.files(run, sensor, key)
-        for table in out:
+        for table in {t for t, _ in self._bins}:
             store.publish_folder(self._folder / table, log_folder(table, run, sensor, key))
         return {table: tuple(files.values()) for table, files in out.items()}
 
@@ -154,7 +160,9 @@ class LogWriter:
             local = self._folder / table
             target = log_folder(table, run, sensor, key)
             found = sorted(local.rglob("*.parquet"))
-            out[table] = {p: describe(p, f"{target}/{p.relative_to(local).as_posix()}") for p in found}
+            out[table_schema(table).holds or table] = {
+                p: describe(p, f"{target}/{p.relative_to(local).as_posix()}") for p in found
+            }
         return out
 
     def _flush(self, key: tuple[str, int]) -> None:
@@ -197,6 +205,9 @@ class LogWriter:
 
 def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
     """Write rows in the encodings that measured best for their kind; equal rows give equal bytes."""
+    if schema.name == PACKED:
+        write_packed_returns(path, rows, schema.row_group_rows)
+        return
     if is_list_table(rows.schema):
         write_list_table(path, rows, schema.row_group_rows)
         return

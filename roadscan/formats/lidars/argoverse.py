@@ -25,11 +25,12 @@ import pyarrow as pa
 
 from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.toml_text import toml
-from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS, returns_batch
+from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.arrow_batches import unlisted_batches, unlisted_reason
 from roadscan.ingest.reading.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve
 from roadscan.store.damage import UNREADABLE
+from roadscan.store.readings.packed_returns import EIGHT_TO_SIXTEEN_BITS
 
 _COLUMNS: Final = ("x", "y", "z", "intensity", "laser_number", "offset_ns")
 _CHUNK_RETURNS: Final = 1 << 18  # returns of a chunk

@@ -20,9 +20,10 @@ from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem
 from roadscan.core.strict import Strict
 from roadscan.core.toml_text import UNKNOWN
-from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS, returns_batch
+from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
+from roadscan.store.readings.packed_returns import EIGHT_TO_SIXTEEN_BITS
 
 _SIGNATURE: Final = b"livox_tech".ljust(16, b"\0")  # first bytes of a file
 _MAGIC: Final = 0xAC0EA767  # behind signature and version

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
 Numbers = npt.NDArray[Any]
-
-EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)
-"""Scales 255 to 65,535: intensities of 8 bits have the range of the table's."""
 
 
 def returns_batch(

@@ -29,22 +29,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import yaml
 
+from roadscan.compute.kernel_options import read_only
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS, returns_batch
+from roadscan.formats.lidars.kernels.velodyne import Firings, Room, returned
 from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, mean_rate, steps, waits_ns
+from roadscan.store.readings.packed_returns import BEAMS, PACKED, Beams
+from roadscan.store.schema import table_schema
 
 Bool = npt.NDArray[np.bool_]
 Float32 = npt.NDArray[np.float32]
 Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
+Numbers = npt.NDArray[Any]
 
 DATA_BYTES: Final = 1206  # bytes of a data packet
 BLOCKS: Final = 12  # blocks of a packet
@@ -129,6 +133,38 @@ class Model:
         firing += 0 if self.banks == 1 else firing // self.rest_after
         sequence = np.arange(SLOTS) // self.lasers
         return self.azimuth_times_ns(dual)[:, None] + sequence * self.cycle_ns + firing * self.firing_ns
+
+    def slots(self, dual: bool) -> npt.NDArray[np.uint8]:
+        """Return (blocks, 32) place of each return in its firing sequence, or sequences where a block holds two."""
+        bank = np.arange(self.blocks(dual))[:, None] // (1 + dual) % self.banks
+        return (bank * SLOTS + np.arange(SLOTS)).astype(np.uint8)
+
+    def beams(self, dual: bool) -> Beams:
+        """Return the beams by slot."""
+        own = slice(0, self.banks * (1 + dual), 1 + dual)  # a block of each bank
+        lasers = self.slot_lasers(dual)[own].reshape(-1)
+        after_ns = (self.slot_times_ns(dual) - self.azimuth_times_ns(dual)[:, None])[own].reshape(-1)
+
+        def of(values: Numbers) -> Float32:
+            return np.broadcast_to(values, self.lasers)[lasers].astype(np.float32)
+
+        elevation, azimuth = np.radians(self.elevations_deg), np.radians(self.azimuths_deg)
+        return Beams(
+            {
+                "slot": np.arange(lasers.size, dtype=np.uint8),
+                "laser": lasers,
+                "after_ns": after_ns,
+                "unit_m": of(np.array(self.distance_mm * 1e-3)),
+                "extra_m": of(np.array(self.extra_mm) * 1e-3),
+                "cos_elevation": of(np.cos(elevation)),
+                "sin_elevation": of(np.sin(elevation)),
+                "cos_azimuth": of(np.cos(azimuth)),
+                "sin_azimuth": of(np.sin(azimuth)),
+                "reach_m": of(np.array(self.reaches_mm) * 1e-3),
+                "side_m": of(np.array(self.sides_mm) * 1e-3),
+                "rise_m": of(np.array(self.rises_mm) * 1e-3),
+            }
+        )
 
     def calibrated(self, file: Path) -> Model:
         """Return the model with the angles and offsets of a calibration file (YAML, as VeloView's are converted).
@@ -291,69 +327,34 @@ def decode(
     epochs : (n,) GPS ns of each packet's stamp.
     sweeps : (n, 12) sweep of each block.
     dual : whether blocks come in pairs of last and strongest return.
-    as_driver : whether azimuths are those of ROS drivers (:func:`_driver_directions`).
+    as_driver : whether azimuths are those of ROS drivers (:func:`_driver_heads`).
 
     Returns
     -------
-    Batch of the table ``returns``, in the order of the packets' slots, without empty slots.
+    Batch of the table ``packed_returns``, in the order of the packets' slots, without empty slots.
     """
     blocks = raw["blocks"][:, : model.blocks(dual)]
-    distance = np.ascontiguousarray(blocks["returns"]["distance"])  # (n, blocks, 32)
-    reflectivity = np.ascontiguousarray(blocks["returns"]["reflectivity"])
-    wanted = distance != 0
-    if dual:
-        last, strongest = slice(0, None, 2), slice(1, None, 2)
-        twice = (distance[:, last] == distance[:, strongest]) & (reflectivity[:, last] == reflectivity[:, strongest])
-        wanted[:, strongest] &= ~twice
-    times_ns, lasers = model.slot_times_ns(dual), model.slot_lasers(dual)
-    rows = np.flatnonzero(wanted)
-    if as_driver and (model.at_once > 1):
-        sines, cosines = _driver_directions(blocks["azimuth"], model, dual)
+    azimuth = np.ascontiguousarray(blocks["azimuth"])
+    if as_driver and model.at_once > 1:
+        rates, head = np.zeros(len(raw)), _driver_heads(azimuth, model, dual)
     else:
-        after_ns = times_ns - model.azimuth_times_ns(dual)[:, None]
-        rates = _rates(blocks["azimuth"], epochs, model.azimuth_times_ns(dual))
-        sines, cosines = _directions(blocks["azimuth"], after_ns, rates)
-    x, y, z = _positions(distance, sines, cosines, model, lasers)
-    shape = distance.shape
-    odd = odd_steps(blocks["azimuth"], model)
-    epoch = np.add(epochs[:, None, None], times_ns)
+        rates, head = _rates(azimuth, epochs, model.azimuth_times_ns(dual)), azimuth[:, :, None]
+    epoch = np.broadcast_to(epochs[:, None], azimuth.shape)
+    odd = odd_steps(azimuth, model)
     if odd.any():
-        rate = mean_rate(blocks["azimuth"], epochs)
-        epoch += waits_ns(blocks["azimuth"], odd, rate, max(1, SLOTS // model.lasers) * model.cycle_ns)[:, :, None]
-    epoch = epoch.reshape(-1)[rows]
-    return returns_batch(
-        epoch,
-        [one.reshape(-1)[rows] for one in (x, y, z)],
-        reflectivity.reshape(-1)[rows] * EIGHT_TO_SIXTEEN_BITS,
-        np.broadcast_to(lasers, shape).reshape(-1)[rows],
-        np.broadcast_to(sweeps[:, : shape[1], None], shape).reshape(-1)[rows],
-    )
-
-
-def _positions(
-    distance: npt.NDArray[np.uint16], sines: Float32, cosines: Float32, model: Model, lasers: npt.NDArray[np.uint8]
-) -> tuple[Float32, Float32, Float32]:
-    """Return x, y, z (n, blocks, 32) in m, from distances and the head's azimuth."""
-
-    def table(values: tuple[float, ...], scale: float = 1.0) -> Float32:
-        return (np.broadcast_to(np.array(values) * scale, model.lasers)[lasers]).astype(np.float32)
-
-    elevation = np.radians(np.array(model.elevations_deg))[lasers]
-    if any(model.azimuths_deg):
-        own = np.radians(np.array(model.azimuths_deg))[lasers]
-        sine, cosine = np.sin(own).astype(np.float32), np.cos(own).astype(np.float32)
-        sines, cosines = sines * cosine + cosines * sine, cosines * cosine - sines * sine
-    range_m = distance.astype(np.float32) * np.float32(model.distance_mm * 1e-3)
-    if any(model.extra_mm):
-        range_m += table(model.extra_mm, 1e-3)
-    level_m = range_m * np.cos(elevation).astype(np.float32)
-    if any(model.reaches_mm):
-        level_m += table(model.reaches_mm, 1e-3)
-    x, y = level_m * cosines, level_m * -sines
-    if any(model.sides_mm):
-        side_m = table(model.sides_mm, 1e-3)
-        x, y = x + side_m * sines, y + side_m * cosines
-    return x, y, range_m * np.sin(elevation).astype(np.float32) + table(model.rises_mm, 1e-3)
+        rate = mean_rate(azimuth, epochs)
+        epoch = epoch + waits_ns(azimuth, odd, rate, max(1, SLOTS // model.lasers) * model.cycle_ns)
+    firings = Firings(
+        np.ascontiguousarray(epoch), head, rates, np.ascontiguousarray(sweeps),
+        model.slot_times_ns(dual), model.slots(dual),
+    )  # fmt: skip
+    schema = table_schema(PACKED).arrow()
+    size = np.count_nonzero(blocks["returns"]["distance"])
+    room = Room(*(np.empty(size, field.type.to_pandas_dtype()) for field in schema))
+    packets = np.ascontiguousarray(raw).view(np.uint8).reshape(len(raw), DATA_BYTES)
+    count = returned(read_only(packets), firings, dual, room)
+    metadata = {BEAMS: model.beams(dual).encoded()}
+    return pa.RecordBatch.from_arrays([pa.array(v[:count]) for v in room], schema=schema.with_metadata(metadata))
 
 
 def _rates(azimuth: npt.NDArray[np.uint16], epochs: Int64, times_ns: Int64) -> npt.NDArray[np.float64]:
@@ -380,34 +381,8 @@ def _rates(azimuth: npt.NDArray[np.uint16], epochs: Int64, times_ns: Int64) -> n
     return np.append(rates, rates[-1])
 
 
-def _directions(
-    azimuth: npt.NDArray[np.uint16], after_ns: Int64, rates: npt.NDArray[np.float64]
-) -> tuple[Float32, Float32]:
-    """Return sine and cosine (n, blocks, 32) of the head's azimuth at each slot's firing.
-
-    Parameters
-    ----------
-    azimuth : (n, blocks), 0.01°.
-    after_ns : (blocks, 32) time of each slot after its block's azimuth.
-    rates : (n,) of the head (rad/ns).
-
-    Notes
-    -----
-    Within a block the head turns by less than 0.02 rad; the series of sine and cosine to the third
-    order are exact there to 1e-8.
-    """
-    start = np.radians(azimuth * 0.01)[:, :, None]
-    same = (after_ns == after_ns[0]).all()
-    turned = rates[:, None, None] * (after_ns[:1] if same else after_ns)
-    square = turned * turned
-    small_sine = (turned * (1.0 - square / 6.0)).astype(np.float32)
-    small_cosine = (1.0 - square / 2.0).astype(np.float32)
-    sine, cosine = np.sin(start).astype(np.float32), np.cos(start).astype(np.float32)
-    return sine * small_cosine + cosine * small_sine, cosine * small_cosine - sine * small_sine
-
-
-def _driver_directions(azimuth: npt.NDArray[np.uint16], model: Model, dual: bool) -> tuple[Float32, Float32]:
-    """Return sine and cosine (n, blocks, 32) of the head's azimuth as ROS drivers have it, to 0.01°.
+def _driver_heads(azimuth: npt.NDArray[np.uint16], model: Model, dual: bool) -> npt.NDArray[np.uint16]:
+    """Return the head's azimuth (n, blocks, 32) at each firing as ROS drivers have it (0.01°).
 
     Each laser gets its share of the turn to the next block, none in the last. A VLP-32C's lasers count as fired one
     after another, which takes 71 µs of a cycle of 55; of a VLS-128, only the last of a sequence's blocks turns, as all
@@ -425,5 +400,5 @@ def _driver_directions(azimuth: npt.NDArray[np.uint16], model: Model, dual: bool
     else:
         step = np.pad(turn, ((0, 0), (0, 1)))
         share = np.arange(SLOTS) * model.firing_ns / model.cycle_ns
-    angle = np.radians(np.rint(azimuth[:, :, None] + step[:, :, None] * share) * 0.01)
-    return np.sin(angle).astype(np.float32), np.cos(angle).astype(np.float32)
+    head = np.rint(azimuth[:, :, None] + step[:, :, None] * share).astype(np.int64)
+    return np.where(head < 0, head + TURN, head).astype(np.uint16)

@@ -12,13 +12,13 @@ import numpy as np
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
-from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS
 from roadscan.formats.ros.bag import Bag, Topic
 from roadscan.formats.ros.definitions import Decode
 from roadscan.formats.ros.return_rows import ReturnRows
 from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource
 from roadscan.ingest.reading.records import options_of
+from roadscan.store.readings.packed_returns import EIGHT_TO_SIXTEEN_BITS
 
 _POINT: Final = (
     ("offset_ns", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"),

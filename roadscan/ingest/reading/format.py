@@ -27,6 +27,7 @@ from roadscan.core.rig import Sensor, SensorKind
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.reading.columns import Quantity
+from roadscan.store.readings.packed_returns import PACKED
 
 if TYPE_CHECKING:
     from roadscan.core.survey import Survey
@@ -230,6 +231,14 @@ class Rows:
     """(n,) record number of each row, where they do not follow one another."""
     velocity_level_m_per_s: npt.NDArray[np.float32] | None = None
     """(n, 3) stated velocity of each row, north, east, down: evidence about its position, which no table stores."""
+
+    packed: pa.RecordBatch | None = None
+    """The same rows as packed returns, which are stored in place of `batch`."""
+
+    @property
+    def stored(self) -> tuple[str, pa.RecordBatch]:
+        """Return the table and the batch that are stored."""
+        return (self.table, self.batch) if self.packed is None else (PACKED, self.packed)
 
     @property
     def numbers(self) -> npt.NDArray[np.int64]:

@@ -32,7 +32,7 @@ class GroupReader(ABC, Generic[Rows, Pages]):
 
     what: ClassVar[str]
     """Name of its readings in errors."""
-    columns: ClassVar[Sequence[str]]
+    columns: Sequence[str]
     """Columns that are read."""
 
     def __init__(self, store: Store, file: str) -> None:

@@ -1,11 +1,11 @@
-"""Reads returns of a lidar from the store into reused arrays.
+"""Reads returns of a lidar from the store into reused arrays, from files of ``returns`` and of ``packed_returns``.
 
 Files with roadscan's pages are decoded by `codecs/parquet`; those of other writers, and of older stores, by Arrow.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -16,6 +16,8 @@ import pyarrow as pa
 from roadscan.store.codecs.parquet.number_file import NumberFile
 from roadscan.store.codecs.parquet.page_file import DamageError
 from roadscan.store.readings.group_reader import GroupReader
+from roadscan.store.readings.kernels.firings import Packed
+from roadscan.store.readings.packed_returns import EIGHT_TO_SIXTEEN_BITS, Beams, as_returns, is_packed
 from roadscan.store.store import Store
 
 _EPOCH, _POSE_EPOCH = "epoch_gps_ns", "pose_epoch_gps_ns"
@@ -25,6 +27,10 @@ _KINDS: Final[dict[str, np.dtype[Any]]] = {
     "intensity": np.dtype(np.uint16),
 }  # fmt: skip
 _COLUMNS: Final = list(_KINDS)
+_PACKED_KINDS: Final[dict[str, np.dtype[Any]]] = {
+    _EPOCH: np.dtype(np.int64), "intensity": np.dtype(np.uint8), "head": np.dtype(np.uint16),
+    "rate_rad_per_ns": np.dtype(np.float64), "distance": np.dtype(np.uint16), "slot": np.dtype(np.uint8),
+}  # fmt: skip
 
 Array = npt.NDArray[Any]
 Int64 = npt.NDArray[np.int64]
@@ -54,13 +60,18 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
 
     def __init__(self, store: Store, file: str) -> None:
         self._arrays = {name: np.empty(0, kind) for name, kind in _KINDS.items()}
+        self._packed_arrays = {name: np.empty(0, kind) for name, kind in _PACKED_KINDS.items()}
+        self._beams: Beams | None = None
+        """Beams of the sensor; None in a file of ``returns``."""
         super().__init__(store, file)
 
     def _suits(self, schema: pa.Schema) -> bool:
-        missing = set(_COLUMNS).difference(schema.names)
+        if is_packed(schema.names):
+            self._beams, self.columns = Beams.of(self._metadata.metadata), list(_PACKED_KINDS)
+        missing = set(self.columns).difference(schema.names)
         if missing:
             raise DamageError(f"it has no column '{min(missing)}'")
-        return _as_stored(schema)
+        return _as_stored(schema, _KINDS if self._beams is None else _PACKED_KINDS)
 
     def _pages(self) -> NumberFile:
         return NumberFile(self._source, self._metadata)
@@ -68,6 +79,8 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
     def _decoded(self, packed: NumberFile, groups: Sequence[int]) -> Returns:
         rows = [self._metadata.row_group(k).num_rows for k in groups]
         total = sum(rows)
+        if self._beams is not None:
+            return self._unpacked(packed, groups, rows, self._beams)
         if self._arrays[_EPOCH].size < total:
             self._arrays = {name: np.empty(total, kind) for name, kind in _KINDS.items()}
         columns = {name: values[:total] for name, values in self._arrays.items()}
@@ -89,7 +102,25 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
             columns[_POSE_EPOCH] = columns[_EPOCH]
         return Returns(*(columns[name] for name in _COLUMNS))
 
+    def _unpacked(self, packed: NumberFile, groups: Sequence[int], rows: Sequence[int], beams: Beams) -> Returns:
+        total, first = sum(rows), 0
+        if self._arrays[_EPOCH].size < total:
+            self._arrays = {name: np.empty(total, kind) for name, kind in _KINDS.items()}
+            self._packed_arrays = {name: np.empty(total, kind) for name, kind in _PACKED_KINDS.items()}
+        columns = {name: values[:total] for name, values in self._packed_arrays.items()}
+        for group, n in zip(groups, rows, strict=True):
+            packed.load(group, list(_PACKED_KINDS))
+            for name, values in columns.items():
+                packed.numbers(name, values[first : first + n])
+            first += n
+        epoch, intensity, *polar = columns.values()
+        xyz = [self._arrays[f"{axis}_sensor_m"][:total] for axis in "xyz"]
+        beams.places(Packed(*polar), xyz)
+        scaled = np.multiply(intensity, EIGHT_TO_SIXTEEN_BITS, out=self._arrays["intensity"][:total])
+        return Returns(epoch, epoch, *xyz, scaled)
+
     def _from_table(self, rows: pa.Table) -> Returns:
+        rows = as_returns(rows, _COLUMNS)
         if any(rows.column(name).null_count for name in _COLUMNS):
             raise DamageError("a return is not whole")
         return Returns(*(np.array(rows.column(name).to_numpy(), kind) for name, kind in _KINDS.items()))
@@ -106,7 +137,7 @@ def distances_m(batch: pa.RecordBatch) -> Float64:
     return np.sqrt(x * x + y * y + z * z)
 
 
-def _as_stored(schema: pa.Schema) -> bool:
+def _as_stored(schema: pa.Schema, kinds: Mapping[str, np.dtype[Any]]) -> bool:
     """Return True if the columns have the current storage types."""
-    kinds = (schema.field(name) for name in _COLUMNS)
-    return all(f.type == pa.from_numpy_dtype(_KINDS[f.name]) and not f.nullable for f in kinds)
+    fields = (schema.field(name) for name in kinds)
+    return all(f.type == pa.from_numpy_dtype(kinds[f.name]) and not f.nullable for f in fields)

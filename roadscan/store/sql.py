@@ -16,8 +16,10 @@ import pyarrow as pa
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, leap_second_steps
 from roadscan.store.asset_schema import ASSET_FOLDER, asset_tables
-from roadscan.store.logs import DataFile, read_log_records
+from roadscan.store.logs import DataFile, log_of, read_log_records, table_of
 from roadscan.store.manifest import Manifest
+from roadscan.store.readings.packed_returns import PACKED
+from roadscan.store.readings.packed_view import beams_query, returns_query
 from roadscan.store.schema import schema_names, table_schema
 from roadscan.store.sql_files import PROTOCOL, StoreFiles, url
 from roadscan.store.store import Store
@@ -26,6 +28,8 @@ from roadscan.store.verified import faults_of_opened, recorded_files
 _PER_TILE = ("cells", "overviews")
 _MISTAKES = (duckdb.CatalogException, duckdb.BinderException, duckdb.ParserException)
 """Errors of the statement."""
+_ROWS: Final = "unpacked_returns"
+"""View of the files of `returns` beside packed ones."""
 _ALWAYS = ("rejects",)
 """Tables that exist before they have a row: an empty table of rejects is an answer, too."""
 _MISSING = re.compile(r"Table (?:Function )?with name \"?(?P<name>\w+)\"? does not exist")
@@ -143,7 +147,7 @@ def _with_views(
             files.setdefault(table, []).extend(own)
     for table, held in files.items():
         partition_s = table_schema(table).partition_s
-        fault = _view(connection, own_files, table, [url(store, f.path) for f in held], damaged, hive=True)
+        fault = _log_view(connection, own_files, table, held, damaged)
         if fault is not None:
             shut[table] = fault
         elif partition_s is not None:
@@ -332,12 +336,11 @@ def _view(
 ) -> StoreError | None:
     """Create a view of some files; where that fails, add the error to `damaged` and return it."""
     files.opened.clear()
-    listed = ", ".join("'" + u.replace("'", "''") + "'" for u in sorted(urls))
     options = "hive_partitioning = true, hive_types_autocast = true" if hive else "hive_partitioning = false"
     if filename:
         options += ", filename = true"
     try:
-        connection.execute(f"CREATE VIEW {name} AS SELECT * FROM read_parquet([{listed}], {options})")
+        connection.execute(f"CREATE VIEW {name} AS SELECT * FROM read_parquet({_listed(urls)}, {options})")
     except duckdb.Error as error:
         fault = StoreError(
             f"table '{name}' cannot be opened: {_reason(error)}",
@@ -349,6 +352,36 @@ def _view(
         damaged.append(fault)
         return fault
     return None
+
+
+def _log_view(
+    connection: duckdb.DuckDBPyConnection,
+    files: StoreFiles,
+    table: str,
+    held: list[DataFile],
+    damaged: list[StoreError] | None,
+) -> StoreError | None:
+    """Create the view of a table's rows of logs, in each form in which its files hold them; faults as of `_view`."""
+    paths: dict[str, list[str]] = {}
+    for file in held:
+        paths.setdefault(table_of(file.path), []).append(file.path)
+    urls = {form: [url(files.store, path) for path in found] for form, found in paths.items()}
+    if PACKED not in urls:
+        return _view(connection, files, table, urls[table], damaged, hive=True)
+    for form, name in ((PACKED, PACKED), (table, _ROWS)):
+        fault = _view(connection, files, name, urls[form], damaged, hive=True) if form in urls else None
+        if fault is not None:
+            return fault
+    one_a_log = {log_of(path): one for path, one in zip(paths[PACKED], urls[PACKED], strict=True)}
+    connection.execute(f"CREATE VIEW beams AS {beams_query(_listed(one_a_log.values()))}")
+    rows = f"SELECT * FROM {_ROWS} UNION ALL BY NAME " if table in urls else ""
+    connection.execute(f"CREATE VIEW {table} AS {rows}({returns_query()})")
+    return None
+
+
+def _listed(urls: Iterable[str]) -> str:
+    """Return a list of files as SQL."""
+    return "[" + ", ".join("'" + u.replace("'", "''") + "'" for u in sorted(urls)) + "]"
 
 
 def _reason(error: duckdb.Error) -> str:

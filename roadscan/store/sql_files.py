@@ -56,7 +56,7 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
 
     def __init__(self, store: Store) -> None:
         super().__init__()
-        self._store = store
+        self.store = store
         self._top = f"survey={store.survey_id}"
         self._root = os.path.realpath(store.root) if store.is_folder else None
         self._inside: set[str] = set()
@@ -77,8 +77,8 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
             stream = _LocalFile(place)
             stamp = stream.stamp()
         else:
-            stamp = _remote_stamp(self._store.fs.info(place))
-            stream = _RemoteFile(self._store.fs.open(place, "rb"), stamp.bytes)
+            stamp = _remote_stamp(self.store.fs.info(place))
+            stream = _RemoteFile(self.store.fs.open(place, "rb"), stamp.bytes)
         with self._alone:
             self.opened.setdefault(self._relative(path), stamp)
         return stream
@@ -90,7 +90,7 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
             local = os.stat(place)  # noqa: PTH116 — thousands of them
             kind = "directory" if stat.S_ISDIR(local.st_mode) else "file"
             return {"name": self._strip_protocol(path), "size": local.st_size, "type": kind}
-        found = self._store.fs.info(place)
+        found = self.store.fs.info(place)
         return {"name": self._strip_protocol(path), "size": found["size"], "type": found["type"]}
 
     def modified(self, path: str) -> Any:
@@ -98,12 +98,12 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         place = self._place(path)
         if self._root is not None:
             return dt.datetime.fromtimestamp(os.stat(place).st_mtime, dt.UTC)  # noqa: PTH116 — thousands of them
-        return self._store.fs.modified(place)
+        return self.store.fs.modified(place)
 
     def ls(self, path: str, detail: bool = True, **_: Any) -> list[Any]:
         """Return the entries of a folder, without links that lead outside."""
         found = []
-        for entry in self._store.fs.ls(self._place(path), detail=True):
+        for entry in self.store.fs.ls(self._place(path), detail=True):
             name = f"{self._strip_protocol(path).rstrip('/')}/{str(entry['name']).rstrip('/').rsplit('/', 1)[1]}"
             found.append({"name": name, "size": entry["size"], "type": entry["type"]})
         return found if detail else [one["name"] for one in found]
@@ -124,10 +124,10 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
 
     def _place(self, path: str) -> str:
         """Return the path in the store's file system; PermissionError outside of the survey's folder."""
-        place = self._store.path(self._relative(path))
+        place = self.store.path(self._relative(path))
         if self._root is not None:
             folder = place.rsplit("/", 1)[0]
-            known = folder in self._inside or place == self._store.root or self._leads_inside(folder)
+            known = folder in self._inside or place == self.store.root or self._leads_inside(folder)
             if not known or (os.path.islink(place) and not self._leads_inside(place)):  # noqa: PTH114 — thousands
                 self._refuse(f"{path} is a link that leads out of the store")
             self._inside.add(folder)

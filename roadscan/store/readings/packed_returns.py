@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from roadscan.compute.kernel_options import read_only
 from roadscan.store.codecs.parquet.number_table import write_number_table
-from roadscan.store.readings.kernels.firings import SLOTS, BeamTable, Packed, positions
+from roadscan.store.readings.kernels.firings import SLOTS, BeamTable, Packed, Turned, positions
 from roadscan.store.schema import TableSchema, table_schema
 
 PACKED: Final = "packed_returns"
@@ -32,7 +32,7 @@ EIGHT_TO_SIXTEEN_BITS: Final = np.uint16(257)
 _AXES: Final = ("x_sensor_m", "y_sensor_m", "z_sensor_m")
 _EPOCHS: Final = ("epoch_gps_ns", "pose_epoch_gps_ns")
 _POLAR: Final = ("head", "rate_rad_per_ns", "distance", "slot")
-"""Columns of :class:`Packed`, in its order."""
+"""Columns that state the place of a return."""
 _STORED: Final = dict.fromkeys(_AXES, _POLAR) | dict.fromkeys(_EPOCHS, ("epoch_gps_ns",)) | {"laser": ("slot",)}
 """Stored columns of which a column of ``returns`` is made, where it is not stored itself."""
 _CENTIDEG: Final = 0.01
@@ -67,20 +67,29 @@ class Beams:
     def table(self) -> BeamTable:
         """Return the tables of the kernel."""
         c = {name: _padded(values) for name, values in self.columns.items()}
-        turn = np.stack([c["cos_azimuth"], c["sin_azimuth"]])
-        return BeamTable(
-            after_ns=c["after_ns"].astype(np.float64),
-            unit_m=c["unit_m"],
-            level=np.stack([c["cos_elevation"], c["sin_elevation"]]),
-            rise_m=c["rise_m"],
-            turn=turn if turn[1].any() else turn[:, :0].copy(),
-            **{name: c[name] if c[name].any() else c[name][:0] for name in ("extra_m", "reach_m", "side_m")},
-        )
+        offsets, azimuths = ("extra_m", "reach_m", "side_m"), ("cos_azimuth", "sin_azimuth")
+        none = offsets if not any(c[name].any() for name in offsets) else ()
+        none += () if c["sin_azimuth"].any() else azimuths
+        c |= {name: c[name][:0] for name in none}
+        c |= {"after_ns": self.columns["after_ns"].astype(np.float64), "unit_m": self.columns["unit_m"][:1]}
+        return BeamTable(*(c[name] for name in BeamTable._fields))
 
     def places(self, packed: Packed, xyz_m: Sequence[Float32]) -> None:
         """Write the positions (n,) of returns in the sensor's axes."""
-        scratch = np.empty((2, SLOTS), np.float32)
-        positions(Packed._make(map(read_only, packed)), self.table, _heads(), scratch, *xyz_m)
+        turned = Turned(*np.zeros((len(Turned._fields), SLOTS), np.float32))
+        positions(Packed._make(map(read_only, packed)), self.table, _heads(), turned, *xyz_m)
+
+
+def packed_of(rows: pa.Table | pa.RecordBatch) -> Packed:
+    """Return what the kernel takes of packed rows."""
+    head, rate, distance, slot = (rows.column(name).to_numpy() for name in _POLAR)
+    return Packed(*_runs(head), *_runs(rate), distance, slot)
+
+
+def _runs(values: Numbers) -> tuple[Numbers, Numbers]:
+    """Return the value of each run of equal values (n,), and the row after it."""
+    ends = np.append(np.flatnonzero(values[1:] != values[:-1]) + 1, values.size)[: values.size]
+    return values[ends - 1], ends
 
 
 def is_packed(names: Sequence[str]) -> bool:
@@ -116,7 +125,7 @@ def returns_of(batch: pa.RecordBatch, names: Sequence[str] | None = None) -> pa.
     columns: dict[str, pa.Array] = {}
     if set(_AXES) & set(schema.names):
         xyz = [np.empty(batch.num_rows, np.float32) for _ in _AXES]
-        beams.places(Packed(*(batch.column(name).to_numpy() for name in _POLAR)), xyz)
+        beams.places(packed_of(batch), xyz)
         columns |= {name: pa.array(values) for name, values in zip(_AXES, xyz, strict=True)}
     for name in schema.names:
         if name in _EPOCHS:
@@ -138,10 +147,11 @@ def write_packed_returns(path: Path, rows: pa.Table, group_rows: int) -> None:
     for first in range(0, rows.num_rows, group_rows):
         part = rows.slice(first, group_rows)
         own = [values[: part.num_rows] for values in xyz]
-        beams.places(Packed(*(part.column(name).to_numpy() for name in _POLAR)), own)
+        beams.places(packed_of(part), own)
         boxes.append([[float(values.min()), float(values.max())] for values in own])
     about = {BEAMS: beams.encoded(), _BOXES: json.dumps(boxes, separators=(",", ":")).encode()}
-    write_number_table(path, rows.replace_schema_metadata(about), group_rows)
+    runs = [c.name for c in table_schema(PACKED).columns if c.encoding == "RLE_DICTIONARY"]
+    write_number_table(path, rows.replace_schema_metadata(about), group_rows, runs)
 
 
 def box_of(metadata: Mapping[bytes, bytes] | None, group: int) -> list[list[float]] | None:

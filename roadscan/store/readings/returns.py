@@ -28,8 +28,8 @@ _KINDS: Final[dict[str, np.dtype[Any]]] = {
 }  # fmt: skip
 _COLUMNS: Final = list(_KINDS)
 _PACKED_KINDS: Final[dict[str, np.dtype[Any]]] = {
-    _EPOCH: np.dtype(np.int64), "intensity": np.dtype(np.uint8), "head": np.dtype(np.uint16),
-    "rate_rad_per_ns": np.dtype(np.float64), "distance": np.dtype(np.uint16), "slot": np.dtype(np.uint8),
+    _EPOCH: np.dtype(np.int64), "distance": np.dtype(np.uint16), "slot": np.dtype(np.uint8),
+    "intensity": np.dtype(np.uint8), "head": np.dtype(np.uint16), "rate_rad_per_ns": np.dtype(np.float64),
 }  # fmt: skip
 
 Array = npt.NDArray[Any]
@@ -60,7 +60,7 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
 
     def __init__(self, store: Store, file: str) -> None:
         self._arrays = {name: np.empty(0, kind) for name, kind in _KINDS.items()}
-        self._packed_arrays = {name: np.empty(0, kind) for name, kind in _PACKED_KINDS.items()}
+        self._distance = np.empty(0, np.uint16)
         self._beams: Beams | None = None
         """Beams of the sensor; None in a file of ``returns``."""
         super().__init__(store, file)
@@ -106,18 +106,21 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
         total, first = sum(rows), 0
         if self._arrays[_EPOCH].size < total:
             self._arrays = {name: np.empty(total, kind) for name, kind in _KINDS.items()}
-            self._packed_arrays = {name: np.empty(total, kind) for name, kind in _PACKED_KINDS.items()}
-        columns = {name: values[:total] for name, values in self._packed_arrays.items()}
+            self._distance = np.empty(total, np.uint16)
+        columns = {name: values[:total] for name, values in self._arrays.items()}
+        columns[_POSE_EPOCH] = columns[_EPOCH]
         for group, n in zip(groups, rows, strict=True):
-            packed.load(group, list(_PACKED_KINDS))
-            for name, values in columns.items():
-                packed.numbers(name, values[first : first + n])
+            packed.load(group, self.columns)
+            own = slice(first, first + n)
+            packed.numbers(_EPOCH, columns[_EPOCH][own])
+            np.multiply(packed.bytes("intensity", n), EIGHT_TO_SIXTEEN_BITS, out=columns["intensity"][own])
+            packed.numbers("distance", self._distance[:n])
+            head_end, head = packed.runs("head", n, _PACKED_KINDS["head"])
+            rate_end, rate = packed.runs("rate_rad_per_ns", n, _PACKED_KINDS["rate_rad_per_ns"])
+            polar = Packed(head, head_end, rate, rate_end, self._distance[:n], packed.bytes("slot", n))
+            beams.places(polar, [columns[f"{axis}_sensor_m"][own] for axis in "xyz"])
             first += n
-        epoch, intensity, *polar = columns.values()
-        xyz = [self._arrays[f"{axis}_sensor_m"][:total] for axis in "xyz"]
-        beams.places(Packed(*polar), xyz)
-        scaled = np.multiply(intensity, EIGHT_TO_SIXTEEN_BITS, out=self._arrays["intensity"][:total])
-        return Returns(epoch, epoch, *xyz, scaled)
+        return Returns(*(columns[name] for name in _COLUMNS))
 
     def _from_table(self, rows: pa.Table) -> Returns:
         rows = as_returns(rows, _COLUMNS)

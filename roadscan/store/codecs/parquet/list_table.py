@@ -192,6 +192,19 @@ class Writer:
         raw = size - packed.content.size + packed.raw
         return chunk(KINDS[field.type], (field.name,), encoding, count, Page(at, size, raw), more)
 
+    def with_dictionary(
+        self, field: pa.Field, dictionary: Packed, known: int, packed: Packed, count: int, more: dict[int, Value]
+    ) -> Value:
+        """Write a column of non-null numbers as a page of a dictionary of `known` values and a page of indices."""
+        start = self._at
+        head = pages.dictionary_header(dictionary.content.size, crc32(dictionary.content), known, dictionary.raw)
+        self._at += self._stream.write(head) + self._stream.write(dictionary.content)
+        first = self._at - start
+        at, size = self.page(b"", packed.content, count, pages.RLE_DICTIONARY, packed.raw)
+        raw = first - dictionary.content.size + dictionary.raw + size - packed.content.size + packed.raw
+        kind, whole = KINDS[field.type], Page(at, first + size, raw, start)
+        return chunk(kind, (field.name,), pages.RLE_DICTIONARY, count, whole, more)
+
     def page(self, levels: bytes, values: Any, count: int, encoding: int, raw: int | None = None) -> tuple[int, int]:
         """Write a page, of `raw` bytes before compression; return where it starts, and its whole size."""
         start = self._at
@@ -230,6 +243,8 @@ class Page(NamedTuple):
     """Its bytes in the file."""
     raw: int | None = None
     """Its bytes before compression; None where it is not compressed."""
+    dictionary_at: int | None = None
+    """First byte of the page of its dictionary, which `size` and `raw` contain."""
 
 
 def chunk(kind: Kind, path: tuple[str, ...], encoding: int, count: int, page: Page, more: dict[int, Value]) -> Value:
@@ -237,6 +252,8 @@ def chunk(kind: Kind, path: tuple[str, ...], encoding: int, count: int, page: Pa
     start, length = i64(page.at), i64(page.size)
     before, codec = (length, _UNCOMPRESSED) if page.raw is None else (i64(page.raw), _LZ4_RAW)
     metadata = _about(kind, path, encoding, codec) | {5: i64(count), 6: before, 7: length, 9: start}
+    if page.dictionary_at is not None:
+        metadata |= {11: i64(page.dictionary_at)}
     return struct({2: start, 3: struct(metadata | more)})
 
 
@@ -245,7 +262,7 @@ def _about(kind: Kind, path: tuple[str, ...], encoding: int, codec: int) -> dict
     """Return the common metadata of all chunks of a column."""
     return {
         1: i32(kind.physical),
-        2: listed([i32(pages.RLE), i32(encoding)]),
+        2: listed([*([i32(pages.PLAIN)] * (encoding == pages.RLE_DICTIONARY)), i32(pages.RLE), i32(encoding)]),
         3: listed([binary(name) for name in path]),
         4: i32(codec),
     }

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 
 from roadscan.store.codecs.kernels.byte_planes import join, join_long, join_low
 from roadscan.store.codecs.kernels.delta_packing import FAULTS, SLACK_BYTES, WHOLE, decode
+from roadscan.store.codecs.kernels.run_lengths import LONGEST_RUN_BYTES, decode_runs
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile
 
@@ -19,6 +20,7 @@ _WORD: Final = 8  # bytes of a 64-bit word
 _ENCODINGS: Final = {
     "PLAIN": pages.PLAIN,
     "DELTA_BINARY_PACKED": pages.DELTA_BINARY_PACKED,
+    "RLE_DICTIONARY": pages.RLE_DICTIONARY,
     "BYTE_STREAM_SPLIT": pages.BYTE_STREAM_SPLIT,
 }
 
@@ -41,6 +43,13 @@ class NumberFile(PageFile):
     def numbers(self, name: str, values: Array) -> None:
         """Write a loaded column to (n,) `values` of the column's type."""
         encoding = _ENCODINGS.get(self.encoding(name), -1)
+        if encoding == pages.RLE_DICTIONARY:
+            if values.dtype == np.uint8:
+                values[:] = self.bytes(name, values.size)
+                return
+            ends, own = self.runs(name, values.size, values.dtype)
+            values[:] = np.repeat(own, np.diff(ends, prepend=0))
+            return
         data, at, end, size = self.page(name, encoding)
         if not 0 <= size <= _most_bytes(values.size):
             raise DamageError(f"column '{name}' does not hold {values.size} values")
@@ -53,6 +62,35 @@ class NumberFile(PageFile):
             _join(page.reshape(max(_PLANES, values.itemsize), values.size), values)
         else:
             raise DamageError(f"column '{name}' does not hold {values.size} values")
+
+    def bytes(self, name: str, rows: int) -> Bytes:
+        """Return the values (rows,) of a loaded column of bytes that has a dictionary."""
+        known, page = self._indexed(name, rows, np.dtype("<i4"), 2 * _WORD + rows)
+        head = b"\x08" + pages.bit_packed(rows)
+        values = page[len(head) : len(head) + rows]
+        whole = page.size == len(head) + -(-rows // 8) * 8 and page[: len(head)].tobytes() == head
+        if not whole or not np.array_equal(known, np.arange(int(values.max(initial=0)) + 1)):
+            raise DamageError(f"column '{name}' does not hold {rows} values")
+        return values
+
+    def runs(self, name: str, rows: int, kind: np.dtype[Any]) -> tuple[npt.NDArray[np.int64], Array]:
+        """Return the runs of a loaded column of `rows` numbers that has a dictionary: the row after each, its value."""
+        stored = kind if kind.itemsize >= _PLANES else np.dtype("<i4")
+        known, page = self._indexed(name, rows, stored, 1 + LONGEST_RUN_BYTES * rows)
+        ends, indices = np.empty((2, max(page.size, 1)), np.int64)
+        count = decode_runs(page, rows, known.size, ends, indices)
+        if count < 0:
+            raise DamageError(f"column '{name}' does not hold {rows} values")
+        return ends[:count], known[indices[:count]].astype(kind)
+
+    def _indexed(self, name: str, rows: int, kind: np.dtype[Any], most: int) -> tuple[Array, Bytes]:
+        """Return the dictionary of a loaded column of `rows` numbers, and its page of indices of `most` bytes."""
+        data, at, end, size = self.dictionary(name, kind.itemsize)
+        _, page_at, page_end, page_size = self.page(name, pages.RLE_DICTIONARY, end)
+        if size % kind.itemsize or size > _most_bytes(max(rows, 256)) or page_size > most:
+            raise DamageError(f"column '{name}' does not hold {rows} values")
+        known = np.frombuffer(self._codec.decompress(data[at:end], size), kind)
+        return known, np.frombuffer(self._codec.decompress(data[page_at:page_end], page_size), np.uint8)
 
     def _differences(self, name: str, page: Bytes, values: Array) -> None:
         words = -(-(page.size + SLACK_BYTES) // _WORD)

@@ -20,8 +20,10 @@ from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.kernels.byte_planes import split, split_rounded
 from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCKS
 from roadscan.store.codecs.kernels.delta_packing_int64 import TOO_FAR, encode_long, room_words
+from roadscan.store.codecs.kernels.run_lengths import LONGEST_RUN_BYTES, encode_runs
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Writer
+from roadscan.store.codecs.parquet.pages import bit_packed
 from roadscan.store.codecs.parquet.thrift import Value, binary, i64, struct, varint, zigzag
 
 _SCRATCH: Final = 2048  # values of the scratch line that the kernels need
@@ -36,11 +38,11 @@ def is_number_table(schema: pa.Schema) -> bool:
     return all(field.type in KINDS and not field.nullable for field in schema)
 
 
-def write_number_table(path: Path, rows: pa.Table, group_rows: int) -> None:
+def write_number_table(path: Path, rows: pa.Table, group_rows: int, runs: Collection[str] = ()) -> None:
     """Write rows in row groups of `group_rows`; equal rows give equal bytes. The table satisfies `is_number_table`."""
     parts = (rows.slice(first, group_rows) for first in range(0, rows.num_rows, group_rows))
     groups = ({name: _values(part.column(name)) for name in rows.column_names} for part in parts)
-    write_number_groups(path, rows.schema, groups)
+    write_number_groups(path, rows.schema, groups, runs=runs)
 
 
 def _values(column: pa.ChunkedArray) -> Array:
@@ -55,6 +57,7 @@ def write_number_groups(
     groups: Iterable[Columns],
     steps: Mapping[str, float] | None = None,
     stated: Collection[str] | None = None,
+    runs: Collection[str] = (),
 ) -> None:
     """Write a row group for each of `groups`; equal rows give equal bytes.
 
@@ -64,11 +67,12 @@ def write_number_groups(
     groups : arrays of each column by its name, of the schema's types.
     steps : columns of floats that are rounded to a multiple of a power of two.
     stated : columns whose least and largest value stand in the footer; all where it is left out.
+    runs : columns that are written as a dictionary and indices: bytes, and numbers that stay the same for many rows.
     """
     steps = steps or {}
     stated = schema.names if stated is None else stated
     if LIBRARY:
-        _write_by_arrow(path, schema, groups, steps)
+        _write_by_arrow(path, schema, groups, steps, runs)
         return
     with path.open("wb") as stream:
         writer = _Numbers(stream)
@@ -76,7 +80,9 @@ def write_number_groups(
         for number, columns in enumerate(groups):
             size = len(columns[schema.names[0]])
             chunks = [
-                writer.column(field, columns[field.name], steps.get(field.name), field.name in stated)
+                writer.runs(field, columns[field.name], field.name in stated)
+                if field.name in runs
+                else writer.column(field, columns[field.name], steps.get(field.name), field.name in stated)
                 for field in schema
             ]
             written.append(writer.row_group(chunks, size, number))
@@ -104,8 +110,14 @@ class _Numbers(Writer):
             encoding, content = self._differences(values)
             packed = self.pack(content)
             self._epochs = values, encoding, packed
-        more = {12: struct(_statistics(values, KINDS[field.type].stored))} if stated and values.size else {}
-        return self.compressed(field, encoding, packed, values.size, more)
+        return self.compressed(field, encoding, packed, values.size, _stated(field, values, stated))
+
+    def runs(self, field: pa.Field, values: Array, stated: bool) -> Value:
+        """Write a column chunk as a dictionary and indices of its values; return its part of the footer."""
+        known, page = _as_bytes(values) if values.dtype == np.uint8 else _as_runs(values)
+        dictionary = self.pack(known.astype(KINDS[field.type].stored).view(np.uint8))
+        more = _stated(field, values if values.dtype == np.uint8 else known, stated)
+        return self.with_dictionary(field, dictionary, known.size, self.pack(page), values.size, more)
 
     def _differences(self, values: Array) -> tuple[int, Bytes]:
         if self._room.size < room_words(values.size):
@@ -130,6 +142,28 @@ class _Numbers(Writer):
         return planes
 
 
+def _as_runs(values: Array) -> tuple[Array, Bytes]:
+    """Return the different values, ascending, and the page of runs of them."""
+    starts = np.flatnonzero(values[1:] != values[:-1]) + 1
+    starts = np.concatenate([np.zeros(min(values.size, 1), np.int64), starts])
+    known, indices = np.unique(values[starts], return_inverse=True)
+    page = np.empty(1 + LONGEST_RUN_BYTES * starts.size, np.uint8)
+    bits = max((known.size - 1).bit_length(), 1)
+    return known, page[: encode_runs(np.diff(starts, append=values.size), indices.astype(np.int64), bits, page)]
+
+
+def _as_bytes(values: Array) -> tuple[Array, Bytes]:
+    """Return all bytes up to the largest, and the page of indices of 8 bits, which are the values (n,) themselves."""
+    head = np.frombuffer(bytes([8]) + bit_packed(values.size), np.uint8)
+    fill = np.zeros(-values.size % 8, np.uint8)
+    return np.arange(int(values.max(initial=0)) + 1), np.concatenate([head, values, fill])
+
+
+def _stated(field: pa.Field, values: Array, stated: bool) -> dict[int, Value]:
+    """Return the field of the footer with the statistics of values; none where they are not stated."""
+    return {12: struct(_statistics(values, KINDS[field.type].stored))} if stated and values.size else {}
+
+
 def _statistics(values: Array, stored: str) -> dict[int, Value]:
     """Return the footer's statistics of values: no nulls, minimum, maximum, zeros with the sign that Parquet wants."""
     low, high = values.min(), values.max()
@@ -141,9 +175,12 @@ def _statistics(values: Array, stored: str) -> dict[int, Value]:
     return none | {5: binary(np.array(high, stored).tobytes()), 6: binary(np.array(low, stored).tobytes())}
 
 
-def _write_by_arrow(path: Path, schema: pa.Schema, groups: Iterable[Columns], steps: Mapping[str, float]) -> None:
-    encodings = {f.name: "DELTA_BINARY_PACKED" if f.type == pa.int64() else "BYTE_STREAM_SPLIT" for f in schema}
-    settings = {"compression": "lz4", "use_dictionary": False, "write_page_checksum": True}
+def _write_by_arrow(
+    path: Path, schema: pa.Schema, groups: Iterable[Columns], steps: Mapping[str, float], runs: Collection[str]
+) -> None:
+    split = [f for f in schema if f.name not in runs]
+    encodings = {f.name: "DELTA_BINARY_PACKED" if f.type == pa.int64() else "BYTE_STREAM_SPLIT" for f in split}
+    settings = {"compression": "lz4", "use_dictionary": list(runs), "write_page_checksum": True}
     with pq.ParquetWriter(path, schema, column_encoding=encodings, **settings) as writer:
         for columns in groups:
             rounded = [_rounded(columns[name], steps.get(name)) for name in schema.names]

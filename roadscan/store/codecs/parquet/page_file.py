@@ -127,21 +127,32 @@ class PageFile:
         chunk, data = self._chunks[name], self.words.view(np.uint8)
         return data[chunk.start - self._origin : chunk.start - self._origin + chunk.size]
 
-    def page(self, name: str, encoding: int) -> tuple[npt.NDArray[np.uint8], int, int, int]:
+    def page(self, name: str, encoding: int, after: int = 0) -> tuple[npt.NDArray[np.uint8], int, int, int]:
         """Return the buffer, the begin and end of a loaded column's page in it, and the page's unpacked bytes.
 
-        The page has its checksum.
+        The page has its checksum. Where a dictionary precedes it, `after` is the end of that.
         """
         chunk, data = self._chunks[name], self.words.view(np.uint8)
-        start = chunk.start - self._origin
-        end = start + chunk.size
+        start, end = chunk.start - self._origin, chunk.start - self._origin + chunk.size
+        start = max(start, after)
         header = pages.read_page_header(data[start:end], chunk.values, encoding)
+        return self._checked(name, data, start, header)
+
+    def dictionary(self, name: str, width: int) -> tuple[npt.NDArray[np.uint8], int, int, int]:
+        """Return the same of the dictionary of a loaded column, numbers of `width` bytes."""
+        data = self.words.view(np.uint8)
+        start = self._chunks[name].start - self._origin
+        return self._checked(name, data, start, pages.read_dictionary_header(self.content(name), width))
+
+    def _checked(
+        self, name: str, data: npt.NDArray[np.uint8], start: int, header: pages.PageHeader | None
+    ) -> tuple[npt.NDArray[np.uint8], int, int, int]:
         if header is None:
             raise DamageError(f"column '{name}': a page's header is damaged")
-        start += header.length
-        if crc32(data[start:end]) != header.crc:
+        begin, end = start + header.length, start + header.length + header.size
+        if crc32(data[begin:end]) != header.crc:
             raise DamageError(f"column '{name}': a page does not have its checksum")
-        return data, start, end, header.raw
+        return data, begin, end, header.raw
 
     def _located(self, group: int, name: str) -> _Chunk:
         known = self._known.get((group, name))
@@ -150,7 +161,8 @@ class PageFile:
         number, nullable = self._columns[name]
         column = self._metadata.row_group(group).column(number)
         size, encoding = column.total_compressed_size, column.encodings[-1]
-        chunk = _Chunk(column.data_page_offset, size, column.num_values, nullable, encoding)
+        start = column.dictionary_page_offset if column.has_dictionary_page else column.data_page_offset
+        chunk = _Chunk(start, size, column.num_values, nullable, encoding)
         if not 0 <= chunk.start <= chunk.start + chunk.size <= self._size:
             raise DamageError("its footer speaks of pages outside of it")
         self._known[group, name] = chunk

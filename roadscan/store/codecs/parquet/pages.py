@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import re
+from collections.abc import Callable
 from itertools import groupby
 from typing import Any, Final, NamedTuple
 
@@ -19,14 +20,16 @@ import numpy.typing as npt
 
 from roadscan.store.codecs.parquet import thrift
 
-PLAIN, RLE, DELTA_BINARY_PACKED, BYTE_STREAM_SPLIT = 0, 3, 5, 9  # encodings (parquet.thrift)
+PLAIN, RLE, DELTA_BINARY_PACKED, RLE_DICTIONARY, BYTE_STREAM_SPLIT = 0, 3, 5, 8, 9  # encodings (parquet.thrift)
 _NUMBER: Final = b"\x15"
 """Compact-protocol header of the next field, if that is a 32-bit number."""
 _DATA_PAGE: Final = _NUMBER + b"\x00"
 """First field of a page's header: its type, a data page."""
+_DICTIONARY_PAGE: Final = _NUMBER + b"\x04"
+"""First field of the header of a page with a dictionary."""
 _LENGTH_BYTES: Final = 4  # bytes of the length before encoded levels
 _SIZES_AND_CRC: Final = re.compile(
-    rb"\x15\x00" + 3 * rb"\x15((?:[\x80-\xFF]{0,3}[\x80-\xFF](?=[^\x00]))?[\x00-\x7F])", re.DOTALL
+    rb"\x15[\x00\x04]" + 3 * rb"\x15((?:[\x80-\xFF]{0,3}[\x80-\xFF](?=[^\x00]))?[\x00-\x7F])", re.DOTALL
 )
 """A page's type, its uncompressed and compressed bytes, its CRC, each after the byte that names the field."""
 _LONGEST_HEADER: Final = 64  # bytes in which the header of a page has to end
@@ -56,14 +59,33 @@ def list_levels(rows: int, size: int, valid: npt.NDArray[np.bool_] | None) -> by
     return _section(repetition) + _section(b"".join(_run(n * size, 2) if there else _run(n, 0) for there, n in runs))
 
 
+def bit_packed(values: int) -> bytes:
+    """Return what precedes one group of bit-packed dictionary indices, which come in eights."""
+    return thrift.varint(-(-values // 8) << 1 | 1)
+
+
 def page_header(size: int, crc: int, values: int, encoding: int, raw: int | None = None) -> bytes:
     """Return the header of a page of `size` bytes (`raw` before compression) and `values` levels.
 
     The CRC-32 is over levels and values as they are stored.
     """
+    return _DATA_PAGE + _sizes(size, crc, raw) + _about(values, encoding)
+
+
+def dictionary_header(size: int, crc: int, values: int, raw: int) -> bytes:
+    """Return the same of a page with the dictionary of a column, PLAIN."""
+    return _DICTIONARY_PAGE + _sizes(size, crc, raw) + _about_dictionary(values)
+
+
+def _sizes(size: int, crc: int, raw: int | None) -> bytes:
     signed = crc - (1 << 32) if crc >> 31 else crc
     sizes = _NUMBER + thrift.zigzag(size if raw is None else raw) + _NUMBER + thrift.zigzag(size)
-    return _DATA_PAGE + sizes + _NUMBER + thrift.zigzag(signed) + _about(values, encoding)
+    return sizes + _NUMBER + thrift.zigzag(signed)
+
+
+def _about_dictionary(values: int) -> bytes:
+    """Return the end of a dictionary's header: the seventh field, a struct, and the stop mark."""
+    return thrift.struct({3: thrift.struct({1: thrift.i32(values), 2: thrift.i32(PLAIN)})}).content
 
 
 @functools.lru_cache(maxsize=64)
@@ -74,28 +96,42 @@ def _about(values: int, encoding: int) -> bytes:
 
 
 class PageHeader(NamedTuple):
-    """Fields of the header of a column chunk's one page."""
+    """Fields of the header of a page."""
 
     length: int
     """Bytes of the header."""
     crc: int
+    size: int
+    """Bytes of the page."""
     raw: int
     """Bytes of the page before compression."""
 
 
 def read_page_header(chunk: npt.NDArray[np.uint8], values: int, encoding: int) -> PageHeader | None:
     """Return the header of the one page of a column chunk; None if it is not as `page_header` writes it."""
+    found = _read(chunk, _DATA_PAGE, lambda _: _about(values, encoding))
+    return found if found is not None and found.length + found.size == chunk.size else None
+
+
+def read_dictionary_header(chunk: npt.NDArray[np.uint8], width: int) -> PageHeader | None:
+    """Return the header of a column chunk's first page, a dictionary of numbers of `width` bytes; None if it is not."""
+    return _read(chunk, _DICTIONARY_PAGE, lambda raw: _about_dictionary(raw // width))
+
+
+def _read(chunk: npt.NDArray[np.uint8], kind: bytes, rest_of: Callable[[int], bytes]) -> PageHeader | None:
+    """Return the header of a page of a kind; its end follows from the bytes before compression."""
     head = chunk[:_LONGEST_HEADER].tobytes()
     found = _SIZES_AND_CRC.match(head)
-    if found is None:
+    if found is None or not head.startswith(kind):
         return None
     raw, size, crc = (_number(varint) for varint in found.groups())
-    rest = _about(values, encoding)
-    length = found.end() + len(rest)
-    known = 0 <= raw < _LIMIT and 0 <= size < _LIMIT and -_LIMIT <= crc < _LIMIT
-    if not known or length + size != chunk.size or head[found.end() : length] != rest:
+    if not (0 <= raw < _LIMIT and 0 <= size < _LIMIT and -_LIMIT <= crc < _LIMIT):
         return None
-    return PageHeader(length, crc % (1 << 32), raw)
+    rest = rest_of(raw)
+    length = found.end() + len(rest)
+    if length + size > chunk.size or head[found.end() : length] != rest:
+        return None
+    return PageHeader(length, crc % (1 << 32), size, raw)
 
 
 def _number(varint: bytes) -> int:

@@ -15,33 +15,51 @@ _ONE, _TWO, _SIX = np.float64(1.0), np.float64(2.0), np.float64(6.0)  # of the s
 
 
 class Packed(NamedTuple):
-    """What the sensor wrote, (n,) each."""
+    """What the sensor wrote of n returns. Azimuth and rate stay the same for runs of them: the row after each run."""
 
     head: npt.NDArray[np.uint16]
-    """Azimuth of the head (0.01°)."""
+    """Azimuth of the head in each run (0.01°)."""
+    head_end: npt.NDArray[np.int64]
     rate: npt.NDArray[np.float64]
-    """Rate of the head (rad/ns)."""
+    """Rate of the head in each run (rad/ns)."""
+    rate_end: npt.NDArray[np.int64]
     distance: npt.NDArray[np.uint16]
+    """(n,)."""
     slot: npt.NDArray[np.uint8]
+    """(n,)."""
 
 
 class BeamTable(NamedTuple):
-    """Beams by slot, (SLOTS,) each; a quantity without a value other than 0 for any slot has none of them."""
+    """Beams by slot, (SLOTS,) each. Own azimuths that are 0 for all slots are left out, and so are a unit's offsets."""
 
     after_ns: npt.NDArray[np.float64]
+    """(slots of the sensor,)."""
     unit_m: npt.NDArray[np.float32]
-    level: npt.NDArray[np.float32]
-    """(2, SLOTS) cosine and sine of the elevation."""
+    """(1,)."""
+    cos_elevation: npt.NDArray[np.float32]
+    sin_elevation: npt.NDArray[np.float32]
     rise_m: npt.NDArray[np.float32]
-    turn: npt.NDArray[np.float32]
-    """(2, SLOTS or 0) cosine and sine of the beam's own azimuth."""
+    cos_azimuth: npt.NDArray[np.float32]
+    sin_azimuth: npt.NDArray[np.float32]
     extra_m: npt.NDArray[np.float32]
+    """Offsets by a calibration file: none of them, or all three."""
     reach_m: npt.NDArray[np.float32]
     side_m: npt.NDArray[np.float32]
 
 
+class Turned(NamedTuple):
+    """Room for what is computed once a firing sequence, by slot, (SLOTS,) each."""
+
+    small_sine: npt.NDArray[np.float32]
+    """Of the angle by which the head turns on until the slot is fired."""
+    small_cosine: npt.NDArray[np.float32]
+    sine: npt.NDArray[np.float32]
+    """Of the azimuth of the beam."""
+    cosine: npt.NDArray[np.float32]
+
+
 @kernel
-def positions(packed, beams, heads, scratch, x_m, y_m, z_m):
+def positions(packed, beams, heads, turned, x_m, y_m, z_m):
     """Write the positions (n,) of returns in the sensor's axes, float32, in its arithmetic.
 
     Parameters
@@ -49,37 +67,46 @@ def positions(packed, beams, heads, scratch, x_m, y_m, z_m):
     packed : Packed.
     beams : BeamTable.
     heads : (2, 65536) sine and cosine of each azimuth of the head, float32.
-    scratch : (2, SLOTS) float32.
+    turned : Turned, zeros for slots that the sensor does not have.
 
     Notes
     -----
     Until its firing the head turns by less than 0.02 rad; the series of sine and cosine to the third order are exact
-    there to 1e-8. They are taken once for all slots while the rate is the same, which is that of a packet.
+    there to 1e-8.
     """
-    before = np.nan
-    for i in range(packed.slot.size):
-        rate = packed.rate[i]
-        if rate != before:
-            before = rate
-            for k in range(beams.after_ns.size):
-                turned = rate * beams.after_ns[k]
-                square = turned * turned
-                scratch[0, k] = np.float32(turned * (_ONE - square / _SIX))
-                scratch[1, k] = np.float32(_ONE - square / _TWO)
-        k = packed.slot[i]
-        sine, cosine = heads[0, packed.head[i]], heads[1, packed.head[i]]
-        small_sine, small_cosine = scratch[0, k], scratch[1, k]
-        sine, cosine = sine * small_cosine + cosine * small_sine, cosine * small_cosine - sine * small_sine
-        if beams.turn.size:
-            own_cosine, own_sine = beams.turn[0, k], beams.turn[1, k]
-            sine, cosine = sine * own_cosine + cosine * own_sine, cosine * own_cosine - sine * own_sine
-        range_m = np.float32(packed.distance[i]) * beams.unit_m[k]
-        if beams.extra_m.size:
-            range_m += beams.extra_m[k]
-        level_m = range_m * beams.level[0, k]
-        if beams.reach_m.size:
-            level_m += beams.reach_m[k]
-        x, y = level_m * cosine, level_m * -sine
-        if beams.side_m.size:
-            x, y = x + beams.side_m[k] * sine, y + beams.side_m[k] * cosine
-        x_m[i], y_m[i], z_m[i] = x, y, range_m * beams.level[1, k] + beams.rise_m[k]
+    start, run, rate_run = 0, 0, -1
+    slots, unit_m = beams.after_ns.size, beams.unit_m[0]
+    while start < packed.slot.size:
+        if rate_run < 0 or packed.rate_end[rate_run] <= start:
+            rate_run += 1
+            rate = packed.rate[rate_run]
+            for k in range(slots):
+                angle = rate * beams.after_ns[k]
+                square = angle * angle
+                turned.small_sine[k] = np.float32(angle * (_ONE - square / _SIX))
+                turned.small_cosine[k] = np.float32(_ONE - square / _TWO)
+        if packed.head_end[run] <= start:
+            run += 1
+        sine, cosine = heads[0, packed.head[run]], heads[1, packed.head[run]]
+        for k in range(slots):
+            turned.sine[k] = sine * turned.small_cosine[k] + cosine * turned.small_sine[k]
+            turned.cosine[k] = cosine * turned.small_cosine[k] - sine * turned.small_sine[k]
+        for k in range(slots if beams.cos_azimuth.size else 0):
+            sine, cosine = turned.sine[k], turned.cosine[k]
+            turned.sine[k] = sine * beams.cos_azimuth[k] + cosine * beams.sin_azimuth[k]
+            turned.cosine[k] = cosine * beams.cos_azimuth[k] - sine * beams.sin_azimuth[k]
+        end = min(packed.head_end[run], packed.rate_end[rate_run])
+        for i in range(start, start if beams.extra_m.size else end):
+            k = packed.slot[i]
+            range_m = np.float32(packed.distance[i]) * unit_m
+            level_m = range_m * beams.cos_elevation[k]
+            x_m[i], y_m[i] = level_m * turned.cosine[k], level_m * -turned.sine[k]
+            z_m[i] = range_m * beams.sin_elevation[k] + beams.rise_m[k]
+        for i in range(start, end if beams.extra_m.size else start):
+            k = packed.slot[i]
+            range_m = np.float32(packed.distance[i]) * unit_m + beams.extra_m[k]
+            level_m = range_m * beams.cos_elevation[k] + beams.reach_m[k]
+            x, y = level_m * turned.cosine[k], level_m * -turned.sine[k]
+            x_m[i], y_m[i] = x + beams.side_m[k] * turned.sine[k], y + beams.side_m[k] * turned.cosine[k]
+            z_m[i] = range_m * beams.sin_elevation[k] + beams.rise_m[k]
+        start = end

@@ -33,6 +33,7 @@ from roadscan.core.witness import Witness, witnesses
 from roadscan.ingest.inspect.known_files import known_files
 from roadscan.ingest.reading.format import LogFormat, log_formats
 from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
+from roadscan.store.readings.packed_view import beams_query, returns_query
 from roadscan.store.schema import TableSchema, schema_folder, schema_names, table_schema
 from roadscan.tiles.product import Product, SurfaceProduct, TileFiles, products
 
@@ -216,6 +217,16 @@ def members(target: str) -> str:
 def tables(_: str) -> str:
     """All tables of ``schemas/`` with their columns."""
     return "\n\n".join(_table_section(table_schema(name)) for name in schema_names())
+
+
+def packed_view(folder: str) -> str:
+    """Statements by which DuckDB alone has the packed returns of a folder as rows of `returns`."""
+    parts = {
+        "packed_returns": f"SELECT * FROM read_parquet('{folder}/**/*.parquet', hive_partitioning = true)",
+        "beams": beams_query(f"'{folder}/*/*/*/*/part-00000.parquet'"),
+        "returns": returns_query(),
+    }
+    return "\n\n".join(f"CREATE VIEW {name} AS\n{query};" for name, query in parts.items())
 
 
 def _table_section(schema: TableSchema) -> str:
@@ -483,6 +494,7 @@ DIRECTIVES: Final[dict[str, Callable[[str], str]]] = {
     "model": model,
     "members": members,
     "tables": tables,
+    "packed_view": packed_view,
     "formats": formats,
     "known_files": known_file_list,
     "products": product_list,

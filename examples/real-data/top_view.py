@@ -1,5 +1,5 @@
 # ruff: noqa: T201
-"""A spinning lidar's returns from above, read out of the store's Parquet files by DuckDB alone.
+"""A spinning lidar's returns from above, out of the store.
 
 python top_view.py PICTURE.png
 """
@@ -9,18 +9,19 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import duckdb
 import pandas as pd
 
-RETURNS = "store/survey=hdl32e/tables/returns/*/*/*/*/*.parquet"
+import roadscan
 
 
 def main(picture: Path) -> None:
     """Draw the returns of one turn by their laser number."""
-    table = duckdb.sql(f"FROM read_parquet('{RETURNS}')")
-    turns = table.aggregate("sweep, count(*) AS returns, count(DISTINCT laser) AS lasers", "sweep").order("sweep")
-    print(turns.df().to_string(index=False))
-    draw(table.filter("sweep = 1").df(), picture)
+    survey = roadscan.open_survey("hdl32e.toml")
+    turns = (
+        "SELECT sweep, count(*) AS returns, count(DISTINCT laser) AS lasers FROM returns GROUP BY sweep ORDER BY sweep"
+    )
+    print(survey.sql(turns).df().to_string(index=False))
+    draw(survey.sql("SELECT * FROM returns WHERE sweep = 1").df(), picture)
 
 
 def draw(returns: pd.DataFrame, picture: Path) -> None:

@@ -86,6 +86,11 @@ class TableSchema:
     location: str | None = None
     """Folder of its Parquet files, relative to the survey's root; None for rows of logs, whose records name them."""
 
+    @property
+    def rows_of(self) -> str:
+        """Return the table whose rows its files hold."""
+        return self.holds or self.name
+
     def arrow(self, list_size: int | None = None) -> pa.Schema:
         """Return the Arrow schema, with unit, frame and meaning as field metadata."""
         return pa.schema(

@@ -86,7 +86,7 @@ class LogWriter:
             held.bytes += part.nbytes
             held.row_bytes = max(held.row_bytes, part.nbytes / part.num_rows)
             self._held += part.nbytes
-        self.rows[schema.holds or table] += rows.num_rows
+        self.rows[schema.rows_of] += rows.num_rows
         while self._held > BUDGET_BYTES:
             self._flush(max(self._bins, key=lambda k: self._bins[k].bytes))
         return faults
@@ -114,7 +114,7 @@ class LogWriter:
 
     def _keys_of(self, table: str) -> list[tuple[str, int]]:
         """Return the keys of the bins with rows of a table, in any form, in order of time."""
-        return sorted(key for key in self._bins if table in (key[0], table_schema(key[0]).holds))
+        return sorted(key for key in self._bins if table_schema(key[0]).rows_of == table)
 
     def leave_out(
         self,
@@ -160,7 +160,7 @@ class LogWriter:
             local = self._folder / table
             target = log_folder(table, run, sensor, key)
             found = sorted(local.rglob("*.parquet"))
-            out[table_schema(table).holds or table] = {
+            out[table_schema(table).rows_of] = {
                 p: describe(p, f"{target}/{p.relative_to(local).as_posix()}") for p in found
             }
         return out

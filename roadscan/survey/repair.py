@@ -16,9 +16,10 @@ from roadscan.ingest.ingest import IngestTask, read_log, record_of, with_span
 from roadscan.ingest.planned_logs import PlannedLog, plan_logs
 from roadscan.ingest.sources import is_unchanged
 from roadscan.navigation.tasks.navigate import keep_trajectory, plan_trajectories
-from roadscan.store.logs import NAVIGATION, DataFile, LogRecord, read_log_records, write_log_record
+from roadscan.store.logs import NAVIGATION, DataFile, LogRecord, read_log_records, table_of, write_log_record
 from roadscan.store.repair_records import repair_records
 from roadscan.store.salvage import Lost, read_lost, salvaged, write_lost
+from roadscan.store.schema import table_schema
 from roadscan.store.sql_files import stamp_of
 from roadscan.store.store import Store
 from roadscan.store.verified import note_verified
@@ -181,7 +182,7 @@ def _with_files(
 ) -> dict[str, tuple[DataFile, ...]]:
     """Return the files of a record by table, with others that replace, or are added to, those that it names."""
     known = {f.path: f for own in record.tables.values() for f in own} | dict(files)
-    of = {path: path.split("/")[1] for path in known}
+    of = {path: table_schema(table_of(path)).rows_of for path in known}
     return {t: tuple(known[path] for path in sorted(known) if of[path] == t) for t in sorted({*tables, *record.tables})}
 
 
@@ -211,7 +212,7 @@ def _keep_sound(store: Store, broken: _Broken, why: str, done: Repair) -> list[s
         if path not in broken.damaged:  # reported before, and its log is still gone
             continue
         file, before = files[path], known.get(path)
-        table = path.split("/")[1]
+        table = table_schema(table_of(path)).rows_of
         with store.scratch() as folder:
             kept, rows, spans = salvaged(store, table, file, folder / Path(path).name)
             aside = _kept_aside(store, path)

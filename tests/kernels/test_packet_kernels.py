@@ -9,6 +9,9 @@ import numpy as np
 
 from roadscan.formats.clouds.kernels.lzf import expand
 from roadscan.formats.lidars.kernels.ouster import Layout, Optics, Returns, checksum_tables, checksums, decode
+from roadscan.formats.lidars.kernels.velodyne import Firings, Room, returned
+from roadscan.store.codecs.kernels.run_lengths import LONGEST_RUN_BYTES, decode_runs, encode_runs
+from roadscan.store.readings.kernels.firings import SLOTS, BeamTable, Packed, Turned, positions
 
 
 def crc64(data: bytes) -> int:
@@ -74,3 +77,79 @@ def test_lzf_expands_what_liblzf_compressed() -> None:
         assert expand(packed[: packed.size // 2], out) < len(content)
         assert expand(packed, out[:100]) <= 100
     assert expand(np.array([0x20, 0x00, 5], np.uint8), out) == 0  # a copy from before the start
+
+
+def test_slots_of_velodyne_packets_become_packed_returns() -> None:
+    """Two blocks of a dual return: empty slots are left out, and what the second block repeats."""
+    packet = np.zeros((1, 1206), np.uint8)
+    for block, (slot, far, bright) in ((0, (3, 515, 7)), (1, (3, 515, 7)), (1, (4, 256, 9)), (0, (31, 1, 255))):
+        at = 100 * block + 4 + 3 * slot
+        packet[0, at : at + 3] = far % 256, far // 256, bright
+    slots = np.tile(np.arange(32, dtype=np.uint8), (2, 1))
+    firings = Firings(
+        np.array([[1_000, 2_000]]), np.array([[[10], [20]]], np.uint16), np.array([0.5]), np.array([[6, 7]], np.int32),
+        np.tile(np.arange(32, dtype=np.int64), (2, 1)), slots,
+    )  # fmt: skip
+    kinds = (np.int64, np.uint16, np.float64, np.uint16, np.uint8, np.uint8, np.int32)
+    for dual, rows in ((True, [(0, 3, 515, 7), (0, 31, 1, 255), (1, 4, 256, 9)]), (False, None)):
+        room = Room(*(np.zeros(4, kind) for kind in kinds))
+        count = returned(packet, firings, dual, room)
+        if rows is None:
+            assert count == 4
+            continue
+        found = [c[:count].tolist() for c in room]
+        assert found[0] == [1_000 * (1 + b) + s for b, s, _, _ in rows] and found[1] == [10 + 10 * r[0] for r in rows]
+        assert found[2] == [0.5] * 3 and found[6] == [6 + r[0] for r in rows]
+        assert [(s, d, i) for s, d, i in zip(found[5], found[3], found[4], strict=True)] == [r[1:] for r in rows]
+
+
+def test_positions_are_those_of_the_manuals_formula() -> None:
+    """Distance, elevation, azimuth at the firing and offsets of each beam, in double precision."""
+    random = np.random.default_rng(0)
+    n, slots = 400, 16
+    head_end, rate_end = np.array([150, 151, 400]), np.array([100, 400])
+    head, rate = np.array([0, 9_000, 35_999], np.uint16), np.array([6e-8, -1.2e-7])
+    distance, slot = random.integers(1, 1 << 16, n).astype(np.uint16), random.integers(0, slots, n).astype(np.uint8)
+    after_ns = 2_304.0 * np.arange(slots)
+    elevation, own = random.uniform(-0.5, 0.3, slots), random.uniform(-0.1, 0.1, slots)
+    offsets = random.normal(0, 0.05, (4, slots))
+    heads = np.radians(np.arange(1 << 16) * 0.01)
+    for turn, moved in ((own, offsets), (0 * own, np.vstack([offsets[:1], 0 * offsets[1:]]))):
+        padded = np.zeros((8, SLOTS), np.float32)
+        padded[:, :slots] = *np.stack([np.cos(elevation), np.sin(elevation), np.cos(turn), np.sin(turn)]), *moved
+        level, rise, turns, rest = padded[:2], padded[4], padded[2:4], padded[5:]
+        turned = turns if turn.any() else turns[:, :0]
+        beams = BeamTable(
+            after_ns, np.full(1, 0.002, np.float32), level[0], level[1], rise, *np.ascontiguousarray(turned),
+            *np.ascontiguousarray(rest if moved[1:].any() else rest[:, :0]),
+        )  # fmt: skip
+        out = np.zeros((3, n), np.float32)
+        turned = Turned(*np.zeros((4, SLOTS), np.float32))
+        positions(
+            Packed(head, head_end, rate, rate_end, distance, slot), beams,
+            np.stack([np.sin(heads), np.cos(heads)]).astype(np.float32), turned, *out,
+        )  # fmt: skip
+        rows = np.arange(n)
+        angle = np.radians(head[np.searchsorted(head_end, rows, "right")] * 0.01) + turn[slot]
+        angle = angle + rate[np.searchsorted(rate_end, rows, "right")] * after_ns[slot]
+        far = distance * 0.002 + moved[1][slot]
+        flat = far * np.cos(elevation[slot]) + moved[2][slot]
+        x = flat * np.cos(angle) + moved[3][slot] * np.sin(angle)
+        y = -flat * np.sin(angle) + moved[3][slot] * np.cos(angle)
+        assert np.abs(out - [x, y, far * np.sin(elevation[slot]) + moved[0][slot]]).max() < 5e-5
+
+
+def test_runs_of_dictionary_indices_come_back() -> None:
+    """The bytes follow Encodings.md: twice the length as a varint, then the index."""
+    page = np.zeros(1 + 2 * LONGEST_RUN_BYTES, np.uint8)
+    size = encode_runs(np.array([3, 200]), np.array([5, 258]), 9, page)
+    assert page[:size].tolist() == [9, 6, 5, 0, 0x90, 0x03, 2, 1]
+    ends, indices = np.zeros(size, np.int64), np.zeros(size, np.int64)
+    assert decode_runs(page[:size], 203, 259, ends, indices) == 2
+    assert ends[:2].tolist() == [3, 203] and indices[:2].tolist() == [5, 258]
+    assert decode_runs(page[:size], 203, 258, ends, indices) == -1  # an index outside of the dictionary
+    assert decode_runs(page[:size], 204, 259, ends, indices) == -1 == decode_runs(page[:size], 202, 259, ends, indices)
+    assert all(decode_runs(page[:k], 203, 259, ends, indices) == -1 for k in range(size))
+    packed = page[:size].copy()
+    packed[1] |= 1  # a bit-packed group
+    assert decode_runs(packed, 203, 259, ends, indices) == -1

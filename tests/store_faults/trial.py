@@ -165,7 +165,7 @@ def commands_on(file: str) -> list[list[str]]:
     found = [["verify", survey]]
     if inside.startswith("manifest/"):
         found += [["status", survey], ["run", survey, "--workers", "0"]]
-    elif inside.startswith(("tables/returns", "tables/trajectory", "tables/footprints", "tables/corrections")):
+    elif inside.startswith(("tables/packed_returns", "tables/trajectory", "tables/footprints", "tables/corrections")):
         found += [["reprocess", survey, "--tile", TILE, "--workers", "0"]]
     elif inside.startswith(("tables/", "products/", "tiles/", "report/")):
         found += [["run", survey, "--workers", "0"], ["publish", survey, "--out", "site"]]
@@ -294,7 +294,7 @@ def trials(tree: Tree, count: int, seed: int, first: int = 0, only: str = "") ->
 
 def _load(tree: Tree) -> None:
     """Run each command once in this process, so that its code is loaded and compiled for all that follow."""
-    kinds = ("tables/returns/x.parquet", "manifest/x", "products/x")
+    kinds = ("tables/packed_returns/x.parquet", "manifest/x", "products/x")
     files = ["inventory/x", *(f"2026-spring/store/survey=street/{kind}" for kind in kinds)]
     for command in {json.dumps(one): one for file in files for one in commands_on(file) if one[0] != "sql"}.values():
         answer = _run(tree, command)

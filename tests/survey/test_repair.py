@@ -20,7 +20,7 @@ from tests.survey.test_damage import MAKE, say
 from tests.surveys import Simulated, outputs
 
 OPENED = {
-    "returns": "tables/returns",
+    "returns": "tables/packed_returns",
     "scans": "tables/scans",
     "trajectory": "tables/trajectory",
     "cells": "tiles/cells",

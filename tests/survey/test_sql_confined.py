@@ -36,7 +36,7 @@ NORMAL = (
     "PIVOT (SELECT sensor, laser FROM returns) ON sensor USING count(*)",
     "SELECT count(*) FROM glob('store://survey={id}/tables/**/*.parquet')",
     "SELECT count(*) FROM '{file}'",
-    "SELECT count(*) FROM read_parquet('store://survey={id}/tables/returns/**/*.parquet', hive_partitioning = true)",
+    "SELECT count(*) FROM read_parquet('store://survey={id}/tables/packed_returns/**/*.parquet')",
 )
 READS = (
     "SELECT * FROM read_text('/etc/passwd')",

@@ -68,8 +68,8 @@ class Beams:
         """Return the tables of the kernel."""
         c = {name: _padded(values) for name, values in self.columns.items()}
         offsets, azimuths = ("extra_m", "reach_m", "side_m"), ("cos_azimuth", "sin_azimuth")
-        none = offsets if not any(c[name].any() for name in offsets) else ()
-        none += () if c["sin_azimuth"].any() else azimuths
+        none = [name for group in (offsets, azimuths[1:]) if not any(c[n].any() for n in group) for name in group]
+        none += azimuths[:1] * ("sin_azimuth" in none)
         c |= {name: c[name][:0] for name in none}
         c |= {"after_ns": self.columns["after_ns"].astype(np.float64), "unit_m": self.columns["unit_m"][:1]}
         return BeamTable(*(c[name] for name in BeamTable._fields))
@@ -77,7 +77,7 @@ class Beams:
     def places(self, packed: Packed, xyz_m: Sequence[Float32]) -> None:
         """Write the positions (n,) of returns in the sensor's axes."""
         turned = Turned(*np.zeros((len(Turned._fields), SLOTS), np.float32))
-        positions(Packed._make(map(read_only, packed)), self.table, _heads(), turned, *xyz_m)
+        positions(Packed(*(read_only(one) for one in packed)), self.table, _heads(), turned, *xyz_m)
 
 
 def packed_of(rows: pa.Table | pa.RecordBatch) -> Packed:

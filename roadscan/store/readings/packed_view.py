@@ -46,14 +46,14 @@ _BETWEEN: Final = (
 
 
 def beams_query(files: str) -> str:
-    """Return the statement that reads the table ``beams`` from the footers of some files, one of each log.
+    """Return the statement that reads the table ``beams`` from the footers of files, one or more of each log.
 
-    files : the list of their names, as SQL.
+    files : their names, as SQL.
     """
     kinds = ", ".join(f'"{c.name}": "{_KINDS[c.type]}"' for c in table_schema("beams").columns)
     return (
-        f"SELECT regexp_extract(file_name, '.*/log=([^/]*)/', 1) AS log, "
-        f"unnest(from_json(decode(value), '[{{{kinds}}}]'), recursive := true) "
+        "SELECT DISTINCT regexp_extract(file_name, '.*/log=([^/]*)/', 1) AS log,\n"
+        f"  unnest(from_json(decode(value), '[{{{kinds}}}]'), recursive := true)\n"
         f"FROM parquet_kv_metadata({files}) WHERE decode(key) = '{BEAMS.decode()}'"
     )
 
@@ -63,5 +63,5 @@ def returns_query() -> str:
     own = [c.name for c in table_schema("returns").columns]
     stored = [c.name for c in (*table_schema(PACKED).columns, *table_schema("beams").columns)]
     rest = dict.fromkeys([*(name for name in stored if name != "intensity"), *_BETWEEN])
-    columns = ", ".join(f"{_COMPUTED[name]} AS {name}" if name in _COMPUTED else name for name in own)
-    return f"WITH {_HEADS.strip()}\nSELECT {columns}, * EXCLUDE ({', '.join(rest)}) FROM aimed"
+    columns = ",\n  ".join(f"{_COMPUTED[name]} AS {name}" if name in _COMPUTED else name for name in own)
+    return f"WITH {_HEADS.strip()}\nSELECT {columns},\n  * EXCLUDE ({', '.join(rest)})\nFROM aimed"

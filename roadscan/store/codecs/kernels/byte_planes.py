@@ -61,17 +61,6 @@ def join(first, second, third, fourth, values):
 
 
 @kernel
-def join_long(planes, values):
-    """Write (n,) unsigned 64-bit values from their planes (8, n), lowest bytes first."""
-    for i in range(values.size):
-        low = np.uint32(planes[0, i]) | (np.uint32(planes[1, i]) << np.uint32(8))
-        low |= (np.uint32(planes[2, i]) << np.uint32(16)) | (np.uint32(planes[3, i]) << np.uint32(24))
-        high = np.uint32(planes[4, i]) | (np.uint32(planes[5, i]) << np.uint32(8))
-        high |= (np.uint32(planes[6, i]) << np.uint32(16)) | (np.uint32(planes[7, i]) << np.uint32(24))
-        values[i] = np.uint64(low) | (np.uint64(high) << np.uint64(32))
-
-
-@kernel
 def join_low(first, second, values):
     """Write (n,) unsigned 16-bit values from their planes (n,), ignoring higher planes."""
     for i in range(values.size):

@@ -198,7 +198,7 @@ class Writer:
         """Write a column of non-null numbers as a page of a dictionary of `known` values and a page of indices."""
         start = self._at
         head = pages.dictionary_header(dictionary.content.size, crc32(dictionary.content), known, dictionary.raw)
-        self._at += self._stream.write(head) + self._stream.write(dictionary.content)
+        self._at += self._stream.write(head) + self._stream.write(dictionary.content.data)
         first = self._at - start
         at, size = self.page(b"", packed.content, count, pages.RLE_DICTIONARY, packed.raw)
         raw = first - dictionary.content.size + dictionary.raw + size - packed.content.size + packed.raw

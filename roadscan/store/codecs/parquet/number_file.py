@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.store.codecs.kernels.byte_planes import join, join_long, join_low
+from roadscan.store.codecs.kernels.byte_planes import join, join_low
 from roadscan.store.codecs.kernels.delta_packing import FAULTS, SLACK_BYTES, WHOLE, decode
 from roadscan.store.codecs.kernels.run_lengths import LONGEST_RUN_BYTES, decode_runs
 from roadscan.store.codecs.parquet import pages
@@ -20,7 +20,6 @@ _WORD: Final = 8  # bytes of a 64-bit word
 _ENCODINGS: Final = {
     "PLAIN": pages.PLAIN,
     "DELTA_BINARY_PACKED": pages.DELTA_BINARY_PACKED,
-    "RLE_DICTIONARY": pages.RLE_DICTIONARY,
     "BYTE_STREAM_SPLIT": pages.BYTE_STREAM_SPLIT,
 }
 
@@ -43,13 +42,6 @@ class NumberFile(PageFile):
     def numbers(self, name: str, values: Array) -> None:
         """Write a loaded column to (n,) `values` of the column's type."""
         encoding = _ENCODINGS.get(self.encoding(name), -1)
-        if encoding == pages.RLE_DICTIONARY:
-            if values.dtype == np.uint8:
-                values[:] = self.bytes(name, values.size)
-                return
-            ends, own = self.runs(name, values.size, values.dtype)
-            values[:] = np.repeat(own, np.diff(ends, prepend=0))
-            return
         data, at, end, size = self.page(name, encoding)
         if not 0 <= size <= _most_bytes(values.size):
             raise DamageError(f"column '{name}' does not hold {values.size} values")
@@ -58,8 +50,12 @@ class NumberFile(PageFile):
             self._differences(name, page, values)
         elif encoding == pages.PLAIN and values.dtype == np.int64 and size == values.nbytes:
             values[:] = page.view("<i8")
-        elif encoding == pages.BYTE_STREAM_SPLIT and size == max(_PLANES, values.itemsize) * values.size:
-            _join(page.reshape(max(_PLANES, values.itemsize), values.size), values)
+        elif encoding == pages.BYTE_STREAM_SPLIT and size == _PLANES * values.size and values.itemsize in (2, 4):
+            planes = [page[k * values.size : (k + 1) * values.size] for k in range(_PLANES)]
+            if values.itemsize == _PLANES:
+                join(*planes, values.view(np.uint32))
+            else:
+                join_low(*planes[:2], values)
         else:
             raise DamageError(f"column '{name}' does not hold {values.size} values")
 
@@ -101,18 +97,6 @@ class NumberFile(PageFile):
         fault = decode(room, self._unpacked, 0, page.size, values)
         if fault != WHOLE:
             raise DamageError(f"column '{name}': {FAULTS[fault]}")
-
-
-def _join(planes: Bytes, values: Array) -> None:
-    """Write (n,) numbers of 1, 2, 4 or 8 bytes from their planes (4 or 8, n)."""
-    if values.itemsize == _WORD:
-        join_long(planes, values.view(np.uint64))
-    elif values.itemsize == _PLANES:
-        join(*planes, values.view(np.uint32))
-    elif values.itemsize == 1:
-        values[:] = planes[0]
-    else:
-        join_low(*planes[:2], values)
 
 
 def _most_bytes(count: int) -> int:

@@ -296,7 +296,7 @@ class EpochOrder(LogCheck):
 
     def refused(self, rows: Rows) -> list[tuple[Int64, str]]:
         """Return the rows of a chunk (by index) that are left out, with reasons."""
-        batch = rows.batch
+        _, batch = rows.stored
         if rows.table == "returns" and batch.num_rows:
             self._returns.take(batch)
         epochs = epochs_in(rows, _ORDERED)

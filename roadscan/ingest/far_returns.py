@@ -11,6 +11,7 @@ import numpy.typing as npt
 from roadscan.core.witness import Witness
 from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.reading.format import LogHeader, Rows
+from roadscan.store.readings.packed_returns import PACKED, farthest_m
 from roadscan.store.readings.returns import distances_m
 from roadscan.store.writer import LogWriter
 
@@ -39,7 +40,11 @@ class FarReturns(LogCheck):
 
     def take(self, rows: Rows, refused: Sequence[npt.NDArray[np.int64]]) -> None:
         """Take the next rows of the table `returns`."""
-        if rows.table != "returns" or not rows.batch.num_rows:
+        table, stored = rows.stored
+        if rows.table != "returns" or not stored.num_rows:
+            return
+        if table == PACKED and farthest_m(stored) <= FARTHEST_M:
+            self._count += stored.num_rows
             return
         columns = [rows.batch.column(f"{axis}_sensor_m").to_numpy(zero_copy_only=False) for axis in "xyz"]
         if np.hypot.reduce([max(float(one.max()), -float(one.min())) for one in columns]) <= FARTHEST_M:

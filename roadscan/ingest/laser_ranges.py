@@ -60,10 +60,10 @@ class LaserRanges(LogCheck):
         """Examine a chunk if its turn has come."""
         if rows.table != _TABLE:
             return
-        batch = rows.batch
         self._chunks += 1
         if not self.in_sensor_frame or self._chunks % _EVERY != 1 or self._chunks > _EVERY * _MOST_CHUNKS:
             return
+        batch = rows.batch
         if "laser" not in batch.schema.names or batch.column("laser").null_count:
             return
         laser = batch.column("laser").to_numpy(zero_copy_only=False).astype(np.int64)

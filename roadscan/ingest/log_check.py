@@ -48,7 +48,8 @@ def epochs_in(rows: Rows, tables: Collection[str]) -> Int64 | None:
 
     The schema's rules for columns reject epochs that are not whole.
     """
-    if rows.table not in tables or not rows.batch.num_rows or "epoch_gps_ns" not in rows.batch.schema.names:
+    _, batch = rows.stored
+    if rows.table not in tables or not batch.num_rows or "epoch_gps_ns" not in batch.schema.names:
         return None
-    column = rows.batch.column("epoch_gps_ns")
+    column = batch.column("epoch_gps_ns")
     return None if column.null_count or not pa.types.is_int64(column.type) else column.to_numpy()

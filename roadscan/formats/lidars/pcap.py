@@ -302,6 +302,8 @@ class _Capture:
     _buffer: bytes = b""
     _at: int = 0
     """Position in the buffer."""
+    _whole: int = 0
+    """Position before which a record that begins is in the buffer as a whole."""
     _base: int = _FILE_HEADER
     """File offset of the buffer."""
 
@@ -332,7 +334,7 @@ class _Capture:
         """Yield all records in file order; bytes that are no record are skipped to the next data packet."""
         unpack = struct.Struct(self.order + "IIII").unpack_from
         number = 0
-        while self._fill():
+        while self._at < self._whole or self._fill():
             at, start = self._at, self._base + self._at
             if len(self._buffer) - at < _RECORD_HEADER:
                 yield Reject("the record is cut off", number, start)
@@ -357,11 +359,13 @@ class _Capture:
             if more:
                 self._drop(self._at)
                 self._buffer += more
+            self._whole = len(self._buffer) - _RECORD_HEADER - _LARGEST_RECORD
         return self._at < len(self._buffer)
 
     def _drop(self, count: int) -> None:
         """Discard the buffer's first `count` bytes."""
         self._buffer = self._buffer[count:]
+        self._whole = 0
         self._base += count
         self._at -= count
 

@@ -349,8 +349,7 @@ def decode(
         model.slot_times_ns(dual), model.slots(dual),
     )  # fmt: skip
     schema = table_schema(PACKED).arrow()
-    size = np.count_nonzero(blocks["returns"]["distance"])
-    room = Room(*(np.empty(size, field.type.to_pandas_dtype()) for field in schema))
+    room = Room(*(np.empty(azimuth.size * SLOTS, field.type.to_pandas_dtype()) for field in schema))
     packets = np.ascontiguousarray(raw).view(np.uint8).reshape(len(raw), DATA_BYTES)
     count = returned(read_only(packets), firings, dual, room)
     metadata = {BEAMS: model.beams(dual).encoded()}

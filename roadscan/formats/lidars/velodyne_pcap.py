@@ -68,9 +68,17 @@ from roadscan.formats.lidars.velodyne_segments import (
 )
 from roadscan.formats.lidars.velodyne_sentences import SENTENCES, Sentences
 from roadscan.formats.lidars.view_gaps import Gap, gap_of
-from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside, log_formats
+from roadscan.ingest.reading.format import (
+    Item,
+    LogFormat,
+    LogHeader,
+    LogSource,
+    PackedRows,
+    Reject,
+    beside,
+    log_formats,
+)
 from roadscan.ingest.reading.records import Sieve, options_of
-from roadscan.store.readings.packed_returns import returns_of
 
 _CHUNK_PACKETS: Final = 640  # 245,760 slots
 _HEADER_PACKETS: Final = 1_000  # least data packets of the first look
@@ -340,7 +348,7 @@ class _Decoder:
                 packed = decode(
                     raw[rows], epochs[rows], sweeps[rows], self.model, dual, self.options.azimuth == "driver"
                 )
-                yield Rows("returns", returns_of(packed), first_record=int(numbers[part[0]]), packed=packed)
+                yield PackedRows(packed, int(numbers[part[0]]))
 
     def _sifted(self, packets: list[Datagram], raw: npt.NDArray[np.void], numbers: npt.NDArray[np.int64]) -> Sieve:
         """Return which packets are sound, no copies, and in a part of the capture on GPS time."""

@@ -27,7 +27,7 @@ from roadscan.core.rig import Sensor, SensorKind
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.reading.columns import Quantity
-from roadscan.store.readings.packed_returns import PACKED
+from roadscan.store.readings.packed_returns import PACKED, returns_of
 
 if TYPE_CHECKING:
     from roadscan.core.survey import Survey
@@ -232,13 +232,10 @@ class Rows:
     velocity_level_m_per_s: npt.NDArray[np.float32] | None = None
     """(n, 3) stated velocity of each row, north, east, down: evidence about its position, which no table stores."""
 
-    packed: pa.RecordBatch | None = None
-    """The same rows as packed returns, which are stored in place of `batch`."""
-
     @property
     def stored(self) -> tuple[str, pa.RecordBatch]:
-        """Return the table and the batch that are stored."""
-        return (self.table, self.batch) if self.packed is None else (PACKED, self.packed)
+        """Return the table and the batch that are stored; its epochs are those of `batch`."""
+        return self.table, self.batch
 
     @property
     def numbers(self) -> npt.NDArray[np.int64]:
@@ -257,6 +254,24 @@ class Rows:
         numbers, offsets = self.numbers[rows], self.offsets[rows]
         runs = np.split(np.arange(rows.size), np.flatnonzero(np.diff(numbers) != 1) + 1)
         return [(int(numbers[run[0]]), int(offsets[run[0]]), run.size) for run in runs if run.size]
+
+
+class PackedRows(Rows):
+    """Packed returns: the rows of ``returns`` are computed where they are asked for."""
+
+    def __init__(self, packed: pa.RecordBatch, first_record: int = 0) -> None:
+        super().__init__("returns", packed, first_record=first_record)
+        self.__dict__["_packed"] = self.__dict__.pop("batch")
+
+    @functools.cached_property
+    def batch(self) -> pa.RecordBatch:  # type: ignore[override]
+        """Return them as rows of ``returns``."""
+        return returns_of(self.__dict__["_packed"])
+
+    @property
+    def stored(self) -> tuple[str, pa.RecordBatch]:
+        """Return the table and the batch that are stored."""
+        return PACKED, self.__dict__["_packed"]
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ class FutureTimes:
 
     def refused(self, rows: Rows) -> list[tuple[npt.NDArray[np.int64], str]]:
         """Return the rows of a chunk (by index) that lie in the future, with the reason."""
-        batch = rows.batch
+        _, batch = rows.stored
         if self.system is TimeSystem.FREE or not batch.num_rows or "epoch_gps_ns" not in batch.schema.names:
             return []
         column = batch.column("epoch_gps_ns")

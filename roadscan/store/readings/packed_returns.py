@@ -139,6 +139,13 @@ def returns_of(batch: pa.RecordBatch, names: Sequence[str] | None = None) -> pa.
     return pa.RecordBatch.from_arrays([columns[name] for name in schema.names], schema=schema)
 
 
+def farthest_m(batch: pa.RecordBatch) -> float:
+    """Return a bound on the distances (m) from the sensor of a batch, n > 0, of packed rows."""
+    c = Beams.of(batch.schema.metadata).columns
+    offsets_m = sum(float(np.abs(c[name]).max()) for name in ("extra_m", "reach_m", "side_m", "rise_m"))
+    return float(batch.column("distance").to_numpy().max() * c["unit_m"][0]) + offsets_m
+
+
 def write_packed_returns(path: Path, rows: pa.Table, group_rows: int) -> None:
     """Write packed rows with their beams, and the box of the places of each row group, in the footer."""
     beams = Beams.of(rows.schema.metadata)

@@ -52,7 +52,7 @@ def returned(packets, firings, dual, room):
     packets : (n, bytes) uint8.
     firings : Firings.
     dual : whether every second block repeats the one before with the other return: equal ones count once.
-    room : Room for all slots with a distance.
+    room : Room for all slots.
     """
     count = 0
     ways = firings.head.shape[2]

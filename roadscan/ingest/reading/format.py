@@ -264,7 +264,7 @@ class PackedRows(Rows):
         self.__dict__["_packed"] = self.__dict__.pop("batch")
 
     @functools.cached_property
-    def batch(self) -> pa.RecordBatch:  # type: ignore[override]
+    def batch(self) -> pa.RecordBatch:
         """Return them as rows of ``returns``."""
         return returns_of(self.__dict__["_packed"])
 

@@ -10,7 +10,7 @@ import typer
 
 from roadscan.cli.arguments import USUAL, AsJson, Dashboard, Scheduler, SurveyFile, Workers, surveys_for
 from roadscan.cli.state import plan
-from roadscan.cli.survey import Where, run_and_sum_up, run_survey, stages_named, sum_up
+from roadscan.cli.survey import Where, run_and_sum_up, run_survey, sum_up
 from roadscan.cli.terminal import print_table
 
 if TYPE_CHECKING:
@@ -40,9 +40,7 @@ def run(
         survey(str(survey_file), workers, scheduler)
         sum_up(survey_file, as_json)
         return
-    from roadscan.run.stage import stages
-
-    run_and_sum_up(survey_file, stages(), Where(workers, scheduler, dashboard), as_json)
+    run_and_sum_up(survey_file, None, Where(workers, scheduler, dashboard), as_json)
 
 
 def ingest(
@@ -53,7 +51,7 @@ def ingest(
     as_json: AsJson = False,
 ) -> None:
     """Raw logs into tables."""
-    run_and_sum_up(survey_file, stages_named("ingest"), Where(workers, scheduler, dashboard), as_json)
+    run_and_sum_up(survey_file, ["ingest"], Where(workers, scheduler, dashboard), as_json)
 
 
 def navigate(survey_file: SurveyFile) -> None:
@@ -61,7 +59,7 @@ def navigate(survey_file: SurveyFile) -> None:
     from roadscan.ingest.ingest import survey_records
     from roadscan.navigation.tasks.navigate import plan_trajectories
 
-    run = run_survey(survey_file, stages_named("navigate"), Where(0))
+    run = run_survey(survey_file, ["navigate"], Where(0))
     if not plan_trajectories(run.survey, run.store, survey_records(run.survey, run.store)):
         typer.echo("no trajectory to compute: each run has a trajectory log, or no GNSS and IMU")
 
@@ -70,7 +68,7 @@ def footprints(
     survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, dashboard: Dashboard = False
 ) -> None:
     """Which raw block touches which tile."""
-    run_survey(survey_file, stages_named("footprints"), Where(workers, scheduler, dashboard))
+    run_survey(survey_file, ["footprints"], Where(workers, scheduler, dashboard))
 
 
 def tile(
@@ -81,7 +79,7 @@ def tile(
     as_json: AsJson = False,
 ) -> None:
     """Readings into points, cells and tile files."""
-    run_and_sum_up(survey_file, stages_named("tiles"), Where(workers, scheduler, dashboard), as_json)
+    run_and_sum_up(survey_file, ["tiles"], Where(workers, scheduler, dashboard), as_json)
 
 
 def surfaces(
@@ -92,7 +90,7 @@ def surfaces(
     as_json: AsJson = False,
 ) -> None:
     """Cells or points of tiles into the reconstructed surface and its files (section `surface` of the survey file)."""
-    run_and_sum_up(survey_file, stages_named("surfaces"), Where(workers, scheduler, dashboard), as_json)
+    run_and_sum_up(survey_file, ["surfaces"], Where(workers, scheduler, dashboard), as_json)
 
 
 def make_products(
@@ -111,7 +109,7 @@ def make_products(
 ) -> None:
     """Mosaics, pictures and tables over all tiles; without a survey file, list the products there are."""
     if survey_file is not None:
-        run_and_sum_up(survey_file, stages_named("products"), Where(workers, scheduler, dashboard), as_json)
+        run_and_sum_up(survey_file, ["products"], Where(workers, scheduler, dashboard), as_json)
         return
     from roadscan.tiles.product import SurfaceProduct, TileProduct, products
 
@@ -141,12 +139,10 @@ def reprocess(
 ) -> None:
     """Compute some tiles once more, whether stale or not."""
     from roadscan.core.errors import ConfigError
-    from roadscan.run.stage import stages
-
     if not (tiles or bbox or span):
         raise ConfigError("nothing was chosen", expected="--tile, --bbox or --span")
     done = run_and_sum_up(
-        survey_file, stages(), Where(workers, scheduler, dashboard), as_json, selected(tiles, bbox, span)
+        survey_file, None, Where(workers, scheduler, dashboard), as_json, selected(tiles, bbox, span)
     )
     typer.echo(f"read {done.raw_bytes_read / 1e6:,.1f} MB of readings", err=as_json)
 

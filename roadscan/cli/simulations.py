@@ -59,11 +59,10 @@ def demo(
 ) -> None:
     """Simulate a small survey, run it, and compare the surface with the truth."""
     from roadscan.demo.demo import prepare_demo, summarise
-    from roadscan.run.stage import stages
     from roadscan.site.demo_page import page_lines
 
     survey_file = prepare_demo(out, lambda text: typer.echo(text, err=as_json))
-    run_survey(survey_file, stages(), Where(workers))
+    run_survey(survey_file, None, Where(workers))
     compared, street = summarise(survey_file), _street_in_two_epochs(out / "street", workers, as_json)
     sum_up(survey_file, as_json, {"height_error_m": compared.height_error(), "inventory": street})
     for line in () if as_json else (*compared.lines(), *street, *page_lines(survey_file)):
@@ -73,11 +72,9 @@ def demo(
 def _street_in_two_epochs(folder: Path, workers: int | None, as_json: bool) -> list[str]:
     """Survey the demo's street twice, with an edit by hand between; what its inventory says then."""
     from roadscan.demo.demo_street import AUTUMN, SPRING, STAGES, compare_epochs, edit_by_hand, prepare_street
-    from roadscan.run.stage import stage_named
 
-    wanted = tuple(stage_named(name) for name in STAGES)
     files = [prepare_street(folder, epoch, lambda text: typer.echo(text, err=as_json)) for epoch in (SPRING, AUTUMN)]
-    run_survey(files[0], wanted, Where(workers))
+    run_survey(files[0], STAGES, Where(workers))
     edit = edit_by_hand(files[0])
-    run_survey(files[1], wanted, Where(workers))
+    run_survey(files[1], STAGES, Where(workers))
     return compare_epochs(files[1], edit)

@@ -5,9 +5,10 @@ Each module holds the commands of one group as plain functions; they become comm
 
 from __future__ import annotations
 
+import gc
 import io
 import sys
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -30,6 +31,10 @@ from roadscan.cli import (
 )
 from roadscan.cli.added_stages import Commands
 from roadscan.cli.ending import ending_well
+
+_OBJECTS: Final = 100_000
+"""New objects after which Python looks for garbage: modules make many and none of it, and looking took a fifth of a
+start."""
 
 app = typer.Typer(
     name="roadscan",
@@ -113,6 +118,7 @@ app.add_typer(assets, name="inventory")
 
 def main() -> None:
     """Run the command line; an error the user can mend is printed without a traceback."""
+    gc.set_threshold(_OBJECTS)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or pipe that knows no "─" or "σ" stops nothing

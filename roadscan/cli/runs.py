@@ -139,11 +139,10 @@ def reprocess(
 ) -> None:
     """Compute some tiles once more, whether stale or not."""
     from roadscan.core.errors import ConfigError
+
     if not (tiles or bbox or span):
         raise ConfigError("nothing was chosen", expected="--tile, --bbox or --span")
-    done = run_and_sum_up(
-        survey_file, None, Where(workers, scheduler, dashboard), as_json, selected(tiles, bbox, span)
-    )
+    done = run_and_sum_up(survey_file, None, Where(workers, scheduler, dashboard), as_json, selected(tiles, bbox, span))
     typer.echo(f"read {done.raw_bytes_read / 1e6:,.1f} MB of readings", err=as_json)
 
 

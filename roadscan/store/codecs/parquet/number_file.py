@@ -9,8 +9,6 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.store.codecs.kernels.byte_planes import join, join_low
-from roadscan.store.codecs.kernels.delta_packing import FAULTS, SLACK_BYTES, WHOLE, decode
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile
 
@@ -40,6 +38,8 @@ class NumberFile(PageFile):
 
     def numbers(self, name: str, values: Array) -> None:
         """Write a loaded column to (n,) `values` of the column's type."""
+        from roadscan.store.codecs.kernels.byte_planes import join, join_low
+
         encoding = _ENCODINGS.get(self.encoding(name), -1)
         data, at, end, size = self.page(name, encoding)
         if not 0 <= size <= _most_bytes(values.size):
@@ -59,6 +59,8 @@ class NumberFile(PageFile):
             raise DamageError(f"column '{name}' does not hold {values.size} values")
 
     def _differences(self, name: str, page: Bytes, values: Array) -> None:
+        from roadscan.store.codecs.kernels.delta_packing import FAULTS, SLACK_BYTES, WHOLE, decode
+
         words = -(-(page.size + SLACK_BYTES) // _WORD)
         if self._unpacked.size < words:
             self._unpacked = np.empty(words, np.uint64)

@@ -32,7 +32,7 @@ from roadscan.cli import (
 from roadscan.cli.added_stages import Commands
 from roadscan.cli.ending import ending_well
 
-_OBJECTS: Final = 100_000
+_OBJECTS: Final = 300_000
 """New objects after which Python looks for garbage: modules make many and none of it, and looking took a fifth of a
 start."""
 

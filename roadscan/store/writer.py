@@ -17,7 +17,6 @@ import pyarrow.parquet as pq
 
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding
-from roadscan.store.codecs.parquet.number_table import is_number_table, write_number_table
 from roadscan.store.derived import with_derived
 from roadscan.store.digest import file_digest
 from roadscan.store.logs import DataFile, log_folder
@@ -197,6 +196,7 @@ class LogWriter:
 def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
     """Write rows in the encodings that measured best for their kind; equal rows give equal bytes."""
     from roadscan.store.codecs.parquet.list_table import is_list_table, write_list_table
+    from roadscan.store.codecs.parquet.number_table import is_number_table, write_number_table
 
     if is_list_table(rows.schema):
         write_list_table(path, rows, schema.row_group_rows)

@@ -8,15 +8,11 @@ import pyarrow as pa
 
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.survey import Survey
-from roadscan.ingest.reading.format import log_formats
 from roadscan.navigation.tasks.navigate import known_keys
-from roadscan.run.stage import stages
 from roadscan.store.asset_schema import asset_tables
 from roadscan.store.schema import schema_names
 from roadscan.store.sql import Limits, missing_table, query
 from roadscan.store.store import Store
-from roadscan.tiles.product import SurveyProduct, products
-from roadscan.tiles.tasks.wanted_products import wanted_products
 
 _MADE_BY: Final = {
     "mountings": "`roadscan calibrate` makes it, from the [[calibration]] of the survey file",
@@ -63,6 +59,11 @@ def not_made(name: str, survey: Survey) -> RoadscanError | None:
 
 def _way_to(table: str, survey: Survey) -> str | None:
     """Return what makes a table; None where no such table is known."""
+    from roadscan.ingest.reading.format import log_formats
+    from roadscan.run.stage import stages
+    from roadscan.tiles.product import SurveyProduct, products
+    from roadscan.tiles.tasks.wanted_products import wanted_products
+
     if table in asset_tables():
         return (
             f"`roadscan assets` makes it, where the survey file's [assets] asks for the kind '{asset_tables()[table]}'"

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import functools
 import re
-from importlib.metadata import entry_points
 from typing import Any, Final
 
 import typer
 from typer.core import TyperGroup
 
 from roadscan.cli.arguments import AsJson, Dashboard, Scheduler, SurveyFile, Workers
-from roadscan.core.plugins import files_at
+from roadscan.core.plugins import added, files_at
 
 _PLACE: Final = "**/stage.py"
 _GROUP: Final = "roadscan.stages"
@@ -41,7 +40,7 @@ def _stated() -> dict[str, str]:
 def _added() -> list[str]:
     """Names of stages that may be there: those that are stated, and entry points."""
     own = {"ingest", "navigate", "footprints", "tiles", "surfaces", "products"}
-    return sorted((_stated().keys() | {entry.name for entry in entry_points(group=_GROUP)}) - own)
+    return sorted((_stated().keys() | {entry.name for entry in added(_GROUP)}) - own)
 
 
 def _stage_command(word: str) -> Any:
@@ -69,7 +68,7 @@ def _stage_command(word: str) -> Any:
 
 def _title_of_added(word: str) -> str | None:
     """Title of a stage that another package adds; None where there is none of this name."""
-    if not entry_points(group=_GROUP):
+    if not added(_GROUP):
         return None
     from roadscan.run.stage import stages
 

@@ -38,6 +38,7 @@ def run_survey(
     """
     from roadscan.core.stopping import Stopped
     from roadscan.run.engine.compute_on import compute_on
+    from roadscan.run.progress import compiling_told
     from roadscan.run.session import Session
     from roadscan.run.stage import stages
     from roadscan.survey.preflight import preflight
@@ -53,7 +54,10 @@ def run_survey(
     def at(address: str) -> None:
         reporter.line(f"dashboard: {address}")
 
-    with compute_on(where.workers, where.scheduler, at if where.dashboard else None) as run.compute:
+    with (
+        compiling_told(reporter),
+        compute_on(where.workers, where.scheduler, at if where.dashboard else None) as run.compute,
+    ):
         try:
             run_stages(run, chosen)
         except Stopped as stop:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from typing import Final
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from roadscan.core.counted import counted
+from roadscan.core.private_folder import cache_place
 from roadscan.run.session import Reporter
+
+_LOOK_S: Final = 3.0
+"""How often it is looked for kernels that were compiled (s)."""
 
 
 class Shown(Reporter):
@@ -83,3 +92,32 @@ class TerminalReporter(Shown):
     def close(self) -> None:
         """Close the bars as they are."""
         self._bars.stop()
+
+
+@contextlib.contextmanager
+def compiling_told(reporter: Reporter) -> Iterator[None]:
+    """Tell every few seconds which kernels this machine compiles meanwhile: a first run does so for a minute.
+
+    Whatever process compiles one, it puts it into the cache that all share.
+    """
+    over, began_s = threading.Event(), time.time()
+
+    def look() -> None:
+        known = 0
+        while not over.wait(_LOOK_S):
+            made: list[tuple[float, str]] = []
+            with contextlib.suppress(OSError):  # another process puts a file in the place of one
+                files = [(file.stat().st_mtime, file.name) for file in cache_place().glob("*/*/*.nbc")]
+                made = sorted(one for one in files if one[0] >= began_s)
+            if len(made) > known:
+                known = len(made)
+                name = made[-1][1].partition("-")[0]
+                reporter.line(f"compiled, once for this machine: {counted(known, 'kernel')}, the last is {name}")
+
+    watch = threading.Thread(target=look, daemon=True)
+    watch.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watch.join()

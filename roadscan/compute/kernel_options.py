@@ -42,7 +42,7 @@ class _Late:
         return getattr(self._made or self._compiled(), name)
 
     def __reduce__(self) -> str:
-        return self.__qualname__  # type: ignore[attr-defined, no-any-return]
+        return self.__qualname__  # type: ignore[no-any-return]
 
     def _compiled(self) -> Kernel:
         from roadscan.compute.compiler import compiled

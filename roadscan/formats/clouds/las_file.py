@@ -43,12 +43,12 @@ Points: TypeAlias = "tuple[int, laspy.ScaleAwarePointRecord]"
 """Number of the first point, and points."""
 
 
-def unreadable() -> tuple[type[Exception], ...]:
-    """Return the errors of laspy and the decompressor on damaged bytes."""
+def unreadable(*more: type[Exception]) -> tuple[type[Exception], ...]:
+    """Return the errors of laspy and the decompressor on damaged bytes, and `more`."""
     import laspy
 
     return (
-        laspy.LaspyException, LazError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError,
+        *more, laspy.LaspyException, LazError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError,
         OverflowError, MemoryError, AssertionError, struct.error,
     )  # fmt: skip
 

@@ -19,6 +19,7 @@ __all__ = ["EXTRAS", "can_draw", "cv2", "is_installed", "missing", "need", "need
 EXTRAS: Final = {
     "bokeh": ("bokeh", "dashboard"),
     "cv2": ("opencv-python-headless", "opencv"),
+    "dask_gateway": ("dask-gateway", "gateway"),
     "geopandas": ("geopandas", "frames"),
     "kiss_icp.kiss_icp": ("kiss-icp", "odometry"),
     "matplotlib": ("matplotlib", "pictures"),

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Enters a root of its own as a user without rights: its root is read-only, and what it writes lies in its own folders.
 #
-#   ROOT=FOLDER [IMAGE=FOLDER] [SEEN="FOLDER …"] OWN="FOLDER:INSIDE …" NAME=NAME enter.sh COMMAND …
+#   ROOT=FOLDER [IMAGE=FOLDER] [SEEN="FOLDER …"] OWN="FOLDER:INSIDE …" [ONLY_READ="INSIDE …"] NAME=NAME enter.sh COMMAND …
 #
 # IMAGE is the root of a container's image; without one, the root is empty but for the folders SEEN of this machine.
 # To be called in a mount and a process namespace of its own (unshare --mount --pid --fork --uts --ipc).
@@ -33,6 +33,7 @@ for pair in $OWN; do
   if [ -d "${pair%%:*}" ]; then mkdir -p "$inside"; elif [ ! -e "$inside" ]; then touch "$inside"; fi
   mount --bind "${pair%%:*}" "$inside"
 done
+for inside in ${ONLY_READ:-}; do mount -o remount,bind,ro "$ROOT$inside"; done
 mount -o "remount,${IMAGE:+bind,}ro" "$ROOT"
 hostname "$NAME"
 cd "$ROOT"

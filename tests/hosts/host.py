@@ -1,4 +1,4 @@
-"""Hosts on this machine: each with its own root, user, folders, processes, name and address, on a network of the tests."""
+"""Hosts on this machine: each with its own root, user, folders, processes, name and address."""
 
 from __future__ import annotations
 
@@ -76,6 +76,8 @@ class Host:
     """Root of a container's image, in place of the folders of this machine."""
     own: dict[str, str] = field(default_factory=dict)
     """Its folders and files, by their path on the host."""
+    only_read: set[str] = field(default_factory=set)
+    """Those of them that it cannot write to."""
 
     def __post_init__(self) -> None:
         self.give("/etc/passwd", self.written("passwd", PASSWD))
@@ -121,7 +123,12 @@ class Host:
         """The command, entered as the host's user; and the environment of the program that enters."""
         root = self.folder / "root"
         root.mkdir(exist_ok=True)
-        entering = {"ROOT": str(root), "NAME": self.name, "OWN": " ".join(f"{h}:{i}" for i, h in self.own.items())}
+        entering = {
+            "ROOT": str(root),
+            "NAME": self.name,
+            "OWN": " ".join(f"{here}:{inside}" for inside, here in self.own.items()),
+        }
+        entering |= {"ONLY_READ": " ".join(sorted(self.only_read))}
         entering |= {"IMAGE": str(self.image)} if self.image else {"SEEN": machine_folders()}
         network = ["ip", "netns", "exec", self.namespace] if self.namespace else []
         inside = ["/usr/bin/env", "-i", *(f"{k}={v}" for k, v in environment.items()), *command]
@@ -156,7 +163,7 @@ class Running:
         return self.log.read_text(errors="replace")
 
     def kill(self) -> None:
-        """End it and all its processes at once, as a power cut does: they share a process namespace, whose first ends."""
+        """End it and all its processes at once, as a power cut does: the first of their process namespace ends."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()

@@ -1,4 +1,7 @@
-"""A network switch in this process: its links are cut, delay frames or lose them, as `tc netem` does where a kernel has it."""
+"""A network switch in this process: its links are cut, delay frames or lose them, as `tc netem` does.
+
+Kernels without netem are common, and a packet filter cannot delay.
+"""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
 @pytest.mark.skipif(not FAKETIME.is_file(), reason="clocks are moved with libfaketime (apt-get install libfaketime)")
 def test_clocks_that_are_off_by_minutes_change_nothing(cluster: Cluster, alone: dict[str, bytes]) -> None:
     store = cluster.fresh("clocks")
-    moved = {"LD_PRELOAD": str(FAKETIME), "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
+    moved = {"LD_PRELOAD": str(FAKETIME), "FAKETIME_DONT_FAKE_MONOTONIC": "1", "NO_FAKE_STAT": "1"}
     for host, minutes in zip(cluster.workers, ("+7m", "-11m"), strict=True):
         cluster.stop(host)
         cluster.start_worker(host, moved | {"FAKETIME": minutes}).wait_for("Registered to")

@@ -83,10 +83,9 @@ c.DaskGateway.backend_class = UnsafeLocalBackend
 c.DaskGateway.authenticator_class = "dask_gateway_server.auth.SimpleAuthenticator"
 c.DaskGateway.address = "127.0.0.1:{api}"
 c.Proxy.address = "127.0.0.1:{port}"
-c.Proxy.tcp_address = "127.0.0.1:{tcp}"
 c.UnsafeLocalBackend.clusters_directory = "{folder}"
-c.ClusterConfig.scheduler_cmd = ["{bin}/dask-scheduler"]
-c.ClusterConfig.worker_cmd = ["{bin}/dask-worker"]
+c.ClusterConfig.scheduler_cmd = ["{bin}/dask", "scheduler"]
+c.ClusterConfig.worker_cmd = ["{bin}/dask", "worker"]
 c.ClusterConfig.environment = {environment}
 """
 """Settings of a gateway whose clusters are processes of this machine."""
@@ -98,11 +97,11 @@ def gateway(tmp_path: Path, environment: dict[str, str]) -> Iterator[str]:
     pytest.importorskip("dask_gateway_server.app")
     from tests.flows.prefect_server import _free_port
 
-    ports = [_free_port() for _ in range(3)]
+    ports = [_free_port() for _ in range(2)]
     file = tmp_path / "gateway.py"
     file.write_text(
         SERVER.format(
-            api=ports[0], port=ports[1], tcp=ports[2], folder=tmp_path, bin=Path(sys.executable).parent,
+            api=ports[0], port=ports[1], folder=tmp_path, bin=Path(sys.executable).parent,
             environment={k: environment[k] for k in ("PATH", "PYTHONPATH", "HOME")},
         )
     )  # fmt: skip

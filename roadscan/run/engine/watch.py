@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from distributed import Client, Status, Worker, WorkerPlugin
+from distributed import Client, Worker, WorkerPlugin
 from tornado.ioloop import PeriodicCallback
 
 from roadscan import __version__
@@ -161,8 +161,8 @@ class SameVersion(WorkerPlugin):  # type: ignore[misc]
         self.expected = expected
 
     async def setup(self, worker: Worker) -> None:
-        """Look at the version. One that has been at work was looked at by :func:`refuse_others`."""
-        if __version__ == self.expected or worker.status == Status.running:
+        """Look at the version. One that has been at work was looked at by :func:`refuse_others`: its heart beats."""
+        if __version__ == self.expected or worker.periodic_callbacks["heartbeat"].is_running():
             return
         log.error(
             "the worker %s has roadscan %s; expected %s, as the run has that uses this scheduler: it leaves",

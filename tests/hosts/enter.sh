@@ -30,7 +30,7 @@ ln -s /proc/self/fd "$ROOT/dev/fd"
 mount -t tmpfs -o mode=1777 tmpfs "$ROOT/dev/shm"
 for pair in $OWN; do
   inside="$ROOT${pair#*:}"
-  if [ -d "${pair%%:*}" ]; then mkdir -p "$inside"; elif [ ! -e "$inside" ]; then touch "$inside"; fi
+  if [ -d "${pair%%:*}" ]; then mkdir -p "$inside"; elif [ ! -e "$inside" ]; then mkdir -p "${inside%/*}"; touch "$inside"; fi
   mount --bind "${pair%%:*}" "$inside"
 done
 for inside in ${ONLY_READ:-}; do mount -o remount,bind,ro "$ROOT$inside"; done

@@ -25,7 +25,8 @@ USER = 10_001
 """Number of the user as whom everything runs, as in deploy/Containerfile."""
 NAMESPACES = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "--uts", "--ipc"]
 ENTER = str(Path(__file__).parent / "enter.sh")
-NETWORK = "10.99.7"
+NETWORK = f"10.{64 + os.getpid() // 256 % 128}.{os.getpid() % 256}"
+"""Beginning of the addresses: two test processes at once have two networks."""
 PASSWD = f"root:x:0:0::/root:/bin/sh\nroadscan:x:{USER}:{USER}::/var/lib/roadscan:/bin/sh\n"
 
 
@@ -215,6 +216,7 @@ class Network:
 @contextlib.contextmanager
 def network(folder: Path) -> Iterator[Network]:
     """A network without hosts; all of them end with it."""
+    folder.mkdir(exist_ok=True)
     folder.chmod(0o755)
     switch = Switch()
     made = Network(folder, switch)

@@ -109,6 +109,18 @@ class Cluster:
             self.stop(host)
             self.start_worker(host, log="again").wait_for("Registered to")
 
+    def moved_clock(self, host: Host, minutes: int) -> dict[str, str]:
+        """Environment in which a host's Python takes the time to be some minutes later."""
+        place = host.folder / "clock"
+        place.mkdir(exist_ok=True)
+        (place / "sitecustomize.py").write_text(
+            "import time\n"
+            "s, ns = time.time, time.time_ns\n"
+            f"time.time, time.time_ns = lambda: s() + {60 * minutes}, lambda: ns() + {60 * minutes} * 10**9\n"
+        )
+        host.give("/srv/clock", place)
+        return {"PYTHONPATH": f"/srv/clock:{REPOSITORY}"}
+
     def give_version(self, host: Host, version: str, log: str = "other") -> Running:
         """Start a worker whose roadscan says that it is of another version, as its installation does."""
         self.stop(host)

@@ -160,7 +160,10 @@ def test_the_services_run_a_survey_through_kills(
         services.start("dask-worker")  # restart: unless-stopped
         assert final(client, tonight.id, said).type is StateType.COMPLETED, said()
         assert "a worker died: tls://" in said()
-        assert any("a worker died: tls://" in line for line in log_of(client, tonight.id) or ())
+        eventually(
+            lambda: any("a worker died: tls://" in line for line in log_of(client, tonight.id) or ()),
+            "the server's log of the run does not tell of the death", ALERT_S,
+        )  # fmt: skip
         patch = stack.enter_context(pytest.MonkeyPatch.context())
         endpoint = f"http://{services.hosts['store'].address}:7070"
         patch.setitem(fsspec.config.conf, "s3", {"endpoint_url": endpoint, "key": "tests", "secret": "tests"})

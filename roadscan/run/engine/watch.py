@@ -20,6 +20,9 @@ log = logging.getLogger(__name__)
 _LOOK_S = 2.0
 """Time between two looks at what the workers say of themselves (s): they say it once in half a second to two."""
 
+_PLUGIN = "roadscan-version"
+"""Name under which the scheduler keeps the plugin that looks at versions."""
+
 WORKERLESS_S = 300.0
 """Time without any worker after which a run with tasks ends (s): workers on a queue need minutes to start."""
 
@@ -151,7 +154,14 @@ def refuse_others(client: Client, scheduler: str) -> None:
     if others:
         log.warning("workers are refused: %s; expected roadscan %s, as this command has", words, __version__)
         client.retire_workers(list(others), close_workers=True, remove=True)
-    client.register_plugin(SameVersion(__version__), name="roadscan-version")
+    client.register_plugin(SameVersion(__version__), name=_PLUGIN)
+
+
+def refuse_nobody(client: Client) -> None:
+    """Let workers of any version join again, at the end of a run; a scheduler that is gone has forgotten it itself."""
+    if client.status == "running":
+        with contextlib.suppress(OSError, ValueError):
+            client.unregister_worker_plugin(_PLUGIN)
 
 
 class SameVersion(WorkerPlugin):  # type: ignore[misc]

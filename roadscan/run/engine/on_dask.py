@@ -18,7 +18,7 @@ from distributed.protocol import pickle
 from roadscan.core.errors import RoadscanError, RunError
 from roadscan.core.extras import need
 from roadscan.run.engine.compute import Done
-from roadscan.run.engine.watch import Watch, refuse_nobody, refuse_others, title_of
+from roadscan.run.engine.watch import Watch, refuse_others, title_of
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -241,7 +241,4 @@ def connected(scheduler: str) -> Iterator[OnDask]:
             ) from error
         with client:
             refuse_others(client, scheduler)
-            try:
-                yield OnDask(client)
-            finally:
-                refuse_nobody(client)
+            yield OnDask(client)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from distributed import Client, Worker, WorkerPlugin
+from distributed import Client
 from tornado.ioloop import PeriodicCallback
 
 from roadscan import __version__
@@ -19,9 +19,6 @@ log = logging.getLogger(__name__)
 
 _LOOK_S = 2.0
 """Time between two looks at what the workers say of themselves (s): they say it once in half a second to two."""
-
-_PLUGIN = "roadscan-version"
-"""Name under which the scheduler keeps the plugin that looks at versions."""
 
 WORKERLESS_S = 300.0
 """Time without any worker after which a run with tasks ends (s): workers on a queue need minutes to start."""
@@ -131,7 +128,7 @@ def title_of(function: Callable[..., Any], task: Any) -> str:
 
 
 def refuse_others(client: Client, scheduler: str) -> None:
-    """Send away the workers of an external scheduler that have another version of roadscan, now and later.
+    """Send away the workers of an external scheduler that have another version of roadscan; later ones are not seen.
 
     Raises
     ------
@@ -154,28 +151,3 @@ def refuse_others(client: Client, scheduler: str) -> None:
     if others:
         log.warning("workers are refused: %s; expected roadscan %s, as this command has", words, __version__)
         client.retire_workers(list(others), close_workers=True, remove=True)
-    client.register_plugin(SameVersion(__version__), name=_PLUGIN)
-
-
-def refuse_nobody(client: Client) -> None:
-    """Let workers of any version join again, at the end of a run; a scheduler that is gone has forgotten it itself."""
-    if client.status == "running":
-        with contextlib.suppress(OSError, ValueError):
-            client.unregister_worker_plugin(_PLUGIN)
-
-
-class SameVersion(WorkerPlugin):  # type: ignore[misc]
-    """Closes a worker that joins with another version, before it gets a task (runs on the worker)."""
-
-    def __init__(self, expected: str) -> None:
-        self.expected = expected
-
-    async def setup(self, worker: Worker) -> None:
-        """Look at the version. One that has been at work was looked at by :func:`refuse_others`: its heart beats."""
-        if __version__ == self.expected or worker.periodic_callbacks["heartbeat"].is_running():
-            return
-        log.error(
-            "the worker %s has roadscan %s; expected %s, as the run has that uses this scheduler: it leaves",
-            worker.address, __version__, self.expected,
-        )  # fmt: skip
-        await worker.close(reason="another version of roadscan")

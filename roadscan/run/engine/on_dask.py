@@ -19,6 +19,7 @@ from roadscan.core.errors import RoadscanError, RunError
 from roadscan.core.extras import need
 from roadscan.run.engine.compute import Done
 from roadscan.run.engine.watch import Watch, refuse_others, title_of
+from roadscan.store.holding.look import others_write
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -79,6 +80,7 @@ class OnDask:
         RunError
             The scheduler is gone, or nobody has been there for minutes to do what waits.
         """
+        others_write()
         threads = self.workers
         died: list[T] = []
         for done in self._ended(function, tasks, lambda left: _HELD_A_THREAD * threads + min(_MORE_HELD, left // 4)):

@@ -116,6 +116,8 @@ def test_a_worker_with_another_version_is_refused(cluster: Cluster, alone: dict[
     run = cluster.run("version-one")
     run.wait_for("footprints: 0 of")
     assert re.search(r"workers are refused: \S+ has roadscan 0\.0\.7; expected roadscan", run.said()), run.said()
+    cluster.give_version(other, "0.0.8", "later")
     assert run.ended(RUN_S) == 0, run.said()
+    assert re.search(r"workers are refused: \S+ has roadscan 0\.0\.8; expected roadscan", run.said()), run.said()
     cluster.stop(other)
     assert_same(contents(store), alone)

@@ -15,10 +15,11 @@ import dask
 from distributed import Client, KilledWorker
 from distributed.protocol import pickle
 
+from roadscan import __version__
 from roadscan.core.errors import RoadscanError, RunError
 from roadscan.core.extras import need
 from roadscan.run.engine.compute import Done
-from roadscan.run.engine.watch import Watch, refuse_others, title_of
+from roadscan.run.engine.watch import OtherVersionError, Watch, check_version, refuse_others, title_of
 from roadscan.store.holding.look import others_write
 
 T = TypeVar("T")
@@ -69,11 +70,11 @@ class OnDask:
         return int(max(1, sum(self._client.nthreads().values())))
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
-        """Run all tasks, most of them in parallel; a task is retried once if its worker dies or the scheduler is lost.
+        """Run all tasks, most of them in parallel; one is tried once more if its worker, or the scheduler, is lost.
 
-        Tasks that waited at the same worker fail with it. So all of them are tried again when the others have ended, on
-        half of the threads and no more than are alive, where none waits behind another: what dies there is at fault
-        itself.
+        A worker that has another version does no task, and is lost as well. Tasks that waited at the same worker fail
+        with it. So all of them are tried again when the others have ended, on half of the threads and no more than are
+        alive, where none waits behind another: what dies there is at fault itself.
 
         Raises
         ------
@@ -97,7 +98,7 @@ class OnDask:
         """
         keys = [f"{function.__name__}-{uuid.uuid4().hex}" for _ in tasks]
         sent = [pickle.dumps((function, task)) for task in tasks]
-        return list(self._client.map(_called, sent, key=keys, pure=False, retries=0))
+        return list(self._client.map(_called, sent, version=__version__, key=keys, pure=False, retries=0))
 
     def _ended(
         self, function: Callable[[T], R], tasks: Sequence[T], held: Callable[[int], int]
@@ -135,6 +136,9 @@ class OnDask:
         if future.status != "error":
             return _LostError("the scheduler lost this task", expected="a scheduler that stays", change="run again")
         error: Exception | None = future.exception()
+        if isinstance(error, OtherVersionError):
+            who = self._watch.refuse(error)
+            return _LostError(who, expected=error.expected, change="install the same version in all places")
         if not isinstance(error, KilledWorker):
             return error
         titles = {key: title_of(function, task) for key, task in held.items()}
@@ -181,12 +185,13 @@ def _more_of(ended: queue.SimpleQueue[Any], taken: list[Any], wanted: int) -> li
     return taken
 
 
-def _called(sent: bytes) -> bytes:
+def _called(sent: bytes, version: str) -> bytes:
     """Return the serialised result of a function and its task, as :class:`OnDask` sends them (runs on a worker).
 
     It is made to bytes while the task runs: a result that cannot be is the task's error then, and one whose worker dies
-    of it counts as a death.
+    of it counts as a death. A worker of another version than the run's reads nothing.
     """
+    check_version(version)
     function, task = pickle.loads(sent)
     result: bytes = pickle.dumps(function(task))
     _freeze()

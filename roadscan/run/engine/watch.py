@@ -9,11 +9,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from distributed import Client
+from distributed import Client, get_worker
 from tornado.ioloop import PeriodicCallback
 
 from roadscan import __version__
-from roadscan.core.errors import RunError
+from roadscan.core.errors import RoadscanError, RunError
 
 log = logging.getLogger(__name__)
 
@@ -92,6 +92,14 @@ class Watch:
                 change="start workers, and run again: what is finished stays",
             )
 
+    def refuse(self, error: OtherVersionError) -> str:
+        """Send away a worker that has refused a task, once; return who it is, and why."""
+        address = str(error.record)
+        if address not in self._told:
+            self._told[address] = f"{address} has {error.arrived}"
+            refuse(self._client, {address: error.arrived})
+        return self._told[address]
+
     def death(self, worker: Any, key: str, titles: Mapping[str, str]) -> str:
         """Return who died, of what and with how much memory; say it once a worker.
 
@@ -127,8 +135,26 @@ def title_of(function: Callable[..., Any], task: Any) -> str:
     return f"{function.__name__} {unit}".strip()
 
 
+class OtherVersionError(RoadscanError):
+    """A task came to a worker with another version of roadscan; `record` is the worker's address."""
+
+
+def check_version(expected: str) -> None:
+    """Check that this worker has the version of the run that sent a task (runs on a worker, before the task is read).
+
+    Raises
+    ------
+    OtherVersionError
+        where it has another.
+    """
+    if __version__ != expected:
+        raise OtherVersionError(f"roadscan {__version__}", expected=f"roadscan {expected}", record=get_worker().address)
+
+
 def refuse_others(client: Client, scheduler: str) -> None:
-    """Send away the workers of an external scheduler that have another version of roadscan; later ones are not seen.
+    """Send away the workers of an external scheduler that have another version of roadscan.
+
+    Those that join later are found by :func:`check_version` at their first task.
 
     Raises
     ------
@@ -137,17 +163,25 @@ def refuse_others(client: Client, scheduler: str) -> None:
     """
     found = client.get_versions(packages=["roadscan"])["workers"]
     others = {
-        address: said["packages"].get("roadscan") or "none"
+        address: f"roadscan {said['packages'].get('roadscan') or 'none'}"
         for address, said in found.items()
         if said["packages"].get("roadscan") != __version__
     }
-    words = "; ".join(f"{address} has roadscan {version}" for address, version in others.items())
     if others and len(others) == len(found):
         raise RunError(
-            f"the workers at {scheduler} have another version: {words}",
+            f"the workers at {scheduler} have another version: {_in_words(others)}",
             expected=f"roadscan {__version__}, as this command has",
             change="install the same version in all places, and start the workers again",
         )
     if others:
-        log.warning("workers are refused: %s; expected roadscan %s, as this command has", words, __version__)
-        client.retire_workers(list(others), close_workers=True, remove=True)
+        refuse(client, others)
+
+
+def refuse(client: Client, others: Mapping[str, str]) -> None:
+    """Send workers away, and say which version each has (by its address)."""
+    log.warning("workers are refused: %s; expected roadscan %s, as this command has", _in_words(others), __version__)
+    client.retire_workers(list(others), close_workers=True, remove=True)
+
+
+def _in_words(others: Mapping[str, str]) -> str:
+    return "; ".join(f"{address} has {version}" for address, version in others.items())

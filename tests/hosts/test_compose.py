@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import http.server
 import json
+import os
+import re
+import signal
+import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 from uuid import UUID
 
 import compose_spec
@@ -19,15 +26,17 @@ import yaml
 from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.client.schemas.objects import StateType
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
-from prefect.states import Scheduled
+from prefect.states import Scheduled, State
 
 from roadscan.core.survey import Survey
+from roadscan.simulate import Scene, simulate
+from roadscan.store.holding.lease import LEASE_S
 from roadscan.store.store import Store
 from tests.conftest import REPOSITORY
 from tests.flows.test_deployment import log_of, planned_runs
 from tests.hosts.composed import Composed, eventually, interpolated
 from tests.hosts.conftest import contents
-from tests.hosts.host import NETWORK, network
+from tests.hosts.host import NETWORK, copy_of_kernels, network
 from tests.surveys import Simulated
 
 SETTINGS = {
@@ -118,10 +127,19 @@ def alerts() -> Iterator[str]:
             thread.join()
 
 
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
+    """The demo survey, run on this machine alone by the command."""
+    survey = simulate(Scene.load("demo"), tmp_path_factory.mktemp("demo") / "city").survey_file
+    command = [sys.executable, "-m", "roadscan", "run", str(survey), "--workers", "2"]
+    subprocess.run(command, check=True, capture_output=True, timeout=RUN_S)
+    return Simulated(survey)
+
+
 @pytest.fixture
-def surveys(simulated: Simulated, tmp_path: Path) -> Path:
+def surveys(demo: Simulated, tmp_path: Path) -> Path:
     """The folder of surveys: one, with its store in the bucket."""
-    copy = simulated.copy_to(tmp_path / "surveys" / "city").survey_file
+    copy = demo.copy_to(tmp_path / "surveys" / "city").survey_file
     lines = [line for line in copy.read_text().splitlines() if not line.startswith("store =")]
     copy.write_text("\n".join(['store = "s3://roadscan/city"', *lines]))
     for folder in (tmp_path, tmp_path / "surveys"):
@@ -130,12 +148,13 @@ def surveys(simulated: Simulated, tmp_path: Path) -> Path:
 
 
 @pytest.mark.nightly
-@pytest.mark.timeout(900)
-def test_the_services_run_a_survey_through_kills(
-    hosts_possible: None, kernels: Path, surveys: Path, alone: dict[str, bytes], tmp_path: Path
+@pytest.mark.timeout(1800)
+def test_the_services_run_the_demo_through_kills(
+    hosts_possible: None, demo: Simulated, surveys: Path, tmp_path: Path
 ) -> None:
-    """A scheduled run, of which a Dask worker is killed and started again: the bytes of a run alone, and no alert."""
+    """A scheduled run is killed, and its alert comes; the next one goes on, loses a worker, and ends as a run alone."""
     given = {"store": ["python", "-m", "moto.server", "-H", "0.0.0.0", "-p", "7070"]}
+    kernels = copy_of_kernels(tmp_path / "kernels")
     with network(tmp_path / "hosts") as net, alerts() as url, ExitStack() as stack:
         settings = SETTINGS | {"ROADSCAN_ALERT_URL": url, "ROADSCAN_SURVEYS": str(surveys)}
         path = f"{Path(sys.executable).parent}:/usr/bin:/bin"
@@ -146,29 +165,57 @@ def test_the_services_run_a_survey_through_kills(
             temporary_settings({PREFECT_API_URL: api, PREFECT_API_AUTH_STRING: SETTINGS["ROADSCAN_PREFECT_AUTH"]})
         )
         client = stack.enter_context(get_client(sync_client=True))
+        said = services.running["worker"].said
 
-        tonight = planned_runs(client)[0]
+        tonight, tomorrow = planned_runs(client)[:2]
         assert tonight.auto_scheduled
         client.set_flow_run_state(tonight.id, Scheduled(), force=True)
-        said = services.running["worker"].said
-        services.running["worker"].wait_for("footprints: 0 of", RUN_S)
+        services.running["worker"].wait_for("tiles: 0 of", RUN_S)
+        for number in run_processes(services.hosts["worker"].namespace):
+            os.kill(number, signal.SIGKILL)
+        assert final(client, tonight.id, said).type is StateType.CRASHED
+        eventually(lambda: bool(Alerts.came), "no alert", ALERT_S)
+        assert [(alert["run"], alert["state"]) for alert in Alerts.came] == [(tonight.name, "Crashed")]
+
+        before = len(said())
+        free = datetime.now(UTC) + timedelta(seconds=LEASE_S)  # the dead run's lease of the store is over
+        client.set_flow_run_state(tomorrow.id, Scheduled(scheduled_time=free), force=True)
+        eventually(lambda: "tiles: 0 of" in said()[before:], "the next run does not go on", RUN_S)
         services.running["dask-worker"].kill()
         services.start("dask-worker")  # restart: unless-stopped
-        assert final(client, tonight.id, said).type is StateType.COMPLETED, said()
+        assert final(client, tomorrow.id, said).type is StateType.COMPLETED, said()
         assert "a worker died: tls://" in said()
         eventually(
-            lambda: any("a worker died: tls://" in line for line in log_of(client, tonight.id) or ()),
+            lambda: any("a worker died: tls://" in line for line in log_of(client, tomorrow.id) or ()),
             "the server's log of the run does not tell of the death", ALERT_S,
         )  # fmt: skip
         patch = stack.enter_context(pytest.MonkeyPatch.context())
         endpoint = f"http://{services.hosts['store'].address}:7070"
         patch.setitem(fsspec.config.conf, "s3", {"endpoint_url": endpoint, "key": "tests", "secret": "tests"})
         store = Store("s3://roadscan/city", Survey.load(surveys / "city" / "SURVEY.toml").config.id)
-        assert contents(store) == alone
-        assert Alerts.came == []
+        assert contents(store) == contents(demo.store())
+        assert len(Alerts.came) == 1
 
 
-def final(client: SyncPrefectClient, run: UUID, said: object) -> object:
+def final(client: SyncPrefectClient, run: UUID, said: Callable[[], str]) -> State[Any]:
     """State of a flow run when it has ended."""
-    eventually(lambda: bool(client.read_flow_run(run).state.is_final()), f"the run does not end: {said}", RUN_S)
-    return client.read_flow_run(run).state
+
+    def state() -> State[Any]:
+        found = client.read_flow_run(run).state
+        assert found is not None
+        return found
+
+    end = time.monotonic() + RUN_S
+    while not state().is_final():
+        assert time.monotonic() < end, said()
+        time.sleep(0.5)
+    return state()
+
+
+def run_processes(namespace: str) -> list[int]:
+    """Processes of a host that conduct a flow run."""
+    listed = subprocess.run(["ip", "netns", "pids", namespace], capture_output=True, text=True, check=True).stdout
+    lines = {int(number): Path(f"/proc/{number}/cmdline") for number in listed.split()}
+    found = [n for n, line in lines.items() if line.exists() and re.search("flow_engine|flow-run", line.read_text())]
+    assert found, "no process of the run"
+    return found

@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from roadscan.store.holding.lease import LEASE_S
 from tests.hosts.conftest import Cluster, contents
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(600)]
@@ -79,11 +80,17 @@ def test_a_scheduler_that_is_killed_ends_the_run_in_words(cluster: Cluster, alon
 
 @pytest.mark.parametrize("after", ["read: run-1/lidar", "footprints: 0 of", "tiles: 0 of", "products: 0 of"])
 def test_a_driver_that_is_killed_is_followed_by_another(cluster: Cluster, alone: dict[str, bytes], after: str) -> None:
+    """The next is refused while the lease of the dead one holds, and goes on when it is over."""
     name = "driver-" + re.sub(r"\W+", "-", after)
     store = cluster.fresh(name)
     run = cluster.run(name)
     run.wait_for(after)
     run.kill()
+    free = time.monotonic() + LEASE_S + 1.0
+    refused = cluster.run(f"{name}-refused")
+    assert refused.ended(30.0) == 2, refused.said()
+    assert "process 1 on driver" in refused.said()
+    time.sleep(free - time.monotonic())
     again = cluster.run(f"{name}-again")
     assert again.ended(RUN_S) == 0, again.said()
     assert_same(contents(store), alone)

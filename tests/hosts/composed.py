@@ -104,7 +104,10 @@ class Composed:
         assert image is not None
         of_image = dict(re.findall(r"(\w+)=(\S+)", image[1]))
         stated = {name: str(value) for name, value in service.get("environment", {}).items()}
-        here = {"PATH": self.search_path, "PYTHONPATH": str(REPOSITORY), "LANG": "C.UTF-8", "OPENBLAS_NUM_THREADS": "1"}
+        here = {"PATH": self.search_path, "PYTHONPATH": str(REPOSITORY), "LANG": "C.UTF-8"}
+        here |= {
+            name: value for name, value in os.environ.items() if name.startswith("OPENBLAS_")
+        }  # they move last bits
         return of_image | here | stated
 
     def _wait(self, needed: str, condition: str) -> None:

@@ -230,3 +230,10 @@ def contents(store: Store) -> dict[str, bytes]:
     """All that a store holds but records, by name."""
     found = outputs(store)
     return found | {path: store.read_bytes(path) for path in store.files("tables")}
+
+
+def assert_same(found: dict[str, bytes], alone: dict[str, bytes]) -> None:
+    """The names of what differs are told: no difference of bytes, which would take minutes."""
+    assert sorted(found) == sorted(alone)
+    differing = [name for name in alone if found[name] != alone[name]]
+    assert differing == []

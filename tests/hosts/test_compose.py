@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import http.server
 import json
-import os
-import re
-import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -24,19 +19,17 @@ import kubernetes_validate
 import pytest
 import yaml
 from prefect.client.orchestration import SyncPrefectClient, get_client
-from prefect.client.schemas.objects import FlowRun, StateType
+from prefect.client.schemas.objects import StateType
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 from prefect.states import Scheduled, State
 
 from roadscan.core.survey import Survey
-from roadscan.simulate import Scene, simulate
-from roadscan.store.holding.lease import LEASE_S
 from roadscan.store.store import Store
 from tests.conftest import REPOSITORY
 from tests.flows.test_deployment import log_of, planned_runs
 from tests.hosts.composed import Composed, eventually, interpolated
-from tests.hosts.conftest import contents
-from tests.hosts.host import NETWORK, copy_of_kernels, network
+from tests.hosts.conftest import assert_same, contents
+from tests.hosts.host import NETWORK, network
 from tests.surveys import Simulated
 
 SETTINGS = {
@@ -49,9 +42,6 @@ RUN_S = 600.0
 """Longest that a run may take."""
 ALERT_S = 60.0
 """Longest that an alert may take: Prefect's worker looks after its processes twice a minute."""
-ORDERED_S = 310.0
-"""Time after which Prefect takes a run's events without the event of its planning, which it never sends: for a run that
-begins within five minutes of it, events wait for that one for a quarter of an hour, and the alert with them."""
 
 
 def test_the_file_is_one_of_compose() -> None:
@@ -130,19 +120,10 @@ def alerts() -> Iterator[str]:
             thread.join()
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
-    """The demo survey, run on this machine alone by the command."""
-    survey = simulate(Scene.load("demo"), tmp_path_factory.mktemp("demo") / "city").survey_file
-    command = [sys.executable, "-m", "roadscan", "run", str(survey), "--workers", "2"]
-    subprocess.run(command, check=True, capture_output=True, timeout=RUN_S)
-    return Simulated(survey)
-
-
 @pytest.fixture
-def surveys(demo: Simulated, tmp_path: Path) -> Path:
+def surveys(simulated: Simulated, tmp_path: Path) -> Path:
     """The folder of surveys: one, with its store in the bucket."""
-    copy = demo.copy_to(tmp_path / "surveys" / "city").survey_file
+    copy = simulated.copy_to(tmp_path / "surveys" / "city").survey_file
     lines = [line for line in copy.read_text().splitlines() if not line.startswith("store =")]
     copy.write_text("\n".join(['store = "s3://roadscan/city"', *lines]))
     for folder in (tmp_path, tmp_path / "surveys"):
@@ -152,12 +133,11 @@ def surveys(demo: Simulated, tmp_path: Path) -> Path:
 
 @pytest.mark.nightly
 @pytest.mark.timeout(2400)
-def test_the_services_run_the_demo_through_kills(
-    hosts_possible: None, demo: Simulated, surveys: Path, tmp_path: Path
+def test_the_services_run_a_survey_through_kills(
+    hosts_possible: None, kernels: Path, surveys: Path, alone: dict[str, bytes], tmp_path: Path
 ) -> None:
-    """A scheduled run loses a worker; the next is killed, and its alert comes; the third ends as a run alone."""
+    """A scheduled run, of which a Dask worker is killed and started again: the bytes of a run alone, and no alert."""
     given = {"store": ["python", "-m", "moto.server", "-H", "0.0.0.0", "-p", "7070"]}
-    kernels = copy_of_kernels(tmp_path / "kernels")
     with network(tmp_path / "hosts") as net, alerts() as url, ExitStack() as stack:
         settings = SETTINGS | {"ROADSCAN_ALERT_URL": url, "ROADSCAN_SURVEYS": str(surveys)}
         path = f"{Path(sys.executable).parent}:/usr/bin:/bin"
@@ -173,12 +153,11 @@ def test_the_services_run_the_demo_through_kills(
         patch.setitem(fsspec.config.conf, "s3", {"endpoint_url": endpoint, "key": "tests", "secret": "tests"})
         name = Survey.load(surveys / "city" / "SURVEY.toml").config.id
         said = services.running["worker"].said
-        tonight, tomorrow, later = planned_runs(client)[:3]
-        planned_s = time.monotonic()
+        tonight = planned_runs(client)[0]
         assert tonight.auto_scheduled
 
-        due(client, tonight)
-        services.running["worker"].wait_for("tiles: 0 of", RUN_S)
+        client.set_flow_run_state(tonight.id, Scheduled(), force=True)
+        services.running["worker"].wait_for("footprints: 0 of", RUN_S)
         services.running["dask-worker"].kill()
         services.start("dask-worker")  # restart: unless-stopped
         assert final(client, tonight.id, said).type is StateType.COMPLETED, said()
@@ -186,28 +165,8 @@ def test_the_services_run_the_demo_through_kills(
             lambda: any("a worker died: tls://" in line for line in log_of(client, tonight.id) or ()),
             "the server's log of the run does not tell of the death", ALERT_S,
         )  # fmt: skip
-        assert contents(Store("s3://roadscan/city", name)) == contents(demo.store())
-
-        Store("s3://roadscan/city", name).remove("tiles")
-        before = len(said())
-        time.sleep(max(0.0, ORDERED_S - (time.monotonic() - planned_s)))
-        due(client, tomorrow)
-        eventually(lambda: "tiles: 0 of" in said()[before:], "the second run does not begin", RUN_S)
-        for process in run_processes(services.hosts["worker"].namespace):
-            os.kill(process, signal.SIGKILL)
-        assert final(client, tomorrow.id, said).type is StateType.CRASHED
-        eventually(lambda: bool(Alerts.came), "no alert", ALERT_S)
-
-        due(client, later, LEASE_S)  # the dead run's lease of the store is over then
-        assert final(client, later.id, said).type is StateType.COMPLETED, said()
-        assert contents(Store("s3://roadscan/city", name)) == contents(demo.store())
-        assert [(alert["run"], alert["state"]) for alert in Alerts.came] == [(tomorrow.name, "Crashed")]
-
-
-def due(client: SyncPrefectClient, run: FlowRun, in_s: float = 0.0) -> None:
-    """Let a planned run come earlier."""
-    at = datetime.now(UTC) + timedelta(seconds=in_s)
-    client.set_flow_run_state(run.id, Scheduled(scheduled_time=at), force=True)
+        assert_same(contents(Store("s3://roadscan/city", name)), alone)
+        assert Alerts.came == []
 
 
 def final(client: SyncPrefectClient, run: UUID, said: Callable[[], str]) -> State[Any]:
@@ -223,13 +182,3 @@ def final(client: SyncPrefectClient, run: UUID, said: Callable[[], str]) -> Stat
         assert time.monotonic() < end, said()
         time.sleep(0.5)
     return state()
-
-
-def run_processes(namespace: str) -> list[int]:
-    """Processes of a host that conduct a flow run."""
-    listed = subprocess.run(["ip", "netns", "pids", namespace], capture_output=True, text=True, check=True).stdout
-    lines = {int(number): Path(f"/proc/{number}/cmdline") for number in listed.split()}
-    conducts = re.compile(r"prefect\.engine|_workspace_")
-    found = [n for n, line in lines.items() if line.exists() and conducts.search(line.read_text())]
-    assert found, "no process of the run"
-    return found

@@ -8,18 +8,12 @@ import time
 import pytest
 
 from roadscan.store.holding.lease import LEASE_S
-from tests.hosts.conftest import Cluster, contents
+from tests.hosts.conftest import Cluster, assert_same, contents
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(600)]
 
 RUN_S = 300.0
 """Longest that a run may take: on hosts without faults it takes 30 s, with a slow store two minutes."""
-
-
-def assert_same(found: dict[str, bytes], alone: dict[str, bytes]) -> None:
-    assert sorted(found) == sorted(alone)
-    differing = [name for name in alone if found[name] != alone[name]]
-    assert differing == []
 
 
 def test_a_run_gives_the_bytes_of_a_run_alone(cluster: Cluster, alone: dict[str, bytes]) -> None:

@@ -19,9 +19,9 @@ import kubernetes_validate
 import pytest
 import yaml
 from prefect.client.orchestration import SyncPrefectClient, get_client
-from prefect.client.schemas.objects import StateType
+from prefect.client.schemas.objects import State, StateType
 from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
-from prefect.states import Scheduled, State
+from prefect.states import Scheduled
 
 from roadscan.core.survey import Survey
 from roadscan.store.store import Store

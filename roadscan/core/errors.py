@@ -131,6 +131,10 @@ class FormatError(RoadscanError):
     """A log cannot be read as the format it is said to be."""
 
 
+class ChangingLogError(FormatError):
+    """A log changes while it is read: its upload has not ended."""
+
+
 class TimeSystemError(RoadscanError):
     """A time stamp has no, or an impossible, time system."""
 
@@ -169,6 +173,22 @@ class AnswerError(DamagedError):
 
 class RunError(RoadscanError):
     """Some units of a run failed; the other outputs are complete and kept."""
+
+
+_OF_NETWORKS = ("ConnectTimeoutError", "ConnectionClosedError", "EndpointConnectionError", "ReadTimeoutError")
+"""Errors of botocore for a place that does not answer; they derive from no error of Python's own that says so."""
+
+
+def may_pass(error: BaseException) -> str:
+    """Return why the same may succeed later: a log still changes, a place does not answer; "" where nothing says so."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, ChangingLogError):
+            return "a log still changes"
+        if isinstance(cause, ConnectionError | TimeoutError) or type(cause).__name__ in _OF_NETWORKS:
+            return "a place does not answer"
+        cause = cause.__cause__ or cause.__context__
+    return ""
 
 
 def in_words(error: OSError) -> RoadscanError:

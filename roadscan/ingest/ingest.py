@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from roadscan.core.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
+from roadscan.core.errors import ChangingLogError, FormatError, FullDiskError, RoadscanError, RunError, StoreError
 from roadscan.core.gpstime import TimeSystem
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
@@ -187,7 +187,9 @@ def _check_unchanged(log: PlannedLog) -> None:
     except OSError:
         same = False
     if not same:
-        raise FormatError("the log changed while it was read", change="run again when its upload has ended", file=path)
+        raise ChangingLogError(
+            "the log changed while it was read", change="run again when its upload has ended", file=path
+        )
 
 
 def survey_records(survey: Survey, store: Store, logs: Logs | None = None) -> list[LogRecord]:

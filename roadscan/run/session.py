@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
-from roadscan.core.errors import StoreError
+from roadscan.core.errors import StoreError, may_pass
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Inline
 from roadscan.run.selection import Selection
@@ -40,6 +40,8 @@ class Session:
     reporter: Reporter = field(default_factory=Reporter)
     failures: list[tuple[str, str, str]] = field(default_factory=list)
     """Stage, unit and reason of everything that failed."""
+    passing: BaseException | None = None
+    """The first failure that may pass by itself; the run's error names it as its cause."""
     raw_bytes_read: int = 0
     """Compressed bytes of readings that the tiles stage requested."""
     stage: str = ""
@@ -113,6 +115,8 @@ class Session:
         for unit, reason in found:
             if (unit, str(reason)) not in known:  # what an earlier stage found applies to all later stages
                 self.failures.append((stage, unit, str(reason)))
+                if self.passing is None and isinstance(reason, BaseException) and may_pass(reason):
+                    self.passing = reason
                 self.reporter.line(f"failed: {stage} {unit}: {reason}")
 
     def bar(self, what: str) -> Callable[[int, int], None]:

@@ -112,7 +112,7 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
         raise RunError(
             f"{counted(len(session.failures), 'unit')} failed: {listed}{more}",
             change="everything else is finished; the next run does only these",
-        )
+        ) from session.passing
 
 
 def _report(session: Session) -> None:

@@ -90,6 +90,9 @@ def arrival(
     except RoadscanError as error:
         tell("failed", name, reason=str(error), survey_file=str(home))
         return failed(error)
+    except Exception as error:
+        tell("failed", name, reason=f"{type(error).__name__}: {error}", survey_file=str(home))
+        raise
     tell("published", name, survey_file=str(survey_file))
     return Completed(data={"survey_file": str(survey_file)})
 

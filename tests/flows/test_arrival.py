@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import shutil
+import socket
 import subprocess
 import sys
 import threading
@@ -15,17 +16,21 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import laspy
 import pytest
+from prefect import flow
 from prefect.blocks.notifications import CustomWebhookNotificationBlock
 from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterDeploymentId
 from prefect.client.schemas.objects import FlowRun
 
-from roadscan.core.errors import RoadscanError
-from roadscan.flows.arrival import arrival
+from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.flows.arrival import arrival, retried
 from roadscan.flows.watch import watch
 from roadscan.simulate import SimulatedSurvey
+from roadscan.survey.arrival.template import FleetTemplate
+from roadscan.survey.arrival.watched import Watched
 from tests.conftest import REPOSITORY
 from tests.flows.prefect_server import PrefectApi
 
@@ -126,12 +131,10 @@ def test_a_quiet_folder_is_started_once(fleet: Fleet, client: SyncPrefectClient)
     runs = {run.name: run for run in started(client, fleet)}
     assert len(started(client, fleet)) == 2
     assert (runs["drive-1"].work_queue_name, runs["urgent-2"].work_queue_name) == ("default", "urgent")
-    queues = (
-        {queue.name: queue.priority for queue in client.read_work_queues(work_pool_name="roadscan")}
-        if hasattr(client, "read_work_queues")
-        else {}
-    )
-    assert not queues or queues["urgent"] < queues["default"]
+    urgent, usual = (client.read_work_queue_by_name(name, work_pool_name="roadscan") for name in ("urgent", "default"))
+    assert urgent.priority is not None
+    assert usual.priority is not None
+    assert urgent.priority < usual.priority  # 1 comes first
 
 
 def test_an_upload_that_goes_on_is_waited_for(fleet: Fleet) -> None:
@@ -182,7 +185,8 @@ def test_from_raw_logs_to_a_page(fleet: Fleet) -> None:
     home = fleet.surveys / "drive-1"
     clouds = (home / "store" / "survey=drive-1" / "tiles" / "las").glob("*.laz")
     assert sum(laspy.read(cloud).header.point_count for cloud in clouds) == fleet.simulated.readings
-    assert (home / "site" / "roadscan.json").is_file() or any((home / "site").iterdir())
+    assert json.loads((home / "site" / "survey.json").read_text())["id"] == "drive-1"
+    assert (home / "inventory.gpkg").is_file()
 
 
 def test_what_the_template_leaves_open_is_named(fleet: Fleet) -> None:
@@ -203,6 +207,76 @@ def test_a_flipped_bit_is_refused(fleet: Fleet) -> None:
     log.write_bytes(bytes([log.read_bytes()[0] ^ 1]) + log.read_bytes()[1:])
     with pytest.raises(RoadscanError, match=r"profiler_left.parquet: not the content of MANIFEST.csv"):
         fleet.arrive("drive-1")
+
+
+def test_a_bucket_that_does_not_answer_is_tried_again(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server is not there when the flow begins; the raw logs are copied as soon as it answers."""
+    moto = pytest.importorskip("moto.server")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    for key, value in {
+        "FSSPEC_S3_ENDPOINT_URL": f"http://127.0.0.1:{port}", "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x",
+        "AWS_DEFAULT_REGION": "us-east-1", "AWS_MAX_ATTEMPTS": "1",
+    }.items():  # fmt: skip
+        monkeypatch.setenv(key, value)
+    monkeypatch.setitem(fsspec.config.conf, "s3", {"endpoint_url": f"http://127.0.0.1:{port}"})
+    write_manifest(fleet.upload("drive-1"))
+    place, homes = Watched("s3://roads/incoming", fleet.surveys), tmp_path / "surveys" / "drive-1"
+    template = FleetTemplate.load(fleet.file)
+
+    tries: list[str] = []
+
+    @flow(name="try a bucket", persist_result=False)
+    def fetched() -> Path:
+        def once() -> Path:
+            tries.append("")
+            return place.fetch("drive-1", template, homes)
+
+        return retried("fetch", once, (1.0,) * 5)
+
+    before, server = (moto.ThreadedMotoServer(ip_address="127.0.0.1", port=port) for _ in range(2))
+    before.start()
+    fs = fsspec.filesystem("s3", skip_instance_cache=True)
+    fs.mkdir("roads")
+    fs.put(str(fleet.incoming), "roads/incoming", recursive=True)
+    before.stop()  # what the bucket holds stays in this process
+
+    def begin() -> None:
+        while not tries:
+            time.sleep(0.05)
+        time.sleep(1.0)
+        server.start()
+
+    helper = threading.Thread(target=begin)
+    helper.start()
+    try:
+        logs = fetched()
+    finally:
+        helper.join()
+        server.stop()
+    assert len(tries) >= 2
+    for raw in (fleet.incoming / "drive-1").rglob("*.*"):
+        assert (logs / raw.relative_to(fleet.incoming / "drive-1")).read_bytes() == raw.read_bytes()
+
+
+def test_a_wrong_setting_is_not_tried_again(fleet: Fleet) -> None:
+    tries: list[str] = []
+
+    @flow(name="try a setting", persist_result=False)
+    def loaded() -> object:
+        def once() -> object:
+            tries.append("")
+            return FleetTemplate.load(fleet.file)
+
+        return retried("load", once, (1.0,) * 5)
+
+    fleet.file.write_text("rigg = 1")
+    with pytest.raises(ConfigError, match="rigg"):
+        loaded()
+    assert len(tries) == 1
 
 
 class Mailbox:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import io
 import re
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, Literal
@@ -73,10 +74,8 @@ class Watched:
     def names(self) -> list[str]:
         """Return the folders; StoreError where the place does not answer."""
         self.fs.invalidate_cache()
-        try:
+        with self._answering():
             found = self.fs.ls(self.root, detail=True)
-        except Exception as error:  # each library of an object store has different ones
-            raise StoreError(f"the watched folder {self.root} cannot be read: {error}", change="see to it") from error
         names = (PurePosixPath(one["name"]).name for one in found if one["type"] == "directory")
         return sorted(name for name in names if not name.startswith("."))
 
@@ -84,7 +83,8 @@ class Watched:
         """Return the files of a folder; hidden ones are left out."""
         self.fs.invalidate_cache()
         top = f"{self.root}/{name}/"
-        found = self.fs.find(top, detail=True)
+        with self._answering():
+            found = self.fs.find(top, detail=True)
         files = {
             path.removeprefix(top): (int(info["size"]), str(info.get("ETag") or info.get("mtime") or ""))
             for path, info in found.items()
@@ -143,7 +143,9 @@ class Watched:
         """Return bytes and SHA-256 ("" where not stated) by name, as a folder's manifest lists them."""
         place = f"{self.root}/{name}/{template.manifest}"
         try:
-            rows = csv.DictReader(io.StringIO(self.fs.cat_file(place).decode("utf-8-sig")))
+            with self._answering():
+                content = self.fs.cat_file(place)
+            rows = csv.DictReader(io.StringIO(content.decode("utf-8-sig")))
             listed = {row["name"]: (int(row["bytes"]), (row.get("sha256") or "").lower()) for row in rows}
         except (ValueError, KeyError, TypeError, csv.Error) as error:
             raise ConfigError(
@@ -164,6 +166,8 @@ class Watched:
             where a file is not what the manifest says, or an object's name would lead elsewhere.
         """
         listing = self.listing(name)
+        if reason := self._lacks(name, listing, template):  # the flow may be started by hand
+            raise ConfigError(reason, change="upload what is missing", file=f"{self.root}/{name}")
         logs = Path(self.root) / name if self.is_local else home / f"raw-{listing.digest[:12]}"
         for file, (size, _) in {} if self.is_local else listing.files.items():
             if ".." in file.split("/"):
@@ -172,7 +176,8 @@ class Watched:
             if not own.exists():
                 own.parent.mkdir(parents=True, exist_ok=True)
                 part = own.with_name(f".{own.name}.part")
-                self.fs.get_file(f"{self.root}/{name}/{file}", str(part))
+                with self._answering():
+                    self.fs.get_file(f"{self.root}/{name}/{file}", str(part))
                 part.replace(own)
             if own.stat().st_size != size:
                 own.unlink()
@@ -207,6 +212,17 @@ class Watched:
         draft = file.with_name(f".{uuid.uuid4().hex}")
         draft.write_bytes(checked_json(asdict(record)))
         draft.replace(file)
+
+    @contextlib.contextmanager
+    def _answering(self) -> Iterator[None]:
+        """Raise StoreError where the watched place does not answer."""
+        try:
+            yield
+        except Exception as error:  # each library of an object store has different ones
+            raise StoreError(
+                f"the watched folder {self.root} cannot be read: {error}",
+                change="see to its address, the network and your keys",
+            ) from error
 
     def _file(self, name: str) -> Path:
         return self.surveys / RECORDS / f"{name}.json"

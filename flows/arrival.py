@@ -14,7 +14,7 @@ from prefect.states import Completed
 from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.kinds import wanted_kinds
 from roadscan.core.errors import RoadscanError, RunError, StoreError, may_pass
-from roadscan.flows.conduct import failed
+from roadscan.flows.expected import failed
 from roadscan.flows.survey import survey
 from roadscan.flows.watch import tell
 from roadscan.inventory.of_survey import inventory_faults, open_inventory

@@ -11,10 +11,11 @@ from prefect.client.orchestration import get_client
 from prefect.client.schemas.objects import State
 from prefect.runtime import flow_run
 from prefect.settings import PREFECT_API_URL
-from prefect.states import Completed, Failed
+from prefect.states import Completed
 
 from roadscan.core.errors import RoadscanError, RunError
 from roadscan.core.survey import Survey
+from roadscan.flows.expected import failed, failed_stage, log_without_tracebacks
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.progress import LineReporter
 from roadscan.run.selection import Selection
@@ -23,6 +24,8 @@ from roadscan.run.stage import Stage, stages
 from roadscan.store.store import Store
 from roadscan.survey.preflight import preflight
 from roadscan.survey.run import close_run, run_stage
+
+log_without_tracebacks()
 
 
 class FlowReporter(LineReporter):
@@ -53,22 +56,29 @@ def conduct(
         survey = Survey.load(survey_file)
         store = Store(survey.store_url, survey.config.id)
         reporter = FlowReporter()
+        store.check_free()
         preflight(survey, store, selection=selection).begin(reporter.line)
         with store.lock(), compute_on(workers, scheduler) as compute:
             run = Session(survey, store, compute, selection, reporter)
             for stage in stages():
-                stage_task(stage, run)()
+                ended = stage_task(stage, run)()
+                if ended is not None:
+                    ended.result()  # raises the error of the stage
             close_run(run, stages())
     except RoadscanError as error:
         return failed(error)
     return Completed(data={"raw_bytes_read": float(run.raw_bytes_read)})
 
 
-def stage_task(stage: Stage, run: Session) -> Task[[], None]:
+def stage_task(stage: Stage, run: Session) -> Task[[], State[Any] | None]:
     """A stage as a Prefect task; what the stages share stays in this process and is not sent to the API."""
 
-    def step() -> None:
-        run_stage(run, stage)
+    def step() -> State[Any] | None:
+        try:
+            run_stage(run, stage)
+        except RoadscanError as error:
+            return failed_stage(error)
+        return None
 
     return Task(
         step,
@@ -78,11 +88,6 @@ def stage_task(stage: Stage, run: Session) -> Task[[], None]:
         cache_policy=NO_CACHE,
         persist_result=False,
     )
-
-
-def failed(error: RoadscanError) -> State[Any]:
-    """Final state of what failed for a reason that the user can mend; whoever called it gets the error raised."""
-    return Failed(message=str(error), data=error)
 
 
 def require_api() -> None:

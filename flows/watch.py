@@ -14,7 +14,7 @@ from prefect.events import emit_event
 from prefect.states import Completed
 
 from roadscan.core.errors import RoadscanError
-from roadscan.flows.conduct import failed
+from roadscan.flows.expected import failed
 from roadscan.survey.arrival.template import FleetTemplate
 from roadscan.survey.arrival.watched import Record, Watched
 

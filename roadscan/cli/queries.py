@@ -32,6 +32,15 @@ def sql(
     unconfined: Annotated[
         bool, typer.Option("--unconfined", help="Let the statement read and write any file that you may.")
     ] = False,
+    timeout: Annotated[
+        float, typer.Option(min=0.0, metavar="SECONDS", help="Stop the statement after this time; 0: never.")
+    ] = 600.0,
+    memory: Annotated[
+        float | None,
+        typer.Option(
+            min=0.01, metavar="GB", help="Memory for the statement, and as much for its answer; 40 % of the machine's."
+        ),
+    ] = None,
 ) -> None:
     """Ask the tables a question; `utc(epoch_gps_ns)` gives the UTC instant of an epoch.
 
@@ -40,12 +49,14 @@ def sql(
     """
     from roadscan.core.errors import AnswerError, StoreError
     from roadscan.run.session import Session
+    from roadscan.store.sql import Limits
     from roadscan.survey.ask import ask
 
+    limits = Limits(timeout, None if memory is None else round(memory * 1e9))
     session = Session.open(survey_file)
     damaged: list[StoreError] = []
     try:
-        result = ask(session.survey, session.store, statement, damaged, unconfined=unconfined)
+        result = ask(session.survey, session.store, statement, damaged, unconfined=unconfined, limits=limits)
     finally:
         for error in damaged:
             typer.echo(f"{'damaged' if isinstance(error, AnswerError) else 'not shown'}: {error}", err=True)

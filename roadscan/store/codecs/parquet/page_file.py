@@ -20,11 +20,14 @@ from roadscan.store.codecs.zlib_stream import crc32
 
 TAIL_BYTES: Final = 8
 """Bytes of the footer's length and of the mark that ends a Parquet file."""
+_FOOTER_BYTES: Final = 64 << 10
+"""Bytes from the end of a file that are read at first: most footers are shorter, and each read is a request to an
+object store."""
 _WORD: Final = 8  # bytes of a 64-bit word
 _LISTED: Final = ".list.element"
 
 
-class DamageError(Exception):
+class DamageError(ValueError):
     """Damage of a file; the message says what is wrong."""
 
 
@@ -55,15 +58,26 @@ class _Chunk:
 def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
     """Return the footer of a Parquet file, and whether `list_table` wrote it; DamageError where it is damaged."""
     size = stream.seek(0, os.SEEK_END)
-    tail = _read(stream, max(size - TAIL_BYTES, 0), size)
-    length = int.from_bytes(tail[:4], "little")
-    if tail[4:] != MAGIC or length > size - TAIL_BYTES:
+    tail = _read(stream, max(size - _FOOTER_BYTES, 0), size)
+    length = int.from_bytes(tail[-TAIL_BYTES:-4], "little")
+    if tail[-4:] != MAGIC or length > size - TAIL_BYTES:
         raise DamageError("it does not end as a Parquet file")
-    tail = _read(stream, size - TAIL_BYTES - length, size)
+    footer = TAIL_BYTES + length
+    tail = tail[-footer:] if footer <= len(tail) else _read(stream, size - footer, size)
     ours = sealed(tail[:-TAIL_BYTES])
     if ours is False:
         raise DamageError("its footer does not have its checksum")
     return pq.read_metadata(pa.BufferReader(tail)), ours is True
+
+
+def opened_parquet(stream: Any) -> pq.ParquetFile:
+    """Return a Parquet file of which the footer was checked before Arrow reads it: a damaged one can end the process.
+
+    A footer without a checksum is read as it is. Checksums of pages are verified in reading.
+    """
+    metadata, _ = read_footer(stream)
+    stream.seek(0)
+    return pq.ParquetFile(stream, metadata=metadata, page_checksum_verification=True)
 
 
 def _read(stream: Any, start: int, end: int) -> bytes:

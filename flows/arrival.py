@@ -135,7 +135,7 @@ def admit(watched: str, fleet: Path, surveys: Path, name: str) -> Path:
 
 
 def run(survey_file: Path, workers: int | None, scheduler: str | None) -> None:
-    """Run the survey as a flow run of its own."""
+    """Run the survey as a flow run below this one."""
     survey(str(survey_file), workers, scheduler)
 
 

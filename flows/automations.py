@@ -31,7 +31,7 @@ async def install(file: Path, notify: str | None) -> list[str]:
     ConfigError
         where the server has no such block.
     """
-    told: list[dict[str, Any]] = yaml.safe_load(file.read_text(encoding="utf-8"))["automations"]
+    asked: list[dict[str, Any]] = yaml.safe_load(file.read_text(encoding="utf-8"))["automations"]
     done = []
     async with get_client() as client:
         if notify is not None:
@@ -40,8 +40,8 @@ async def install(file: Path, notify: str | None) -> list[str]:
                 block = await client.read_block_document_by_name(name, kind)
             except ObjectNotFound:
                 raise ConfigError(f"the server has no block {notify}", expected="TYPE/NAME of a saved block") from None
-            told = json.loads(json.dumps(told).replace(f'"{_NOTIFY}"', f'"{block.id}"'))
-        for one in told:
+            asked = json.loads(json.dumps(asked).replace(f'"{_NOTIFY}"', f'"{block.id}"'))
+        for one in asked:
             if f'"{_NOTIFY}"' in json.dumps(one):
                 continue
             wanted = AutomationCore.model_validate(one)
@@ -60,6 +60,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("--notify", help="block that sends messages, TYPE/NAME")
-    asked = parser.parse_args()
-    for installed in asyncio.run(install(asked.file, asked.notify)):
+    arguments = parser.parse_args()
+    for installed in asyncio.run(install(arguments.file, arguments.notify)):
         typer.echo(f"installed: {installed}")

@@ -8,17 +8,30 @@ from pathlib import Path
 from typing import Any, Literal
 
 from prefect import flow, get_run_logger
-from prefect.client.schemas.objects import State
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import (
+    FlowRunFilter,
+    FlowRunFilterDeploymentId,
+    FlowRunFilterState,
+    FlowRunFilterStateType,
+)
+from prefect.client.schemas.objects import State, StateType
+from prefect.client.schemas.sorting import FlowRunSort
 from prefect.deployments import run_deployment
 from prefect.events import emit_event
-from prefect.states import Completed
+from prefect.exceptions import ObjectNotFound
+from prefect.states import Completed, Scheduled
+from prefect.utilities.hashing import hash_objects
 
-from roadscan.core.errors import RoadscanError
+from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.flows.expected import failed
 from roadscan.survey.arrival.template import FleetTemplate
 from roadscan.survey.arrival.watched import Record, Watched
 
 What = Literal["arrived", "refused", "changed", "published", "failed"]
+
+RESUMES = 3
+"""Most times that a run whose process died is resumed: one that needs more memory than there is dies each time."""
 
 
 def tell(what: What, survey: str, **payload: Any) -> None:
@@ -31,6 +44,8 @@ def tell(what: What, survey: str, **payload: Any) -> None:
 def watch(watched: str, fleet: str, surveys: str = ".", deployment: str = "arrival/fleet") -> State[Any]:
     """Look at each folder once: start a run for one that is complete, name one that is refused, leave others.
 
+    Runs whose process died are resumed.
+
     Parameters
     ----------
     watched : folder or URL of a bucket; each folder in it is a survey's raw logs.
@@ -40,7 +55,7 @@ def watch(watched: str, fleet: str, surveys: str = ".", deployment: str = "arriv
 
     Returns
     -------
-    Names of folders by what became of them: `started`, `refused`, `changed`.
+    Names of folders by what became of them: `started`, `refused`, `changed`, `resumed`.
 
     Raises
     ------
@@ -49,11 +64,12 @@ def watch(watched: str, fleet: str, surveys: str = ".", deployment: str = "arriv
         looked at; all others were.
     """
     log = get_run_logger()
-    new: dict[str, list[str]] = {"started": [], "refused": [], "changed": []}
+    new: dict[str, list[str]] = {"started": [], "refused": [], "changed": [], "resumed": []}
     faults: list[RoadscanError] = []
     try:
         place, template = Watched(watched, Path(surveys)), FleetTemplate.load(Path(fleet))
         names = place.names()
+        new["resumed"] += _resumed(deployment)
     except RoadscanError as error:
         return failed(error)
     parameters = {"watched": watched, "fleet": fleet, "surveys": surveys}
@@ -83,15 +99,38 @@ def watch(watched: str, fleet: str, surveys: str = ".", deployment: str = "arriv
 
 
 def _start(deployment: str, template: FleetTemplate, name: str, found: Record, parameters: dict[str, str]) -> None:
-    """Ask for a run; the server starts no second one for the same files, whoever asks."""
+    """Ask for a run; the server starts no second one for the same files of the same place, whoever asks."""
+    parameters = parameters | {"name": name}
     run: Any = run_deployment(
         deployment,
-        parameters=parameters | {"name": name},
+        parameters=parameters,
         flow_run_name=name,
         timeout=0,
         as_subflow=False,
-        idempotency_key=f"roadscan-arrival-{name}-{found.listing}",
+        idempotency_key=hash_objects("roadscan arrival", parameters, found.listing),
         work_queue_name=next((q for pattern, q in template.queues.items() if fnmatchcase(name, pattern)), None),
     )
     get_run_logger().info("%s arrived: flow run %s", name, run.id)
     tell("arrived", name, flow_run=str(run.id))
+
+
+def _resumed(deployment: str) -> list[str]:
+    """Schedule runs again that crashed: their process, its worker or their machine died. Return the folders."""
+    names = []
+    with get_client(sync_client=True) as client:
+        try:
+            of_deployment = FlowRunFilterDeploymentId(any_=[client.read_deployment_by_name(deployment).id])
+        except ObjectNotFound:
+            raise ConfigError(
+                f"the server has no deployment {deployment}",
+                change="prefect deploy --all --prefect-file deploy/arrival.yaml",
+            ) from None
+        crashed = FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.CRASHED]))
+        found = FlowRunFilter(deployment_id=of_deployment, state=crashed)
+        for run in client.read_flow_runs(flow_run_filter=found, sort=FlowRunSort.START_TIME_DESC):
+            if run.run_count <= RESUMES:
+                state: State[Any] = Scheduled(message=f"Resumed, {run.run_count} of {RESUMES}: its process had died")
+                client.set_flow_run_state(run.id, state, force=True)
+                get_run_logger().warning("%s: %s", run.name, state.message)
+                names.append(run.name)
+    return names

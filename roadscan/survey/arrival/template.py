@@ -151,7 +151,7 @@ def _laid_over(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, A
 
 
 def _lines(values: Mapping[str, Any], above: str = "") -> Iterator[str]:
-    """Yield a table as TOML: values first, then tables and lists of tables with headers of their own."""
+    """Yield a table as TOML: values first, then tables and lists of tables, each below a header."""
     nested = {k: v for k, v in values.items() if isinstance(v, dict) or _is_list_of_tables(v)}
     yield from (f"{toml_key(k)} = {toml(v)}" for k, v in values.items() if k not in nested)
     for key, value in nested.items():

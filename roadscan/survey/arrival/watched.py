@@ -26,6 +26,8 @@ RECORDS: Final = ".arrivals"
 """Folder of the records below the folder of surveys: one file a folder that was seen."""
 _SOUND: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 """Names that a survey's id can have."""
+_MARKS: Final = ("ETag", "etag", "md5Hash", "last_modified", "mtime")
+"""What changes with a file's content, by the names that S3, Azure and Google, and file systems give it."""
 _TOLD: Final = 5
 """Most files that a reason names."""
 
@@ -72,10 +74,15 @@ class Watched:
         self.surveys = surveys
 
     def names(self) -> list[str]:
-        """Return the folders; StoreError where the place does not answer."""
+        """Return the folders; StoreError where the place does not answer, or no such folder or bucket is there."""
         self.fs.invalidate_cache()
         with self._answering():
-            found = self.fs.ls(self.root, detail=True)
+            try:
+                found = self.fs.ls(self.root, detail=True)
+            except FileNotFoundError:  # below a bucket, a folder is there as soon as something lies in it
+                if self.is_local or not self.fs.exists(self.root.partition("/")[0]):
+                    raise
+                found = []
         names = (PurePosixPath(one["name"]).name for one in found if one["type"] == "directory")
         return sorted(name for name in names if not name.startswith("."))
 
@@ -86,7 +93,7 @@ class Watched:
         with self._answering():
             found = self.fs.find(top, detail=True)
         files = {
-            path.removeprefix(top): (int(info["size"]), str(info.get("ETag") or info.get("mtime") or ""))
+            path.removeprefix(top): (int(info["size"]), str(next((info[key] for key in _MARKS if info.get(key)), "")))
             for path, info in found.items()
         }
         return Listing({n: v for n, v in files.items() if not any(p.startswith(".") for p in n.split("/")) and n})
@@ -172,16 +179,18 @@ class Watched:
         for file, (size, _) in {} if self.is_local else listing.files.items():
             if ".." in file.split("/"):
                 raise ConfigError(f"an object is named {file!r}", expected="a name without ..", file=name)
-            own = logs / file
-            if not own.exists():
-                own.parent.mkdir(parents=True, exist_ok=True)
-                part = own.with_name(f".{own.name}.part")
+            copy = logs / file
+            if not copy.exists():
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                part = copy.with_name(f".{copy.name}.part")
                 with self._answering():
                     self.fs.get_file(f"{self.root}/{name}/{file}", str(part))
-                part.replace(own)
-            if own.stat().st_size != size:
-                own.unlink()
-                raise ChangingLogError("the object changed while it was copied", change="wait for its upload", file=own)
+                part.replace(copy)
+            if copy.stat().st_size != size:
+                copy.unlink()
+                raise ChangingLogError(
+                    "the object changed while it was copied", change="wait for its upload", file=copy
+                )
         wanted = self.manifest(name, template) if template.manifest in listing.files else {}
         for file, (_, digest) in wanted.items():
             with (logs / file).open("rb") as stream:

@@ -36,12 +36,14 @@ clock = {{ system = "gps_week_seconds", week = "overlap" }}
 class Fleet:
     """A watched folder, a folder of surveys and a template."""
 
-    def __init__(self, folder: Path, simulated: SimulatedSurvey) -> None:
-        self.incoming, self.surveys, self.file = folder / "incoming", folder / "surveys", folder / "FLEET.toml"
+    def __init__(self, folder: Path, simulated: SimulatedSurvey, *, together: bool = False) -> None:
+        """`together`: surveys lie beside the watched folder, as deploy/arrival.yaml has it."""
+        self.incoming, self.file = folder / "incoming", folder / "FLEET.toml"
+        self.surveys = folder if together else folder / "surveys"
         self.simulated = simulated
         self.raw = simulated.folder / "raw"
         self.incoming.mkdir()
-        self.surveys.mkdir()
+        self.surveys.mkdir(exist_ok=True)
         shutil.copy(simulated.folder / "RIG.toml", folder)
         self.state(quiet_min=0)
 
@@ -62,6 +64,10 @@ class Fleet:
 
     def arrive(self, name: str, *after_s: float) -> None:
         arrival(**self.parameters(name=name, workers=0, retry_after_s=after_s))
+
+    def knows(self, name: str) -> bool:
+        """Whether anything is remembered of a folder."""
+        return (self.surveys / ".arrivals" / f"{name}.json").is_file()
 
     def record(self, name: str) -> dict[str, Any]:
         """What is remembered of a folder."""

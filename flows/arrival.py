@@ -14,6 +14,7 @@ from prefect.states import Completed
 from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.kinds import wanted_kinds
 from roadscan.core.errors import RoadscanError, RunError, StoreError, may_pass
+from roadscan.flows.conduct import end_with_worker
 from roadscan.flows.expected import failed
 from roadscan.flows.survey import survey
 from roadscan.flows.watch import tell
@@ -72,6 +73,7 @@ def arrival(
     RoadscanError
         where a step failed; those before it are done.
     """
+    end_with_worker()
     home = Path(surveys) / name
 
     def step(title: str, work: Callable[[], T]) -> T:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +31,11 @@ from roadscan.survey.run import close_run, run_stage
 
 log_without_tracebacks()
 
+_BY_WORKER = "PREFECT__FLOW_RUN_ID"
+"""Variable that Prefect's workers set for the process of a run."""
+_LOOK_S = 1.0
+"""Time between looks at the worker (s)."""
+
 
 class FlowReporter(LineReporter):
     """Sends a run's news to the flow run's log; progress at most twice a minute."""
@@ -38,6 +47,23 @@ class FlowReporter(LineReporter):
     def line(self, text: str) -> None:
         """Log one line."""
         self._logger.info(text)
+
+
+def end_with_worker() -> None:
+    """Let this process end soon after the worker that started it, if one did.
+
+    Nobody reads the run's output then. A run whose Dask workers were about to start has waited for them for ever, and
+    lived as far as the server could see.
+    """
+    worker = os.getppid()
+
+    def look() -> None:
+        while os.getppid() == worker:
+            time.sleep(_LOOK_S)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    if _BY_WORKER in os.environ:
+        threading.Thread(target=look, name="roadscan-worker-lives", daemon=True).start()
 
 
 def run_name() -> str:
@@ -52,6 +78,7 @@ def conduct(
 
     An error that the user can mend makes the run Failed with the error's own words; any other keeps its traceback.
     """
+    end_with_worker()
     try:
         survey = Survey.load(survey_file)
         store = Store(survey.store_url, survey.config.id)

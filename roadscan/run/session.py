@@ -40,8 +40,8 @@ class Session:
     reporter: Reporter = field(default_factory=Reporter)
     failures: list[tuple[str, str, str]] = field(default_factory=list)
     """Stage, unit and reason of everything that failed."""
-    passing: BaseException | None = None
-    """The first failure that may pass by itself; the run's error names it as its cause."""
+    passes: str = ""
+    """Why one of them may pass by itself, empty where nothing says so."""
     raw_bytes_read: int = 0
     """Compressed bytes of readings that the tiles stage requested."""
     stage: str = ""
@@ -115,8 +115,8 @@ class Session:
         for unit, reason in found:
             if (unit, str(reason)) not in known:  # what an earlier stage found applies to all later stages
                 self.failures.append((stage, unit, str(reason)))
-                if self.passing is None and isinstance(reason, BaseException) and may_pass(reason):
-                    self.passing = reason
+                why = may_pass(reason) if isinstance(reason, BaseException) else getattr(reason, "passes", "")
+                self.passes = self.passes or why
                 self.reporter.line(f"failed: {stage} {unit}: {reason}")
 
     def bar(self, what: str) -> Callable[[int, int], None]:

@@ -130,10 +130,12 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
     if session.failures:
         listed = "; ".join(f"{s} {u}: {r}" for s, u, r in session.failures[:10])
         more = f"; and {len(session.failures) - 10} more (`roadscan status`)" if len(session.failures) > 10 else ""
-        raise RunError(
+        error = RunError(
             f"{counted(len(session.failures), 'unit')} failed: {listed}{more}",
             change="everything else is finished; the next run does only these",
-        ) from session.passing
+        )
+        error.passes = session.passes
+        raise error
 
 
 def _report(session: Session) -> None:

@@ -72,7 +72,7 @@ class RoadscanError(Exception):
         self.file = None if file is None else str(file)
         self.record = record
         self.passes = ""
-        """What :func:`may_pass` said where its cause was known: a worker does not send it."""
+        """What :func:`may_pass` said where its cause was known: a worker need not send it."""
         super().__init__(arrived, expected, change, self.file, record)
 
     def __str__(self) -> str:

@@ -108,9 +108,9 @@ class RoadscanError(Exception):
         )
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Keep the keyword parts when a worker pickles the error for the scheduler."""
+        """Keep the keyword parts, and what was noted on it, when a worker pickles the error for the scheduler."""
         state = (self.arrived, self.expected, self.change, self.file, self.record, self.missing)
-        return (_rebuild, (type(self), state))
+        return (_rebuild, (type(self), state), self.__dict__)
 
 
 def _rebuild(kind: type[RoadscanError], state: tuple[Any, ...]) -> RoadscanError:

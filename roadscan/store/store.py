@@ -52,6 +52,19 @@ MADE_AGAIN: Final = "run `roadscan verify`, which finds all such files; the next
 
 _T = TypeVar("_T")
 
+_PUT: Final = [0]
+"""Bytes of the files that this process has published."""
+
+
+def count_put(size: int) -> None:
+    """Count bytes that this process has published."""
+    _PUT[0] += size
+
+
+def bytes_put() -> int:
+    """Return the bytes of all files that this process has published in stores so far."""
+    return _PUT[0]
+
 
 class Store:
     """Location of one survey's store; cheap to create, and safe to send to a worker."""
@@ -175,6 +188,7 @@ class Store:
     def publish(self, local: Path, relative: str, *, lasting: bool = False) -> None:
         """Move a finished local file into the store under its final name, durably if it is `lasting`."""
         target = self.path(relative)
+        count_put(local.stat().st_size)
         if self.is_folder:
             try:
                 _made(Path(target).parent, lambda: local.replace(target), lasting)

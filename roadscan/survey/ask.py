@@ -22,6 +22,7 @@ _MADE_BY: Final = {
     "mountings": "`roadscan calibrate` makes it, from the [[calibration]] of the survey file",
     "outputs": "`roadscan run` makes it",
     "reading_classes": "`roadscan classes` writes it as a file of its own; read that with read_parquet",
+    "run_history": "`roadscan run` writes it when it ends",
     "regions": 'a run makes it with regions = "found" in [surface]',
 }
 """What makes tables that no stage writes, or not always."""

@@ -21,6 +21,7 @@ from roadscan.ingest.sources import damaged_sources
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.session import Session
 from roadscan.run.stage import StageState, findings_of, stages
+from roadscan.store.history import history_faults
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
 from roadscan.store.repair_records import fault_of
@@ -180,7 +181,13 @@ def find_damage(store: Store, report: Callable[[int, int], None] = lambda _a, _b
     manifest = Manifest(store, damaged)
     logs = read_log_records(store, damaged=damaged)
     found = Damage(
-        [*map(str, damaged), *damaged_sources(store), *_copy_faults(store, [r.key for r in logs]), *held_faults(store)]
+        [
+            *map(str, damaged),
+            *damaged_sources(store),
+            *_copy_faults(store, [r.key for r in logs]),
+            *held_faults(store),
+            *history_faults(store).values(),
+        ]
     )
     data = [f for r in logs for own in r.tables.values() for f in own]
     outputs = [r for r in manifest.all() if r.path]

@@ -118,6 +118,15 @@ SurveyOption = Annotated[
         autocompletion=surveys_for,
     ),
 ]
+SurveyOrFleet = Annotated[
+    Path | None,
+    typer.Option(
+        "--survey",
+        help="The survey file; the current folder's where it is left out.",
+        show_default=False,
+        autocompletion=surveys_for,
+    ),
+]
 Workers = Annotated[
     int | None, typer.Option(help="Worker processes of the embedded cluster; 0 computes in this process.")
 ]

@@ -24,6 +24,21 @@ def write_history(store: Store, name: str, rows: Iterable[Mapping[str, Any]]) ->
     store.write_bytes(f"{schema.location}/{name}.parquet", content)
 
 
+def last_run(store: Store) -> dict[str, Any] | None:
+    """Return the first row of the run that began last, None where the history is empty.
+
+    Raises
+    ------
+    DamagedError
+        Its file is damaged.
+    """
+    paths = store.files(str(table_schema(TABLE).location), ".parquet")
+    if not paths:
+        return None
+    rows: list[dict[str, Any]] = _read(store, paths[-1]).to_pylist()
+    return rows[0]
+
+
 def history_faults(store: Store, paths: Iterable[str] | None = None) -> dict[str, str]:
     """Return the faults of files of the history (of all, where none are named) by their paths."""
     folder = str(table_schema(TABLE).location)
@@ -32,10 +47,14 @@ def history_faults(store: Store, paths: Iterable[str] | None = None) -> dict[str
         if not path.startswith(f"{folder}/"):
             continue
         try:
-            content = store.read_bytes(path)
-            if not bears_seal(content):
-                raise DamagedError("the file bears no seal", change=_CHANGE, file=store.path(path))
-            store.parse_table(content, path, change=_CHANGE)
+            _read(store, path)
         except StoreError as error:
             found[path] = str(error)
     return found
+
+
+def _read(store: Store, path: str) -> pa.Table:
+    content = store.read_bytes(path)
+    if not bears_seal(content):
+        raise DamagedError("the file bears no seal", change=_CHANGE, file=store.path(path))
+    return store.parse_table(content, path, change=_CHANGE)

@@ -12,7 +12,7 @@ import io
 import os
 import stat
 import threading
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 from fsspec import AbstractFileSystem
 
@@ -44,6 +44,23 @@ def url(store: Store, path: str) -> str:
     return f"{PROTOCOL}://survey={store.survey_id}/{path}"
 
 
+class OpenedFiles(Protocol):
+    """What a connection opens and what it was denied."""
+
+    @property
+    def refused(self) -> list[str]:
+        """Denied requests, in words."""
+        ...
+
+    def last(self) -> str | None:
+        """Return the file that was opened last."""
+        ...
+
+    def forget(self) -> None:
+        """Count no file as opened by now."""
+        ...
+
+
 class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
     """One survey's files as ``store://survey=<id>/…``; it records which of them are opened.
 
@@ -64,8 +81,20 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         self._alone = threading.Lock()  # DuckDB opens files from several threads
         self.opened: dict[str, Stamp] = {}
         """Opened files, relative to the survey's root, with their stamps at that time."""
-        self.refused: list[str] = []
+        self._refused: list[str] = []
+
+    @property
+    def refused(self) -> list[str]:
         """Denied requests, in words."""
+        return self._refused
+
+    def last(self) -> str | None:
+        """Return the file that was opened last."""
+        return next(reversed(self.opened), None)
+
+    def forget(self) -> None:
+        """Count no file as opened by now."""
+        self.opened.clear()
 
     def open(self, path: str, mode: str = "rb", **_: Any) -> Any:
         """Return a file's bytes; PermissionError for any other mode and for files outside."""
@@ -138,7 +167,7 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         return real == self._root or real.startswith(f"{self._root}/")
 
     def _refuse(self, words: str) -> None:
-        self.refused.append(words)
+        self._refused.append(words)
         raise PermissionError(words)
 
 

@@ -72,7 +72,7 @@ class Store:
     def __init__(self, url: str, survey_id: str) -> None:
         self.url = url
         self.survey_id = survey_id
-        self.fs, base = _opened(url)
+        self.fs, base = opened_url(url)
         self.root = f"{base.rstrip('/')}/survey={survey_id}"
         self.is_folder = "file" in self.fs.protocol or "local" in self.fs.protocol
 
@@ -338,7 +338,7 @@ def _sync_file(path: Path) -> None:
         os.fsync(stream.fileno())
 
 
-def _opened(url: str) -> tuple[Any, str]:
+def opened_url(url: str) -> tuple[Any, str]:
     """Return file system and path of a store; a folder's name may contain the URL separator ``::`` of fsspec.
 
     Lists of what an object store holds are not kept: workers write to it at the same time.
@@ -357,6 +357,24 @@ def _opened(url: str) -> tuple[Any, str]:
         return opened
     folders = fsspec.filesystem("file")
     return folders, folders._strip_protocol(url)
+
+
+def put_file(fs: Any, path: str, content: bytes) -> None:
+    """Write a small file that belongs to no survey, whole or not at all; one that has this content stays as it is."""
+    with _in_words(path):
+        if fs.exists(path) and bytes(fs.cat_file(path)) == content:
+            return
+        if "file" not in fs.protocol and "local" not in fs.protocol:
+            fs.pipe_file(path, content)
+            return
+        target = Path(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = target.with_name(f".{os.getpid()}-{uuid.uuid4().hex}")
+        try:
+            temporary.write_bytes(content)
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -138,6 +138,7 @@ Dashboard = Annotated[
         help="Serve Dask's dashboard of the embedded cluster; every user of this machine can look at it.",
     ),
 ]
+PlainJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object, and nothing else.")]
 
 

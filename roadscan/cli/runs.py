@@ -12,7 +12,7 @@ import typer
 from roadscan.cli.arguments import USUAL, AsJson, Dashboard, Scheduler, SurveyFile, Workers, options_apart, surveys_for
 from roadscan.cli.state import plan
 from roadscan.cli.survey import Where, run_and_sum_up, run_survey, stages_named, sum_up
-from roadscan.cli.terminal import print_table
+from roadscan.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from roadscan.run.selection import Selection
@@ -77,21 +77,29 @@ def ingest(
     run_and_sum_up(survey_file, stages_named("ingest"), Where(workers, scheduler, dashboard), as_json)
 
 
-def navigate(survey_file: SurveyFile) -> None:
+def navigate(survey_file: SurveyFile, as_json: AsJson = False) -> None:
     """Trajectories from GNSS, IMU and odometer, and clocks from shared motion."""
     from roadscan.ingest.ingest import survey_records
     from roadscan.navigation.tasks.navigate import plan_trajectories
 
     run = run_survey(survey_file, stages_named("navigate"), Where(0))
-    if not plan_trajectories(run.survey, run.store, survey_records(run.survey, run.store)):
+    if as_json:
+        sum_up(survey_file, as_json)
+    elif not plan_trajectories(run.survey, run.store, survey_records(run.survey, run.store)):
         typer.echo("no trajectory to compute: each run has a trajectory log, or no GNSS and IMU")
 
 
 def footprints(
-    survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, dashboard: Dashboard = False
+    survey_file: SurveyFile,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    dashboard: Dashboard = False,
+    as_json: AsJson = False,
 ) -> None:
     """Which raw block touches which tile."""
     run_survey(survey_file, stages_named("footprints"), Where(workers, scheduler, dashboard))
+    if as_json:
+        sum_up(survey_file, as_json)
 
 
 def tile(
@@ -147,7 +155,11 @@ def make_products(
         )
         for name, p in products().items()
     ]
-    print_table(("product", "of", "made", "what"), rows)
+    head = ("product", "of", "made", "what")
+    if as_json:
+        print_json([dict(zip(head, row, strict=True)) for row in rows])
+        return
+    print_table(head, rows)
 
 
 def reprocess(

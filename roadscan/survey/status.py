@@ -80,6 +80,28 @@ class Status:
         found = [one.line for one in self.findings]
         return [*self.checked, *found, *(note for state in self.stages.values() for note in state.notes)]
 
+    def as_json(self) -> dict[str, Any]:
+        """Return what `roadscan status` prints as JSON values."""
+        states = {
+            name: {"current": one.current, "due": one.stale, "empty": one.empty, "why": dict(one.why)}
+            for name, one in self.stages.items()
+        }
+        return {
+            "complete": self.is_complete,
+            "logs": self.logs,
+            "unused_logs": self.unused_logs,
+            "readings": self.readings,
+            "stages": states,
+            "due": self.due,
+            "outputs": self.outputs,
+            "damaged": self.damaged,
+            "lost": [one.as_json() for one in self.lost],
+            "notes": self.notes,
+            "no_tiles": self.note or self.places_nothing,
+            "would_fail": self.would_fail,
+            "failures": self.failures,
+        }
+
     @property
     def due(self) -> dict[str, int]:
         """How many units the next run would make, by stage, as far as is known by now; :mod:`roadscan.survey.plan`

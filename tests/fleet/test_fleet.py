@@ -34,6 +34,18 @@ ROADS = {
     "south-2026": (3.0, "2026-06-09T08:00:00Z", {"crs": "EPSG:32633", "easting_m": 391000.0, "northing_m": 5820000.0}),
 }
 """Roughness that the road has (IRI, m/km), when it was driven, and its map."""
+LANES = """
+[adjust]
+on = false
+
+[condition]
+section_m = 25.0
+
+[[condition.lanes]]
+name = "2"
+offset_m = 0.0
+width_m = 3.5
+"""
 SBET = np.dtype([("time", "<f8"), ("lat", "<f8"), ("lon", "<f8"), ("alt", "<f8"), ("more", "<f8", 13)])
 YEARLY = """SELECT f.year, round(sum(s.station_to_m - s.station_from_m) / 1000, 3) AS lane_km,
 sum(s.mri_m_per_km * (s.station_to_m - s.station_from_m)) / sum(s.station_to_m - s.station_from_m) AS mri
@@ -55,8 +67,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
             profilers={"spacing_m": 0.05, "readings": 200},
         )  # fmt: skip
         file = simulate(scene, folder / name).survey_file
-        lanes = '\n[condition]\nsection_m = 25.0\n[[condition.lanes]]\nname = "2"\noffset_m = 0.0\nwidth_m = 3.5\n'
-        file.write_text(file.read_text() + lanes)
+        file.write_text(file.read_text() + LANES)
         done = cli("run", str(file), "--workers", "0")
         assert done.exit_code == 0, (done.output, done.exception)
     assert cli("fleet", str(folder)).exit_code == 0

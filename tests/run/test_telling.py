@@ -7,6 +7,7 @@ import gzip
 import json
 import os
 import pickle
+import re
 import shutil
 import socket
 import threading
@@ -30,6 +31,7 @@ from roadscan.run.progress import LineReporter
 from roadscan.store.history import history_faults
 from roadscan.store.sql import query
 from roadscan.store.store import Store
+from tests.conftest import REPOSITORY
 from tests.surveys import Simulated, outputs
 
 ALL_STAGES = [
@@ -170,6 +172,13 @@ def test_prometheus_reads_the_figures(told: Simulated, events: list[dict[str, An
         assert found["roadscan_stage_written_bytes", event["stage"]] == event["bytes_written"]
     assert (found["roadscan_run_ok", ""], found["roadscan_run_running", ""]) == (1.0, 0.0)
     assert found["roadscan_run_seconds", ""] == events[-1]["seconds"]
+
+
+def test_the_board_asks_for_what_a_run_writes(told: Simulated) -> None:
+    written = {f.name for f in text_string_to_metric_families((told.survey_file.parent / "run.prom").read_text())}
+    asked = set(re.findall(r"roadscan_\w+", (REPOSITORY / "deploy" / "grafana.json").read_text()))
+    assert asked <= written and len(asked) > 8
+    assert written - asked == {"roadscan_run_seconds", "roadscan_stage_tasks"}
 
 
 def test_who_listens_changes_no_output(told: Simulated, finished: Simulated, tmp_path: Path) -> None:

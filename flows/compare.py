@@ -11,8 +11,10 @@ from prefect.states import Completed
 
 from roadscan.condition.tasks.compare import compare_surveys
 from roadscan.core.errors import RoadscanError
-from roadscan.flows.conduct import failed
+from roadscan.flows.expected import failed, log_without_tracebacks
 from roadscan.run.session import Session
+
+log_without_tracebacks()
 
 
 @flow(name="compare", persist_result=False)

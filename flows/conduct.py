@@ -11,10 +11,11 @@ from prefect.client.orchestration import get_client
 from prefect.client.schemas.objects import State
 from prefect.runtime import flow_run
 from prefect.settings import PREFECT_API_URL
-from prefect.states import Completed, Failed
+from prefect.states import Completed
 
 from roadscan.core.errors import RoadscanError, RunError
 from roadscan.core.survey import Survey
+from roadscan.flows.expected import failed, failed_stage, log_without_tracebacks
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.progress import LineReporter
 from roadscan.run.selection import Selection
@@ -24,6 +25,8 @@ from roadscan.run.told import Asked, told_run
 from roadscan.store.store import Store
 from roadscan.survey.preflight import preflight
 from roadscan.survey.run import close_run, run_stage
+
+log_without_tracebacks()
 
 
 class FlowReporter(LineReporter):
@@ -58,23 +61,30 @@ def conduct(
     try:
         survey = Survey.load(survey_file)
         store = Store(survey.store_url, survey.config.id)
+        store.check_free()
         run = Session(survey, store, selection=selection, reporter=FlowReporter())
         with told_run(run, [stage.name for stage in stages()], Asked.of(events, metrics)):
             preflight(survey, store, selection=selection).begin(run.reporter.line)
             with store.lock(), compute_on(workers, scheduler) as run.compute:
                 for stage in stages():
-                    stage_task(stage, run)()
+                    ended = stage_task(stage, run)()
+                    if ended is not None:
+                        ended.result()  # raises the error of the stage
                 close_run(run, stages())
     except RoadscanError as error:
         return failed(error)
     return Completed(data={"raw_bytes_read": float(run.raw_bytes_read)})
 
 
-def stage_task(stage: Stage, run: Session) -> Task[[], None]:
+def stage_task(stage: Stage, run: Session) -> Task[[], State[Any] | None]:
     """A stage as a Prefect task; what the stages share stays in this process and is not sent to the API."""
 
-    def step() -> None:
-        run_stage(run, stage)
+    def step() -> State[Any] | None:
+        try:
+            run_stage(run, stage)
+        except RoadscanError as error:
+            return failed_stage(error)
+        return None
 
     return Task(
         step,
@@ -84,11 +94,6 @@ def stage_task(stage: Stage, run: Session) -> Task[[], None]:
         cache_policy=NO_CACHE,
         persist_result=False,
     )
-
-
-def failed(error: RoadscanError) -> State[Any]:
-    """Final state of what failed for a reason that the user can mend; whoever called it gets the error raised."""
-    return Failed(message=str(error), data=error)
 
 
 def require_api() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.adjustment import adjust_survey, is_current, solution_key, why_due, withdraw
+from roadscan.adjust.tasks.control_work import read_picked
 from roadscan.adjust.tasks.hand_ties import read_hand_ties
 from roadscan.adjust.tasks.outcome import FOLDER, TABLES, known_findings, known_lines
 from roadscan.core.errors import ConfigError, RoadscanError
@@ -55,20 +56,15 @@ class Adjust(Stage):
         session.failed(self.name, found)
 
     def check(self, survey: Survey) -> list[RoadscanError]:
-        """Check that the file of picked targets exists, and that the file of ties by hand is valid."""
+        """Check that the files of picked targets and of ties by hand are valid."""
         if not AdjustConfig.of(survey).on:
             return []
         found: list[RoadscanError] = []
-        picked = AdjustConfig.of(survey).targets.picked
-        file = None if picked is None else survey.resolve(picked)
-        if file is not None and not file.is_file():
-            found.append(
-                ConfigError("there is no file of picked targets", change="correct adjust.targets.picked", file=file)
-            )
-        try:
-            read_hand_ties(survey)
-        except ConfigError as error:
-            found.append(error)
+        for read in (read_picked, read_hand_ties):
+            try:
+                read(survey)
+            except ConfigError as error:
+                found.append(error)
         return found
 
     def state(self, session: Session) -> StageState:

@@ -14,6 +14,7 @@ import typer
 from roadscan import __version__
 from roadscan.cli import (
     cameras,
+    cleaning,
     estimates,
     exports,
     fleets,
@@ -68,6 +69,8 @@ app.command("reprocess")(runs.reprocess)
 app.command("plan")(state.plan)
 app.command("status")(state.status)
 app.command("verify")(state.verify)
+app.command("clean")(cleaning.clean)
+app.command("archive")(cleaning.archive)
 app.command("report")(reports.report)
 app.command("compare")(reports.compare)
 app.command("view")(pages.view)

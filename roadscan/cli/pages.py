@@ -80,8 +80,11 @@ def publish(
     if out is not None:
         made = published(material, out, lambda d, t: reporter.progress("publish", d, t))
         reporter.close()
-        for path, reason in made.failures:
-            typer.echo(f"failed: {path}: {reason}")
+        told = [f"failed: {path}: {reason}" for path, reason in made.failures]
+        told += [f"left out: {reason}" for reason in made.left_out]
+        told += [f"damaged: {path} was not as it had been published, and was made again" for path in made.damaged]
+        for line in told:
+            typer.echo(line)
         if web_folder() is None:
             typer.echo(f"note: the folder holds the data without the page: {HOW_TO_BUILD}")
         typer.echo(f"site: {out} ({counted(made.files, 'file')}, {made.made:,} new, {made.bytes / 1e6:,.1f} MB)")

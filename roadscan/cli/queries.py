@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _MOST_ROWS = 200  # rows that a terminal shows
 
 
-def sql(
+def sql(  # noqa: PLR0913  each is an option of the command
     statement: Annotated[str, typer.Argument(help="DuckDB statement over the views (SHOW TABLES lists them).")],
     survey_file: SurveyOrFleet = None,
     fleet: Annotated[
@@ -43,6 +43,15 @@ def sql(
     unconfined: Annotated[
         bool, typer.Option("--unconfined", help="Let the statement read and write any file that you may.")
     ] = False,
+    timeout: Annotated[
+        float, typer.Option(min=0.0, metavar="SECONDS", help="Stop the statement after this time; 0: never.")
+    ] = 600.0,
+    memory: Annotated[
+        float | None,
+        typer.Option(
+            min=0.01, metavar="GB", help="Memory for the statement, and as much for its answer; 40 % of the machine's."
+        ),
+    ] = None,
 ) -> None:
     """Ask the tables a question; `utc(epoch_gps_ns)` gives the UTC instant of an epoch.
 
@@ -52,17 +61,19 @@ def sql(
     from roadscan.core.errors import AnswerError, ConfigError, StoreError
     from roadscan.fleet.ask import ask_fleet
     from roadscan.run.session import Session
+    from roadscan.store.sql import Limits
     from roadscan.survey.ask import ask
 
     if fleet is not None and survey_file is not None:
         raise ConfigError("--fleet and --survey are both given", expected="one of them")
+    limits = Limits(timeout, None if memory is None else round(memory * 1e9))
     damaged: list[StoreError] = []
     try:
         if fleet is not None:
-            result = ask_fleet(fleet, statement, damaged, unconfined=unconfined)
+            result = ask_fleet(fleet, statement, damaged, unconfined=unconfined, limits=limits)
         else:
             session = Session.open(survey_file or found_survey())
-            result = ask(session.survey, session.store, statement, damaged, unconfined=unconfined)
+            result = ask(session.survey, session.store, statement, damaged, unconfined=unconfined, limits=limits)
     finally:
         for error in damaged:
             typer.echo(f"{'damaged' if isinstance(error, AnswerError) else 'not shown'}: {error}", err=True)

@@ -83,12 +83,15 @@ def run_and_sum_up(
     """The same, with a summary of the survey printed at the end, also of a run of which some units failed."""
     from roadscan.core.errors import RunError
 
-    try:
-        run = run_survey(survey_file, stages, where, selection)
-    except RunError:
+    store = opened_store(survey_file)
+    store.check_free()
+    with store.looked():
+        try:
+            run = run_survey(survey_file, stages, where, selection)
+        except RunError:
+            sum_up(survey_file, as_json)
+            raise
         sum_up(survey_file, as_json)
-        raise
-    sum_up(survey_file, as_json)
     return run
 
 

@@ -23,6 +23,7 @@ from roadscan.georeference.place import Placed, passes_of
 from roadscan.georeference.plan.centre_line import load_buffer
 from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
 from roadscan.georeference.sources import Georeferencer, RawSlice, geometry_of
+from roadscan.store.damage import UNREADABLE
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.tile_points import near_lines
@@ -85,7 +86,7 @@ def _refuse_other_file(out: Path) -> None:
         return
     try:
         is_older = pq.read_schema(out).names == table_schema(TABLE).arrow().names
-    except (pa.ArrowException, OSError):
+    except UNREADABLE:
         is_older = False
     if not is_older:
         raise ConfigError(

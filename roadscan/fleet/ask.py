@@ -7,12 +7,17 @@ import pyarrow as pa
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.fleet.catalogue import TABLE, doubled, read_catalogue
 from roadscan.fleet.members import surveys_in
-from roadscan.store.sql import missing_table, query
+from roadscan.store.sql import Limits, missing_table, query
 from roadscan.store.sql_fleet import FleetStores
 
 
 def ask_fleet(
-    place: str, statement: str, damaged: list[StoreError] | None = None, *, unconfined: bool = False
+    place: str,
+    statement: str,
+    damaged: list[StoreError] | None = None,
+    *,
+    unconfined: bool = False,
+    limits: Limits | None = None,
 ) -> pa.Table:
     """Return the result of a DuckDB statement over the tables of all surveys of a folder or bucket.
 
@@ -39,7 +44,9 @@ def ask_fleet(
     catalogue = read_catalogue(place)
     beside = {} if catalogue is None else {TABLE: catalogue}
     try:
-        return query(FleetStores(shown, beside), statement, None, damaged, unconfined=unconfined)
+        return query(
+            FleetStores(shown, beside), statement, None, damaged, unconfined=unconfined, limits=limits or Limits()
+        )
     except RoadscanError as error:
         name = missing_table(error.__cause__)
         if name is None:

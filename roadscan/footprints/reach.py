@@ -11,13 +11,15 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.core.errors import NavigationError, StoreError
+from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.reach import RangeSpans, Reach, Touched, joined
 from roadscan.georeference.sources import MapSettings, RawSlice, ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import load_recorded
+from roadscan.store.codecs.parquet.page_file import opened_parquet
+from roadscan.store.damage import ROWS_CHANGE, damage_named
 from roadscan.store.readings.profiles import ProfileReader
 from roadscan.store.store import Store
 
@@ -88,16 +90,12 @@ def _loaded(store: Store, ground: MapSettings, source: ReadingSource, spans: Seq
 
 @contextmanager
 def opened(store: Store, one: RawSlice) -> Iterator[pq.ParquetFile]:
-    """Open the file of a slice; raises :class:`StoreError` where it cannot be read."""
-    try:
-        with store.fs.open(store.path(one.file), "rb") as stream:
-            yield pq.ParquetFile(stream)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise StoreError(
-            f"ingested rows cannot be read ({error})",
-            change="`roadscan verify` names damaged files; remove the log's record to ingest it again",
-            file=one.file,
-        ) from error
+    """Open the file of a slice; raises :class:`DamagedError` where it cannot be read."""
+    with (
+        damage_named("ingested rows cannot be read", one.file, ROWS_CHANGE),
+        store.fs.open(store.path(one.file), "rb") as stream,
+    ):
+        yield opened_parquet(stream)
 
 
 def _on_time(one: RawSlice, epochs_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

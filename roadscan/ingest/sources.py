@@ -209,6 +209,17 @@ def _remembered(store: Store) -> tuple[dict[str, Any] | None, bool]:
     return None, False
 
 
+def files_of(store: Store, folder: Path, path: Path, format_: LogFormat, companions: list[Path]) -> dict[Path, str]:
+    """Return the files of a log that is there, and their digests as fingerprinted (empty where they were not).
+
+    Those of a log that was moved away are not known by their places: none is returned.
+    """
+    known, _ = _remembered(store)
+    files = _renamed(known or {}, folder).get(listed_name(path, folder), {"files": {}})["files"]
+    named = _named(path, format_, companions) if path.exists() else {}
+    return {file: str(files[name][2]) if name in files else "" for name, file in named.items()}
+
+
 def _name(file: Path, log: Path) -> str:
     return file.relative_to(log).as_posix() if file != log and log in file.parents else ""
 

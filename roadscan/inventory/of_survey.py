@@ -27,7 +27,7 @@ from roadscan.inventory.settings import InventoryConfig
 from roadscan.inventory.visibility import Unknown, Visibility, VisibilityOfSquares
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
-from roadscan.store.asset_truth import AssetTruth
+from roadscan.store.asset_truth import COMMITS, AssetTruth
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import read_recorded
 from roadscan.store.store import Store
@@ -53,6 +53,11 @@ def open_inventory(session: Session) -> Inventory:
 def truth_of(session: Session) -> Inventory:
     """Returns the same read-only: its home is a file that is not opened."""
     return _opened(session, GeoPackage(Path("inventory.gpkg"), None))
+
+
+def commits_of(session: Session) -> list[str]:
+    """Returns the files of the inventory's commits, each of which is written once."""
+    return _truth(session.survey).store.files(COMMITS)
 
 
 def _opened(session: Session, home: Home) -> Inventory:

@@ -6,19 +6,27 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
+import pyarrow as pa
+import pyarrow.compute as pc
 from jinja2 import Environment, StrictUndefined
 
 from roadscan import __version__
 from roadscan.core.errors import RoadscanError
+from roadscan.inventory.of_survey import commits_of
 from roadscan.navigation.tasks.recorded_pictures import keep_file
 from roadscan.report.blocks import Paragraph, Part
 from roadscan.report.section import Material, Section, sections
+from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session
 from roadscan.site.report_copy import REPORT
+from roadscan.store.digest import bytes_digest
+from roadscan.store.small_tables import REPAIR_HINT, small_path
 
 PATH: Final = "report/report.html"
 """Its path, relative to the survey's root."""
+_NOT_SHOWN: Final = ("manifest/log_copies/", "manifest/sources")
+"""Records of which the report shows nothing: copies, and when raw files were read last."""
 
 
 def report_page(session: Session) -> str:
@@ -43,17 +51,36 @@ def report_page(session: Session) -> str:
 
 
 def keep_report(session: Session) -> str:
-    """Write the report if it changed; return its path relative to the survey's root."""
-    page = report_page(session).encode("utf-8")
-    manifest = session.manifest
-    known, key = manifest.get(REPORT, REPORT), key_of(page.hex())
-    if known is None or known.key != key or not session.store.exists(PATH):
+    """Write the report if what it is made of changed; return its path relative to the survey's root."""
+    manifest, key = session.manifest, _key(session)
+    if not manifest.is_current(REPORT, REPORT, key):
 
         def write(file: Path) -> None:
-            file.write_bytes(page)
+            file.write_bytes(report_page(session).encode("utf-8"))
 
         keep_file(session.store, manifest, (REPORT, REPORT), key, PATH, write)
     return PATH
+
+
+def _key(session: Session) -> str:
+    """Return the key of the report: a hash of all records, small tables and settings, and of its sections' code."""
+    store, survey = session.store, session.survey
+    outputs = session.manifest.table()
+    outputs = outputs.filter(pc.not_equal(outputs.column("product"), REPORT))
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, outputs.schema) as stream:
+        stream.write_table(outputs.combine_chunks())
+    read = [path for path in store.files("manifest", ".json") if not path.startswith(_NOT_SHOWN)]
+    read += [path for path in map(small_path, REPAIR_HINT) if store.exists(path)]
+    return key_of(
+        __version__,
+        code_digest(f"{__name__}:report_page", *sorted({type(section).__module__ for section in sections()})),
+        bytes_digest(sink.getvalue()),
+        [(path, bytes_digest(store.read_bytes(path))) for path in read],
+        survey.config.model_dump_json(exclude={"rig"}),
+        survey.rig.model_dump_json(),
+        commits_of(session),
+    )
 
 
 def _part(section: Section, material: Material) -> Part:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import os
 import shutil
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from roadscan.core.crs import MapFrame, crs_from_text
 from roadscan.core.errors import ConfigError, RoadscanError
@@ -22,9 +21,12 @@ from roadscan.site.document import Ask, Document, json_document
 from roadscan.site.material import SHEET_M, Box, Material
 from roadscan.site.part import site_parts
 from roadscan.site.parts.catalog import to_longitude_latitude
+from roadscan.site.parts.vectors import site_layers
 from roadscan.site.report_copy import REPORT, linked_report
 from roadscan.site.web_part import web_documents
+from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.codecs import SOFTWARE
+from roadscan.store.digest import file_digest
 from roadscan.store.manifest import read_recorded
 
 LAYOUT: Final = 1  # version of the site's layout
@@ -32,7 +34,7 @@ ENTRY: Final = "survey.json"
 REPORT_PAGE: Final = "report.html"
 _LINKED: Final = "roadscan.site.report_copy:linked_report"
 KEYS: Final = "keys.json"
-"""Documents of the folder, with the key of each."""
+"""Documents of the folder, with the key and the digest of each."""
 
 
 @functools.lru_cache(maxsize=2)
@@ -88,6 +90,10 @@ class Published:
     bytes: int
     failures: tuple[tuple[str, str], ...]
     """Documents that could not be made, with reasons."""
+    left_out: tuple[str, ...] = ()
+    """Layers that are missing, with reasons."""
+    damaged: tuple[str, ...] = ()
+    """Files of the folder that were missing or were not as they had been written; they are made again."""
 
 
 def publish(material: Material, out: Path, report: Callable[[int, int], None] = lambda _a, _b: None) -> Published:
@@ -100,7 +106,7 @@ def publish(material: Material, out: Path, report: Callable[[int, int], None] = 
     ConfigError
         where `out` holds something else than a site.
     """
-    known = known_files(out)
+    known, damaged = known_files(out)
     scratch = out.parent / f".{out.name}-{uuid.uuid4().hex}"
     out.parent.mkdir(parents=True, exist_ok=True)
     scratch.mkdir()
@@ -112,33 +118,53 @@ def publish(material: Material, out: Path, report: Callable[[int, int], None] = 
             if done % 50 == 0:
                 report(done, len(documents))
         report(len(documents), len(documents))
-        (scratch / KEYS).write_text(json.dumps({"layout": LAYOUT, "keys": writer.keys}, sort_keys=True))
+        told = {"layout": LAYOUT, "keys": writer.keys, "digests": writer.digests}
+        (scratch / KEYS).write_bytes(checked_json(told))
         _exchange(scratch, out)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    return Published(out, len(writer.keys), writer.made, writer.bytes, tuple(writer.failures))
+    left_out = site_layers(material)[1]
+    return Published(out, len(writer.keys), writer.made, writer.bytes, tuple(writer.failures), left_out, tuple(damaged))
 
 
-def known_files(out: Path) -> dict[str, Path]:
-    """Return the files of an already published folder by key; nothing where it is missing or empty."""
+def known_files(out: Path) -> tuple[dict[str, _Known], list[str]]:
+    """Return the whole files of an already published folder by key, and those that are missing or damaged.
+
+    Both are empty where there is no folder, or an empty one. Of a site without digests, which an older version
+    published, every file is made again.
+    """
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return {}
+        return {}, []
     try:
-        told = json.loads((out / KEYS).read_text())
-        return {key: out / path for path, key in told["keys"].items() if (out / path).is_file()}
-    except (OSError, ValueError, KeyError, AttributeError) as error:
+        told = parse_checked((out / KEYS).read_bytes())
+        keys, digests = dict(told["keys"]), told.get("digests")
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
-            f"{out} is there already and holds no site", expected="a new or empty folder, or a site to be renewed",
-            change="choose another --out",
-        ) from error  # fmt: skip
+            f"{out} is there already and holds no site, or one whose {KEYS} is damaged ({error})",
+            expected="a new or empty folder, or a site to be renewed",
+            change="choose another --out, or remove the folder if it was a site: it is made anew",
+        ) from error
+    if digests is None:
+        return {}, []
+    whole = {path: (out / path).is_file() and file_digest(out / path) == digests.get(path) for path in keys}
+    known = {key: _Known(out / path, digests[path]) for path, key in keys.items() if whole[path]}
+    return known, [path for path in sorted(keys) if not whole[path]]
+
+
+class _Known(NamedTuple):
+    """A file of a folder that was published before."""
+
+    path: Path
+    digest: str
 
 
 class _Writer:
     """Writes documents into a folder, once each."""
 
-    def __init__(self, folder: Path, known: dict[str, Path]) -> None:
+    def __init__(self, folder: Path, known: dict[str, _Known]) -> None:
         self._folder, self._known = folder, known
         self.keys: dict[str, str] = {}
+        self.digests: dict[str, str] = {}
         self.made = self.bytes = 0
         self.failures: list[tuple[str, str]] = []
 
@@ -149,7 +175,7 @@ class _Writer:
         try:
             known = self._known.get(document.key)
             if known is not None:
-                _linked(known, path)
+                _linked(known.path, path)
             else:
                 document.write(path, self._ask)
                 self.made += 1
@@ -158,6 +184,7 @@ class _Writer:
             self.failures.append((document.path, str(error)))
             return
         self.keys[document.path] = document.key
+        self.digests[document.path] = file_digest(path) if known is None else known.digest
         self.bytes += path.stat().st_size
 
     def _ask(self, path: str) -> Path:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Final
 
 from roadscan.assets.tasks.picture_work import CUT_OUTS
-from roadscan.core.errors import RoadscanError
+from roadscan.core.errors import DamagedError, RoadscanError
 from roadscan.core.grid import Bounds
 from roadscan.pictures.placed import Pictures as PlacedPictures
 from roadscan.pictures.placed import plan_pictures
@@ -30,6 +30,8 @@ def placed_pictures(material: Material) -> PlacedPictures | None:
         return None
     try:
         held = plan_pictures(material.plan, _RULE)
+    except DamagedError:
+        raise
     except RoadscanError:
         return None  # no camera, interior orientation or picture with a pose: the page goes without
     near = material.wishes.near

@@ -3,6 +3,7 @@
     tables/assets_found/<number>-<digest>.parquet     what a run found
     tables/asset_edits/<number>-<digest>.parquet      what people changed
     tables/asset_commits/<number>.parquet             written last: it makes the rows part of the inventory
+    inventory/head.json                               how many commits there are: tells that the last one is missing
     inventory/published/<token>.parquet               rows of an inventory file as published or last read
 
 A file of rows that no commit names remained from an interrupted program; the next append removes it.
@@ -22,6 +23,7 @@ from typing import Final, Literal, TypeAlias
 import pyarrow as pa
 
 from roadscan.core.errors import DamagedError, StoreError
+from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.digest import bytes_digest, bytes_hold
 from roadscan.store.inventory_schema import evidence_table
 from roadscan.store.schema import table_schema
@@ -39,8 +41,12 @@ COMMITS: Final = "tables/asset_commits"
 _ROWS: Final = {"found": "tables/assets_found", "edits": "tables/asset_edits"}
 _PUBLISHED: Final = "inventory/published"
 _LOCK: Final = "inventory/lock"
+_HEAD: Final = "inventory/head.json"
+_TOKEN: Final = b"roadscan:published"
+"""Metadata of published rows: the token under which they are stored."""
 _POLL_S: Final = 0.05  # time between two attempts to get the lock (s)
 _PUBLISH_ANEW: Final = "publish to a new home: what was changed in this one cannot be told"
+_FORGET_HEAD: Final = "remove it, if the last commit is there (`roadscan inventory log`)"
 _RESTORE: Final = "restore it from a copy of the store: what people changed cannot be made again"
 
 
@@ -104,13 +110,29 @@ class AssetTruth:
         self._commits = None
 
     def _read_commits(self) -> Iterator[Commit]:
-        for place, file in enumerate(self.store.files(COMMITS, ".parquet"), start=1):
+        files = self.store.files(COMMITS, ".parquet")
+        for place, file in enumerate(files, start=1):
             commit = self._read_commit(file)
             if commit.number != place:
-                raise DamagedError(
-                    f"commit {place} of the inventory is missing", change=_RESTORE, file=self.store.path(file)
-                )
+                raise self._missing(place)
             yield commit
+        if len(files) < self._known():
+            raise self._missing(len(files) + 1)
+
+    def _missing(self, number: int) -> DamagedError:
+        file = self.store.path(f"{COMMITS}/{number:08d}.parquet")
+        return DamagedError(f"commit {number} of the inventory is missing", change=_RESTORE, file=file)
+
+    def _known(self) -> int:
+        """Return how many commits there are at least; 0 in an inventory of an older version."""
+        if not self.store.exists(_HEAD):
+            return 0
+        try:
+            return int(parse_checked(self.store.read_bytes(_HEAD))["commits"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise DamagedError(
+                f"the file is damaged: {error}", change=_FORGET_HEAD, file=self.store.path(_HEAD)
+            ) from error
 
     def _read_commit(self, file: str) -> Commit:
         rows = self.store.read_table(file, change=_RESTORE).to_pylist()
@@ -153,11 +175,16 @@ class AssetTruth:
                     self.rows(commit)
             except StoreError as error:
                 found.append(str(error))
-        gaps = sorted(set(range(1, max(numbers, default=0) + 1)) - set(numbers))
+        known = 0
+        try:
+            known = self._known()
+        except StoreError as error:
+            found.append(str(error))
+        gaps = sorted(set(range(1, max([known, *numbers]) + 1)) - set(numbers))
         found += [f"{COMMITS}/{n:08d}.parquet: commit {n} of the inventory is missing; {_RESTORE}" for n in gaps]
         for file in self.store.files(_PUBLISHED, ".parquet"):
             try:
-                self.store.read_table(file, change=_PUBLISH_ANEW)
+                self._published(file)
             except StoreError as error:
                 found.append(str(error))
         return found
@@ -215,6 +242,7 @@ class AssetTruth:
                 "another program appended to the inventory", change="try again", file=self.store.path(name)
             )
         self.store.write_bytes(name, _content(pa.Table.from_pylist([asdict(commit)], schema)))
+        self.store.write_bytes(_HEAD, checked_json({"commits": number}))
         self._commits = (*self.commits, commit)
         return commit
 
@@ -233,14 +261,25 @@ class AssetTruth:
 
     def keep_published(self, token: str, rows: pa.Table) -> None:
         """Store the rows of an inventory file under the token that it carries."""
-        self.store.write_bytes(f"{_PUBLISHED}/{token}.parquet", _content(rows))
+        stamped = rows.replace_schema_metadata({_TOKEN: token})
+        self.store.write_bytes(f"{_PUBLISHED}/{token}.parquet", _content(stamped))
 
     def published(self, token: str) -> pa.Table | None:
         """Return the rows of an inventory file as published or last read; None where this inventory did not make it."""
         file = f"{_PUBLISHED}/{token}.parquet"
         if "/" in token or not self.store.exists(file):
             return None
-        return self.store.read_table(file, change=_PUBLISH_ANEW)
+        return self._published(file)
+
+    def _published(self, file: str) -> pa.Table:
+        rows = self.store.read_table(file, change=_PUBLISH_ANEW)
+        token = file.rpartition("/")[2].removesuffix(".parquet")
+        stated = (rows.schema.metadata or {}).get(_TOKEN, token.encode())
+        if stated != token.encode():
+            raise DamagedError(
+                "the file holds the rows of another publication", change=_PUBLISH_ANEW, file=self.store.path(file)
+            )
+        return rows
 
 
 def _schema_of(kind: CommitKind) -> pa.Schema:

@@ -124,6 +124,7 @@ class Manifest:
         known = [self._of(r.product).get(r.unit) for r in added]
         for r in added:
             self._rows[r.product][r.unit] = (*r,)
+        self._store.told((r.path, r.bytes) for r in added if r.path and r.key != _DAMAGED)
         self._append(Packed.of(table_of(added)))
         pairs = zip(known, added, strict=True)
         self._moved += [old[3] for old, new in pairs if old is not None and old[3] not in ("", new.path)]
@@ -132,6 +133,10 @@ class Manifest:
         """Record many outputs as a worker packed them."""
         if records.rows:
             self._rows.clear()
+            if not self._store.is_folder:
+                table = records.table()
+                paths, sizes = (table.column(name).to_pylist() for name in ("path", "bytes"))
+                self._store.told(pair for pair in zip(paths, sizes, strict=True) if pair[0])
             self._append(records)
 
     def settle(self) -> None:

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from roadscan.store.damage import UNREADABLE
 from roadscan.store.seal import check_seal, sealed_parquet, without_seal
 
 RECORDS: Final = pa.schema(
@@ -30,9 +31,6 @@ RECORDS: Final = pa.schema(
 
 _GROUP_ROWS: Final = 8192
 """Rows of a row group, which a damaged page loses at most."""
-
-_DAMAGE: Final = (pa.ArrowException, OSError, ValueError)
-"""Errors of reading damaged files."""
 
 Row: TypeAlias = tuple[str, str, str, str, int, str, str]
 
@@ -107,14 +105,14 @@ def sound_rows(content: bytes) -> tuple[pa.Table, str]:
     """Return the records of such a file without damaged row groups, and what is wrong with these ("" for nothing)."""
     try:
         return unpacked(content).cast(RECORDS), ""
-    except _DAMAGE as error:
+    except UNREADABLE as error:
         reason = str(error)
     sound, groups = [RECORDS.empty_table()], 0
-    with contextlib.suppress(*_DAMAGE):
+    with contextlib.suppress(*UNREADABLE):
         file = _opened(content)
         groups = file.num_row_groups
         for group in range(groups):
-            with contextlib.suppress(*_DAMAGE):
+            with contextlib.suppress(*UNREADABLE):
                 sound.append(file.read_row_group(group, use_threads=False).cast(RECORDS))
     if len(sound) > groups:  # the pages hold, so the damage is in the footer, which says what they mean
         return RECORDS.empty_table(), reason

@@ -15,13 +15,13 @@ import pyarrow.parquet as pq
 from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.store.checked_json import checked_json, parse_checked
+from roadscan.store.damage import UNREADABLE
 from roadscan.store.logs import DataFile, data_file
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import describe, write_parquet
 
 _LOST: Final = "manifest/lost.json"
-_DAMAGE: Final = (pa.ArrowException, OSError, ValueError, KeyError)
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def _sound_groups(store: Store, table: str, file: DataFile) -> list[pa.Table | N
         opened = pq.ParquetFile(pa.BufferReader(store.read_bytes(file.path)), page_checksum_verification=True)
         if opened.num_row_groups != len(none):
             return none
-    except (*_DAMAGE, StoreError):
+    except (*UNREADABLE, StoreError):
         return none
     return [_sound_group(opened, number, table, file) for number in range(len(none))]
 
@@ -109,7 +109,7 @@ def _sound_group(opened: pq.ParquetFile, number: int, table: str, file: DataFile
     try:
         rows = opened.read_row_group(number, use_threads=False)
         rows.validate(full=True)
-    except _DAMAGE:
+    except UNREADABLE:
         return None
     known = {column.name for column in table_schema(table).columns}
     if not known <= set(rows.schema.names) or rows.num_rows != file.group_rows[number]:

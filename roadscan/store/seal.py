@@ -7,6 +7,7 @@ column, and the file reads as another table. Any reader of Parquet opens a seale
 from __future__ import annotations
 
 import io
+import re
 from typing import Any, Final
 
 import pyarrow as pa
@@ -19,8 +20,10 @@ _BLANK: Final = "0" * len(bytes_digest(b""))
 """Stands in the place of the digest while that is taken."""
 _HEAD_BYTES: Final = 2
 """Between the key and its value: type and length of a text in Thrift's compact protocol."""
-_END_BYTES: Final = 8
-"""Length of the footer and the mark of the format, which end a file."""
+_NAMELESS: Final = re.compile(rb"\x18%c.{%d}\x18%cblake3:[0-9a-f]{32}" % (len(_KEY), len(_KEY), len(_BLANK)), re.DOTALL)
+"""An entry of a footer as long as the seal's, and with a digest in it: texts of Thrift's compact protocol."""
+_TAIL_BYTES: Final = 1 << 20
+"""How far from the end of a file it is sought (bytes): entries stand at the end of a footer."""
 
 
 def sealed_parquet(table: pa.Table, **settings: Any) -> bytes:
@@ -47,9 +50,11 @@ def bears_seal(content: bytes) -> bool:
 
 
 def check_seal(content: bytes) -> None:
-    """Raise ValueError where a file bears a seal that does not hold; one that bears none is not told apart."""
+    """Raise ValueError where a file bears a seal that does not hold, or whose name is damaged; others pass."""
     place = _place(content)
     if place.start < 0:
+        if _NAMELESS.search(content, max(len(content) - _TAIL_BYTES, 0)):
+            raise ValueError("the name of its digest is damaged")
         return
     stated = content[place]
     if bytes_digest(_with(content, place, _BLANK)).encode() != stated:
@@ -64,9 +69,7 @@ def without_seal(table: pa.Table) -> pa.Table:
 
 def _place(content: bytes) -> slice:
     """Return where the digest of a file stands; a negative beginning where it bears none."""
-    end = len(content) - _END_BYTES
-    footer = max(end - int.from_bytes(content[end : end + 4], "little"), 0)
-    key = content.rfind(_KEY.encode(), footer)
+    key = content.rfind(_KEY.encode())  # not from where the footer's length says, which may be damaged itself
     start = key + len(_KEY) + _HEAD_BYTES
     return slice(-1, -1) if key < 0 else slice(start, start + len(_BLANK))
 

@@ -1,8 +1,8 @@
 """Reads and writes small tables as whole files: the estimated clocks, mountings and trajectories.
 
 No record of the manifest names them, and no run makes all of them. So each one itself says how to repair it. A list of
-their digests (``manifest/held.json``) reveals damage that the checksums of their pages do not cover; it lists no table
-that someone put there and roadscan did not write.
+their digests (``manifest/held.json``) reveals damage that the checksums of pages do not cover whenever one is read;
+it lists no table that someone put there and roadscan did not write.
 """
 
 from __future__ import annotations
@@ -53,7 +53,11 @@ def read_small(store: Store, name: str) -> pa.Table | None:
     if not store.exists(path):
         return None
     change = REPAIR_HINT[name]
-    table = store.read_table(path, change=change)
+    content = store.read_bytes(path)
+    known = _known(store).get(name)
+    if known is not None and bytes_digest(content) not in (known.get("digest"), known.get("before")):
+        raise DamagedError("the file is damaged: it is not as it was written", change=change, file=store.path(path))
+    table = store.parse_table(content, path, change=change)
     missing = [c.name for c in table_schema(name).columns if not c.nullable and c.name not in table.column_names]
     if missing:
         raise DamagedError(

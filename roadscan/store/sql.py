@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Callable, Iterable
+import tempfile
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import duckdb
 import pyarrow as pa
@@ -45,7 +48,27 @@ _NO_EXTENSIONS = (
     "SET enable_external_file_cache = false",
 )
 """Settings that prevent downloads, confined or not; files are opened when they are used."""
+_MEMORY_SHARE: Final = "40%"
+"""DuckDB's own default is 80 %, which leaves no room for an answer beside it, nor for a run on the same machine."""
+_SPILT: Final = 4
+"""An unconfined statement may write so many times its memory to a temporary folder, which ends with it."""
+_BATCH_ROWS: Final = 100_000
+"""Rows of an answer that are fetched at once."""
 _WAY_OUT_OF_STORE = "`--unconfined` (in Python `unconfined=True`) lets a statement reach other files"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one statement may take; it ends with an error where that does not suffice."""
+
+    time_s: float = 600.0
+    """Longest time (s); 0: any. The slowest of docs/queries.md takes 2 s on a survey of 20 km."""
+    memory_bytes: int | None = None
+    """Most memory of DuckDB, and as much again for the answer (bytes); None: `_MEMORY_SHARE` of the machine's each."""
+
+    def memory_words(self) -> str:
+        """Return the memory as DuckDB's settings take it."""
+        return _MEMORY_SHARE if self.memory_bytes is None else f"{self.memory_bytes}B"
 
 
 @dataclass(frozen=True)
@@ -89,6 +112,7 @@ def connect(
     damaged: list[StoreError] | None = None,
     *,
     unconfined: bool = False,
+    limits: Limits = Limits(),
 ) -> duckdb.DuckDBPyConnection:
     """Return a DuckDB connection with one view per table and, for tables in time, one macro per table.
 
@@ -101,13 +125,18 @@ def connect(
     The macro ``utc(epoch_gps_ns)`` gives the UTC instant of a GPS epoch.
 
     Statements reach the store's files, as ``store://survey=<id>/…``, and memory. They write no file and read no other,
-    unless the connection is `unconfined`. Extensions are never fetched.
+    unless the connection is `unconfined`. Extensions are never fetched. Of the `limits` that of memory holds for each
+    statement of the connection; answers and time are the caller's.
     """
-    return _opened(store, logs, damaged, unconfined).connection
+    return _opened(store, logs, damaged, unconfined, limits).connection
 
 
 def _opened(
-    store: Store | Stores, logs: Iterable[str] | None, damaged: list[StoreError] | None, unconfined: bool
+    store: Store | Stores,
+    logs: Iterable[str] | None,
+    damaged: list[StoreError] | None,
+    unconfined: bool,
+    limits: Limits,
 ) -> Opened:
     connection = duckdb.connect()
     try:
@@ -115,6 +144,8 @@ def _opened(
             opened = _with_views(connection, store, logs, damaged)
         else:
             opened = store.with_views(connection, damaged)
+        connection.execute(f"SET memory_limit = '{limits.memory_words()}'")
+        connection.execute(f"SET max_temp_directory_size = '{_SPILT * _memory_bytes(connection)}B'")
         for setting in (*_NO_EXTENSIONS, *(() if unconfined else _CONFINED)):
             connection.execute(setting)
     except BaseException:
@@ -187,18 +218,28 @@ def query(
     damaged: list[StoreError] | None = None,
     *,
     unconfined: bool = False,
+    limits: Limits = Limits(),
 ) -> pa.Table:
     """Run one SQL statement over the store's views (:func:`connect`).
 
     The files that it opens are verified against their records if they changed since the last verification. One that is
     damaged is an error, or joins `damaged` (as :class:`AnswerError`), and the answer is given.
+
+    Raises
+    ------
+    RoadscanError
+        where the statement fails, or takes more time or memory than the `limits` allow.
     """
-    opened = _opened(store, logs, damaged, unconfined)
-    with opened.connection as connection:
+    opened = _opened(store, logs, damaged, unconfined, limits)
+    with opened.connection as connection, tempfile.TemporaryDirectory(prefix="roadscan-sql-") as folder:
+        if unconfined:
+            connection.execute(f"SET temp_directory = '{folder}'")
         _refuse_to_fetch(connection, statement)
         try:
-            relation = connection.sql(statement)
-            answer = pa.table({}) if relation is None else relation.to_arrow_table()
+            with _interrupted_after(connection, limits.time_s):
+                answer = _answer(connection, statement)
+        except duckdb.InterruptException:
+            raise _too_long(limits) from None
         except duckdb.Error as error:
             if damaged is not None:
                 damaged += opened.faults()
@@ -213,6 +254,53 @@ def query(
     if damaged is not None:
         damaged += faults
     return answer
+
+
+def _answer(connection: duckdb.DuckDBPyConnection, statement: str) -> pa.Table:
+    """Return the answer to a statement; RoadscanError where it is larger than the memory that DuckDB may take."""
+    most = _memory_bytes(connection)
+    relation = connection.sql(statement)
+    if relation is None:
+        return pa.table({})
+    reader = relation.to_arrow_reader(_BATCH_ROWS)
+    parts, held = [], 0
+    for part in reader:
+        parts.append(part)
+        held += part.nbytes
+        if held > most:
+            raise RoadscanError(
+                f"the answer is larger than {most / 1e9:.2g} GB, after {sum(p.num_rows for p in parts):,} rows",
+                change="ask for less at once (a LIMIT, a span of time), or give it more with --memory",
+            )
+    return pa.Table.from_batches(parts, reader.schema)
+
+
+@contextlib.contextmanager
+def _interrupted_after(connection: duckdb.DuckDBPyConnection, time_s: float) -> Iterator[None]:
+    """Interrupt what a connection does after a time (s), unless that is 0."""
+    alarm = threading.Timer(time_s, connection.interrupt)
+    alarm.daemon = True
+    if time_s:
+        alarm.start()
+    try:
+        yield
+    finally:
+        alarm.cancel()
+
+
+def _too_long(limits: Limits) -> RoadscanError:
+    return RoadscanError(
+        f"the query was stopped after {limits.time_s:g} s",
+        change="ask for less at once (the macros TABLE_between open only the files of a span of time), or give it more "
+        "time with --timeout",
+    )
+
+
+def _memory_bytes(connection: duckdb.DuckDBPyConnection) -> int:
+    """Return the memory that DuckDB may take (bytes), of its own words such as ``9.3 GiB``."""
+    ((words,),) = connection.execute("SELECT current_setting('memory_limit')").fetchall()
+    number, unit = str(words).split()
+    return int(float(number) * 1024 ** ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB").index(unit))
 
 
 def _in_words(error: duckdb.Error, files: OpenedFiles) -> RoadscanError:
@@ -230,7 +318,10 @@ def _in_words(error: duckdb.Error, files: OpenedFiles) -> RoadscanError:
     if isinstance(error, _MISTAKES):
         change = "`roadscan sql 'SHOW TABLES'` lists what there is"
     if isinstance(error, duckdb.OutOfMemoryException):
-        change = "ask for less at once; with `--unconfined`, what does not fit into memory goes to the folder .tmp"
+        change = (
+            "ask for less at once, or give it more with --memory; with `--unconfined`, what does not fit into memory "
+            "goes to a temporary folder"
+        )
     return RoadscanError(f"the query failed: {text}", change=change)
 
 

@@ -18,10 +18,10 @@ import contextlib
 import errno
 import os
 import shutil
-import socket
 import tempfile
+import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -31,7 +31,12 @@ import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, FullDiskError, RoadscanError, StoreError
 from roadscan.core.extras import need
+from roadscan.store.damage import UNREADABLE
+from roadscan.store.lease import FolderPlace, Lease, ObjectPlace
+from roadscan.store.look import Look, at_once, look_of, looking
+from roadscan.store.process import own_tag, tag_lives
 from roadscan.store.seal import check_seal, without_seal
+from roadscan.store.written_by import VERSION_FILE, refuse_newer, version_of
 
 try:
     import fcntl
@@ -39,6 +44,9 @@ except ImportError:  # systems without such locks
     fcntl = None  # type: ignore[assignment]
 
 _STAGING: Final = ".staging"
+_LOCK: Final = "manifest/lock"
+_STRAY_S: Final = 6 * 3600.0
+"""Age (s) at which a temporary file of another machine is removed: no single task takes that long."""
 
 _NO_ROOM_BYTES: Final = 8 << 20
 """A writer that fails without a reason while less is free (bytes) is taken to have filled the disk: GDAL and others
@@ -75,6 +83,7 @@ class Store:
         self.fs, base = opened_url(url)
         self.root = f"{base.rstrip('/')}/survey={survey_id}"
         self.is_folder = "file" in self.fs.protocol or "local" in self.fs.protocol
+        self._lease: Lease | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle without the file system, which workers open themselves."""
@@ -86,8 +95,16 @@ class Store:
 
     def exists(self, relative: str) -> bool:
         """Return True if the file or folder exists; StoreError where the store does not answer."""
+        with self._reached():
+            known = None if (look := self._look()) is None else look.exists(relative)
+            return bool(self.fs.exists(self.path(relative))) if known is None else known
+
+    @contextlib.contextmanager
+    def _reached(self) -> Iterator[None]:
         try:
-            return bool(self.fs.exists(self.path(relative)))
+            yield
+        except RoadscanError:
+            raise
         except Exception as error:  # each library of an object store has different ones
             raise StoreError(
                 f"the store {self.url} cannot be reached: {error}",
@@ -96,6 +113,11 @@ class Store:
 
     def size(self, relative: str) -> int | None:
         """Return the bytes of a file, None where it is missing."""
+        if (look := self._look()) is not None:
+            with self._reached():
+                size = look.size(relative)
+            if size is not None or look.is_whole:
+                return size
         try:
             return int(self.fs.size(self.path(relative)))
         except FileNotFoundError:
@@ -103,16 +125,32 @@ class Store:
 
     def files(self, relative: str, suffix: str = "") -> list[str]:
         """Return the files below a folder, relative to the root, sorted."""
+        if (look := self._look()) is not None:
+            with self._reached():
+                known = look.files(relative)
+            if known is not None:
+                return sorted(f for f in known if f.endswith(suffix))
         if not self.exists(relative):
             return []
         found = self.fs.find(self.path(relative))
         start = len(self.fs._strip_protocol(self.root)) + 1
         return sorted(f[start:] for f in found if f.endswith(suffix))
 
+    def changed_s(self, relative: str) -> float:
+        """Return when a file was written (Unix s), by the store's clock."""
+        return float(self.fs.modified(self.path(relative)).timestamp())
+
+    def now_s(self) -> float:
+        """Return what the store's clock says (Unix s): that of the file server, or of the object store."""
+        return self._lease_place().now_s()
+
     def read_bytes(self, relative: str) -> bytes:
         """Return the content of a small file."""
+        look = self._look()
+        if look is not None and (known := look.content(relative)) is not None:
+            return known
         try:
-            return bytes(self.fs.cat_file(self.path(relative)))
+            content = bytes(self.fs.cat_file(self.path(relative), **at_once(self.fs)))
         except FileNotFoundError as error:
             raise StoreError("the file is missing from the store", file=self.path(relative)) from error
         except IsADirectoryError as error:
@@ -123,6 +161,9 @@ class Store:
                 change="see to its rights and to the disk",
                 file=self.path(relative),
             ) from error
+        if look is not None:
+            look.keep(relative, content)
+        return content
 
     def read_table(self, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN) -> pa.Table:
         """Return a small Parquet file, its seal and its page checksums verified; `change` says how to repair it.
@@ -140,7 +181,7 @@ class Store:
             check_seal(content)
             file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
             return without_seal(file.read(None if columns is None else list(columns), use_threads=False))
-        except (pa.ArrowException, OSError, ValueError) as error:
+        except UNREADABLE as error:
             raise DamagedError(f"the file is damaged: {error}", change=change, file=self.path(relative)) from error
 
     def write_bytes(self, relative: str, content: bytes, *, lasting: bool = True) -> None:
@@ -148,17 +189,16 @@ class Store:
 
         One that is `lasting` is on the disk when this returns, with its name.
         """
+        self._check_lease()
         with _in_words(self.path(relative)):
             self._write_bytes(relative, content, lasting)
 
     def _write_bytes(self, relative: str, content: bytes, lasting: bool) -> None:
         if not self.is_folder:
-            with self.scratch() as folder:
-                temporary = folder / "content"
-                temporary.write_bytes(content)
-                self.publish(temporary, relative)
+            self.fs.pipe_file(self.path(relative), content)
+            self._wrote(relative, len(content), content)
             return
-        temporary = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
+        temporary = self._temporary()
         try:
             with _made(temporary.parent, lambda: temporary.open("wb"), lasting=True) as stream:
                 stream.write(content)
@@ -174,7 +214,7 @@ class Store:
     def scratch(self) -> Iterator[Path]:
         """Return a temporary local folder, on the store's disk where it is a folder."""
         if self.is_folder:
-            folder = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
+            folder = self._temporary()
             with _in_words(str(folder)):
                 _made(folder.parent, folder.mkdir, lasting=True)
         else:
@@ -198,11 +238,18 @@ class Store:
             if lasting:
                 _sync_folder(Path(target).parent)
         else:
+            size = local.stat().st_size
             self.fs.put_file(str(local), target)
             local.unlink()
+            self._wrote(relative, size)
 
     def publish_folder(self, local: Path, relative: str) -> None:
-        """Move a finished local folder durably into the store, replacing one of that name."""
+        """Move a finished local folder durably into the store, replacing one of that name.
+
+        An object store shows its files one by one, and removes those that are not of it last: only the record that is
+        written afterwards tells that they are there.
+        """
+        self._check_lease()
         if self.is_folder:
             for path in (local, *local.rglob("*")):
                 sync = _sync_folder if path.is_dir() else _sync_file
@@ -214,21 +261,28 @@ class Store:
             local.rename(target)
             _sync_folder(target.parent)
             return
-        self.remove(relative)
-        for file in sorted(p for p in local.rglob("*") if p.is_file()):
-            self.fs.put_file(str(file), f"{self.path(relative)}/{file.relative_to(local).as_posix()}")
+        files = {f"{relative}/{p.relative_to(local).as_posix()}": p for p in local.rglob("*") if p.is_file()}
+        for name, file in sorted(files.items()):
+            self.fs.put_file(str(file), self.path(name))
+            self._wrote(name, file.stat().st_size)
+        for name in self.files(relative):
+            if name not in files:
+                self.remove(name)
 
     def remove(self, relative: str) -> None:
         """Remove a file or folder if it exists; a folder disappears at once."""
+        self._check_lease()
         if not self.is_folder:
             if self.exists(relative):
                 self.fs.rm(self.path(relative), recursive=True)
+                if (look := self._look()) is not None:
+                    look.removed(relative)
             return
         path = Path(self.path(relative))
         if not path.is_dir():
             path.unlink(missing_ok=True)
             return
-        doomed = Path(self.path(_STAGING)) / f"{os.getpid()}-{uuid.uuid4().hex}"
+        doomed = self._temporary()
         _made(doomed.parent, lambda: path.rename(doomed))
         shutil.rmtree(doomed, ignore_errors=True)
 
@@ -249,6 +303,8 @@ class Store:
                 self.fs.copy(self.path(relative), self.path(aside))
             else:
                 self.fs.mv(self.path(relative), self.path(aside))
+        if (look := self._look()) is not None:
+            look.forget()
         return aside
 
     def local_copy(self, relative: str, folder: Path) -> Path:
@@ -261,40 +317,107 @@ class Store:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Lock out a second run of a folder store; leftovers of dead runs are cleared."""
-        if not self.is_folder:
-            yield
-            return
-        file = Path(self.path("manifest/lock"))
-        with _in_words(str(file)):
-            _make_folder(file.parent, lasting=True)
-            self._take(file)
-        try:
-            self._clear_staging()
-            yield
-        finally:
-            file.unlink(missing_ok=True)
+        """Lock out a second run, also one on another machine; leftovers of dead runs are cleared.
 
-    def _take(self, file: Path) -> None:
-        me = f"{socket.gethostname()} {os.getpid()}"
-        with alone_in(file.parent):
-            for _ in range(2):
-                try:
-                    with file.open("x") as stream:
-                        stream.write(me)
-                    return
-                except FileExistsError:
-                    _check_dead(file)
-                    file.unlink(missing_ok=True)
-        raise StoreError("the store's lock cannot be taken", change="run again", file=file)
+        Raises
+        ------
+        StoreError
+            where another run has the store; and at a later change, where this one has lost it.
+        """
+        file, lease = self.path(_LOCK), self._new_lease()
+        with _in_words(file):
+            if self.is_folder:
+                _make_folder(Path(file).parent, lasting=True)
+        with _in_words(file), contextlib.nullcontext() if self.is_folder else self._reached():
+            lease.take()
+        try:
+            self._lease = lease
+            if self.is_folder:
+                self._clear_staging()
+            with self.looked():
+                self.check_version()
+                yield
+        finally:
+            self._lease = None
+            lease.give_back()
+
+    def last_version(self) -> str:
+        """Return the version of roadscan that wrote last, empty where that is not known."""
+        if not self.exists(VERSION_FILE):
+            return ""
+        try:
+            return version_of(self.read_bytes(VERSION_FILE))
+        except ValueError:
+            return ""
+
+    def check_version(self) -> None:
+        """Raise StoreError where a newer version of roadscan than this one wrote to the store."""
+        if version := self.last_version():
+            refuse_newer(version, self.root)
+
+    def check_free(self) -> None:
+        """Raise StoreError where another run has the store now: before long work, since :meth:`lock` asks again."""
+        with contextlib.nullcontext() if self.is_folder else self._reached():
+            self._new_lease().check_free()
+
+    def _new_lease(self) -> Lease:
+        return Lease(self._lease_place())
+
+    def _lease_place(self) -> FolderPlace | ObjectPlace:
+        file = self.path(_LOCK)
+        return FolderPlace(Path(file), self._new_temporary, alone_in) if self.is_folder else ObjectPlace(self.fs, file)
+
+    @contextlib.contextmanager
+    def looked(self) -> Iterator[None]:
+        """Ask an object store for nothing twice, as long as nobody else writes to it (a folder is asked each time)."""
+        with contextlib.ExitStack() as stack:
+            if not self.is_folder:
+                stack.enter_context(looking((self.url, self.survey_id), self.fs, self.root))
+            yield
+
+    def told(self, written: Iterable[tuple[str, int]]) -> None:
+        """Note the paths and bytes of files that workers wrote, so that nobody asks an object store for them."""
+        if (look := self._look()) is not None:
+            for path, size in written:
+                look.wrote(path, size)
+
+    def _look(self) -> Look | None:
+        return None if self.is_folder else look_of((self.url, self.survey_id))
+
+    def _wrote(self, relative: str, size: int, content: bytes | None = None) -> None:
+        if (look := self._look()) is not None:
+            look.wrote(relative, size, content)
+
+    def _check_lease(self) -> None:
+        if self._lease is not None:
+            self._lease.check()
+
+    def _temporary(self) -> Path:
+        """Return a new name on the store's disk, which tells who made it."""
+        return Path(self.path(_STAGING)) / f"{own_tag()}-{uuid.uuid4().hex}"
+
+    def _new_temporary(self) -> Path:
+        """Return the same in a folder that is there."""
+        named = self._temporary()
+        _make_folder(named.parent, lasting=True)
+        return named
 
     def _clear_staging(self) -> None:
+        """Remove temporary files of dead processes, and of other machines' after some hours."""
         parent = Path(self.path(_STAGING))
         for left in parent.iterdir() if parent.is_dir() else ():
-            maker = left.name.split("-")[0]
-            if not (maker.isdigit() and process_lives(int(maker))):
-                shutil.rmtree(left, ignore_errors=True)
-                left.unlink(missing_ok=True) if left.is_file() else None
+            lives = tag_lives(left.name)
+            if lives or (lives is None and not _is_stray(left)):
+                continue
+            shutil.rmtree(left, ignore_errors=True)
+            left.unlink(missing_ok=True) if left.is_file() else None
+
+
+def _is_stray(left: Path) -> bool:
+    """Return True if nothing in a temporary file or folder has changed for hours."""
+    with contextlib.suppress(OSError):
+        return time.time() - max(p.stat().st_mtime for p in (left, *left.rglob("*"))) > _STRAY_S
+    return False
 
 
 def _move_aside(file: Path, aside: Path, keep: bool) -> None:
@@ -453,37 +576,3 @@ def alone_in(folder: Path) -> Iterator[None]:
             with contextlib.suppress(OSError):  # file systems without such locks
                 fcntl.flock(opened, fcntl.LOCK_EX)
         yield
-
-
-def _check_dead(lock: Path) -> None:
-    """Raise StoreError where the process of a lock may be running; text that no run writes names none."""
-    try:
-        owner = lock.read_text().split()
-    except FileNotFoundError:
-        return
-    except (OSError, ValueError) as error:
-        raise StoreError(
-            f"the store's lock cannot be read: {error}", change="remove it if no run is at work", file=lock
-        ) from error
-    if (
-        len(owner) != 2
-        or not owner[1].isdigit()
-        or (owner[0] == socket.gethostname() and not process_lives(int(owner[1])))
-    ):
-        return
-    raise StoreError(
-        f"process {owner[1]} on {owner[0]} is working on this store",
-        expected="one run at a time",
-        change=f"wait for it, or remove {lock} if that process is gone",
-    )
-
-
-def process_lives(pid: int) -> bool:
-    """Return True if a process of this machine has that number."""
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True

@@ -13,7 +13,7 @@ from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.stage import stages
 from roadscan.store.asset_schema import asset_tables
 from roadscan.store.schema import schema_names
-from roadscan.store.sql import missing_table, query
+from roadscan.store.sql import Limits, missing_table, query
 from roadscan.store.store import Store
 from roadscan.tiles.product import SurveyProduct, products
 from roadscan.tiles.tasks.wanted_products import wanted_products
@@ -35,6 +35,7 @@ def ask(
     damaged: list[StoreError] | None = None,
     *,
     unconfined: bool = False,
+    limits: Limits | None = None,
 ) -> pa.Table:
     """Return the result of a DuckDB statement over a survey's tables (:func:`roadscan.store.sql.query`).
 
@@ -44,7 +45,9 @@ def ask(
         The statement fails; of a table that is not there yet it says what makes it.
     """
     try:
-        return query(store, statement, known_keys(survey, store), damaged, unconfined=unconfined)
+        return query(
+            store, statement, known_keys(survey, store), damaged, unconfined=unconfined, limits=limits or Limits()
+        )
     except RoadscanError as error:
         name = missing_table(error.__cause__)
         told = None if name is None else not_made(name, survey)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import datetime as dt
 import functools
 import os
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 
+from roadscan.core.counted import size_in_words
 from roadscan.core.crs import (
     LOCAL_WORLD,
     MapFrame,
@@ -47,17 +49,20 @@ from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reje
 from roadscan.ingest.sources import listed_name, remembered_formats
 from roadscan.navigation.odometry.registration import LIBRARY, WHAT
 from roadscan.navigation.tasks.clocks import check_clocks
-from roadscan.navigation.tasks.navigation_logs import unknown_imu
+from roadscan.navigation.tasks.navigation_logs import unknown_imu, unknown_way
 from roadscan.navigation.tasks.odometry_trajectory import LOCAL_MAP
+from roadscan.pictures.frames.stage import no_folder_of_frames
 from roadscan.run.selection import Selection
-from roadscan.run.stage import stages
+from roadscan.run.stage import stage_named, stages
 from roadscan.store.logs import has_log, read_log_records
 from roadscan.store.store import Store
+from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.settings import SurfaceConfig
+from roadscan.surface.tasks.found_regions import none_across
 from roadscan.surface.tasks.surface_colours import check_cameras
 from roadscan.surface.tasks.surface_plan import checked_surface
 from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.wanted_products import check_product, wanted_tile_products
+from roadscan.tiles.tasks.wanted_products import check_product, wanted_surface_products, wanted_tile_products
 
 FARTHEST_DEG: Final = 10.0
 """Positions farther than this outside the area of the map's CRS are refused (degrees): a metre of such a map is no
@@ -392,6 +397,25 @@ def check_poses(asked: Asked) -> Iterator[RoadscanError]:
             )
 
 
+def check_encoders(asked: Asked) -> Iterator[RoadscanError]:
+    """Check that the way of a tick is known where poses are computed of an encoder that only counts ticks."""
+    for log in asked.logs:
+        wheels = {} if log.header is None else log.header.attributes.get("wheels", {})
+        quantities = {quantity for wheel in wheels.values() for quantity in wheel}
+        made = asked.is_solved(log.run) and "trajectory" not in asked.yields(log.run)
+        if made and "ticks" in quantities and "distance" not in quantities:
+            sensor = asked.survey.rig.sensors.get(getattr(log.config, "sensor", None) or "")
+            if sensor is None or sensor.metres_per_tick is None:
+                yield unknown_way(str(log.config.path))
+
+
+def check_videos(asked: Asked) -> Iterator[RoadscanError]:
+    """Check that the store is a folder where key frames of videos are wanted."""
+    videos = [log for log in asked.logs if log.header is not None and log.header.attributes.get("kind") == "video"]
+    if videos and not asked.store.is_folder and stage_named("video_frames").is_asked(asked.survey):
+        yield no_folder_of_frames()
+
+
 def check_odometry(asked: Asked) -> Iterator[RoadscanError]:
     """Check that what makes poses from sweeps is installed, and that the map takes poses of a local frame."""
     frame = asked.frame
@@ -433,10 +457,12 @@ def check_products(asked: Asked) -> Iterator[RoadscanError]:
     yield from faults
     if faults or asked.frame is None:
         return
-    tiles = survey.config.tiles
-    nowhen = dt.date(1980, 1, 6)
-    context = ProductContext(survey.config.id, "", asked.frame, TileGrid(tiles.size_m, tiles.cell_m), (), nowhen)
+    grid = TileGrid(survey.config.tiles.size_m, survey.config.tiles.cell_m)
+    surface, nowhen = SurfaceConfig.stated(survey), dt.date(1980, 1, 6)
+    cell_m = None if surface is None else SurfaceGrid(grid, surface).cell_m
+    context = ProductContext(survey.config.id, "", asked.frame, grid, (), nowhen, cell_m)
     yield from _faults(lambda: wanted_tile_products(survey, context))
+    yield from _faults(lambda: wanted_surface_products(survey, context))
     yield from _faults(lambda: check_cameras(survey))
 
 
@@ -447,6 +473,8 @@ def check_surface(asked: Asked) -> Iterator[RoadscanError]:
         yield from _faults(lambda: need("cv2", "the section [surface]"), None)
     if surface is not None and asked.frame is not None:
         yield from _faults(lambda: checked_surface(asked.survey, surface))
+    if surface is not None and surface.regions == "found" and _none_across(asked):
+        yield none_across(_tables_of_sensors(asked))
 
 
 def check_centre_lines(asked: Asked) -> Iterator[RoadscanError]:
@@ -476,7 +504,8 @@ def check_passes(asked: Asked) -> Iterator[RoadscanError]:
 
 
 def check_store(asked: Asked) -> Iterator[RoadscanError]:
-    """Check that the store can be written, and contains only a survey's files."""
+    """Check that the store can be written, that no newer version wrote it, and that it has only a survey's files."""
+    yield from _faults(asked.store.check_version)
     if not asked.store.is_folder:
         yield from _faults(lambda: asked.store.exists("manifest"))
         return
@@ -520,7 +549,9 @@ CHECKS: Final[tuple[tuple[str, Check], ...]] = (
     ("ingest", check_times),
     ("navigate", check_motion_clocks),
     ("navigate", check_imu),
+    ("navigate", check_encoders),
     ("navigate", check_odometry),
+    ("video_frames", check_videos),
     ("footprints", check_poses),
     ("footprints", check_segmentation),
     ("footprints", check_centre_lines),
@@ -551,6 +582,11 @@ class Preflight:
 
 def preflight(survey: Survey, store: Store, last_stage: str = "", selection: Selection | None = None) -> Preflight:
     """Run all checks that stages up to `last_stage` need (all, where none is named), for some tiles or for all."""
+    with store.looked():
+        return _preflight(survey, store, last_stage, selection)
+
+
+def _preflight(survey: Survey, store: Store, last_stage: str, selection: Selection | None) -> Preflight:
     if selection is not None and not store.exists("manifest/outputs"):
         raise ConfigError("tiles are chosen, and none is computed yet", change="run `roadscan run` first")
     asked = Asked(survey, store)
@@ -593,12 +629,45 @@ def _notes(asked: Asked) -> Iterator[str]:
             f"[segmentation] applies to {', '.join(sorted(segmented))}; all readings of {', '.join(rest)} count, "
             "whether they hit the road or not"
         )
+    yield from _room(asked)
     for log, place, beyond_deg in asked.places:
         if _NEAR_DEG < beyond_deg <= FARTHEST_DEG:
             yield (
                 f"{log.path}: its positions begin near {_place_words(place)}, {beyond_deg:.1f}° outside the area of "
                 f"{_map_words(asked)}: distances on the map differ from those on the ground"
             )
+
+
+def _room(asked: Asked) -> Iterator[str]:
+    """Yield a note where the store's disk has less room than the logs have that are still to be ingested.
+
+    Rows take a third to three times the space of their log: a run may end well with less room, and badly with more.
+    """
+    if not asked.store.is_folder:
+        return
+    root = Path(asked.store.root)
+    held = {(record.run, record.path) for record in read_log_records(asked.store, damaged=[])}
+    due = [log.path for log in asked.logs if (log.run, str(log.config.path)) not in held]
+    needed = sum(path.stat().st_size for path in due if path.is_file())
+    free = shutil.disk_usage(next(folder for folder in (root, *root.parents) if folder.exists())).free
+    if free < needed:
+        yield (
+            f"the logs that are not ingested yet have {size_in_words(needed)}, and {size_in_words(free)} are free on "
+            "the store's disk: the run may stop for want of room; what is finished then stays"
+        )
+
+
+def _none_across(asked: Asked) -> bool:
+    """Return whether no profiles lie across the road, as far as the headers of all logs tell the mountings."""
+    scans = [log for log in asked.logs if "scans" in log.yields]
+    if not scans or _segmented(asked) or any(log.format is None or log.header is None for log in asked.logs):
+        return False
+    sensors = [
+        asked.survey.sensor(log.config.sensor).mounted_as(log.header.attributes.get("mounting", {}))
+        for log in scans
+        if log.header is not None and isinstance(log.config, LogConfig) and log.config.sensor is not None
+    ]
+    return bool(sensors) and not any(looks_across(sensor.mounting()) for sensor in sensors)
 
 
 def _tables_of_sensors(asked: Asked) -> dict[str, set[str]]:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
+from roadscan import __version__
 from roadscan.core.counted import counted
 from roadscan.core.errors import RoadscanError, RunError
 from roadscan.georeference.plan.plan import NothingToPlaceError
@@ -18,10 +19,13 @@ from roadscan.run.session import Session
 from roadscan.run.stage import Stage, findings_of, stages
 from roadscan.run.told import told_run, told_stage
 from roadscan.store.logs import read_log_records
+from roadscan.store.look import look_again
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
 from roadscan.store.repair_records import repair_records
 from roadscan.store.verified import note_written, recorded_files
+from roadscan.store.written_by import VERSION_FILE, version_content
 from roadscan.surface.tasks.surface_colours import check_cameras
+from roadscan.survey.status import survey_status
 from roadscan.tiles.tasks.wanted_products import wanted_products
 
 _CLOCK_TICK_NS: Final = 50_000_000
@@ -50,8 +54,10 @@ def run_stages(session: Session, chosen: Sequence[Stage] | None = None) -> None:
 def run_stage(session: Session, stage: Stage) -> None:
     """Run one stage. If an earlier stage had failures, append this error to them instead of raising it."""
     session.stage = stage.name
+    look_again()
     if session.goes_on is None:
         repair_records(session.store, session.note)
+        _tell_upgrade(session)
         session.goes_on = begin_changes(session.store)
         session.began_ns = time.time_ns() - _CLOCK_TICK_NS
     with told_stage(session, stage.name):
@@ -77,6 +83,21 @@ def _run_stage(session: Session, stage: Stage) -> None:
                 write_failures(session.store, [{"stage": stage.name, "unit": "as a whole", "reason": str(error)}])
             raise
         session.failed(stage.name, [("as a whole", error)])
+
+
+def _tell_upgrade(session: Session) -> None:
+    """Say what this version of roadscan makes anew of a store that another one wrote, before it does so."""
+    store, last = session.store, session.store.last_version()
+    if last == __version__:
+        return
+    if store.exists("manifest/logs"):
+        due = survey_status(Session(session.survey, store, only_looks=True)).due
+        made = ", ".join(f"{count:,} of {stage}" for stage, count in due.items()) or "nothing"
+        session.note(
+            f"the store was written by {f'roadscan {last}' if last else 'an older version'}, this is roadscan "
+            f"{__version__}; to be made anew, as far as is known before: {made}"
+        )
+    store.write_bytes(VERSION_FILE, version_content())
 
 
 def _tell_findings(session: Session, stage: Stage) -> None:

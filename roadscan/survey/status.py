@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import RoadscanError, StoreError
@@ -21,6 +20,7 @@ from roadscan.ingest.sources import damaged_sources
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.session import Session
 from roadscan.run.stage import StageState, findings_of, stages
+from roadscan.store.damage import UNREADABLE
 from roadscan.store.history import history_faults
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
@@ -29,6 +29,7 @@ from roadscan.store.salvage import Lost, read_lost
 from roadscan.store.sql_files import Stamp, stamp_of
 from roadscan.store.store import Store
 from roadscan.store.verified import held_faults, note_verified
+from roadscan.store.written_by import VERSION_FILE
 from roadscan.survey.preflight import preflight
 from roadscan.tiles.product import products
 from roadscan.tiles.tasks.tile_plan import TILE
@@ -116,6 +117,11 @@ class Status:
 
 def survey_status(session: Session) -> Status:
     """Return the state of a survey from its manifest; no readings are read."""
+    with session.store.looked():
+        return _survey_status(session)
+
+
+def _survey_status(session: Session) -> Status:
     store, damaged = session.store, session.hear_of_damage()
     found = preflight(session.survey, store)
     causes = [*map(str, found.causes), *found.failing]
@@ -206,6 +212,7 @@ def find_damage(store: Store, report: Callable[[int, int], None] = lambda _a, _b
         [
             *map(str, damaged),
             *damaged_sources(store),
+            *_version_faults(store),
             *_copy_faults(store, [r.key for r in logs]),
             *held_faults(store),
             *history_faults(store).values(),
@@ -239,6 +246,13 @@ def find_damage(store: Store, report: Callable[[int, int], None] = lambda _a, _b
     return found
 
 
+def _version_faults(store: Store) -> list[str]:
+    """Return the fault of the file that names the version which wrote last, if it has one."""
+    if store.exists(VERSION_FILE) and not store.last_version():
+        return [f"{VERSION_FILE}: it is damaged; the next run writes it anew"]
+    return []
+
+
 def _copy_faults(store: Store, keys: Sequence[str]) -> list[str]:
     """Return faults of record copies that differ from sound log records; they are set aside and written again."""
     faults: list[str] = []
@@ -260,6 +274,6 @@ def _check_output(store: Store, folder: Path, record: OutputRecord) -> str | Non
             products()[record.product].check(local)
         elif record.path.endswith(".parquet"):
             pq.ParquetFile(local).read(use_threads=False)
-    except (RoadscanError, OSError, pa.ArrowInvalid) as error:
+    except (RoadscanError, *UNREADABLE) as error:
         return f"{record.path}: {error}"
     return None

@@ -108,6 +108,7 @@ def test_a_worker_runs_the_deployments(
     assert run.state_type is StateType.FAILED
     assert run.state is not None
     assert f"tiles {TILE}: " in run.state.message
+    assert "roadscan.core.errors" not in (survey_file.parent.parent / "worker.log").read_text()  # no traceback
 
 
 def planned_runs(client: SyncPrefectClient) -> list[FlowRun]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import socket
@@ -18,8 +19,11 @@ import rasterio
 from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
 from prefect.client.schemas.objects import FlowRun, State, StateType
+from prefect.flow_engine import run_flow
+from prefect.logging.loggers import flow_run_logger
 
-from roadscan.core.errors import ConfigError, RoadscanError, RunError
+from roadscan.core.errors import ConfigError, RoadscanError, RunError, StoreError
+from roadscan.flows import conduct
 from roadscan.flows.reprocess import reprocess
 from roadscan.flows.survey import survey
 from roadscan.simulate import SimulatedSurvey
@@ -183,3 +187,61 @@ def test_an_api_that_does_not_answer(survey_file: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.startswith(f"roadscan: no Prefect API answers at {url}")
     assert not (survey_file.parent / "store").exists()
+
+
+class Heard(logging.Handler):
+    """What Prefect's loggers of runs print."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+        self.setFormatter(logging.Formatter("%(message)s"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a line, with its traceback."""
+        self.lines.append(self.format(record))
+
+
+def log_of_worker(client: SyncPrefectClient, survey_file: Path) -> str:
+    """What the process that a worker starts logs of a flow run: it runs the flow with Prefect's logger of errors."""
+    parameters = {"survey_file": str(survey_file), "workers": 0}
+    flow_run = client.create_flow_run(survey, parameters=parameters)
+    heard = Heard()
+    loggers = [logging.getLogger(f"prefect.{name}") for name in ("flow_runs", "task_runs", "engine")]
+    for logger in loggers:
+        logger.addHandler(heard)
+    try:
+        with pytest.raises((RoadscanError, ZeroDivisionError)):
+            run_flow(survey, flow_run=flow_run, parameters=parameters, error_logger=flow_run_logger(flow_run))
+    finally:
+        for logger in loggers:
+            logger.removeHandler(heard)
+    return "\n".join(heard.lines)
+
+
+def test_an_expected_error_is_logged_once_and_without_traceback(survey_file: Path, client: SyncPrefectClient) -> None:
+    (survey_file.parent / "raw" / "run-1" / "profiler_left.parquet").unlink()
+    log = log_of_worker(client, survey_file)
+    assert log.count("profiler_left.parquet: the log does not exist") == 1
+    assert "Traceback" not in log
+    assert "NoneType" not in log
+
+
+def test_an_expected_error_of_a_stage_likewise(
+    survey_file: Path, client: SyncPrefectClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> None:
+        raise StoreError("the store is not to be written")
+
+    monkeypatch.setattr(conduct, "run_stage", stopped)
+    log = log_of_worker(client, survey_file)
+    assert log.count("the store is not to be written") == 1
+    assert "Traceback" not in log
+    assert "NoneType" not in log
+
+
+def test_an_unexpected_error_keeps_its_traceback(
+    survey_file: Path, client: SyncPrefectClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conduct, "run_stage", lambda *_: 1 // 0)
+    assert "ZeroDivisionError: integer division" in log_of_worker(client, survey_file).partition("Traceback")[2]

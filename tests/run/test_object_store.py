@@ -17,11 +17,13 @@ from roadscan.run.engine.compute import Inline
 from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
+from roadscan.store.look import look_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status, verify_store
+from tests.object_store import served
 from tests.surveys import Lines, Simulated, outputs
 
 
@@ -37,13 +39,12 @@ class Remembering(MemoryFileSystem):
     def _strip_protocol(cls, path: str) -> str:
         return str(super()._strip_protocol(path.removeprefix("remembering:/")))
 
-    def find(self, path: str, *_: object, **__: object) -> list[str]:
+    def find(self, path: str, *_: object, detail: bool = False, **__: object) -> Any:
         try:
-            return list(self.dircache[path])
+            found = self.dircache[path]
         except KeyError:
-            found = sorted(super().find(path))
-            self.dircache[path] = found
-            return found
+            found = self.dircache[path] = super().find(path, detail=True)
+        return dict(found) if detail else sorted(found)
 
 
 @pytest.fixture
@@ -81,6 +82,26 @@ def test_a_whole_run(finished: Simulated, objects: str) -> None:
     assert verify_store(store) == []
     assert outputs(store) == outputs(folder)
     assert store.files("damaged") == [f"damaged/{part}"]
+
+
+def test_an_idle_run_lists_s3_once(finished: Simulated) -> None:
+    """What the run knows of the store at its end is what the store holds, and a second run asks for records alone."""
+    survey = Survey.load(finished.survey_file)
+    with served() as objects:
+        store = Store(f"{objects.url}/roads", survey.config.id)
+        with store.looked():
+            run(survey, store)
+            seen = look_of((store.url, store.survey_id))
+            assert seen is not None
+            known = dict(seen._listed())
+        listed = store.fs.find(store.root, detail=True).items()
+        held = {path.removeprefix(f"{store.root}/"): info["size"] for path, info in listed}
+        assert held == known | {"manifest/lock": 0}  # given back since
+        objects.requests.clear()
+        with store.looked():
+            assert run(survey, store).raw_bytes_read == 0
+        assert not any("HEAD" in method and "tiles" in path for method, path in objects.requests)
+        assert len(objects.requests) <= 60 < len(held)
 
 
 def test_what_a_worker_wrote_is_seen(objects: str) -> None:

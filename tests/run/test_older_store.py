@@ -13,11 +13,16 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from roadscan import __version__
 from roadscan.cli import app
+from roadscan.core.errors import StoreError
 from roadscan.ingest.reading.format import log_formats
 from roadscan.run.session import Session
+from roadscan.store.checked_json import checked_json
 from roadscan.store.sql import query
+from roadscan.store.written_by import VERSION_FILE
 from roadscan.survey.status import survey_status, verify_store
+from tests.surveys import Simulated
 
 OLD = Path(__file__).resolve().parents[1] / "stores" / "version-0.1.tar.xz"
 ROWS = {"scans": (164, 80328896), "trajectory": (580, 350080502)}
@@ -66,6 +71,9 @@ def test_an_older_store_is_read_and_made_again(survey_file: Path) -> None:
     assert {log["state"] for log in state.logs if log["path"] not in waiting} == {"ingested"}
     done = CliRunner().invoke(app, ["run", str(survey_file), "--workers", "0"])
     assert done.exit_code == 0, done.output
+    assert f"the store was written by an older version, this is roadscan {__version__}; to be made anew" in done.output
+    assert "as far as is known before: 6 of ingest" in done.output
+    assert session.store.last_version() == __version__
     assert survey_status(Session.open(survey_file)).is_complete
     assert verify_store(session.store) == []
     for table, expected in ROWS.items():
@@ -73,3 +81,18 @@ def test_an_older_store_is_read_and_made_again(survey_file: Path) -> None:
         assert tuple(found.to_pylist()[0].values()) == expected
     tiles = query(session.store, "SELECT count(*) AS tiles, sum(points) AS points FROM tiles").to_pylist()[0]
     assert tuple(tiles.values()) == TILES
+
+
+def test_a_newer_store_is_refused_by_name(finished: Simulated, tmp_path: Path) -> None:
+    """Before long work, by each command that writes; what only looks says it too."""
+    copy = finished.copy_with_store_to(tmp_path / "survey")
+    copy.store().write_bytes(VERSION_FILE, checked_json({"roadscan": "9.1.0"}))
+    for command in ("run", "verify", "report"):
+        refused = CliRunner().invoke(app, [command, str(copy.survey_file)])
+        assert isinstance(refused.exception, StoreError)
+        assert f"roadscan 9.1.0 wrote to this store, and this is roadscan {__version__}" in str(refused.exception)
+    assert "roadscan 9.1.0 wrote to this store" in survey_status(Session.open(copy.survey_file)).would_fail[0]
+    copy.store().write_bytes(VERSION_FILE, b"{}")
+    assert [VERSION_FILE in fault for fault in verify_store(copy.store())] == [True]
+    copy.run()
+    assert verify_store(copy.store()) == []

@@ -420,6 +420,28 @@ def test_the_same_survey_gives_the_same_bytes_and_nothing_is_made_twice(
     assert [f.name for f in tmp_path.iterdir()] == ["site"]
 
 
+def test_a_damaged_file_of_a_site_is_named_and_made_again(
+    survey_file: Path, published: Published, tmp_path: Path
+) -> None:
+    site = tmp_path / "site"
+    shutil.copytree(published.folder, site)
+    files = sorted(f for f in site.rglob("*") if f.is_file() and f.name != KEYS and f.stat().st_size)
+    flipped, cut, gone, one, other = random.Random(1).sample(files, 5)
+    sound = {f: f.read_bytes() for f in files}
+    flipped.write_bytes(bytes([sound[flipped][0] ^ 1]) + sound[flipped][1:])
+    cut.write_bytes(sound[cut][:-1])
+    gone.unlink()
+    one.write_bytes(sound[other])
+    other.write_bytes(sound[one])
+    again = publish(Material(opened(survey_file)), site)
+    assert again.damaged == tuple(sorted(f.relative_to(site).as_posix() for f in (flipped, cut, gone, one, other)))
+    assert {f: f.read_bytes() for f in files} == sound
+    keys = site / KEYS
+    keys.write_bytes(keys.read_bytes().replace(b"blake3", b"blake7", 1))
+    with pytest.raises(ConfigError, match=r"keys\.json is damaged"):
+        publish(Material(opened(survey_file)), site)
+
+
 def test_a_folder_of_something_else_is_left_alone(survey_file: Path, tmp_path: Path) -> None:
     (tmp_path / "letters.txt").write_text("dear")
     done = CliRunner().invoke(app, ["publish", str(survey_file), "--out", str(tmp_path)])

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import laspy
 import numpy as np
@@ -27,6 +28,7 @@ from roadscan.run.stage import stages
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import write_parquet
+from roadscan.survey.preflight import preflight
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import verify_store
 from tests.drawing import drawn
@@ -133,3 +135,17 @@ def test_a_run_on_a_full_disk_goes_on_when_there_is_room(finished: Simulated, di
     run_stages(done, stages())
     assert verify_store(store) == []
     assert outputs(store) == outputs(finished.run(name="store-roomy", **products).store)
+
+
+def test_logs_that_are_larger_than_the_room_are_told_before(
+    simulated: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = simulated.copy_to(tmp_path / "survey")
+    survey = Survey.load(copy.survey_file)
+    said = "are free on the store's disk: the run may stop for want of room"
+    assert not any(said in note for note in preflight(survey, copy.store()).notes)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=10**9, used=10**9 - 5000, free=5000))
+    (note,) = [note for note in preflight(survey, copy.store()).notes if said in note]
+    logs = sum((copy.survey_file.parent / log.path).stat().st_size for run in survey.config.runs for log in run.logs)
+    assert logs / 1e6 == pytest.approx(float(note.partition(" MB")[0].rpartition(" ")[2]), abs=0.2)
+    assert "5.0 kB are free" in note

@@ -532,3 +532,51 @@ def test_a_sigma_that_no_survey_has_is_named(tmp_path: Path, unit: str, sigmas: 
 def test_sigmas_that_surveys_have_are_not_doubted(tmp_path: Path) -> None:
     """Precise levelling, tachymetry, GNSS in the field."""
     assert with_control(tmp_path, "mm", "0.2", "3", "25", "150", "") == []
+
+
+# --- settings that a late stage refuses -------------------------------------------------------------
+
+SURFACE = '[surface]\nmethod = "points"\nsigma_m = 0.002\n'
+
+
+def picked(*rows: str) -> Callable[[Path], object]:
+    """A file of picked targets."""
+    return lambda folder: (folder / "picked.csv").write_text("\n".join(["run,name,easting_m,northing_m", *rows]))
+
+
+def layer(shape: dict[str, object]) -> Callable[[Path], object]:
+    """A layer of reference lines with one feature."""
+    feature = {"type": "Feature", "properties": {}, "geometry": shape}
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
+    whole = {"type": "FeatureCollection", "crs": crs, "features": [feature]}
+    return lambda folder: (folder / "lines.geojson").write_text(json.dumps(whole))
+
+
+@pytest.mark.parametrize(
+    ("section", "make", "words"),
+    [
+        (
+            f'{SURFACE}[products]\nmake = ["crack_pieces"]\n\n[tiles]\ncell_m = 0.05\n\n',
+            None,
+            "'crack_pieces' got cells of 0.05 × 0.05 m",
+        ),
+        (f'{SURFACE}regions = "found"\n\n', None, 'surface.regions = "found" needs profiles across the road'),
+        ('[adjust]\ntargets = { picked = "picked.csv" }\n\n', picked("sunday,a,1,2"), "picked in run 'sunday'"),
+        ('[adjust]\ntargets = { picked = "picked.csv" }\n\n', picked("monday,a,1,x"), "could not convert string"),
+        (
+            '[condition]\nreference = "layer"\nlayer = "lines.geojson"\n\n',
+            layer({"type": "Point", "coordinates": [500000.0, 5300000.0]}),
+            "feature 0 of the layer (counted from 0) cannot be used",
+        ),
+    ],
+    ids=["cells", "regions", "run", "metres", "feature"],
+)
+def test_what_a_late_stage_would_refuse_is_refused_before_a_log_is_read(
+    tmp_path: Path, section: str, make: Callable[[Path], object] | None, words: str
+) -> None:
+    turned = ("[0.0, 0.0, 0.0] }", '[0.0, 0.0, 0.0], axes = "flu" }') if "found" in section else ("", "")
+    changed(tmp_path, turned, ("[[runs]]\n", f"{section}[[runs]]\n"), make=make or (lambda _: None))
+    code, text = run(tmp_path)
+    assert code == 2
+    assert words in text
+    assert not (tmp_path / "store").exists()

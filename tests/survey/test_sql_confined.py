@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.core.errors import RoadscanError
-from roadscan.store.sql import connect, query
+from roadscan.store.sql import Limits, connect, query
 from roadscan.store.sql_files import StoreFiles
 from roadscan.store.store import Store
 from tests.survey.test_damage import say
@@ -244,3 +246,50 @@ def test_a_store_that_cannot_be_written_is_asked_all_the_same(attacked: Simulate
     held.mkdir()  # nothing can be published under its name
     store = Simulated(tmp_path / "survey" / attacked.survey_file.name).store()
     assert query(store, "SELECT count(*) AS n FROM trajectory").num_rows == 1
+
+
+ENDLESS = "SELECT count(*) FROM range(3000000) a, range(3000000) b WHERE a.range * b.range % 7 = 3"
+
+
+def test_a_statement_is_stopped_after_its_time(finished: Simulated) -> None:
+    started = time.perf_counter()
+    with pytest.raises(RoadscanError, match=r"stopped after 0\.5 s.*--timeout"):
+        query(finished.store(), ENDLESS, limits=Limits(time_s=0.5))
+    assert time.perf_counter() - started < 8.0  # a hundred hours else
+
+
+def test_the_command_takes_time_and_memory(finished: Simulated) -> None:
+    code, text = say("sql", ENDLESS, "--survey", finished.survey_file, "--timeout", "0.5")
+    assert (code, "stopped after 0.5 s" in text) == (2, True)
+    code, text = say("sql", "SELECT * FROM range(100000000)", "--survey", finished.survey_file, "--memory", "0.1")
+    assert (code, "the answer is larger than 0.1 GB" in text) == (2, True)
+
+
+@pytest.mark.parametrize("unconfined", [False, True])
+def test_a_statement_takes_no_more_memory_than_it_is_given(finished: Simulated, unconfined: bool) -> None:
+    """Groups of 0.5 GB, with 50 MB of memory and, where it may write, 200 MB of disk."""
+    limits = Limits(memory_bytes=50_000_000)
+    statement = "SELECT h, list(range) FROM (SELECT range, hash(range) AS h FROM range(30000000)) GROUP BY h LIMIT 1"
+    with pytest.raises(RoadscanError, match="--memory"):
+        query(finished.store(), statement, unconfined=unconfined, limits=limits)
+
+
+def test_an_answer_has_a_bound_of_its_own(finished: Simulated) -> None:
+    """DuckDB's bound does not count what has left it."""
+    with pytest.raises(RoadscanError, match=r"the answer is larger than 0\.1 GB"):
+        query(finished.store(), "SELECT * FROM range(2000000000)", limits=Limits(memory_bytes=100_000_000))
+    answer = query(finished.store(), "SELECT * FROM range(1000000)", limits=Limits(memory_bytes=100_000_000))
+    assert answer.column(0).to_pylist()[-1] == 999_999
+
+
+def test_what_is_spilt_is_bounded_and_removed(
+    finished: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    statement = "SELECT count(*) FROM (SELECT hash(range) AS h FROM range(12000000) ORDER BY h LIMIT 10000000)"
+    limits = Limits(memory_bytes=120_000_000)
+    with pytest.raises(RoadscanError, match="--memory"):
+        query(finished.store(), statement, limits=limits)
+    answer = query(finished.store(), statement, unconfined=True, limits=limits)
+    assert answer.column(0).to_pylist() == [10_000_000]
+    assert not list(tmp_path.iterdir())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -23,6 +24,7 @@ from roadscan.adjust.tasks.tracks import runs_of
 from roadscan.core.errors import ConfigError
 from roadscan.core.frames import rotation_from_rph, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
+from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import MapSettings
@@ -112,18 +114,18 @@ def _shape(target: TargetConfig) -> Shape | None:
             return None
 
 
-def picked_places(plan: SurveyPlan, points: Sequence[ControlPoint]) -> dict[tuple[str, str], PickedPlace]:
-    """Returns places that the user picked, by run and name of the point.
+def read_picked(survey: Survey) -> list[tuple[int, str, str, PickedPlace]]:
+    """Returns places that the user picked: line of the file, run, name of the point, place.
 
     Raises
     ------
     ConfigError
         where the file is not there or a row of it is none.
     """
-    targets = AdjustConfig.of(plan.survey).targets
+    targets = AdjustConfig.of(survey).targets
     if targets.picked is None:
-        return {}
-    path = plan.survey.resolve(targets.picked)
+        return []
+    path = survey.resolve(targets.picked)
     if not path.is_file():
         raise ConfigError("there is no file of picked targets", change="correct adjust.targets.picked", file=path)
     with path.open(encoding="utf-8-sig", newline="") as stream:
@@ -133,21 +135,41 @@ def picked_places(plan: SurveyPlan, points: Sequence[ControlPoint]) -> dict[tupl
             raise ConfigError(
                 f"the picked targets have no column '{missing[0]}'", expected=", ".join(_PICKED_COLUMNS), file=path
             )
-        known = {point.name for point in points}
-        runs = {run.id for run in plan.survey.config.runs}
-        found: dict[tuple[str, str], PickedPlace] = {}
+        runs = {run.id for run in survey.config.runs}
+        found = []
         for number, row in enumerate(rows, 2):
-            if row["name"] not in known or row["run"] not in runs:
-                raise ConfigError(
-                    f"a target of point '{row['name']}' was picked in run '{row['run']}'",
-                    expected="a control point and a run of the survey", file=path, record=number,
-                )  # fmt: skip
+            if row["run"] not in runs:
+                raise _not_picked(row["name"], row["run"], path, number)
             try:
                 place = (float(row["easting_m"]), float(row["northing_m"]))
-            except ValueError as error:
+            except (TypeError, ValueError) as error:
                 raise ConfigError(str(error), expected="metres", file=path, record=number) from error
-            found[row["run"], row["name"]] = PickedPlace(*place, targets.picked_sigma_m)
+            found.append((number, row["run"], row["name"], PickedPlace(*place, targets.picked_sigma_m)))
     return found
+
+
+def picked_places(plan: SurveyPlan, points: Sequence[ControlPoint]) -> dict[tuple[str, str], PickedPlace]:
+    """Returns places that the user picked, by run and name of the point.
+
+    Raises
+    ------
+    ConfigError
+        where the file is not there, a row of it is none, or it names no control point.
+    """
+    known = {point.name for point in points}
+    picked = read_picked(plan.survey)
+    for number, run, name, _ in picked:
+        if name not in known:
+            file = AdjustConfig.of(plan.survey).targets.picked
+            raise _not_picked(name, run, None if file is None else plan.survey.resolve(file), number)
+    return {(run, name): place for _, run, name, place in picked}
+
+
+def _not_picked(name: str, run: str, path: Path | None, record: int) -> ConfigError:
+    return ConfigError(
+        f"a target of point '{name}' was picked in run '{run}'",
+        expected="a control point and a run of the survey", file=path, record=record,
+    )  # fmt: skip
 
 
 def control_tasks(

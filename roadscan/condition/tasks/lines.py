@@ -90,7 +90,7 @@ def _layer_file(plan: SurveyPlan, config: ConditionConfig) -> Path | None:
 def find_lines(plan: SurveyPlan, config: ConditionConfig) -> Roads:
     """Find the lines and lanes: from the drives, or those of the layer that were driven."""
     drives = [Drive(one.pass_id, _path_m(plan, one, source), one.lane) for one, source in _driven(plan)]
-    lines, lanes = find_roads(drives, stated_lines(plan, config), config)
+    lines, lanes = find_roads(drives, stated_lines(plan.survey, config, plan.ground.map), config)
     return Roads({line.road: line for line in lines}, tuple(_with_roll(plan, lanes)))
 
 
@@ -150,21 +150,19 @@ def _wander(plan: SurveyPlan, one: LanePass, source: TrajectorySource) -> float:
 
 
 def check_layer(survey: Survey) -> None:
-    """Open the layer of reference lines, where the survey file states one.
+    """Read the layer of reference lines, where the survey file states one.
 
     Raises
     ------
     FormatError, ConfigError, CrsError
-        if it does not exist, cannot be read as stated, or cannot be brought into the map.
+        if it does not exist, cannot be read as stated or brought into the map, or a feature cannot be used.
     """
     config = ConditionConfig.stated(survey)
     if config is not None and config.layer is not None:
-        path = survey.resolve(config.layer)
-        layer = LineLayer.of(path, RoadLinesOptions.parse(config.layer_options, file=path), config.layer_crs)
-        place_in_map(layer.crs, survey.frame(), path)
+        stated_lines(survey, config, survey.frame())
 
 
-def stated_lines(plan: SurveyPlan, config: ConditionConfig) -> list[StatedLine]:
+def stated_lines(survey: Survey, config: ConditionConfig, frame: MapFrame) -> list[StatedLine]:
     """Return the lines of the survey file's layer; none where it has none.
 
     Raises
@@ -172,12 +170,12 @@ def stated_lines(plan: SurveyPlan, config: ConditionConfig) -> list[StatedLine]:
     FormatError, ConfigError, CrsError
         if the layer cannot be read as stated, or a feature cannot be used.
     """
-    path = _layer_file(plan, config)
-    if path is None:
+    if config.layer is None:
         return []
+    path = survey.resolve(config.layer)
     layer = LineLayer.of(path, RoadLinesOptions.parse(config.layer_options, file=path), config.layer_crs)
     found: list[StatedLine] = []
-    for item in read_lines(layer, place_in_map(layer.crs, plan.ground.map, path), need_widths=False):
+    for item in read_lines(layer, place_in_map(layer.crs, frame, path), need_widths=False):
         if isinstance(item, Reject):
             raise ConfigError(
                 f"feature {item.record} of the layer (counted from 0) cannot be used: {item.reason}",

@@ -29,6 +29,7 @@ from roadscan.formats.lidars.returns_batch import EIGHT_TO_SIXTEEN_BITS, returns
 from roadscan.ingest.reading.arrow_batches import unlisted_batches, unlisted_reason
 from roadscan.ingest.reading.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve
+from roadscan.store.damage import UNREADABLE
 
 _COLUMNS: Final = ("x", "y", "z", "intensity", "laser_number", "offset_ns")
 _CHUNK_RETURNS: Final = 1 << 18  # returns of a chunk
@@ -36,7 +37,6 @@ _FARTHEST_M: Final = 10_000.0  # farther positions count as damage
 _LONGEST_OFFSET_NS: Final = 1_000_000_000  # larger offsets count as damage
 _SWEEP: Final = re.compile(r"^\d{10,19}\.feather$")
 _CLOCK: Final = {"system": "unix_gps", "unit": "ns"}
-_UNREADABLE: Final = (pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError, MemoryError)
 """Errors that Arrow raises on damaged bytes."""
 
 
@@ -58,7 +58,7 @@ class Argoverse(LogFormat):
         try:
             first = next(iter(sorted(_sweeps(path))), None)
             return first is not None and _has_columns(_open(first).schema)
-        except _UNREADABLE:
+        except UNREADABLE:
             return False
 
     def files(self, path: Path) -> list[Path]:
@@ -90,7 +90,7 @@ class Argoverse(LogFormat):
                 sweep = _open(file)
                 if not _has_columns(sweep.schema):
                     raise ValueError(f"its columns are {', '.join(sweep.schema.names)}")
-            except (*_UNREADABLE, TimeSystemError) as error:
+            except (*UNREADABLE, TimeSystemError) as error:
                 yield Reject(f"the sweep cannot be read: {_brief(error)}", 0, -1, 1, name)
                 continue
             yield from _items(sweep, name, stamp, number)
@@ -121,7 +121,7 @@ def _open(file: Path) -> Any:
 def _readable(file: Path) -> bool:
     try:
         return _has_columns(_open(file).schema)
-    except _UNREADABLE:
+    except UNREADABLE:
         return False
 
 
@@ -156,7 +156,7 @@ def _items(sweep: Any, name: str, stamp_gps_ns: int, number: int) -> Iterator[It
         try:
             batch = sweep.get_batch(index).select(list(_COLUMNS))
             batch.validate(full=True)
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             yield Reject(f"the sweep's record batch is damaged: {_brief(error)}", first, -1, 1, name)
             continue
         for start in range(0, batch.num_rows, _CHUNK_RETURNS):

@@ -31,11 +31,12 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.core.errors import ConfigError, FormatError
-from roadscan.ingest.reading.column_table import UNREADABLE, Lost, brief, is_number, open_table
+from roadscan.ingest.reading.column_table import Lost, brief, is_number, open_table
 from roadscan.ingest.reading.columns import Found
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve
 from roadscan.ingest.reading.table_stamps import EPOCH, TableStamps, column_stamps, need_type
+from roadscan.store.damage import UNREADABLE
 
 AXES: Final = ("x_sensor_m", "y_sensor_m", "z_sensor_m")
 

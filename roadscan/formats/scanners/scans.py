@@ -39,10 +39,11 @@ from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.strict import Strict
-from roadscan.ingest.reading.column_table import UNREADABLE, Lost, brief, open_table
+from roadscan.ingest.reading.column_table import Lost, brief, open_table
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.table_stamps import EPOCH, column_stamps, refuse_clock
+from roadscan.store.damage import UNREADABLE
 
 GEOMETRY_KEY: Final = "roadscan.scan_geometry"
 """Key of the schema metadata with the geometry as JSON."""

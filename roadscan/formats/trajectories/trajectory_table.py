@@ -25,13 +25,14 @@ from roadscan.formats.trajectories.level_poses import (
     level_poses,
     pose_quantities,
 )
-from roadscan.ingest.reading.column_table import UNREADABLE, ColumnTable, Lost, is_number, need_table, open_table
+from roadscan.ingest.reading.column_table import ColumnTable, Lost, is_number, need_table, open_table
 from roadscan.ingest.reading.columns import ColumnOption, Found, find_columns, fits
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import North, Placement, PoseReader, level_placement
 from roadscan.ingest.reading.records import Sieve, options_of
 from roadscan.ingest.reading.stamps import TIME
 from roadscan.ingest.reading.table_stamps import EPOCH, TableStamps, need_type
+from roadscan.store.damage import UNREADABLE
 
 FRAME_KEY: Final = "roadscan.trajectory"
 """Key of the schema metadata with the frame of the poses as JSON."""

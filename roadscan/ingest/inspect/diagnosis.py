@@ -17,13 +17,14 @@ from typing import Final
 
 from roadscan.core.errors import FormatError, Missing, RoadscanError
 from roadscan.core.toml_text import toml
-from roadscan.ingest.inspect.file_kinds import UNPACKING_ERRORS, head_of, is_cut_off, kind_of, open_wrapped, wrapper_of
+from roadscan.ingest.inspect.file_kinds import UNPACKING_ERRORS, head_of, is_cut_off, kind_of, wrapper_of
 from roadscan.ingest.inspect.known_files import known_file
 from roadscan.ingest.inspect.log_figures import LogFigures
 from roadscan.ingest.inspect.provisional import OpenedLog, Stated, open_log
 from roadscan.ingest.reading.columns import Likeness, likeness
 from roadscan.ingest.reading.format import LogFormat, log_formats
 from roadscan.ingest.reading.text_table import TextOptions, first_words, text_layout
+from roadscan.ingest.reading.unpacked import open_unpacked
 
 UNPACKED_BYTES: Final = 16 << 20
 """Bytes of a compressed file that are unpacked to look inside."""
@@ -169,7 +170,7 @@ def unpack(path: Path, wrapper: str, target: Path, limit: int) -> str:
     written = 0
     with target.open("wb") as out:
         try:
-            with open_wrapped(path, wrapper) as stream:
+            with open_unpacked(path, wrapper) as stream:
                 read = getattr(stream, "read1", stream.read)  # also yields the bytes before the damage
                 while written < limit and (chunk := read(_CHUNK_BYTES)):
                     out.write(chunk)

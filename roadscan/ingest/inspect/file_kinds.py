@@ -6,8 +6,6 @@ use ("a PNG picture, 640 × 480"). Nothing here trusts a size that a file claims
 
 from __future__ import annotations
 
-import bz2
-import gzip
 import lzma
 import struct
 import tarfile
@@ -17,7 +15,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final, cast
+from typing import Any, Final
 
 import pyarrow as pa
 
@@ -129,17 +127,6 @@ def wrapper_of(path: Path) -> str:
     """Return the compression of a single compressed file, "" for none."""
     head = head_of(path)
     return next((name for name, magic in _WRAPPERS.items() if head.startswith(magic)), "")
-
-
-def open_wrapped(path: Path, wrapper: str) -> IO[bytes]:
-    """Open the file inside a compressed one."""
-    if wrapper == "gzip":
-        return cast(IO[bytes], gzip.open(path, "rb"))
-    if wrapper == "bzip2":
-        return cast(IO[bytes], bz2.open(path, "rb"))
-    if wrapper == "xz":
-        return cast(IO[bytes], lzma.open(path, "rb"))
-    return cast(IO[bytes], pa.input_stream(str(path), compression="zstd"))
 
 
 def head_of(path: Path) -> bytes:

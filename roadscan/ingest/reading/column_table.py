@@ -13,9 +13,7 @@ import pyarrow.parquet as pq
 from roadscan.core.errors import FormatError
 from roadscan.ingest.reading.arrow_batches import MappedBatches, unlisted_batches, unlisted_reason
 from roadscan.store.codecs.parquet.foreign_pages import ParquetPages
-
-UNREADABLE: Final = (pa.ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError, MemoryError)
-"""Errors that Arrow raises on damaged bytes."""
+from roadscan.store.damage import UNREADABLE
 
 _MAPPED_CHUNKS: Final = 8
 """Chunks of a mapped file after which its pages are released."""

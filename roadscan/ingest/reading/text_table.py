@@ -8,7 +8,6 @@ that end with a carriage return alone, is read, too; offsets then count bytes of
 
 from __future__ import annotations
 
-import bz2
 import codecs
 import csv
 import gzip
@@ -32,6 +31,7 @@ from roadscan.core.strict import Strict
 from roadscan.core.witness import Witness
 from roadscan.ingest.reading.format import Reject
 from roadscan.ingest.reading.later_headers import AGAIN, Headers, NameLines
+from roadscan.ingest.reading.unpacked import is_unpacked, open_unpacked
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
@@ -185,16 +185,16 @@ class TextBlock:
 
 
 def open_text(path: Path) -> IO[bytes]:
-    """Open a text file, decompressing gzip, bzip2 and xz (identified by their first bytes)."""
+    """Open a text file, decompressing gzip, bzip2 and xz (identified by their first bytes) within bounds."""
     raw = path.open("rb")
     magic = raw.read(6)
     raw.close()
     if magic.startswith(b"\x1f\x8b"):
-        return cast(IO[bytes], gzip.open(path, "rb"))
+        return open_unpacked(path, "gzip")
     if magic.startswith(b"BZh"):
-        return cast(IO[bytes], bz2.open(path, "rb"))
+        return open_unpacked(path, "bzip2")
     if magic == b"\xfd7zXZ\x00":
-        return cast(IO[bytes], lzma.open(path, "rb"))
+        return open_unpacked(path, "xz")
     return path.open("rb")
 
 
@@ -614,7 +614,7 @@ def line_blocks(
 def byte_pieces(path: Path) -> Iterator[bytes | Reject]:
     """Yield pieces of a file (decompressed) of up to some 1 MB; last a reject where a compressed stream breaks off."""
     with open_text(path) as stream:
-        packed = isinstance(stream, gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile)
+        packed = is_unpacked(stream)
         parts: list[bytes] = []
         broken: Reject | None = None
         while True:

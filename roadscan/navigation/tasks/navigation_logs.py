@@ -129,10 +129,7 @@ def odometer_readings(store: Store, records: Sequence[LogRecord], sensor: Sensor
         distance = rows["distance_m"]
     elif np.isfinite(rows["ticks"]).any():
         if sensor is None or sensor.metres_per_tick is None:
-            raise ConfigError(
-                f"the encoder log '{records[0].path}' counts ticks, and the way of one is not known",
-                expected="metres_per_tick of its sensor in the rig file",
-            )
+            raise unknown_way(records[0].path)
         distance = rows["ticks"] * sensor.metres_per_tick
     else:
         distance = np.full(rows["epoch_gps_ns"].size, np.nan)
@@ -170,6 +167,14 @@ def unknown_imu(name: str) -> ConfigError:
         f"the rig file does not say how good the IMU '{name}' is",
         expected="its errors",
         change='add imu = "mems" (or "tactical", "industrial", "navigation", or a table of its data sheet)',
+    )
+
+
+def unknown_way(path: str) -> ConfigError:
+    """Return the error of an encoder log that only counts ticks, where the rig does not say how long one is."""
+    return ConfigError(
+        f"the encoder log '{path}' counts ticks, and the way of one is not known",
+        expected="metres_per_tick of its sensor in the rig file",
     )
 
 

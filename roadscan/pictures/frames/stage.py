@@ -112,11 +112,17 @@ class VideoFrames(Stage):
         cameras = [n for n, s in sorted(plan.survey.rig.sensors.items()) if s.kind == "camera" and s.interior]
         videos = [one for name in cameras for one in camera_pictures(plan, name) if one.is_video and one.files]
         if videos and not plan.store.is_folder:
-            raise ConfigError(
-                "frames of videos are read from files, and the store is not a folder",
-                expected="a store on a disk", change="set [video_frames] on = false, or move the store",
-            )  # fmt: skip
+            raise no_folder_of_frames()
         return [task for one in videos for task in _of_video(plan, one)]
+
+
+def no_folder_of_frames() -> ConfigError:
+    """Returns the error of a survey whose videos give key frames and whose store is no folder."""
+    return ConfigError(
+        "frames of videos are read from files, and the store is not a folder",
+        expected="a store on a disk",
+        change="set [video_frames] on = false, or move the store",
+    )
 
 
 def _of_video(plan: SurveyPlan, taken: TakenPictures) -> list[FrameTask]:

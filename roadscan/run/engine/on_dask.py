@@ -17,6 +17,7 @@ from distributed.protocol import pickle
 
 from roadscan.core.errors import RoadscanError
 from roadscan.run.engine.compute import Done
+from roadscan.store.look import others_write
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -60,6 +61,7 @@ class OnDask:
         half of the threads and no more than are alive, where none waits behind another: what dies there is at fault
         itself.
         """
+        others_write()
         threads = self.workers
         died: list[T] = []
         for done in self._ended(function, tasks, lambda left: _HELD_A_THREAD * threads + min(_MORE_HELD, left // 4)):

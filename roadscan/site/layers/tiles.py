@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from roadscan.core.errors import RoadscanError
+from roadscan.core.errors import DamagedError, RoadscanError
 from roadscan.core.ids import TileId
 from roadscan.site import evidence
 from roadscan.site.layer import (
@@ -76,6 +76,8 @@ def _keys(material: Material) -> tuple[dict[TileId, str], bool]:
     """Return keys of the tiles that readings may touch; False where they are unknown, as without the raw logs."""
     try:
         planned = tiles_of(material.session)
+    except DamagedError:
+        raise
     except RoadscanError:
         return {}, False
     return dict(zip(planned.ids, planned.keys, strict=True)), True

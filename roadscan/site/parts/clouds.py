@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-from roadscan.core.errors import RoadscanError, StoreError
+from roadscan.core.errors import DamagedError, RoadscanError, StoreError
 from roadscan.core.ids import TileId
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.cloud import TilePoints
@@ -81,6 +81,8 @@ def cloud_sheets(material: Material) -> dict[str, tuple[TileId, ...]]:
         return {}
     try:
         known = tiles_of(material.session)
+    except DamagedError:
+        raise
     except RoadscanError:
         return {}
     held = {

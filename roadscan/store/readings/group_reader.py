@@ -5,21 +5,20 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Final, Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.core.errors import StoreError
+from roadscan.core.errors import DamagedError
 from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile, read_footer
+from roadscan.store.damage import ROWS_CHANGE, UNREADABLE
 from roadscan.store.readings.byte_source import opened
 from roadscan.store.store import Store
 
 Rows = TypeVar("Rows")
 Pages = TypeVar("Pages", bound=PageFile)
-
-_DAMAGE: Final = (OSError, ValueError, pa.ArrowException, DamageError)
 
 
 class GroupReader(ABC, Generic[Rows, Pages]):
@@ -27,7 +26,7 @@ class GroupReader(ABC, Generic[Rows, Pages]):
 
     Raises
     ------
-    StoreError
+    DamagedError
         naming file and row groups, where the file is missing, damaged or does not hold such readings.
     """
 
@@ -45,13 +44,13 @@ class GroupReader(ABC, Generic[Rows, Pages]):
             suits = self._suits(self._metadata.schema.to_arrow_schema())
             if ours and suits and not LIBRARY:
                 self._packed = self._pages()
-        except _DAMAGE as error:
+        except UNREADABLE as error:
             raise self._error(error) from error
 
     def expect(self, groups: Sequence[int]) -> None:
         """Start to read row groups ahead; their faults are reported when they are read."""
         if self._packed is not None:
-            with contextlib.suppress(*_DAMAGE):
+            with contextlib.suppress(*UNREADABLE):
                 self._packed.expect([k for k in groups if 0 <= k < self._metadata.num_row_groups], self.columns)
 
     def read(self, groups: Sequence[int]) -> Rows:
@@ -62,7 +61,7 @@ class GroupReader(ABC, Generic[Rows, Pages]):
             if self._packed is not None:
                 return self._decoded(self._packed, groups)
             return self._from_table(self._arrow(groups))
-        except _DAMAGE as error:
+        except UNREADABLE as error:
             raise self._error(error, groups) from error
 
     @abstractmethod
@@ -85,10 +84,10 @@ class GroupReader(ABC, Generic[Rows, Pages]):
         file = pq.ParquetFile(self._source.stream, metadata=self._metadata, page_checksum_verification=True)
         return file.read_row_groups(list(groups), columns=list(self.columns), use_threads=False)
 
-    def _error(self, error: Exception, groups: Sequence[int] = ()) -> StoreError:
-        return StoreError(
+    def _error(self, error: Exception, groups: Sequence[int] = ()) -> DamagedError:
+        return DamagedError(
             f"ingested {self.what} cannot be read ({error})",
-            change="`roadscan verify` names damaged files; remove the log's record to ingest it again",
+            change=ROWS_CHANGE,
             file=self._file,
             record=f"row groups {', '.join(map(str, groups))}" if groups else None,
         )

@@ -6,7 +6,7 @@ it. So a region has the same corners however the readings lie in files, and whic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
@@ -89,13 +89,20 @@ def searched_sources(plan: SurveyPlan) -> list[tuple[ReadingSource, tuple[DataFi
         return []
     sources = [(s, files) for s, files in plan.sources if s.table == "scans" and _sees_the_road(s)]
     if not sources and any(s.table == "scans" for s, _ in plan.sources):
-        known = sorted({s.sensor for s, _ in plan.sources})
-        raise ConfigError(
-            f'surface.regions = "found" needs profiles across the road; there is {", ".join(known)}',
-            expected="scans of a sensor that looks down, its x along the driving direction",
-            change='take regions = "everywhere" or "polygons"',
-        )
+        raise none_across({s.sensor for s, _ in plan.sources})
     return sources
+
+
+def none_across(sensors: Iterable[str]) -> ConfigError:
+    """Returns the error of a survey whose regions are sought in profiles, and whose sensors have none across the road.
+
+    sensors : names of those that it has.
+    """
+    return ConfigError(
+        f'surface.regions = "found" needs profiles across the road; there is {", ".join(sorted(sensors))}',
+        expected="scans of a sensor that looks down, its x along the driving direction",
+        change='take regions = "everywhere" or "polygons"',
+    )
 
 
 def region_pieces(plan: SurveyPlan) -> list[RegionPiece]:

@@ -25,6 +25,7 @@ from roadscan.core.errors import DamagedError, StoreError
 from roadscan.core.ids import TileId
 from roadscan.core.survey import CellColumns
 from roadscan.store.codecs.parquet.number_table import write_number_groups
+from roadscan.store.damage import UNREADABLE
 from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import MADE_AGAIN, Store
@@ -131,7 +132,7 @@ def read_overview(store: Store, record: OutputRecord, factor: int) -> Level:
             file = pq.ParquetFile(stream, page_checksum_verification=True)
             held = {int(file.metadata.row_group(k).column(0).statistics.min): k for k in range(file.num_row_groups)}
             rows = file.read_row_group(held[factor], use_threads=False) if factor in held else None
-    except (pa.ArrowException, OSError, AttributeError) as error:
+    except UNREADABLE as error:
         raise DamagedError(f"the file is damaged: {error}", change=MADE_AGAIN, file=path) from error
     if rows is None:
         raise StoreError(

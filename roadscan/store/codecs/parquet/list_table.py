@@ -41,6 +41,10 @@ _SEAL: Final = b"roadscan.footer_crc32"
 _SEAL_DIGITS: Final = 8  # hexadecimal digits of the footer's CRC-32
 _ENCODE: Final = wide_packing.encode if wide_packing.THERE else delta_packing.encode
 _SEALED: Final = re.compile(_SEAL + rb"\x18\x08(.{8})", re.DOTALL)
+_MARRED: Final = re.compile(
+    re.escape(_SEAL) + rb"|\x18%c.{%d}\x18\x08[0-9a-f]{8}" % (len(_SEAL), len(_SEAL)), re.DOTALL
+)
+"""What is left of such an entry where one of its bytes is another."""
 
 
 class Kind(NamedTuple):
@@ -102,7 +106,7 @@ def sealed(footer: bytes) -> bool | None:
     """
     found = list(_SEALED.finditer(footer))
     if not found:
-        return None
+        return False if _MARRED.search(footer) else None
     digits = found[-1].span(1)
     return b"%08x" % crc32(_with_digits(footer, digits[0], b"0" * _SEAL_DIGITS)) == footer[slice(*digits)]
 

@@ -24,7 +24,7 @@ _WORD: Final = 8  # bytes of a 64-bit word
 _LISTED: Final = ".list.element"
 
 
-class DamageError(Exception):
+class DamageError(ValueError):
     """Damage of a file; the message says what is wrong."""
 
 
@@ -64,6 +64,16 @@ def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
     if ours is False:
         raise DamageError("its footer does not have its checksum")
     return pq.read_metadata(pa.BufferReader(tail)), ours is True
+
+
+def opened_parquet(stream: Any) -> pq.ParquetFile:
+    """Return a Parquet file of which the footer was checked before Arrow reads it: a damaged one can end the process.
+
+    A footer without a checksum is read as it is. Checksums of pages are verified in reading.
+    """
+    metadata, _ = read_footer(stream)
+    stream.seek(0)
+    return pq.ParquetFile(stream, metadata=metadata, page_checksum_verification=True)
 
 
 def _read(stream: Any, start: int, end: int) -> bytes:

@@ -1,0 +1,167 @@
+"""What the one writer of an object store knows of it: names, sizes and small contents, so that it asks for none twice.
+
+It is valid while the store's lease is held: nobody else writes then but the workers of this run. A command that only
+looks sees the store as it was when it began. What they write is
+told here by its record. Between the start of tasks and the next listing, a name that is not known may be new, and the
+store is asked for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, Final
+
+_CONTENT_BYTES: Final = 1 << 20
+"""Largest content (bytes) that is kept: that of records and small tables …"""
+_ALL_BYTES: Final = 128 << 20
+"""… and of all that are kept: those of a network's records are let go, the oldest first."""
+
+
+class Look:
+    """One store's names, as listed when the first question came."""
+
+    def __init__(self, fs: Any, root: str, before: Look | None = None) -> None:
+        """`before` is an earlier look at the same store: the contents that it kept hold where their names do (ETag)."""
+        self._fs, self._root = fs, root
+        self._before = before
+        self._states: dict[str, str] = {}
+        """The store's own name of each content as it was listed."""
+        self._sizes: dict[str, int] | None = None
+        self._folders: Counter[str] = Counter()
+        """Number of files below each folder."""
+        self._contents: dict[str, bytes] = {}
+        self._held_bytes = 0
+        self.is_whole = True
+        """False where workers may have written files that are not known here."""
+
+    def size(self, path: str) -> int | None:
+        """Return the bytes of a file, None where it is not known."""
+        return self._listed().get(path)
+
+    def exists(self, path: str) -> bool | None:
+        """Return True if the file or folder exists; None where only the store can tell."""
+        if path in self._listed() or path in self._folders:
+            return True
+        return False if self.is_whole else None
+
+    def files(self, folder: str) -> list[str] | None:
+        """Return the files below a folder (or the file itself), None where only the store can tell."""
+        listed = self._listed()
+        if not self.is_whole:
+            return None
+        return [folder] if folder in listed else [path for path in listed if path.startswith(f"{folder}/")]
+
+    def content(self, path: str) -> bytes | None:
+        """Return the content of a small file that was read or written before."""
+        return self._contents.get(path) if path in self._listed() and self.is_whole else None
+
+    def keep(self, path: str, content: bytes) -> None:
+        """Keep the content of a file that was read."""
+        if len(content) > _CONTENT_BYTES:
+            return
+        self._held_bytes += len(content) - len(self._contents.pop(path, b""))
+        self._contents[path] = content
+        while self._held_bytes > _ALL_BYTES:
+            self._held_bytes -= len(self._contents.pop(next(iter(self._contents))))
+
+    def wrote(self, path: str, size: int, content: bytes | None = None) -> None:
+        """Note a file that was written, by this process or by a worker."""
+        self._held_bytes -= len(self._contents.pop(path, b""))
+        self._states.pop(path, None)
+        if content is not None:
+            self.keep(path, content)
+        if self._sizes is not None:
+            if path not in self._sizes:
+                self._folders.update(_folders_of(path))
+            self._sizes[path] = size
+
+    def removed(self, path: str) -> None:
+        """Note that a file or folder is gone."""
+        if self._sizes is None:
+            return
+        if self._sizes.pop(path, None) is not None:
+            self._held_bytes -= len(self._contents.pop(path, b""))
+            for folder in _folders_of(path):
+                self._folders[folder] -= 1
+                if not self._folders[folder]:
+                    del self._folders[folder]
+        elif path in self._folders:
+            self.forget()
+
+    def forget(self) -> None:
+        """List the store again when the next question comes."""
+        self._sizes, self.is_whole = None, True
+        self._folders.clear()
+        self._contents.clear()
+        self._held_bytes = 0
+
+    def _take_over(self) -> None:
+        """Keep what an earlier look read of files that are still the same."""
+        before, self._before = self._before, None
+        if before is None:
+            return
+        for path, content in before._contents.items():
+            if path in self._states and self._states[path] == before._states.get(path):
+                self.keep(path, content)
+
+    def _listed(self) -> dict[str, int]:
+        if self._sizes is None:
+            try:
+                found = self._fs.find(self._root, detail=True)
+            except FileNotFoundError:
+                found = {}
+            start = len(self._fs._strip_protocol(self._root)) + 1
+            self._sizes = {path[start:]: int(info["size"]) for path, info in found.items()}
+            self._folders = Counter(folder for path in self._sizes for folder in _folders_of(path))
+            self._states = {path[start:]: state for path, info in found.items() if (state := str(info.get("ETag", "")))}
+            self._take_over()
+        return self._sizes
+
+
+def _folders_of(path: str) -> Iterator[str]:
+    """Yield the folders that a file lies in."""
+    at = path.find("/")
+    while at >= 0:
+        yield path[:at]
+        at = path.find("/", at + 1)
+
+
+_LOOKS: Final[dict[tuple[str, str], Look]] = {}
+"""The looks of the stores whose lease this process holds, by URL and survey: all its `Store` objects share them."""
+
+
+@contextlib.contextmanager
+def looking(key: tuple[str, str], fs: Any, root: str) -> Iterator[None]:
+    """Remember what an object store holds, from now on and anew."""
+    is_inner = key in _LOOKS
+    _LOOKS[key] = Look(fs, root, _LOOKS.get(key))
+    try:
+        yield
+    finally:
+        if not is_inner:
+            del _LOOKS[key]
+
+
+def look_of(key: tuple[str, str]) -> Look | None:
+    """Return what this process remembers of a store, None where it asks for everything."""
+    return _LOOKS.get(key)
+
+
+def at_once(fs: Any) -> dict[str, int]:
+    """Return the options with which a file system reads a small object by one request: s3fs asks for its size first."""
+    return {"max_concurrency": 1} if "s3" in fs.protocol else {}
+
+
+def others_write() -> None:
+    """Note that workers may write files from now on which are not told here at once."""
+    for look in _LOOKS.values():
+        look.is_whole = False
+
+
+def look_again() -> None:
+    """List stores again that workers may have written to."""
+    for look in _LOOKS.values():
+        if not look.is_whole:
+            look.forget()

@@ -1,0 +1,1 @@
+"""Faults drawn into files of stores: each is harmless, named by the next command that rests on it, or refused."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -50,8 +51,6 @@ def served() -> Iterator[ObjectStore]:
             seen.append((self.command, self.path))
 
     server = make_server("127.0.0.1", 0, application, threaded=True, request_handler=Quiet)
-    import threading
-
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     store = ObjectStore(f"http://127.0.0.1:{server.server_port}", seen)

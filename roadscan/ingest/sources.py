@@ -178,8 +178,7 @@ def is_unchanged(store: Store, folder: Path, path: Path, format_: LogFormat, com
     OSError
         A file cannot be read.
     """
-    known, _ = _remembered(store)
-    files = _renamed(known or {}, folder).get(listed_name(path, folder), {"files": {}})["files"]
+    files = _fingerprinted(store, folder, path)
     named = _named(path, format_, companions)
     return named.keys() == files.keys() and all(digest_holds(file, files[name][2]) for name, file in named.items())
 
@@ -214,10 +213,16 @@ def files_of(store: Store, folder: Path, path: Path, format_: LogFormat, compani
 
     Those of a log that was moved away are not known by their places: none is returned.
     """
-    known, _ = _remembered(store)
-    files = _renamed(known or {}, folder).get(listed_name(path, folder), {"files": {}})["files"]
+    files = _fingerprinted(store, folder, path)
     named = _named(path, format_, companions) if path.exists() else {}
     return {file: str(files[name][2]) if name in files else "" for name, file in named.items()}
+
+
+def _fingerprinted(store: Store, folder: Path, path: Path) -> dict[str, Known]:
+    """Return what is known of a log's files, by their names in its fingerprint."""
+    known, _ = _remembered(store)
+    files: dict[str, Known] = _renamed(known or {}, folder).get(listed_name(path, folder), {"files": {}})["files"]
+    return files
 
 
 def _name(file: Path, log: Path) -> str:

@@ -25,6 +25,8 @@ from roadscan.store.small_tables import REPAIR_HINT, small_path
 
 PATH: Final = "report/report.html"
 """Its path, relative to the survey's root."""
+_NOT_WHOLE: Final = "not whole"
+"""Key of a report without some section: the next run makes it again, whatever kept the section from being made."""
 _NOT_SHOWN: Final = ("manifest/log_copies/", "manifest/sources")
 """Records of which the report shows nothing: copies, and when raw files were read last."""
 
@@ -34,13 +36,18 @@ def report_page(session: Session) -> str:
 
     A section whose tables are damaged says so in its place; the others stand.
     """
-    config = session.survey.config
+    return _made(session)[0]
+
+
+def _made(session: Session) -> tuple[str, bool]:
+    """Return the report, and whether all its sections could be made."""
+    config, failed = session.survey.config, list[str]()
     material = Material(session)
-    parts = [part for part in (_part(section, material) for section in sections()) if part.blocks]
+    parts = [part for part in (_part(section, material, failed) for section in sections()) if part.blocks]
     template = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     ).from_string(files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
-    return template.render(
+    page = template.render(
         title=f"{config.id}: report of the survey",
         heading=config.title or config.id,
         lead=f"Report of the survey {config.id}. Lengths are in metres unless a unit is named; σ is one standard "
@@ -48,17 +55,19 @@ def report_page(session: Session) -> str:
         parts=parts,
         footer=f"Made by roadscan {__version__} from the records and tables of the survey's store.",
     )
+    return page, not failed
 
 
 def keep_report(session: Session) -> str:
     """Write the report if what it is made of changed; return its path relative to the survey's root."""
     manifest, key = session.manifest, _key(session)
     if not manifest.is_current(REPORT, REPORT, key):
+        page, is_whole = _made(session)
 
         def write(file: Path) -> None:
-            file.write_bytes(report_page(session).encode("utf-8"))
+            file.write_bytes(page.encode("utf-8"))
 
-        keep_file(session.store, manifest, (REPORT, REPORT), key, PATH, write)
+        keep_file(session.store, manifest, (REPORT, REPORT), key if is_whole else _NOT_WHOLE, PATH, write)
     return PATH
 
 
@@ -83,9 +92,11 @@ def _key(session: Session) -> str:
     )
 
 
-def _part(section: Section, material: Material) -> Part:
+def _part(section: Section, material: Material, failed: list[str]) -> Part:
+    """Return a section of the report; where it cannot be made, its name joins `failed`."""
     try:
         return Part(section.name, section.title, tuple(section.blocks(material)))
     except RoadscanError as error:
+        failed.append(section.name)
         told = Paragraph(f"This section could not be made: {error}", is_warning=True)
         return Part(section.name, section.title, (told,))

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Final
 
+import pyarrow.compute as pc
+
 from roadscan.core.plugins import found_kinds
 from roadscan.ingest.planned_logs import logs_of
 from roadscan.navigation.tasks.navigate import known_keys
@@ -16,6 +18,8 @@ from roadscan.report.blocks import Block
 from roadscan.report.summary import SurveySummary, survey_summary
 from roadscan.run.session import Session
 from roadscan.store.logs import LogRecord, read_log_records
+from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.store.records import rows_of
 
 ENTRY_POINT_GROUP: Final = "roadscan.report_sections"
 
@@ -41,6 +45,24 @@ class Material:
         """Records of the survey file's logs and of the trajectories computed from them."""
         listed = set(known_keys(self.session.survey, self.session.store, logs_of(self.session)))
         return [record for key, record in self.records.items() if key in listed]
+
+    @cached_property
+    def _recorded(self) -> dict[str, OutputRecord]:
+        """Records of pictures by path."""
+        table = self.session.manifest.table()
+        pictures = table.filter(pc.ends_with(table.column("path"), ".png"))
+        return {row[3]: OutputRecord._make(row) for row in rows_of(pictures)}
+
+    def picture(self, path: str) -> bytes:
+        """Return a picture of the store, verified against its record.
+
+        Raises
+        ------
+        DamagedError
+            It is not as it was recorded.
+        """
+        record = self._recorded.get(path)
+        return self.session.store.read_bytes(path) if record is None else read_recorded(self.session.store, record)
 
 
 class Section(ABC):

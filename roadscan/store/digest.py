@@ -14,7 +14,13 @@ _ALGORITHM: Final = "blake3:"
 
 def file_digest(path: Path) -> str:
     """Return the BLAKE3-128 of a file's bytes: ``blake3:`` and 32 hexadecimal digits."""
-    return f"{_ALGORITHM}{_hashed(path, blake3()).digest(length=16).hex()}"
+    with path.open("rb", buffering=0) as stream:
+        return stream_digest(stream)
+
+
+def stream_digest(stream: Any) -> str:
+    """Return the same digest for the rest of an open binary stream."""
+    return f"{_ALGORITHM}{_hashed(stream, blake3()).digest(length=16).hex()}"
 
 
 def bytes_digest(content: bytes) -> str:
@@ -29,7 +35,8 @@ def digest_holds(path: Path, digest: str) -> bool:
     """
     if ":" in digest:
         return file_digest(path) == digest
-    return bool(_hashed(path, hashlib.blake2b(digest_size=16)).hexdigest() == digest)
+    with path.open("rb", buffering=0) as stream:
+        return bool(_hashed(stream, hashlib.blake2b(digest_size=16)).hexdigest() == digest)
 
 
 def bytes_hold(content: bytes, digest: str) -> bool:
@@ -39,11 +46,10 @@ def bytes_hold(content: bytes, digest: str) -> bool:
     return hashlib.blake2b(content, digest_size=16).hexdigest() == digest
 
 
-def _hashed(path: Path, state: Any) -> Any:
+def _hashed(stream: Any, state: Any) -> Any:
     # Read, not mapped: an unreadable sector then raises OSError, instead of a signal that ends the process.
     buffer = bytearray(_CHUNK)
     view = memoryview(buffer)
-    with path.open("rb", buffering=0) as stream:
-        while count := stream.readinto(buffer):
-            state.update(view[:count])
+    while count := stream.readinto(buffer):
+        state.update(view[:count])
     return state

@@ -32,9 +32,9 @@ import pyarrow.parquet as pq
 from roadscan.core.errors import DamagedError, FullDiskError, RoadscanError, StoreError
 from roadscan.core.extras import need
 from roadscan.store.damage import UNREADABLE
-from roadscan.store.lease import FolderPlace, Lease, ObjectPlace
-from roadscan.store.look import Look, at_once, look_of, looking
-from roadscan.store.process import own_tag, tag_lives
+from roadscan.store.holding.lease import FolderPlace, Lease, ObjectPlace, changed_s
+from roadscan.store.holding.look import Look, at_once, look_of, looking
+from roadscan.store.holding.process import own_tag, tag_lives
 from roadscan.store.seal import check_seal, without_seal
 from roadscan.store.written_by import VERSION_FILE, refuse_newer, version_of
 
@@ -138,7 +138,7 @@ class Store:
 
     def changed_s(self, relative: str) -> float:
         """Return when a file was written (Unix s), by the store's clock."""
-        return float(self.fs.modified(self.path(relative)).timestamp())
+        return changed_s(self.fs.info(self.path(relative)))
 
     def now_s(self) -> float:
         """Return what the store's clock says (Unix s): that of the file server, or of the object store."""
@@ -227,6 +227,7 @@ class Store:
 
     def publish(self, local: Path, relative: str, *, lasting: bool = False) -> None:
         """Move a finished local file into the store under its final name, durably if it is `lasting`."""
+        self._check_lease()
         target = self.path(relative)
         count_put(local.stat().st_size)
         if self.is_folder:
@@ -291,6 +292,7 @@ class Store:
 
         With `keep` it stays under its old name too, until another takes its place at once.
         """
+        self._check_lease()
         aside, number = f"damaged/{relative}", 1
         while self.exists(aside):
             number += 1

@@ -10,20 +10,19 @@ from __future__ import annotations
 
 import datetime as dt
 import hashlib
+import io
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, Self
-
-from blake3 import blake3
+from typing import IO, Any, Final, Self
 
 from roadscan.core.errors import DamagedError, RunError, StoreError
 from roadscan.ingest.planned_logs import logs_of
 from roadscan.ingest.sources import files_of, listed_name
 from roadscan.run.session import Session
 from roadscan.store.checked_json import checked_json, parse_checked
-from roadscan.store.digest import file_digest
+from roadscan.store.digest import file_digest, stream_digest
 from roadscan.store.logs import has_log
 from roadscan.store.store import opened_url
 
@@ -82,32 +81,20 @@ class Archive:
     def write_list(self, survey: str, files: Mapping[str, Mapping[str, Any]]) -> None:
         """Write the list, atomically."""
         made = dt.datetime.now(dt.UTC).isoformat(timespec="seconds")
-        content = checked_json({"survey": survey, "made_utc": made, "files": files})
-        self._put(LIST, iter([content]))
+        self._put(io.BytesIO(checked_json({"survey": survey, "made_utc": made, "files": files})), LIST)
 
-    def copy(self, file: Path, place: str) -> str:
-        """Copy a file; return the digest of the bytes that were read."""
-        state = blake3()
-
-        def chunks() -> Iterator[bytes]:
-            with file.open("rb") as stream:
-                while chunk := stream.read(_CHUNK):
-                    state.update(chunk)
-                    yield chunk
-
-        self._put(place, chunks())
-        return f"blake3:{state.digest(length=16).hex()}"
+    def copy(self, file: Path, place: str) -> None:
+        """Copy a file."""
+        with file.open("rb") as stream:
+            self._put(stream, place)
 
     def digest(self, place: str) -> str:
         """Return the digest of a file of the archive, empty where it is not there; reads all of it."""
-        state = blake3()
         try:
             with self._fs.open(f"{self._root}/{place}", "rb") as stream:
-                while chunk := stream.read(_CHUNK):
-                    state.update(chunk)
+                return stream_digest(stream)
         except FileNotFoundError:
             return ""
-        return f"blake3:{state.digest(length=16).hex()}"
 
     def size(self, place: str) -> int | None:
         """Return the bytes of a file of the archive, None where it is not there."""
@@ -121,27 +108,26 @@ class Archive:
         self._fs.rm_file(f"{self._root}/{place}")
 
     def fetch(self, place: str, file: Path) -> None:
-        """Copy a file of the archive to a local place, under another name first."""
-        file.parent.mkdir(parents=True, exist_ok=True)
-        part = file.with_name(f".{file.name}.part")
-        with self._fs.open(f"{self._root}/{place}", "rb") as stream, part.open("wb") as local:
-            shutil.copyfileobj(stream, local, _CHUNK)
-        part.replace(file)
+        """Copy a file of the archive to a local place."""
+        with self._fs.open(f"{self._root}/{place}", "rb") as stream:
+            _copy_whole(stream, file)
 
-    def _put(self, place: str, chunks: Iterator[bytes]) -> None:
+    def _put(self, stream: IO[bytes], place: str) -> None:
         path = f"{self._root}/{place}"
-        if not self._is_folder:
-            with self._fs.open(path, "wb") as stream:
-                for chunk in chunks:
-                    stream.write(chunk)
+        if self._is_folder:
+            _copy_whole(stream, Path(path))
             return
-        final = Path(path)
-        final.parent.mkdir(parents=True, exist_ok=True)
-        part = final.with_name(f".{final.name}.part")
-        with part.open("wb") as stream:
-            for chunk in chunks:
-                stream.write(chunk)
-        part.replace(final)
+        with self._fs.open(path, "wb") as target:
+            shutil.copyfileobj(stream, target, _CHUNK)
+
+
+def _copy_whole(stream: IO[bytes], file: Path) -> None:
+    """Write a local file under another name first, so that it is there whole or not at all."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_name(f".{file.name}.part")
+    with part.open("wb") as target:
+        shutil.copyfileobj(stream, target, _CHUNK)
+    part.replace(file)
 
 
 def archive(
@@ -170,11 +156,11 @@ def archive(
         if not has_log(store, log.key):
             done.not_ingested.append(str(log.config.path))
     listed = _listed(kept)
-    for number, (file, digest) in enumerate(wanted.items(), 1):
-        name = listed_name(file, folder)
+    for number, (file, ingested) in enumerate(wanted.items(), 1):
+        name, digest = listed_name(file, folder), ingested or file_digest(file)
         place = _place(name)
         known, size = listed.get(place), file.stat().st_size
-        if known and known["digest"] == (digest or file_digest(file)) and kept.size(place) == known["bytes"] == size:
+        if known and known["digest"] == digest and kept.size(place) == known["bytes"] == size:
             done.there.append(name)
         elif fault := _copied(kept, file, place, digest):
             kept.remove(place)
@@ -182,7 +168,7 @@ def archive(
             listed.pop(place, None)
         else:
             done.copied.append(name)
-            listed[place] = {"path": name, "bytes": size, "digest": digest or file_digest(file)}
+            listed[place] = {"path": name, "bytes": size, "digest": digest}
         report(number, len(wanted))
     kept.write_list(session.survey.config.id, dict(sorted(listed.items())))
     return done
@@ -226,11 +212,13 @@ def restore(session: Session, url: str, report: Callable[[int, int], None] = lam
 
 
 def _copied(kept: Archive, file: Path, place: str, digest: str) -> str:
-    """Copy a file and read the copy; return what is wrong with it, empty where nothing is."""
-    read = kept.copy(file, place)
-    if digest and read != digest:
-        return "its bytes are others than those that were ingested; `roadscan run` reads it again"
-    return "" if kept.digest(place) == read else "the copy holds other bytes than were written; archive again"
+    """Copy a file and read the copy; return what is wrong with it, empty where it has the digest."""
+    kept.copy(file, place)
+    if kept.digest(place) == digest:
+        return ""
+    if file_digest(file) == digest:
+        return "the copy holds other bytes than were written; archive again"
+    return "its bytes are others than those that were ingested; `roadscan run` reads it again"
 
 
 def _listed(kept: Archive) -> dict[str, dict[str, Any]]:

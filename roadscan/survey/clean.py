@@ -16,7 +16,7 @@ from roadscan.ingest.planned_logs import logs_of
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
-from roadscan.store.logs import LogRecord, copy_path, log_of, read_log_records, record_path
+from roadscan.store.logs import NAVIGATION, LogRecord, copy_path, log_of, read_log_records, record_path
 from roadscan.store.store import Store
 
 SUPERSEDED: Final = "superseded"
@@ -127,7 +127,10 @@ def _unused(session: Session, records: Collection[LogRecord]) -> set[str]:
             expected="logs that can be read: else theirs would count as unused",
             change="put them right, or leave out 'unused'",
         )
-    return {record.key for record in records} - {*known_keys(session.survey, session.store, logs_of(session))}
+    used = {*known_keys(session.survey, session.store, logs_of(session))}
+    runs = {run.id for run in session.survey.config.runs}
+    # A trajectory of a run that is there is the run's to replace: where it cannot be planned now, its key is not known.
+    return {r.key for r in records if r.key not in used and not (r.sensor == NAVIGATION and r.run in runs)}
 
 
 def _sized(store: Store, chosen: dict[str, str], older_s: float) -> Iterator[Waste]:

@@ -7,6 +7,7 @@ itself is at fault, since another check reports that. Of a log its header is rea
 
 from __future__ import annotations
 
+import contextlib
 import datetime as dt
 import functools
 import os
@@ -154,10 +155,15 @@ class Asked:
         ]
 
     @cached_property
+    def due(self) -> list[CheckedLog]:
+        """Logs of which the store has no rows yet."""
+        held = {(record.run, record.path) for record in read_log_records(self.store, damaged=[])}
+        return [log for log in self.logs if (log.run, str(log.config.path)) not in held]
+
+    @cached_property
     def times(self) -> list[LookedAt]:
         """When the logs of runs that are not ingested were recorded, by a first look."""
-        held = {(record.run, record.path) for record in read_log_records(self.store, damaged=[])}
-        due = {log.run for log in self.logs if (log.run, str(log.config.path)) not in held}
+        due = {log.run for log in self.due}
         found: list[LookedAt] = []
         for log in self.logs:
             if log.run not in due or log.format is None or log.source is None or log.header is None:
@@ -646,14 +652,15 @@ def _room(asked: Asked) -> Iterator[str]:
     if not asked.store.is_folder:
         return
     root = Path(asked.store.root)
-    held = {(record.run, record.path) for record in read_log_records(asked.store, damaged=[])}
-    due = [log.path for log in asked.logs if (log.run, str(log.config.path)) not in held]
-    needed = sum(path.stat().st_size for path in due if path.is_file())
-    free = shutil.disk_usage(next(folder for folder in (root, *root.parents) if folder.exists())).free
-    if free < needed:
+    needed = 0
+    for log in asked.due:
+        with contextlib.suppress(OSError):  # a log that cannot be opened is told by itself
+            needed += log.path.stat().st_size
+    disk = shutil.disk_usage(next(folder for folder in (root, *root.parents) if folder.exists()))
+    if disk.total and disk.free < needed:
         yield (
-            f"the logs that are not ingested yet have {size_in_words(needed)}, and {size_in_words(free)} are free on "
-            "the store's disk: the run may stop for want of room; what is finished then stays"
+            f"the logs that are not ingested yet have {size_in_words(needed)}, and {size_in_words(disk.free)} are free "
+            "on the store's disk: the run may stop for want of room; what is finished then stays"
         )
 
 

@@ -18,8 +18,8 @@ from roadscan.run.selection import SelectionError
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, findings_of, stages
 from roadscan.run.told import told_run, told_stage
+from roadscan.store.holding.look import look_again
 from roadscan.store.logs import read_log_records
-from roadscan.store.look import look_again
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
 from roadscan.store.repair_records import repair_records
 from roadscan.store.verified import note_written, recorded_files

@@ -219,12 +219,15 @@ def log_of_worker(client: SyncPrefectClient, survey_file: Path) -> str:
     return "\n".join(heard.lines)
 
 
-def test_an_expected_error_is_logged_once_and_without_traceback(survey_file: Path, client: SyncPrefectClient) -> None:
-    (survey_file.parent / "raw" / "run-1" / "profiler_left.parquet").unlink()
-    log = log_of_worker(client, survey_file)
-    assert log.count("profiler_left.parquet: the log does not exist") == 1
+def told_once(log: str, words: str) -> None:
+    assert log.count(words) == 1
     assert "Traceback" not in log
     assert "NoneType" not in log
+
+
+def test_an_expected_error_is_logged_once_and_without_traceback(survey_file: Path, client: SyncPrefectClient) -> None:
+    (survey_file.parent / "raw" / "run-1" / "profiler_left.parquet").unlink()
+    told_once(log_of_worker(client, survey_file), "profiler_left.parquet: the log does not exist")
 
 
 def test_an_expected_error_of_a_stage_likewise(
@@ -234,10 +237,7 @@ def test_an_expected_error_of_a_stage_likewise(
         raise StoreError("the store is not to be written")
 
     monkeypatch.setattr(conduct, "run_stage", stopped)
-    log = log_of_worker(client, survey_file)
-    assert log.count("the store is not to be written") == 1
-    assert "Traceback" not in log
-    assert "NoneType" not in log
+    told_once(log_of_worker(client, survey_file), "the store is not to be written")
 
 
 def test_an_unexpected_error_keeps_its_traceback(

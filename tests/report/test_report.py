@@ -17,8 +17,10 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from roadscan.cli import app
+from roadscan.core.errors import StoreError
 from roadscan.report.page import PATH, keep_report, report_page
 from roadscan.report.section import sections
+from roadscan.report.sections.coverage import Coverage
 from roadscan.run.session import Session
 from roadscan.site.report_copy import linked_report
 from roadscan.store.logs import read_log_records
@@ -155,3 +157,32 @@ def test_a_browser_shows_the_page_and_asks_nobody(finished: Simulated, tmp_path:
     assert (shown < 100).mean() > 0.005  # text
     asked = set(re.findall(r'"url":"(https?://[^"]*)"', log.read_text(errors="replace")))
     assert not {address for address in asked if not BROWSERS_OWN.search(address)}
+
+
+def test_a_report_without_some_section_is_made_again(
+    finished: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What kept the section from being made may have passed: nothing that the report is made of tells."""
+    copy = finished.copy_with_store_to(tmp_path / "survey")
+
+    def silent(*_: object) -> None:
+        raise StoreError("the store does not answer")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Coverage, "blocks", silent)
+        copy.store().remove(PATH)
+        keep_report(Session.open(copy.survey_file))
+        assert "the store does not answer" in copy.store().read_bytes(PATH).decode()
+    keep_report(Session.open(copy.survey_file))
+    assert "the store does not answer" not in copy.store().read_bytes(PATH).decode()
+
+
+@drawn()
+def test_a_damaged_picture_is_named_in_its_place(finished: Simulated, tmp_path: Path) -> None:
+    copy = finished.copy_with_store_to(tmp_path / "survey")
+    store = copy.store()
+    (path,) = store.files("products/hillshade", ".png")
+    content = bytearray(store.read_bytes(path))
+    content[len(content) // 2] ^= 1
+    store.write_bytes(path, bytes(content))
+    assert f"{Path(path).name}: the file is not as it was recorded" in report_page(Session.open(copy.survey_file))

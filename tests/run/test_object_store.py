@@ -17,7 +17,7 @@ from roadscan.run.engine.compute import Inline
 from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
-from roadscan.store.look import look_of
+from roadscan.store.holding.look import look_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.sql import query
 from roadscan.store.store import Store

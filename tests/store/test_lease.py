@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from roadscan.core.errors import StoreError
-from roadscan.store import lease
-from roadscan.store.lease import LEASE_S, ObjectPlace
-from roadscan.store.process import Process, own_tag, tag_lives
+from roadscan.store.holding import lease
+from roadscan.store.holding.lease import LEASE_S, ObjectPlace
+from roadscan.store.holding.process import Process, own_tag, tag_lives
 from roadscan.store.store import Store
 from tests.conftest import REPOSITORY
 from tests.object_store import ObjectStore, served
@@ -211,14 +211,22 @@ def test_temporary_files_of_other_machines_stay_for_hours(tmp_path: Path) -> Non
 
 def test_a_namespace_of_its_own_is_not_seen(tmp_path: Path) -> None:
     """With the kernel's own means of containers: the same name, and number 1 beside number 1."""
-    command = ["unshare", "--fork", "--pid", "--mount-proc", sys.executable, "-c", HOLDER, str(tmp_path)]
+    command = [
+        "unshare",
+        "--fork",
+        "--pid",
+        "--mount-proc",
+        "--kill-child",
+        sys.executable,
+        "-c",
+        HOLDER,
+        str(tmp_path),
+    ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=REPOSITORY) as holder:
         assert holder.stdout is not None
         if holder.stdout.readline() != b"held\n":
             pytest.skip("this machine gives no namespaces of process numbers")
-        second = subprocess.run(
-            [*command[:5], "-c", HOLDER, str(tmp_path)], capture_output=True, text=True, check=False, cwd=REPOSITORY
-        )
+        second = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
         assert "StoreError: process 1 on" in second.stderr
         assert "(seen " in second.stderr
         holder.kill()

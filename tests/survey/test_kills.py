@@ -51,6 +51,8 @@ def kill_often(copy: Simulated, store: Store, chance: random.Random) -> None:
             see(store, gone)
             if ended == "killed":
                 kills += 1
+                if kills % 20 == 0:
+                    print(f"{store.url}: {kills} kills", file=sys.__stderr__, flush=True)
                 continue
             assert verify_store(store) == []
             gone = STEPS[steps % len(STEPS)]

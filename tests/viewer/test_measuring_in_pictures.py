@@ -287,9 +287,11 @@ def test_two_pictures_give_a_place_and_the_second_shows_the_ray_of_the_first(yar
         x, y = in_picture(page, true[1])
         box = page.locator(".picture-frame").bounding_box()
         marks = "document.querySelector('.picture-marks').getContext('2d')"
-        read = f"([x, y]) => [...{marks}.getImageData(x - 6, y - 6, 13, 13).data]"
-        around = np.array(page.evaluate(read, [x - box["x"], y - box["y"]])).reshape(-1, 4)
-        assert ((around[:, 0] > 200) & (around[:, 1] > 150) & (around[:, 2] < 120)).any()
+        around = f"[...{marks}.getImageData(x - 6, y - 6, 13, 13).data]"
+        yellow = (
+            f"([x, y]) => {around}.some((v, k, all) => k % 4 == 0 && v > 200 && all[k + 1] > 150 && all[k + 2] < 120)"
+        )
+        page.wait_for_function(yellow, arg=[x - box["x"], y - box["y"]])  # it is drawn in a later frame
         page.mouse.click(x, y)
         figure = page.locator(".figure", has_text="Place by two pictures")
         figure.wait_for()

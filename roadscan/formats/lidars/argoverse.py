@@ -37,7 +37,6 @@ _FARTHEST_M: Final = 10_000.0  # farther positions count as damage
 _LONGEST_OFFSET_NS: Final = 1_000_000_000  # larger offsets count as damage
 _SWEEP: Final = re.compile(r"^\d{10,19}\.feather$")
 _CLOCK: Final = {"system": "unix_gps", "unit": "ns"}
-"""Errors that Arrow raises on damaged bytes."""
 
 
 class Argoverse(LogFormat):

@@ -31,8 +31,8 @@ from roadscan.inventory.homes.value_lists import add_value_lists
 from roadscan.inventory.qgis.styles import add_styles
 from roadscan.inventory.values import iso_wkb
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.holding.process import process_lives
 from roadscan.store.inventory_schema import GEOMETRY, asset_columns, asset_table
-from roadscan.store.process import process_lives
 
 MARKS: Final = "roadscan_inventory"
 CONFLICTS: Final = "conflicts"

@@ -16,7 +16,6 @@ from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.report.section import Material, Section
 from roadscan.run.session import Session
-from roadscan.store.store import Store
 
 _MOST_TARGETS: Final = 24  # pictures of targets
 _TARGET_MM: Final = 25.0  # width of a target's picture
@@ -43,14 +42,14 @@ class Adjustment(Section):
     def blocks(self, material: Material) -> Iterator[Block]:
         """Yield figures in words, faults, accuracy, seams before and after, control points, targets."""
         session = material.session
-        store, manifest = session.store, session.manifest
+        manifest = session.manifest
         for one in known_findings(manifest):
             yield Paragraph(one.text, is_warning=True)
         for line in known_lines(manifest):
             yield Paragraph(line)
-        yield from _pictures(store, [f"{FOLDER}/adjustment.png"], "Control residuals on the map and as histograms")
+        yield from _pictures(material, [f"{FOLDER}/adjustment.png"], "Control residuals on the map and as histograms")
         seams = "Two passes at the place where they differed most, and at a typical one, before and after"
-        yield from _pictures(store, [f"{FOLDER}/seams.png"], seams)
+        yield from _pictures(material, [f"{FOLDER}/seams.png"], seams)
         yield from _accuracy(_rows(session, "absolute_accuracy"))
         yield from _by_distance(_rows(session, "accuracy_by_distance"))
         yield from agreement(_rows(session, "tie_residuals"))
@@ -60,7 +59,7 @@ class Adjustment(Section):
         if targets:
             yield Paragraph("Targets as the passes saw them: point, run and status, and when:")
         for path in targets[:_MOST_TARGETS]:
-            yield from _pictures(store, [path], _of_target(store, path), _TARGET_MM)
+            yield from _pictures(material, [path], _of_target(material, path), _TARGET_MM)
 
 
 def _rows(session: Session, table: str) -> Rows:
@@ -68,15 +67,15 @@ def _rows(session: Session, table: str) -> Rows:
     return [row for record in records if record.path for row in session.store.read_table(record.path).to_pylist()]
 
 
-def _pictures(store: Store, paths: Sequence[str], caption: str, width_mm: float = 170.0) -> Iterator[Picture]:
+def _pictures(material: Material, paths: Sequence[str], caption: str, width_mm: float = 170.0) -> Iterator[Picture]:
     for path in paths:
-        if store.exists(path):
-            yield Picture(store.read_bytes(path), caption, width_mm)
+        if material.session.store.exists(path):
+            yield Picture(material.picture(path), caption, width_mm)
 
 
-def _of_target(store: Store, path: str) -> str:
+def _of_target(material: Material, path: str) -> str:
     """Return point, run and status, which are the picture's title, and the time, whose GPS second ends its name."""
-    title = Image.open(io.BytesIO(store.read_bytes(path))).info.get("Title", "")
+    title = Image.open(io.BytesIO(material.picture(path))).info.get("Title", "")
     gps_s = int(path.removesuffix(".png").rsplit("-", 1)[-1])
     return f"{title}, {iso_from_gps_ns(gps_s * NS_PER_S)[:19].replace('T', ' ')}"
 

@@ -69,7 +69,7 @@ class Condition(Section):
         yield from _table(rows, _SURFACE, "Surface and width", notes)
         yield from notes.paragraphs()
         yield from _lacking(session)
-        yield from _pictures(session)
+        yield from _pictures(material)
 
 
 def _sections(session: Session) -> list[dict[str, Any]]:
@@ -144,7 +144,7 @@ def _lacking(session: Session) -> Iterator[Paragraph]:
         yield Paragraph(f"In no section: {', '.join(named)}. {reason[:1].upper()}{reason[1:]}.")
 
 
-def _pictures(session: Session) -> Iterator[Picture]:
+def _pictures(material: Material) -> Iterator[Picture]:
     for product, caption in (
         (PICTURES, ""),
         (RAVELLING_PICTURES, "Patches of the lane that have lost stones, with their outlines."),
@@ -153,9 +153,9 @@ def _pictures(session: Session) -> Iterator[Picture]:
             "Places that are darker than the road around them (red), over the intensity; by section of 10 m.",
         ),
     ):
-        shown = sorted((r for r in session.manifest.of(product).values() if r.path), key=lambda r: r.path)
+        shown = sorted((r for r in material.session.manifest.of(product).values() if r.path), key=lambda r: r.path)
         for record in shown[:_MOST_PICTURES]:
-            yield Picture(session.store.read_bytes(record.path), caption or _caption(record.unit))
+            yield Picture(material.picture(record.path), caption or _caption(record.unit))
 
 
 def _caption(unit: str) -> str:

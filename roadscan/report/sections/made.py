@@ -19,10 +19,11 @@ from roadscan.adjust.tasks.outcome import PICTURES as ADJUSTMENT_PICTURES
 from roadscan.condition.tasks.pictures import PICTURES as CONDITION_PICTURES
 from roadscan.condition.tasks.ravelling import RAVELLING_PICTURES
 from roadscan.condition.tasks.roughness_regions import REGION_PICTURES
+from roadscan.core.errors import DamagedError
 from roadscan.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.report.section import Material, Section
 from roadscan.run.session import Session
-from roadscan.store.manifest import OutputRecord
+from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.store import Store
 from roadscan.tiles.product import products
 
@@ -58,7 +59,7 @@ class Made(Section):
         for record in _shown(session):
             try:
                 small = _small_picture(session.store, record)
-            except (RasterioError, OSError, ValueError) as error:
+            except (RasterioError, DamagedError, OSError, ValueError) as error:
                 yield Paragraph(f"{record.path} could not be read for a small picture: {error}", is_warning=True)
                 continue
             if small is not None:
@@ -96,12 +97,12 @@ def _small_picture(store: Store, record: OutputRecord) -> bytes | None:
     if record.bytes > _MOST_BYTES and not store.is_folder:
         return None
     if not record.path.endswith(".tif"):
-        picture = Image.open(io.BytesIO(store.read_bytes(record.path)))
+        picture = Image.open(io.BytesIO(read_recorded(store, record)))
         picture.thumbnail((_EDGE, _EDGE))
         return _png(picture)
     if store.is_folder:
         return _png(_reduced(store.path(record.path)))
-    with MemoryFile(store.read_bytes(record.path)) as held:
+    with MemoryFile(read_recorded(store, record)) as held:
         return _png(_reduced(held.name))
 
 

@@ -28,7 +28,7 @@ class Navigation(Section):
             yield Paragraph(line)
         for path, caption in (_pictures(found) | {PICTURE: "Calibration of the mountings"}).items():
             if store.exists(path):
-                yield Picture(store.read_bytes(path), caption)
+                yield Picture(material.picture(path), caption)
 
 
 def _pictures(found: NavigationStatus) -> dict[str, str]:

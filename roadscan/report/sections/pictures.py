@@ -32,7 +32,7 @@ class Pictures(Section):
         yield _cameras(rows)
         for record in session.manifest.of(PICTURES).values():
             if record.path.startswith(f"{FOLDER}/camera-") and session.store.exists(record.path):
-                yield Picture(session.store.read_bytes(record.path), "Residuals of tie points, before and after", 170.0)
+                yield Picture(material.picture(record.path), "Residuals of tie points, before and after", 170.0)
         yield _worst(rows)
         control = _table(session, "picture_control")
         if control is not None:

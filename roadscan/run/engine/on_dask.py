@@ -17,7 +17,7 @@ from distributed.protocol import pickle
 
 from roadscan.core.errors import RoadscanError
 from roadscan.run.engine.compute import Done
-from roadscan.store.look import others_write
+from roadscan.store.holding.look import others_write
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -20,6 +20,9 @@ from roadscan.store.codecs.zlib_stream import crc32
 
 TAIL_BYTES: Final = 8
 """Bytes of the footer's length and of the mark that ends a Parquet file."""
+_FOOTER_BYTES: Final = 64 << 10
+"""Bytes from the end of a file that are read at first: most footers are shorter, and each read is a request to an
+object store."""
 _WORD: Final = 8  # bytes of a 64-bit word
 _LISTED: Final = ".list.element"
 
@@ -55,11 +58,12 @@ class _Chunk:
 def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
     """Return the footer of a Parquet file, and whether `list_table` wrote it; DamageError where it is damaged."""
     size = stream.seek(0, os.SEEK_END)
-    tail = _read(stream, max(size - TAIL_BYTES, 0), size)
-    length = int.from_bytes(tail[:4], "little")
-    if tail[4:] != MAGIC or length > size - TAIL_BYTES:
+    tail = _read(stream, max(size - _FOOTER_BYTES, 0), size)
+    length = int.from_bytes(tail[-TAIL_BYTES:-4], "little")
+    if tail[-4:] != MAGIC or length > size - TAIL_BYTES:
         raise DamageError("it does not end as a Parquet file")
-    tail = _read(stream, size - TAIL_BYTES - length, size)
+    footer = TAIL_BYTES + length
+    tail = tail[-footer:] if footer <= len(tail) else _read(stream, size - footer, size)
     ours = sealed(tail[:-TAIL_BYTES])
     if ours is False:
         raise DamageError("its footer does not have its checksum")

@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from roadscan.core.errors import StoreError
-from roadscan.store.look import at_once
-from roadscan.store.process import Process, process_lives
+from roadscan.store.holding.look import at_once
+from roadscan.store.holding.process import Process, process_lives
 
 LEASE_S: Final = 40.0
 """A lease (s) that was not renewed for this long is over: a run on another machine can go on within a minute."""
@@ -187,9 +187,10 @@ class Lease:
 def _check_over(held: Held, place: Place) -> None:
     """Raise StoreError where the holder of a lease may be at work."""
     process, older = held.process, held.older_holder
-    if process is not None and process.lives is not None:
-        if process.lives:
-            raise _in_use(str(process), "wait for it")
+    lives = None if process is None else process.lives
+    if lives:
+        raise _in_use(str(process), "wait for it")
+    if lives is not None:
         return
     if older is not None:
         if older[0] == socket.gethostname() and not process_lives(older[1]):
@@ -336,9 +337,8 @@ class ObjectPlace:
         """Return the lease and the store's time of it."""
         try:
             info = self._fs.info(self._path)
-            return Held(
-                bytes(self._fs.cat_file(self._path, **at_once(self._fs))), _changed_s(info), str(info.get("ETag", ""))
-            )
+            content = bytes(self._fs.cat_file(self._path, **at_once(self._fs)))
+            return Held(content, changed_s(info), str(info.get("ETag", "")))
         except FileNotFoundError:
             return None
 
@@ -352,10 +352,8 @@ class ObjectPlace:
             self._fs.pipe_file(self._path, content, **self._only_if(held))
         except OSError:
             found = self.read()
-            if (
-                found is not None and found.version == held.version
-            ):  # nobody else was faster: the store cannot be written
-                raise
+            if found is not None and found.version == held.version:
+                raise  # since nobody else was faster: the store cannot be written
             return False
         found = self.read()
         return found is not None and found.content == content
@@ -369,7 +367,7 @@ class ObjectPlace:
         made = f"{self._path}-{uuid.uuid4().hex}"
         try:
             self._fs.pipe_file(made, b"")
-            return _changed_s(self._fs.info(made))
+            return changed_s(self._fs.info(made))
         finally:
             with contextlib.suppress(OSError):
                 self._fs.rm_file(made)
@@ -378,8 +376,8 @@ class ObjectPlace:
         return {"IfMatch": held.version} if self._is_s3 and held.version else {}
 
 
-def _changed_s(info: dict[str, Any]) -> float:
-    """Return when an object was written (Unix s), as its store says; each library has a name of its own for it."""
+def changed_s(info: dict[str, Any]) -> float:
+    """Return when a file or object was written (Unix s), as its store says; each library has its own name for it."""
     for name in ("LastModified", "last_modified", "updated", "mtime", "created"):
         found = info.get(name)
         if isinstance(found, datetime):

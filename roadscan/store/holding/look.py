@@ -1,9 +1,8 @@
 """What the one writer of an object store knows of it: names, sizes and small contents, so that it asks for none twice.
 
-It is valid while the store's lease is held: nobody else writes then but the workers of this run. A command that only
-looks sees the store as it was when it began. What they write is
+It is valid while the store's lease is held: nobody else writes then but the workers of this run. What they write is
 told here by its record. Between the start of tasks and the next listing, a name that is not known may be new, and the
-store is asked for it.
+store is asked for it. A command that only looks sees the store as it was when it began.
 """
 
 from __future__ import annotations
@@ -18,6 +17,9 @@ _CONTENT_BYTES: Final = 1 << 20
 _ALL_BYTES: Final = 128 << 20
 """… and of all that are kept: those of a network's records are let go, the oldest first."""
 
+_RECORDS: Final = "manifest/"
+"""Folder of records: this process alone writes over one, and workers add those of new logs."""
+
 
 class Look:
     """One store's names, as listed when the first question came."""
@@ -25,7 +27,8 @@ class Look:
     def __init__(self, fs: Any, root: str, before: Look | None = None) -> None:
         """`before` is an earlier look at the same store: the contents that it kept hold where their names do (ETag)."""
         self._fs, self._root = fs, root
-        self._before = before
+        self._before = {} if before is None else before._named_contents()
+        """Contents that were read before the listing, by path and ETag."""
         self._states: dict[str, str] = {}
         """The store's own name of each content as it was listed."""
         self._sizes: dict[str, int] | None = None
@@ -55,7 +58,8 @@ class Look:
 
     def content(self, path: str) -> bytes | None:
         """Return the content of a small file that was read or written before."""
-        return self._contents.get(path) if path in self._listed() and self.is_whole else None
+        known = path in self._listed() and (self.is_whole or path.startswith(_RECORDS))
+        return self._contents.get(path) if known else None
 
     def keep(self, path: str, content: bytes) -> None:
         """Keep the content of a file that was read."""
@@ -92,18 +96,21 @@ class Look:
 
     def forget(self) -> None:
         """List the store again when the next question comes."""
+        self._before = self._named_contents()
         self._sizes, self.is_whole = None, True
         self._folders.clear()
         self._contents.clear()
         self._held_bytes = 0
 
+    def _named_contents(self) -> dict[tuple[str, str], bytes]:
+        """Return what was read of files whose state the store has named."""
+        return {(path, self._states[path]): c for path, c in self._contents.items() if path in self._states}
+
     def _take_over(self) -> None:
-        """Keep what an earlier look read of files that are still the same."""
-        before, self._before = self._before, None
-        if before is None:
-            return
-        for path, content in before._contents.items():
-            if path in self._states and self._states[path] == before._states.get(path):
+        """Keep what was read before the listing of files that are still the same."""
+        before, self._before = self._before, {}
+        for (path, state), content in before.items():
+            if self._states.get(path) == state:
                 self.keep(path, content)
 
     def _listed(self) -> dict[str, int]:

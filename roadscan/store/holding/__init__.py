@@ -1,0 +1,1 @@
+"""Who has a store, and what that process knows of it."""

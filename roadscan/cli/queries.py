@@ -61,7 +61,7 @@ def sql(  # noqa: PLR0913  each is an option of the command
     from roadscan.core.errors import AnswerError, ConfigError, StoreError
     from roadscan.fleet.ask import ask_fleet
     from roadscan.run.session import Session
-    from roadscan.store.sql import Limits
+    from roadscan.store.query.sql import Limits
     from roadscan.survey.ask import ask
 
     if fleet is not None and survey_file is not None:

@@ -7,8 +7,8 @@ import pyarrow as pa
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.fleet.catalogue import TABLE, doubled, read_catalogue
 from roadscan.fleet.members import surveys_in
-from roadscan.store.sql import Limits, missing_table, query
-from roadscan.store.sql_fleet import FleetStores
+from roadscan.store.query.sql import Limits, missing_table, query
+from roadscan.store.query.sql_fleet import FleetStores
 
 
 def ask_fleet(

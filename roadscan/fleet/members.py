@@ -11,7 +11,7 @@ from typing import Any, Final
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.survey import Survey
 from roadscan.navigation.tasks.navigate import known_keys
-from roadscan.store.sql_fleet import Member
+from roadscan.store.query.sql_fleet import Member
 from roadscan.store.store import Store, opened_url
 
 _DEPTH: Final = 3

@@ -26,7 +26,7 @@ from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.store.repair_records import fault_of
 from roadscan.store.small_tables import REPAIR_HINT, read_small, small_path, small_records
-from roadscan.store.sql_files import Stamp, stamp_of
+from roadscan.store.stamp import Stamp, stamp_of
 from roadscan.store.store import MADE_AGAIN, Store
 
 _FILE: Final = "manifest/verified.parquet"

@@ -26,7 +26,7 @@ from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records,
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
 from roadscan.store.repair_records import fault_of
 from roadscan.store.salvage import Lost, read_lost
-from roadscan.store.sql_files import Stamp, stamp_of
+from roadscan.store.stamp import Stamp, stamp_of
 from roadscan.store.store import Store
 from roadscan.store.verified import held_faults, note_verified
 from roadscan.store.written_by import VERSION_FILE

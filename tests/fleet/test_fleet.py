@@ -26,7 +26,7 @@ from roadscan.core.survey import Survey
 from roadscan.fleet.ask import ask_fleet
 from roadscan.fleet.catalogue import make_catalogue
 from roadscan.simulate import simulate
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 
 ROADS = {

@@ -29,7 +29,7 @@ from roadscan.core.errors import StoreError
 from roadscan.run.engine.measured import Cost, Measured, cost_of_error
 from roadscan.run.progress import LineReporter
 from roadscan.store.history import history_faults
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from tests.conftest import REPOSITORY
 from tests.surveys import Simulated, outputs

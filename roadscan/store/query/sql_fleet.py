@@ -10,9 +10,19 @@ import pyarrow as pa
 from fsspec import AbstractFileSystem
 
 from roadscan.core.errors import AnswerError, RoadscanError, StoreError
+from roadscan.store.query.sql import (
+    ALWAYS,
+    PER_TILE,
+    Opened,
+    Tables,
+    add_span_macro,
+    add_utc,
+    add_view,
+    rows_of,
+    tables_of,
+)
+from roadscan.store.query.sql_files import PROTOCOL, StoreFiles
 from roadscan.store.schema import table_schema
-from roadscan.store.sql import ALWAYS, PER_TILE, Opened, Tables, add_span_macro, add_utc, add_view, rows_of, tables_of
-from roadscan.store.sql_files import PROTOCOL, StoreFiles
 from roadscan.store.store import Store
 from roadscan.store.verified import faults_of_opened
 

@@ -18,8 +18,8 @@ from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, leap_second_steps
 from roadscan.store.asset_schema import ASSET_FOLDER, asset_tables
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
+from roadscan.store.query.sql_files import PROTOCOL, OpenedFiles, StoreFiles, url
 from roadscan.store.schema import schema_names, table_schema
-from roadscan.store.sql_files import PROTOCOL, OpenedFiles, StoreFiles, url
 from roadscan.store.store import Store
 from roadscan.store.verified import faults_of_opened, recorded_files
 
@@ -85,7 +85,7 @@ class Opened:
 
 
 class Stores(Protocol):
-    """Several stores that one statement reaches (:class:`roadscan.store.sql_fleet.FleetStores`)."""
+    """Several stores that one statement reaches (:class:`roadscan.store.query.sql_fleet.FleetStores`)."""
 
     def with_views(self, connection: duckdb.DuckDBPyConnection, damaged: list[StoreError] | None) -> Opened:
         """Add the views of their tables to a connection."""

@@ -15,6 +15,7 @@ import shapely
 from roadscan.core.errors import DamagedError
 from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.fleet.members import Found, surveys_in
+from roadscan.fleet.page import fleet_page
 from roadscan.fleet.row import Row, row_key, row_of
 from roadscan.store.schema import table_schema
 from roadscan.store.seal import bears_seal, check_seal, sealed_parquet, without_seal
@@ -24,6 +25,7 @@ TABLE: Final = "fleet"
 FOLDER: Final = "fleet"
 """Folder of the catalogue, within that of the surveys."""
 _FILE: Final = "surveys.parquet"
+PAGE: Final = "index.html"
 _STAC: Final = "1.1.0"
 
 
@@ -66,6 +68,7 @@ def make_catalogue(place: str) -> Catalogue:
     for name, item in items.items():
         put_file(fs, f"{base}/items/{name}.json", _json(item))
     put_file(fs, f"{base}/collection.json", _json(_collection(rows, sorted(items))))
+    put_file(fs, f"{base}/{PAGE}", fleet_page(rows).encode())
     for path in fs.glob(f"{base}/items/*.json"):
         if path.rsplit("/", 1)[1].removesuffix(".json") not in items:
             fs.rm_file(path)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import shutil
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -180,6 +182,47 @@ def test_other_programs_open_the_catalogue(fleet: Path) -> None:
     for name, item in items.items():
         item.validate()
         assert item.common_metadata.start_datetime.isoformat()[:10] == ROADS[name][1][:10]
+
+
+class Tables(HTMLParser):
+    """Rows of the tables of a page, as lists of texts, by the section that they stand in."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.of: dict[str, list[list[str]]] = {}
+        self._section = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "section":
+            self._section = dict(attrs)["id"] or ""
+        elif tag == "tr":
+            self.of.setdefault(self._section, []).append([])
+        elif tag in ("td", "th"):
+            self.of[self._section][-1].append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.of.get(self._section) and self.of[self._section][-1] and data.strip():
+            self.of[self._section][-1][-1] += data
+
+
+def test_the_page_says_the_same_as_the_catalogue(fleet: Path, tmp_path: Path) -> None:
+    told = Tables((fleet / "fleet/index.html").read_text()).of
+    asked = list(csv.DictReader(io.StringIO(cli("sql", "--fleet", str(fleet), "--csv", YEARLY).output)))
+    assert [(row[0], row[1]) for row in told["years"][1:]] == [("2025", "1"), ("2026", "1")]
+    for row, one in zip(told["years"][1:], asked, strict=True):
+        assert float(row[4]) == pytest.approx(float(one["mri"]), abs=0.006)
+    assert [row[:3:2] for row in told["surveys"][1:]] == [[name, "finished"] for name in sorted(ROADS)]
+    assert "wrong" not in told
+    copy = tmp_path / "fleet"
+    shutil.copytree(fleet, copy)
+    shutil.rmtree(root(copy, "south-2026"))
+    (copy / "broken").mkdir()
+    (copy / "broken/SURVEY.toml").write_text('id = "<b>"\n[map]\n[[runs]]\n')
+    assert cli("fleet", str(copy)).exit_code == 1
+    page = (copy / "fleet/index.html").read_text()
+    wrong = {row[0]: row for row in Tables(page).of["wrong"][1:]}
+    assert wrong["south-2026"][1] == "not run" and len(wrong) == 2 and "<b>" not in page
 
 
 def test_only_what_changed_is_made_anew(fleet: Path, tmp_path: Path) -> None:

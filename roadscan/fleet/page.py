@@ -106,9 +106,9 @@ def _surveys(rows: Sequence[Row]) -> Part:
     told = [
         [
             str(one["survey"]), str(one["title"]), str(one["state"]), _day(one.get("first_epoch_gps_ns")),
-            str(one["rig"]), _shown(one.get("driven_km"), ",.1f"), _shown(one.get("lane_km"), ",.1f"),
+            str(one["rig"]), _shown(one.get("driven_km"), ",.2f"), _shown(one.get("lane_km"), ",.2f"),
             _shown(one.get("sigma_down_m"), ".1f", 1e3), _shown(one.get("mri_m_per_km"), ".2f"),
-            str(one["version"]), str(one["store"]),
+            str(one["version"]),
         ]
         for one in (row.values for row in rows)
     ]  # fmt: skip
@@ -126,7 +126,7 @@ def _shown(value: float | None, form: str, factor: float = 1.0) -> str:
 
 def _sum(rows: Sequence[dict[str, Any]], name: str) -> str:
     known = [float(row[name]) for row in rows if row.get(name) is not None]
-    return f"{sum(known):,.1f}" if known else ""
+    return f"{sum(known):,.2f}" if known else ""
 
 
 def _mean(rows: Sequence[dict[str, Any]], name: str, weight: str, form: str) -> str:

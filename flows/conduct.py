@@ -25,6 +25,7 @@ from roadscan.run.progress import LineReporter
 from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, stages
+from roadscan.run.told import Asked, told_run
 from roadscan.store.store import Store
 from roadscan.survey.preflight import preflight
 from roadscan.survey.run import close_run, run_stage
@@ -72,7 +73,12 @@ def run_name() -> str:
 
 
 def conduct(
-    survey_file: str, workers: int | None, scheduler: str | None, selection: Selection | None = None
+    survey_file: str,
+    workers: int | None,
+    scheduler: str | None,
+    selection: Selection | None = None,
+    events: str | None = None,
+    metrics: str | None = None,
 ) -> State[Any]:
     """Run all stages; returns the flow run's final state.
 
@@ -82,16 +88,16 @@ def conduct(
     try:
         survey = Survey.load(survey_file)
         store = Store(survey.store_url, survey.config.id)
-        reporter = FlowReporter()
         store.check_free()
-        preflight(survey, store, selection=selection).begin(reporter.line)
-        with store.lock(), compute_on(workers, scheduler) as compute:
-            run = Session(survey, store, compute, selection, reporter)
-            for stage in stages():
-                ended = stage_task(stage, run)()
-                if ended is not None:
-                    ended.result()  # raises the error of the stage
-            close_run(run, stages())
+        run = Session(survey, store, selection=selection, reporter=FlowReporter())
+        with told_run(run, [stage.name for stage in stages()], Asked.of(events, metrics)):
+            preflight(survey, store, selection=selection).begin(run.reporter.line)
+            with store.lock(), compute_on(workers, scheduler) as run.compute:
+                for stage in stages():
+                    ended = stage_task(stage, run)()
+                    if ended is not None:
+                        ended.result()  # raises the error of the stage
+                close_run(run, stages())
     except RoadscanError as error:
         return failed(error)
     return Completed(data={"raw_bytes_read": float(run.raw_bytes_read)})

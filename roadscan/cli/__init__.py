@@ -17,6 +17,7 @@ from roadscan.cli import (
     cleaning,
     estimates,
     exports,
+    fleets,
     inventory,
     logs,
     pages,
@@ -76,6 +77,7 @@ app.command("view")(pages.view)
 app.command("publish")(pages.publish)
 app.command("sql")(queries.sql)
 app.command("where")(queries.where)
+app.command("fleet")(fleets.fleet)
 
 export = typer.Typer(
     cls=exports.Exports, help="Readings and pictures as files of other programs.", no_args_is_help=True

@@ -110,16 +110,14 @@ class RoadscanError(Exception):
         )
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Keep the keyword parts when a worker pickles the error for the scheduler."""
-        state = (self.arrived, self.expected, self.change, self.file, self.record, self.missing, may_pass(self))
-        return (_rebuild, (type(self), state))
+        """Keep the keyword parts, and what was noted on it, when a worker pickles the error for the scheduler."""
+        state = (self.arrived, self.expected, self.change, self.file, self.record, self.missing)
+        return (_rebuild, (type(self), state), self.__dict__ | {"passes": may_pass(self)})
 
 
 def _rebuild(kind: type[RoadscanError], state: tuple[Any, ...]) -> RoadscanError:
-    arrived, expected, change, file, record, missing, passes = state
-    error = kind(arrived, expected=expected, change=change, file=file, record=record, missing=missing)
-    error.passes = passes
-    return error
+    arrived, expected, change, file, record, missing = state
+    return kind(arrived, expected=expected, change=change, file=file, record=record, missing=missing)
 
 
 def _wanted(missing: Alternatives) -> str:

@@ -174,7 +174,7 @@ class OpenSurvey:
         Its statements reach the store and memory; `unconfined` lets them read and write any file.
         """
         from roadscan.navigation.tasks.navigate import known_keys
-        from roadscan.store.sql import connect
+        from roadscan.store.query.sql import connect
 
         return connect(self.store, known_keys(self.survey, self.store), unconfined=unconfined)
 
@@ -191,7 +191,7 @@ class OpenSurvey:
         """
         import duckdb
 
-        from roadscan.store.sql import missing_table
+        from roadscan.store.query.sql import missing_table
         from roadscan.survey.ask import not_made
 
         try:

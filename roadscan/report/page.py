@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
@@ -44,18 +45,24 @@ def _made(session: Session) -> tuple[str, bool]:
     config, failed = session.survey.config, list[str]()
     material = Material(session)
     parts = [part for part in (_part(section, material, failed) for section in sections()) if part.blocks]
+    lead = (
+        f"Report of the survey {config.id}. Lengths are in metres unless a unit is named; σ is one standard "
+        "deviation; times are UTC."
+    )
+    made_of = "the records and tables of the survey's store"
+    return html_page(f"{config.id}: report of the survey", config.title or config.id, lead, parts, made_of), not failed
+
+
+def html_page(title: str, heading: str, lead: str, parts: Sequence[Part], made_of: str) -> str:
+    """Return parts as a self-contained page.
+
+    title : of the browser's window; heading, lead : what stands first; made_of : what the page follows from, in words.
+    """
     template = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     ).from_string(files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
-    page = template.render(
-        title=f"{config.id}: report of the survey",
-        heading=config.title or config.id,
-        lead=f"Report of the survey {config.id}. Lengths are in metres unless a unit is named; σ is one standard "
-        "deviation; times are UTC.",
-        parts=parts,
-        footer=f"Made by roadscan {__version__} from the records and tables of the survey's store.",
-    )
-    return page, not failed
+    footer = f"Made by roadscan {__version__} from {made_of}."
+    return template.render(title=title, heading=heading, lead=lead, parts=parts, footer=footer)
 
 
 def keep_report(session: Session) -> str:

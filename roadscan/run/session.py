@@ -12,6 +12,7 @@ from roadscan.core.errors import StoreError, may_pass
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Inline
 from roadscan.run.selection import Selection
+from roadscan.run.telling.teller import Teller
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 
@@ -38,6 +39,8 @@ class Session:
     selection: Selection | None = None
     """If given, only these tiles are computed, even if they are current."""
     reporter: Reporter = field(default_factory=Reporter)
+    teller: Teller | None = None
+    """Tells those who listen what the run does, while it is at work."""
     failures: list[tuple[str, str, str]] = field(default_factory=list)
     """Stage, unit and reason of everything that failed."""
     passes: str = ""

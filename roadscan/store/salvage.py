@@ -41,6 +41,11 @@ class Lost:
     accepted: bool = False
     """True once the user accepted that the store continues without them."""
 
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        told = {"file": self.file.path, "table": self.table, "rows": self.rows, "accepted": self.accepted}
+        return {**told, "told": self.told}
+
     def __str__(self) -> str:
         """Return in words what is lost."""
         kept = f"; the damaged file is kept ({self.aside})" if self.aside else ""

@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from roadscan.core.errors import RoadscanError, StoreError
+from roadscan.core.errors import DamagedError, RoadscanError, StoreError
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import PRODUCT
 from roadscan.georeference.plan.plan import NothingToPlaceError
@@ -30,6 +30,7 @@ from roadscan.store.stamp import Stamp, stamp_of
 from roadscan.store.store import Store
 from roadscan.store.verified import held_faults, note_verified
 from roadscan.store.written_by import VERSION_FILE
+from roadscan.survey.forgotten import forgotten_pictures
 from roadscan.survey.preflight import preflight
 from roadscan.tiles.product import products
 from roadscan.tiles.tasks.tile_plan import TILE
@@ -213,6 +214,7 @@ def find_damage(store: Store, report: Callable[[int, int], None] = lambda _a, _b
             *map(str, damaged),
             *damaged_sources(store),
             *_version_faults(store),
+            *_forgotten_faults(store),
             *_copy_faults(store, [r.key for r in logs]),
             *held_faults(store),
             *history_faults(store).values(),
@@ -250,6 +252,15 @@ def _version_faults(store: Store) -> list[str]:
     """Return the fault of the file that names the version which wrote last, if it has one."""
     if store.exists(VERSION_FILE) and not store.last_version():
         return [f"{VERSION_FILE}: it is damaged; the next run writes it anew"]
+    return []
+
+
+def _forgotten_faults(store: Store) -> list[str]:
+    """Return the fault of the record of forgotten pictures, if it has one."""
+    try:
+        forgotten_pictures(store)
+    except DamagedError as error:
+        return [str(error)]
     return []
 
 

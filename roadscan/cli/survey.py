@@ -24,6 +24,10 @@ class Where(NamedTuple):
     """Address of a Dask scheduler that runs elsewhere."""
     dashboard: bool = False
     """Whether the embedded cluster serves Dask's dashboard."""
+    events: Path | None = None
+    """File of the run's events; the environment may name one, too."""
+    metrics: Path | None = None
+    """File of the run's figures for Prometheus; the environment may name one, too."""
 
 
 def stages_named(name: str) -> tuple[Stage, ...]:
@@ -46,24 +50,26 @@ def run_survey(
     from roadscan.core.stopping import Stopped
     from roadscan.run.engine.compute_on import compute_on
     from roadscan.run.session import Session
+    from roadscan.run.told import Asked, told_run
     from roadscan.survey.preflight import preflight
     from roadscan.survey.run import run_stages
 
     run, reporter = Session.open(survey_file), new_reporter()
     run.selection, run.reporter = selection, reporter
-    preflight(run.survey, run.store, stages[-1].name, selection).begin(reporter.line)
 
     def at(address: str) -> None:
         reporter.line(f"dashboard: {address}")
 
-    with compute_on(where.workers, where.scheduler, at if where.dashboard else None) as run.compute:
-        try:
-            run_stages(run, stages)
-        except Stopped as stop:
-            stop.add_note(f"{reporter.where(run.stage)}; the next run goes on from there")
-            raise
-        finally:
-            reporter.close()
+    with told_run(run, [stage.name for stage in stages], Asked.of(where.events, where.metrics)):
+        preflight(run.survey, run.store, stages[-1].name, selection).begin(run.reporter.line)
+        with compute_on(where.workers, where.scheduler, at if where.dashboard else None) as run.compute:
+            try:
+                run_stages(run, stages)
+            except Stopped as stop:
+                stop.add_note(f"{reporter.where(run.stage)}; the next run goes on from there")
+                raise
+            finally:
+                reporter.close()
     return run
 
 

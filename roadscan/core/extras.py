@@ -24,6 +24,7 @@ EXTRAS: Final = {
     "kiss_icp.kiss_icp": ("kiss-icp", "odometry"),
     "matplotlib": ("matplotlib", "pictures"),
     "onnxruntime": ("onnxruntime", "onnx"),
+    "opentelemetry.sdk.trace": ("opentelemetry-sdk", "otel"),
     "psycopg": ("psycopg", "postgis"),
     "rapidocr": ("rapidocr", "ocr"),
     "lz4.frame": ("lz4", "ros"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ from roadscan.core.errors import RoadscanError
 from roadscan.run.engine import embedded as own_cluster
 from roadscan.run.engine.embedded import embedded
 from roadscan.run.engine.on_dask import OnDask
+from roadscan.run.telling.events import Listener, UnitEnded
+from roadscan.run.telling.teller import Teller, ToldCompute
 
 DEADLY = 7
 
@@ -36,6 +39,21 @@ def test_only_the_task_that_kills_its_worker_is_lost(cluster: OnDask) -> None:
     assert isinstance(error, RoadscanError)
     assert "died" in str(error)
     assert {task: done.result for task, done in ended.items()} == {task: task**2 for task in ended}
+
+
+def test_a_task_is_told_with_the_worker_that_did_it(cluster: OnDask) -> None:
+    heard: list[UnitEnded] = []
+    listener = Listener()
+    listener.hear = lambda event: heard.append(event) if isinstance(event, UnitEnded) else None  # type: ignore[method-assign,assignment]
+    told = ToldCompute(cluster, Teller("survey", [listener], print))
+    (process,) = (done.result for done in told.map(worker, [0]))
+    assert [done.result for done in told.map(squared, [DEADLY])] == [None]
+    assert isinstance(next(told.map(inverse, [0])).error, ZeroDivisionError)
+    fine, dead, wrong = heard
+    assert (fine.outcome, fine.host, fine.process) == ("done", socket.gethostname(), process)
+    assert process != os.getpid()
+    assert (dead.outcome, dead.host, dead.seconds) == ("failed", None, None) and "died" in dead.reason
+    assert wrong.outcome == "failed" and wrong.process not in (None, os.getpid()) and "zero" in wrong.reason
 
 
 def test_an_error_is_the_tasks_own(cluster: OnDask) -> None:
@@ -89,6 +107,10 @@ def test_workers_keep_their_memory(cluster: OnDask) -> None:
 def version_of(_: int) -> str:
     time.sleep(0.02)
     return roadscan.__version__
+
+
+def worker(_: int) -> int:
+    return os.getpid()
 
 
 def squared(number: int) -> int:

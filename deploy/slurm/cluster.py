@@ -22,6 +22,9 @@ PROLOGUE = [
     "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False",
     "export MALLOC_TRIM_THRESHOLD_=1073741824 MALLOC_TOP_PAD_=67108864 MALLOC_MMAP_MAX_=0 MALLOC_ARENA_MAX=1",
     "export GLIBC_TUNABLES=glibc.malloc.hugetlb=1",
+    # The same last bits on each processor: docs/scaling.md, "Without AVX-512".
+    "export OPENBLAS_CORETYPE=Haswell OPENBLAS_NUM_THREADS=1 NPY_DISABLE_CPU_FEATURES=X86_V4",
+    "export ARROW_USER_SIMD_LEVEL=AVX2 OPENCV_CPU_DISABLE=AVX512-SKX",
 ]
 
 

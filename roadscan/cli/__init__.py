@@ -19,6 +19,7 @@ from roadscan.cli import (
     cleaning,
     estimates,
     exports,
+    fleets,
     inventory,
     logs,
     pages,
@@ -76,12 +77,14 @@ app.command("status")(state.status)
 app.command("verify")(state.verify)
 app.command("clean")(cleaning.clean)
 app.command("archive")(cleaning.archive)
+app.command("forget")(cleaning.forget)
 app.command("report")(reports.report)
 app.command("compare")(reports.compare)
 app.command("view")(pages.view)
 app.command("publish")(pages.publish)
 app.command("sql")(queries.sql)
 app.command("where")(queries.where)
+app.command("fleet")(fleets.fleet)
 
 export = typer.Typer(
     cls=exports.Exports, help="Readings and pictures as files of other programs.", no_args_is_help=True

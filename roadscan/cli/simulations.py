@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from roadscan.cli.arguments import AsJson, Workers, scenes_for
+from roadscan.cli.arguments import AsJson, PlainJson, Workers, scenes_for
 from roadscan.cli.survey import Where, run_survey, sum_up
-from roadscan.cli.terminal import print_table
+from roadscan.cli.terminal import print_json, print_table
 
 
 def simulate(
@@ -40,12 +40,20 @@ def simulate(
     typer.echo(f"survey file: {made.survey_file}")
 
 
-def list_scenes() -> None:
+def list_scenes(as_json: PlainJson = False) -> None:
     """List the scenes that ship with roadscan."""
     from roadscan.simulate import Scene
     from roadscan.simulate.scene import shipped_scenes
 
     scenes = {name: Scene.load(name) for name in shipped_scenes()}
+    if as_json:
+        print_json(
+            [
+                {"scene": name, "length_m": one.length_m, "passes": len(one.passes), "title": one.title}
+                for name, one in scenes.items()
+            ]
+        )
+        return
     print_table(
         ("scene", "length m", "passes", "what"),
         [(name, f"{one.length_m:g}", str(len(one.passes)), one.title) for name, one in scenes.items()],

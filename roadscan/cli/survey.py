@@ -24,6 +24,10 @@ class Where(NamedTuple):
     """Address of a Dask scheduler that runs elsewhere."""
     dashboard: bool = False
     """Whether the embedded cluster serves Dask's dashboard."""
+    events: Path | None = None
+    """File of the run's events; the environment may name one, too."""
+    metrics: Path | None = None
+    """File of the run's figures for Prometheus; the environment may name one, too."""
 
 
 def run_survey(
@@ -41,6 +45,7 @@ def run_survey(
     from roadscan.run.progress import compiling_told
     from roadscan.run.session import Session
     from roadscan.run.stage import stages
+    from roadscan.run.told import Asked, told_run
     from roadscan.survey.preflight import preflight
     from roadscan.survey.run import run_stages
 
@@ -49,22 +54,21 @@ def run_survey(
         where = where._replace(workers=0)
     run, reporter = Session.open(survey_file), new_reporter()
     run.selection, run.reporter = selection, reporter
-    preflight(run.survey, run.store, chosen[-1].name, selection).begin(reporter.line)
 
     def at(address: str) -> None:
         reporter.line(f"dashboard: {address}")
 
-    with (
-        compiling_told(reporter),
-        compute_on(where.workers, where.scheduler, at if where.dashboard else None) as run.compute,
-    ):
-        try:
-            run_stages(run, chosen)
-        except Stopped as stop:
-            stop.add_note(f"{reporter.where(run.stage)}; the next run goes on from there")
-            raise
-        finally:
-            reporter.close()
+    asked = Asked.of(where.events, where.metrics)
+    with told_run(run, [stage.name for stage in chosen], asked), compiling_told(run.reporter):
+        preflight(run.survey, run.store, chosen[-1].name, selection).begin(run.reporter.line)
+        with compute_on(where.workers, where.scheduler, at if where.dashboard else None) as run.compute:
+            try:
+                run_stages(run, chosen)
+            except Stopped as stop:
+                stop.add_note(f"{reporter.where(run.stage)}; the next run goes on from there")
+                raise
+            finally:
+                reporter.close()
     return run
 
 

@@ -23,7 +23,7 @@ from roadscan.store.logs import DataFile, log_folder
 from roadscan.store.merge import merged
 from roadscan.store.row_order import sorted_batch, sorted_rows
 from roadscan.store.schema import TableSchema, table_schema
-from roadscan.store.store import Store
+from roadscan.store.store import Store, count_put
 
 BUDGET_BYTES: Final = 128 << 20
 """Bytes of rows in memory before the fullest partitions are written."""
@@ -143,6 +143,7 @@ class LogWriter:
         out = self.files(run, sensor, key)
         for table in out:
             store.publish_folder(self._folder / table, log_folder(table, run, sensor, key))
+            count_put(sum(file.bytes for file in out[table].values()))
         return {table: tuple(files.values()) for table, files in out.items()}
 
     def files(self, run: str, sensor: str, key: str) -> dict[str, dict[Path, DataFile]]:

@@ -10,14 +10,15 @@ from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.survey import Survey
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.store.asset_schema import asset_tables
+from roadscan.store.query.sql import Limits, missing_table, query
 from roadscan.store.schema import schema_names
-from roadscan.store.sql import Limits, missing_table, query
 from roadscan.store.store import Store
 
 _MADE_BY: Final = {
     "mountings": "`roadscan calibrate` makes it, from the [[calibration]] of the survey file",
     "outputs": "`roadscan run` makes it",
     "reading_classes": "`roadscan classes` writes it as a file of its own; read that with read_parquet",
+    "run_history": "`roadscan run` writes it when it ends",
     "regions": 'a run makes it with regions = "found" in [surface]',
 }
 """What makes tables that no stage writes, or not always."""
@@ -32,7 +33,7 @@ def ask(
     unconfined: bool = False,
     limits: Limits | None = None,
 ) -> pa.Table:
-    """Return the result of a DuckDB statement over a survey's tables (:func:`roadscan.store.sql.query`).
+    """Return the result of a DuckDB statement over a survey's tables (:func:`roadscan.store.query.sql.query`).
 
     Raises
     ------

@@ -30,7 +30,7 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.blocks import Block

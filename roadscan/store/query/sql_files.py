@@ -12,36 +12,36 @@ import io
 import os
 import stat
 import threading
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Protocol
 
 from fsspec import AbstractFileSystem
 
+from roadscan.store.stamp import Stamp, stamp_of_info, stamp_of_stat
 from roadscan.store.store import Store
 
 PROTOCOL: Final = "store"
 
 
-class Stamp(NamedTuple):
-    """Size and time that show, without reading it, that a file has not been written since."""
-
-    bytes: int
-    changed: str
-    """Time of the last change (ns) in a folder; an object store's equivalent, empty where it has none."""
-
-
-def stamp_of(store: Store, path: str) -> Stamp | None:
-    """Return size and time of a file of the store (`path` relative to the survey's root), None where it is missing."""
-    try:
-        if store.is_folder:
-            return _stamp_of_stat(os.stat(store.path(path)))  # noqa: PTH116 — thousands of them
-        return _remote_stamp(store.fs.info(store.path(path)))
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-
-
 def url(store: Store, path: str) -> str:
     """Return the name of a file of the store in statements."""
     return f"{PROTOCOL}://survey={store.survey_id}/{path}"
+
+
+class OpenedFiles(Protocol):
+    """What a connection opens and what it was denied."""
+
+    @property
+    def refused(self) -> list[str]:
+        """Denied requests, in words."""
+        ...
+
+    def last(self) -> str | None:
+        """Return the file that was opened last."""
+        ...
+
+    def forget(self) -> None:
+        """Count no file as opened by now."""
+        ...
 
 
 class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
@@ -64,8 +64,20 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         self._alone = threading.Lock()  # DuckDB opens files from several threads
         self.opened: dict[str, Stamp] = {}
         """Opened files, relative to the survey's root, with their stamps at that time."""
-        self.refused: list[str] = []
+        self._refused: list[str] = []
+
+    @property
+    def refused(self) -> list[str]:
         """Denied requests, in words."""
+        return self._refused
+
+    def last(self) -> str | None:
+        """Return the file that was opened last."""
+        return next(reversed(self.opened), None)
+
+    def forget(self) -> None:
+        """Count no file as opened by now."""
+        self.opened.clear()
 
     def open(self, path: str, mode: str = "rb", **_: Any) -> Any:
         """Return a file's bytes; PermissionError for any other mode and for files outside."""
@@ -77,7 +89,7 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
             stream = _LocalFile(place)
             stamp = stream.stamp()
         else:
-            stamp = _remote_stamp(self._store.fs.info(place))
+            stamp = stamp_of_info(self._store.fs.info(place))
             stream = _RemoteFile(self._store.fs.open(place, "rb"), stamp.bytes)
         with self._alone:
             self.opened.setdefault(self._relative(path), stamp)
@@ -138,7 +150,7 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         return real == self._root or real.startswith(f"{self._root}/")
 
     def _refuse(self, words: str) -> None:
-        self.refused.append(words)
+        self._refused.append(words)
         raise PermissionError(words)
 
 
@@ -151,7 +163,7 @@ class _LocalFile(io.RawIOBase):
 
     def stamp(self) -> Stamp:
         """Return size and time of the open file."""
-        return _stamp_of_stat(os.fstat(self._file))
+        return stamp_of_stat(os.fstat(self._file))
 
     def readable(self) -> bool:
         """Return True."""
@@ -213,12 +225,3 @@ class _RemoteFile(_LocalFile):
 
     def _release(self) -> None:
         self._stream.close()
-
-
-def _stamp_of_stat(found: os.stat_result) -> Stamp:
-    return Stamp(found.st_size, str(found.st_mtime_ns))
-
-
-def _remote_stamp(found: dict[str, Any]) -> Stamp:
-    known = (found.get(name) for name in ("ETag", "etag", "md5Hash", "LastModified", "mtime", "updated", "created"))
-    return Stamp(int(found["size"]), str(next((one for one in known if one), "")))

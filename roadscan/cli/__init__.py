@@ -120,10 +120,19 @@ for command in (
 app.add_typer(assets, name="inventory")
 
 
+def _leave() -> None:
+    """Let the process end without looking for garbage in what it leaves.
+
+    DuckDB would tell of each of its objects that nobody frees, so theirs are looked for.
+    """
+    if "duckdb" not in sys.modules:
+        gc.freeze()
+
+
 def main() -> None:
     """Run the command line; an error the user can mend is printed without a traceback."""
     gc.set_threshold(_OBJECTS)
-    atexit.register(gc.freeze)
+    atexit.register(_leave)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or pipe that knows no "─" or "σ" stops nothing

@@ -59,7 +59,6 @@ def sql(  # noqa: PLR0913  each is an option of the command
     answer, or in it.
     """
     from roadscan.core.errors import AnswerError, ConfigError, StoreError
-    from roadscan.fleet.ask import ask_fleet
     from roadscan.run.session import Session
     from roadscan.store.query.sql import Limits
     from roadscan.survey.ask import ask
@@ -70,6 +69,8 @@ def sql(  # noqa: PLR0913  each is an option of the command
     damaged: list[StoreError] = []
     try:
         if fleet is not None:
+            from roadscan.fleet.ask import ask_fleet
+
             result = ask_fleet(fleet, statement, damaged, unconfined=unconfined, limits=limits)
         else:
             session = Session.open(survey_file or found_survey())

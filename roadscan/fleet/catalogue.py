@@ -15,7 +15,6 @@ import shapely
 from roadscan.core.errors import DamagedError
 from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.fleet.members import Found, surveys_in
-from roadscan.fleet.page import fleet_page
 from roadscan.fleet.row import Row, row_key, row_of
 from roadscan.store.schema import table_schema
 from roadscan.store.seal import bears_seal, check_seal, sealed_parquet, without_seal
@@ -52,6 +51,8 @@ def make_catalogue(place: str) -> Catalogue:
     StoreError
         It cannot be written.
     """
+    from roadscan.fleet.page import fleet_page  # A question to a fleet draws no page.
+
     fs, base = opened_url(place)
     base = f"{base.rstrip('/')}/{FOLDER}"
     before = _rows_before(fs, f"{base}/{_FILE}")
